@@ -1,0 +1,71 @@
+"""The exceptions of the toolkit: one root, and leaves that carry the data a caller needs.
+
+Every message says what was found, where, and what to try. ``poses`` and ``trajectories`` import nothing from here and
+raise their own subclasses of `ValueError`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+
+class CalibError(Exception):
+    """Root of all errors this toolkit raises on purpose."""
+
+
+class UsageError(CalibError):
+    """A command, an option or an options file that cannot be carried out as said."""
+
+
+class RobotError(CalibError):
+    """A robot description that cannot be read or does not hold together."""
+
+
+class MeasurementError(CalibError):
+    """Measured data that cannot be what they claim to be.
+
+    Attributes:
+        file, row, column: where it was found; ``row`` counts data rows from 1 (the header is not a row), None where
+            the complaint is about the whole file.
+    """
+
+    def __init__(self, message: str, file: str | Path | None = None, row: int | None = None, column: str | None = None):
+        self.file, self.row, self.column = file, row, column
+        place = ", ".join(
+            part
+            for part in (
+                str(file) if file else "",
+                f"row {row}" if row is not None else "",
+                f"column '{column}'" if column else "",
+            )
+            if part
+        )
+        super().__init__(f"{place}: {message}" if place else message)
+
+
+class Unidentifiable(CalibError):
+    """Parameters that the data cannot tell apart.
+
+    Attributes:
+        names: the parameters concerned.
+        singular_values: of the column-scaled observation matrix, falling.
+    """
+
+    def __init__(self, message: str, names: Sequence[str] = (), singular_values: np.ndarray | None = None):
+        self.names, self.singular_values = tuple(names), singular_values
+        super().__init__(message)
+
+
+class NotConverged(CalibError):
+    """An iteration that stopped before its tolerance; ``last`` is its last estimate."""
+
+    def __init__(self, message: str, last: object = None):
+        self.last = last
+        super().__init__(message)
+
+
+class SessionError(CalibError):
+    """A session folder that is busy, damaged, or not in the state a command needs."""
