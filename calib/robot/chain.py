@@ -1,0 +1,190 @@
+"""What a robot is to this toolkit: a chain of elementary transforms, the same for an MDH table and for a URDF.
+
+    T(q) = Π_k  placement_k · exp(sign_k · axis_k · (value_k + ratio_k · q_{joint_k})) · tail
+
+``axis_k`` is one of the six elementary motions tx ty tz rx ry rz. A calibrated robot is a Chain too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from calib.arrays import frozen
+from calib.errors import RobotError
+
+AXES = ("tx", "ty", "tz", "rx", "ry", "rz")
+GRAVITY = (0.0, 0.0, -9.81)
+
+
+@dataclass(frozen=True)
+class Joint:
+    """One actuated joint: its name, kind and limits (SI; infinite where none are given)."""
+
+    name: str
+    kind: str = "revolute"
+    lower: float = -np.inf
+    upper: float = np.inf
+    velocity: float = np.inf
+    effort: float = np.inf
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("revolute", "prismatic"):
+            raise RobotError(f"joint '{self.name}': kind '{self.kind}' is neither 'revolute' nor 'prismatic'")
+        if not self.lower < self.upper:
+            raise RobotError(f"joint '{self.name}': lower limit {self.lower:g} is not below the upper {self.upper:g}")
+
+    @property
+    def unit(self) -> str:
+        return "rad" if self.kind == "revolute" else "m"
+
+
+@dataclass(frozen=True)
+class Element:
+    """One elementary transform ``placement · exp(sign · axis · (value + ratio · q))``.
+
+    Attributes:
+        name: as it appears in tables, e.g. ``alpha3`` or ``elbow_joint.x``.
+        axis: one of `AXES`.
+        value: [m] or [rad].
+        owner: index of the joint whose placement it helps to describe; n for what follows the last joint.
+        joint: index of the joint that moves it, None where it is constant.
+        ratio: 1, or the multiplier of a mimic joint.
+        sign: +1 or -1, for a joint axis that points against the elementary one.
+        placement: (4, 4), the fixed transform before it; None for the identity.
+    """
+
+    name: str
+    axis: str
+    value: float = 0.0
+    owner: int = 0
+    joint: int | None = None
+    ratio: float = 1.0
+    sign: float = 1.0
+    placement: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        if self.axis not in AXES:
+            raise RobotError(f"element '{self.name}': axis '{self.axis}' is none of {', '.join(AXES)}")
+        if not np.isfinite(self.value):
+            raise RobotError(f"element '{self.name}': value {self.value} is not finite")
+        if self.placement is not None:
+            object.__setattr__(self, "placement", frozen(self.placement))
+
+    @property
+    def unit(self) -> str:
+        return "m" if self.axis[0] == "t" else "rad"
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """A serial arm from ``base`` to ``tip``, without the instrument and without the tool.
+
+    Attributes:
+        joints: the n actuated joints, in the order of q.
+        elements: the K elementary transforms, base to tip.
+        tail: (4, 4), what follows the last element.
+        inertias: (n, 10) standard parameters XX XY XZ YY YZ ZZ MX MY MZ M of the body behind each joint, about the
+            frame right after the joint's moving element [kg m², kg m, kg]; None where unknown.
+        gravity: (3,) in the base frame [m/s²].
+        links: names of the n links behind the joints (URDF), for messages and export.
+    """
+
+    name: str
+    joints: tuple[Joint, ...]
+    elements: tuple[Element, ...]
+    base: str = "base"
+    tip: str = "tip"
+    tail: np.ndarray = field(default_factory=lambda: np.eye(4))
+    inertias: np.ndarray | None = None
+    gravity: np.ndarray = field(default_factory=lambda: np.array(GRAVITY))
+    links: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "tail", frozen(self.tail))
+        object.__setattr__(self, "gravity", frozen(self.gravity))
+        if self.inertias is not None:
+            object.__setattr__(self, "inertias", frozen(self.inertias))
+        for what, names in (("joint", self.joint_names), ("element", self.names)):
+            doubled = {name for name in names if names.count(name) > 1}
+            if doubled:
+                raise RobotError(f"robot '{self.name}': {what} name '{sorted(doubled)[0]}' occurs twice")
+        driven = {element.joint for element in self.elements if element.joint is not None}
+        if driven != set(range(len(self.joints))):
+            raise RobotError(f"robot '{self.name}': every joint has to move at least one element")
+
+    @property
+    def n(self) -> int:
+        """Number of actuated joints."""
+        return len(self.joints)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        return tuple(joint.name for joint in self.joints)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(element.name for element in self.elements)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return tuple(element.unit for element in self.elements)
+
+    @property
+    def values(self) -> np.ndarray:
+        """The K values [m or rad]."""
+        return np.array([element.value for element in self.elements])
+
+    @property
+    def lower(self) -> np.ndarray:
+        return np.array([joint.lower for joint in self.joints])
+
+    @property
+    def upper(self) -> np.ndarray:
+        return np.array([joint.upper for joint in self.joints])
+
+    @property
+    def moving(self) -> np.ndarray:
+        """(n,) index of the element that each joint moves first (a mimic joint's follower comes later)."""
+        index = np.full(self.n, -1)
+        for k in reversed(range(len(self.elements))):
+            if (joint := self.elements[k].joint) is not None:
+                index[joint] = k
+        return index
+
+    def with_values(self, values: np.ndarray | Mapping[str, float]) -> Chain:
+        """Return the same chain with other element values: all K of them, or some by name."""
+        if isinstance(values, Mapping):
+            unknown = set(values) - set(self.names)
+            if unknown:
+                raise RobotError(f"robot '{self.name}' has no element '{sorted(unknown)[0]}'")
+            values = np.array([values.get(element.name, element.value) for element in self.elements])
+        elements = tuple(replace(element, value=float(value)) for element, value in zip(self.elements, values, strict=True))
+        return replace(self, elements=elements)
+
+
+def sampling_limits(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
+    """Return finite lower and upper joint limits (n,), ±π or ±1 m standing in where a joint has none."""
+    reach = np.array([np.pi if joint.kind == "revolute" else 1.0 for joint in chain.joints])
+    return np.where(np.isfinite(chain.lower), chain.lower, -reach), np.where(np.isfinite(chain.upper), chain.upper, reach)
+
+
+def random_joints(chain: Chain, count: int, seed: int | np.random.Generator = 0) -> np.ndarray:
+    """Draw (count, n) joint values, uniform within the limits [rad or m]."""
+    lower, upper = sampling_limits(chain)
+    return np.random.default_rng(seed).uniform(lower, upper, (count, chain.n))
+
+
+def element_index(chain: Chain, names: Iterable[str]) -> np.ndarray:
+    """Return the indices of elements by name.
+
+    Raises:
+        RobotError: for a name the chain does not have.
+    """
+    table = {name: k for k, name in enumerate(chain.names)}
+    try:
+        return np.array([table[name] for name in names], dtype=int)
+    except KeyError as error:
+        raise RobotError(f"robot '{chain.name}' has no element {error}; it has {', '.join(chain.names)}") from None

@@ -1,0 +1,174 @@
+"""Forward kinematics and the Jacobian of every element, in batch: no Python loop over poses.
+
+The sample axis runs last inside (structure of arrays), so that each elementary transform is a handful of vector
+operations over all poses, and so that a stacked observation matrix is column-major without a copy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.arrays import shaped
+from calib.robot.chain import AXES, Chain
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """One pass along the chain for m poses.
+
+    Attributes:
+        directions: (K, 3, m) unit vector of each element's motion, in the reference frame, sign included.
+        origins: (K, 3, m) where each element's frame stands [m].
+        rotation: (3, 3, m), ``rotation[c]`` being column c of the flange's rotation.
+        position: (3, m) of the flange [m].
+    """
+
+    directions: np.ndarray
+    origins: np.ndarray
+    rotation: np.ndarray
+    position: np.ndarray
+
+    def poses(self) -> np.ndarray:
+        """Return the flange poses (m, 4, 4)."""
+        result = np.zeros((self.position.shape[1], 4, 4))
+        result[:, :3, :3] = self.rotation.transpose(2, 1, 0)
+        result[:, :3, 3] = self.position.T
+        result[:, 3, 3] = 1.0
+        return result
+
+
+def displacements(chain: Chain, q: np.ndarray) -> np.ndarray:
+    """Return value + ratio · q for every element: (K, m) [m or rad]."""
+    values = np.repeat(chain.values[:, None], len(q), axis=1)
+    for k, element in enumerate(chain.elements):
+        if element.joint is not None:
+            values[k] += element.ratio * q[:, element.joint]
+    return values
+
+
+def sweep(chain: Chain, q: np.ndarray, base: np.ndarray | None = None, extra: np.ndarray | None = None) -> Sweep:
+    """Walk the chain once for all poses.
+
+    Args:
+        chain: the arm.
+        q: (m, n) joint values [rad or m].
+        base: (4, 4) or (m, 4, 4), the pose of the arm's base in the reference; None for the identity.
+        extra: (K, m) added to the elements' displacements (deflections) [m or rad].
+    """
+    q = shaped(q, (None, chain.n), f"joint values of '{chain.name}'")
+    m, count = len(q), len(chain.elements)
+    motion = displacements(chain, q)
+    if extra is not None:
+        motion = motion + extra
+    rotation, position = _start(base, m)
+    directions, origins = np.empty((count, 3, m)), np.empty((count, 3, m))
+    for k, element in enumerate(chain.elements):
+        if element.placement is not None:
+            rotation, position = _place(rotation, position, element.placement)
+        axis, angular = AXES.index(element.axis) % 3, element.axis[0] == "r"
+        directions[k] = rotation[axis] if element.sign > 0 else -rotation[axis]
+        origins[k] = position
+        constant = extra is None and element.joint is None
+        amount = element.sign * (element.value if constant else motion[k])
+        if constant and amount == 0.0:
+            continue
+        if angular:
+            rotation = _rotate(rotation, axis, amount)
+        else:
+            position = position + rotation[axis] * amount
+    rotation, position = _place(rotation, position, chain.tail)
+    return Sweep(directions, origins, rotation, position)
+
+
+def forward(chain: Chain, q: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
+    """Return the tip's poses (m, 4, 4) in the base frame for joint values q (m, n)."""
+    return sweep(chain, q, extra=extra).poses()
+
+
+def element_jacobian(chain: Chain, walked: Sweep, point: np.ndarray) -> np.ndarray:
+    """Return the derivative of `point`, carried by the flange, with respect to every element's value.
+
+    For a rotation about z through o: [z × (point - o); z]; for a translation along z: [z; 0].
+
+    Args:
+        walked: what `sweep` returned.
+        point: (3, m) [m], in the reference frame.
+
+    Returns:
+        (K, 6, m): linear velocity of the point, then angular velocity, both in the reference frame.
+    """
+    angular = np.array([element.axis[0] == "r" for element in chain.elements])
+    jacobian = np.empty((len(angular), 6, point.shape[1]))
+    z, lever = walked.directions, point - walked.origins
+    jacobian[:, 0] = z[:, 1] * lever[:, 2] - z[:, 2] * lever[:, 1]
+    jacobian[:, 1] = z[:, 2] * lever[:, 0] - z[:, 0] * lever[:, 2]
+    jacobian[:, 2] = z[:, 0] * lever[:, 1] - z[:, 1] * lever[:, 0]
+    jacobian[:, 3:] = z
+    jacobian[~angular, :3] = z[~angular]
+    jacobian[~angular, 3:] = 0.0
+    return jacobian
+
+
+def jacobian(chain: Chain, q: np.ndarray) -> np.ndarray:
+    """Return the observation Jacobian of all elements at the tip, (m, 6, K): [v; ω] per unit of each value."""
+    walked = sweep(chain, q)
+    return element_jacobian(chain, walked, walked.position).transpose(2, 1, 0)
+
+
+def joint_jacobian(chain: Chain, elements: np.ndarray) -> np.ndarray:
+    """Gather an element Jacobian (K, rows, m) into the one of the joints (n, rows, m), mimic followers included."""
+    result = np.zeros((chain.n, *elements.shape[1:]))
+    for k, element in enumerate(chain.elements):
+        if element.joint is not None:
+            result[element.joint] += element.ratio * elements[k]
+    return result
+
+
+def joint_frames(chain: Chain, q: np.ndarray) -> np.ndarray:
+    """Return the frames right after each joint's moving element, (n, m, 4, 4): where `Chain.inertias` are given."""
+    m = len(q)
+    motion = displacements(chain, shaped(q, (None, chain.n), "joint values"))
+    rotation, position = _start(None, m)
+    frames = np.zeros((chain.n, m, 4, 4))
+    frames[..., 3, 3] = 1.0
+    first = {int(k): j for j, k in enumerate(chain.moving)}
+    for k, element in enumerate(chain.elements):
+        if element.placement is not None:
+            rotation, position = _place(rotation, position, element.placement)
+        axis, amount = AXES.index(element.axis) % 3, element.sign * motion[k]
+        if element.axis[0] == "r":
+            rotation = _rotate(rotation, axis, amount)
+        else:
+            position = position + rotation[axis] * amount
+        if k in first:
+            frames[first[k], :, :3, :3] = rotation.transpose(2, 1, 0)
+            frames[first[k], :, :3, 3] = position.T
+    return frames
+
+
+def _start(base: np.ndarray | None, m: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return rotation columns (3, 3, m) and position (3, m) of the base placement."""
+    placement = np.broadcast_to(np.eye(4) if base is None else base, (m, 4, 4))
+    return np.ascontiguousarray(placement[:, :3, :3].transpose(2, 1, 0)), np.ascontiguousarray(placement[:, :3, 3].T)
+
+
+def _place(rotation: np.ndarray, position: np.ndarray, placement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Multiply frames by a fixed placement from the right."""
+    flat = rotation.reshape(3, -1)
+    position = position + (placement[:3, 3] @ flat).reshape(position.shape)
+    if not np.array_equal(placement[:3, :3], np.eye(3)):
+        rotation = (placement[:3, :3].T @ flat).reshape(rotation.shape)
+    return rotation, position
+
+
+def _rotate(rotation: np.ndarray, axis: int, angle: np.ndarray | float) -> np.ndarray:
+    """Multiply frames by a rotation about their own axis from the right: two columns mix, the third stays."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    one, two = (axis + 1) % 3, (axis + 2) % 3
+    result = np.empty_like(rotation)
+    result[axis] = rotation[axis]
+    result[one] = cosine * rotation[one] + sine * rotation[two]
+    result[two] = cosine * rotation[two] - sine * rotation[one]
+    return result

@@ -1,0 +1,143 @@
+"""Observability indices of a set of poses, with their gradients.
+
+``s1 >= ... >= sp`` are the singular values of the whitened observation matrix W of m poses, U and V its singular vectors.
+
+========  =========================  =========  ===========================================================
+index     formula                    direction  source
+========  =========================  =========  ===========================================================
+``O1``    (s1 s2 ... sp)^(1/p)/√m    maximise   Borm & Menq 1989/1991 (D-optimality: det(WᵀW)^(1/2p)/√m)
+``O2``    sp / s1                    maximise   Driels & Pathre 1990
+``O3``    sp                         maximise   Nahvi, Hollerbach & Hayward 1994 (E-optimality)
+``O4``    sp² / s1                   maximise   Nahvi & Hollerbach 1996 (noise amplification index)
+``O5``    1 / (1/s1 + ... + 1/sp)    maximise   Sun & Hollerbach 2008 (some write p over the sum)
+``cond``  s1 / sp                    minimise   = 1/O2; the number the LWR4+ study minimises
+========  =========================  =========  ===========================================================
+
+O1 is the default everywhere in this package: multiplying a column of W (changing the unit of a parameter) multiplies
+O1 of *every* set by the same factor, so its ranking of sets does not depend on units. That of O2-O5 and cond does.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from poses.errors import BadInput
+
+Index = Literal["O1", "O2", "O3", "O4", "O5", "cond"]
+
+
+def observability(W: ArrayLike, index: Index = "O1", m: int | None = None) -> float:
+    """Return an observability index of a set of poses; the formulas stand at the head of this module.
+
+    Args:
+        W: (m, rows, p) whitened Jacobians of the poses, or (m rows, p) the same stacked; unitless rows.
+        index: one of "O1" ... "O5", "cond".
+        m: number of poses; needed for O1 of a stacked W only.
+
+    Returns:
+        The index; 0 (infinity for cond) where W has not full column rank.
+    """
+    stacked, poses = _stacked(W, index, m)
+    if len(stacked) < stacked.shape[1]:
+        return np.inf if index == "cond" else 0.0
+    return float(index_of_singular_values(np.linalg.svd(stacked, compute_uv=False), index, poses))
+
+
+def gradient(W: ArrayLike, index: Index = "O1", m: int | None = None) -> tuple[float, np.ndarray]:
+    """Return an index and its gradient with respect to W.
+
+    ∂O/∂W = U diag(∂O/∂s) Vᵀ, because ∂s_i/∂W = u_i v_iᵀ. For O1 and O5, symmetric and smooth in s, it holds for any s;
+    for O2, O3, O4 and cond it exists only where the extreme singular values concerned are simple (elsewhere this is
+    one subgradient out of many).
+
+    Args:
+        W: (m, rows, p) or (m rows, p), of full column rank.
+        index, m: as in `observability`.
+
+    Returns:
+        The index, and the gradient in the shape of W.
+    """
+    stacked, poses = _stacked(W, index, m)
+    u, s, vt = np.linalg.svd(stacked, full_matrices=False)
+    value = float(index_of_singular_values(s, index, poses))
+    return value, ((u * (value * _log_slope(s, index))) @ vt).reshape(np.shape(W))
+
+
+def merit(W: np.ndarray, index: Index) -> tuple[float, np.ndarray]:
+    """Return what the searches maximise, and its gradient: log O (−log cond), O1 with m = 1 poses.
+
+    Args:
+        W: (rows in all, p) stacked observation matrix.
+
+    Returns:
+        The merit (−inf without full column rank) and its gradient (rows in all, p).
+    """
+    u, s, vt = np.linalg.svd(W, full_matrices=False)
+    if len(s) < W.shape[1] or s[-1] <= 1e-14 * s[0]:
+        return -np.inf, np.zeros_like(W)
+    sign = -1.0 if index == "cond" else 1.0
+    value = sign * float(np.log(index_of_singular_values(s, index, 1)))
+    return value, (u * (sign * _log_slope(s, index))) @ vt
+
+
+def index_of_singular_values(s: np.ndarray, index: Index, m: int) -> np.ndarray:
+    """Return the index of singular values given along the last axis, largest first.
+
+    Args:
+        s: (..., p) singular values.
+        index: one of "O1" ... "O5", "cond".
+        m: number of poses (used by O1).
+
+    Returns:
+        (...) indices.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if index == "O1":
+            return np.exp(np.log(s).mean(-1)) / np.sqrt(m)
+        if index == "O2":
+            return s[..., -1] / s[..., 0]
+        if index == "O3":
+            return s[..., -1]
+        if index == "O4":
+            return s[..., -1] ** 2 / s[..., 0]
+        if index == "O5":
+            return 1.0 / (1.0 / s).sum(-1)
+        if index == "cond":
+            return s[..., 0] / s[..., -1]
+    raise BadInput(f"index '{index}' is not known; take one of {', '.join(get_args(Index))}")
+
+
+def is_better(value: float, than: float, index: Index) -> bool:
+    """Return whether `value` of the index beats `than`: larger, or smaller for cond."""
+    return value < than if index == "cond" else value > than
+
+
+def _log_slope(s: np.ndarray, index: Index) -> np.ndarray:
+    """Return ∂ log O / ∂s (p,)."""
+    slope = np.zeros_like(s)
+    if index == "O1":
+        return 1.0 / (len(s) * s)
+    if index == "O5":
+        return s**-2.0 / (1.0 / s).sum()
+    slope[-1] = {"O2": 1.0, "O3": 1.0, "O4": 2.0, "cond": -1.0}[index] / s[-1]
+    if index != "O3":
+        slope[0] += (1.0 if index == "cond" else -1.0) / s[0]
+    return slope
+
+
+def _stacked(W: ArrayLike, index: Index, m: int | None) -> tuple[np.ndarray, int]:
+    """Return W as (rows in all, p) and the number of poses."""
+    if index not in get_args(Index):
+        raise BadInput(f"index '{index}' is not known; take one of {', '.join(get_args(Index))}")
+    array = np.asarray(W, dtype=float)
+    if array.ndim not in (2, 3) or not array.size:
+        raise BadInput(f"W: expected (m, rows, p) or (m rows, p), found {array.shape}")
+    if not np.isfinite(array).all():
+        raise BadInput("W holds values that are not finite; look for poses outside the model's domain or failed divisions")
+    if array.ndim == 2 and m is None and index == "O1":
+        raise BadInput("O1 of a stacked W needs the number of poses: give m, or W as (m, rows, p)")
+    poses = m if m is not None else len(array)
+    return array.reshape(-1, array.shape[-1]), poses

@@ -1,0 +1,124 @@
+"""Jacobians of candidates, checked and brought to coordinates in which all parameters weigh alike."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.linalg import solve_triangular
+
+from poses.errors import BadInput, NotIdentifiable, TooFewCandidates
+
+RANK_TOLERANCE = 1e-7
+"""Smallest accepted ratio of singular values of the column-scaled candidates: our choice, the Gram matrix resolves 1e-8."""
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Candidates in the coordinates z = J T where the mean information of all of them is the unit matrix.
+
+    D-optimality does not see the change (log det shifts by a constant), numerics do.
+
+    Attributes:
+        z: (N, rows, p) transformed Jacobians.
+        known: (p, p) transformed information of the poses already measured.
+        transform: (p, p) T, upper triangular.
+        shift: log det(WᵀW) = log det(ZᵀZ) + shift.
+    """
+
+    z: np.ndarray
+    known: np.ndarray
+    transform: np.ndarray
+    shift: float
+
+
+def checked(jacobians: ArrayLike, name: str = "jacobians") -> np.ndarray:
+    """Return Jacobians as a finite, C-contiguous (N, rows, p) array of floats.
+
+    Raises:
+        BadInput: with the shape found, or the first pose holding a value that is not finite.
+    """
+    array = np.ascontiguousarray(jacobians, dtype=float)
+    if array.ndim != 3 or 0 in array.shape[1:]:
+        raise BadInput(f"{name}: expected an array (N, rows, p), found shape {array.shape}")
+    finite = np.isfinite(array).all(axis=(1, 2))
+    if not finite.all():
+        first = int(np.argmin(finite))
+        raise BadInput(
+            f"{name}: {int((~finite).sum())} of {len(array)} poses hold values that are not finite, the first is pose "
+            f"{first}; check the model there, or leave such poses out by the predicate"
+        )
+    return array
+
+
+def prepared(jacobians: ArrayLike, m: int, existing: ArrayLike | None = None) -> Candidates:
+    """Return candidates in well-scaled coordinates, after checking that m of them can determine all parameters.
+
+    T = D⁻¹ R⁻¹ with D the root mean square of the columns and RᵀR the mean information after that scaling.
+
+    Args:
+        jacobians: (N, rows, p) whitened Jacobians of the candidates.
+        m: number of poses to choose.
+        existing: (k, rows, p) whitened Jacobians of poses already measured.
+
+    Raises:
+        BadInput, TooFewCandidates, NotIdentifiable
+    """
+    array = checked(jacobians)
+    count, rows, p = array.shape
+    before = np.zeros((0, rows, p)) if existing is None else checked(existing, "existing")
+    if before.shape[2] != p:
+        raise BadInput(f"existing: {before.shape[2]} parameters, the candidates have {p}")
+    _check_counts(count, rows, p, m, before.shape[0] * before.shape[1])
+    stacked, measured = array.reshape(-1, p), before.reshape(-1, p)
+    gram = (stacked.T @ stacked) / count
+    past = measured.T @ measured
+    scale = np.sqrt(np.diag(gram) + np.diag(past) / count)
+    _check_columns(scale)
+    mean = (gram + past / count) / np.outer(scale, scale)
+    _check_rank(mean)
+    transform = solve_triangular(np.linalg.cholesky(mean).T, np.eye(p)) / scale[:, None]
+    known = transform.T @ past @ transform
+    z = (stacked @ transform).reshape(array.shape)
+    return Candidates(z, (known + known.T) / 2, transform, -2.0 * float(np.log(np.abs(np.diag(transform))).sum()))
+
+
+def log_det(matrices: np.ndarray) -> np.ndarray:
+    """Return log det of symmetric matrices (..., p, p); −inf where not positive."""
+    sign, value = np.linalg.slogdet(matrices)
+    return np.where(sign > 0, value, -np.inf)
+
+
+def _check_counts(count: int, rows: int, p: int, m: int, measured: int) -> None:
+    if m < 1:
+        raise BadInput(f"m = {m}: at least one pose is to be chosen")
+    if count < m:
+        raise TooFewCandidates(
+            f"{count} candidates for {m} poses: draw more candidates or ask for fewer poses", count, m
+        )
+    if m * rows + measured < p:
+        raise NotIdentifiable(
+            f"{m} poses of {rows} rows{f' and {measured} rows measured before' if measured else ''} give "
+            f"{m * rows + measured} equations for {p} parameters: at least {-(-(p - measured) // rows)} poses are needed"
+        )
+
+
+def _check_columns(scale: np.ndarray) -> None:
+    if not (scale > 0).all():
+        dead = [int(i) for i in np.flatnonzero(scale == 0)]
+        raise NotIdentifiable(
+            f"columns {dead} of the Jacobians are zero in every candidate: these parameters do not act on the "
+            "measurement; keep base columns only"
+        )
+
+
+def _check_rank(mean: np.ndarray) -> None:
+    s = np.sqrt(np.maximum(np.linalg.eigvalsh(mean)[::-1], 0.0))
+    rank = int((s > RANK_TOLERANCE * s[0]).sum())
+    if rank < len(s):
+        raise NotIdentifiable(
+            f"all candidates together have rank {rank} for {len(s)} parameters (smallest singular value ratio "
+            f"{s[-1] / s[0]:.1e}): the columns are not base columns, or the candidates do not move enough joints",
+            s,
+        )
