@@ -36,6 +36,7 @@ class PoseMeasurements:
         file, rows: where they came from; rows count data rows from 1.
         joint_names: as in the file's header.
         ignored: header names that were not used, for the message.
+        notes: what is odd but was accepted, for the message.
     """
 
     kind: str
@@ -55,6 +56,7 @@ class PoseMeasurements:
     file: str = ""
     rows: np.ndarray | None = None
     ignored: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = field(default=())
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:

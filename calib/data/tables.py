@@ -1,0 +1,272 @@
+"""CSV tables: a header with units, columns in SI, and complaints that name the row and the column.
+
+Separator comma, semicolon or tab (the one that occurs most often in the header); UTF-8 with or without a byte order
+mark; lines that begin with ``#`` are comments; the decimal mark is a point. Where no line but a comment names the
+columns (numpy's savetxt), the last comment before the numbers is the header.
+"""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import math
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from calib.arrays import frozen
+from calib.errors import MeasurementError
+
+ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180, "°": math.pi / 180, "degrees": math.pi / 180}
+LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "cm": 1e-2, "in": 0.0254}
+_HEADING = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
+_DECIMAL_COMMA = re.compile(r"^[+-]?\d*,\d+([eE][+-]?\d+)?$")
+_CHUNK = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """A table as the file has it.
+
+    Attributes:
+        file: its path, for messages.
+        header: column names without units.
+        units: what stood in brackets behind each name; "" where nothing did.
+        cells: one array per column: floats (NaN where a cell is empty) where every cell is a number, else texts.
+        rows: (m,) number of each row in the file; data rows count from 1.
+    """
+
+    file: str
+    header: tuple[str, ...]
+    units: tuple[str, ...]
+    cells: tuple[np.ndarray, ...]
+    rows: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.header
+
+    def index(self, name: str) -> int:
+        """Return the place of column `name`; one that is not there is refused with the nearest one that is."""
+        if name not in self.header:
+            found = ", ".join(self.header)
+            raise MeasurementError(f"column '{name}' is missing{nearest(name, self.header)}; found: {found}", self.file)
+        return self.header.index(name)
+
+    def texts(self, name: str) -> list[str]:
+        """Return a column (m,) as texts; numbers in their shortest form (``0``, not ``0.0``)."""
+        cells = self.cells[self.index(name)]
+        return [f"{cell:.12g}" for cell in cells] if cells.dtype == float else [str(cell) for cell in cells]
+
+    def numbers(self, name: str, dimension: str = "", unit: str = "", gaps: bool = False) -> np.ndarray:
+        """Return a column (m,) as floats in SI.
+
+        Args:
+            dimension: ``angle`` [rad], ``length`` [m], ``joint`` (either) or "" (a plain number).
+            unit: what the column is in where its header does not say; "" for SI.
+            gaps: leave empty and NaN cells as NaN, where otherwise they are refused.
+
+        Raises:
+            MeasurementError: at the first cell that is no number, or not finite; at a unit of another dimension.
+        """
+        column = self.index(name)
+        cells = self.cells[column]
+        if cells.dtype != float:
+            row = next(i for i, cell in enumerate(cells) if not _is_number(cell))
+            raise MeasurementError(_not_a_number(cells[row]), self.file, int(self.rows[row]), name)
+        wrong = np.isinf(cells) if gaps else ~np.isfinite(cells)
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            found = "an empty or NaN cell" if np.isnan(cells[row]) else f"{cells[row]}"
+            message = f"found {found} where a number is needed; leave the row out, or measure it again"
+            raise MeasurementError(message, self.file, int(self.rows[row]), name)
+        return cells * self._factor(column, dimension, unit)
+
+    def _factor(self, column: int, dimension: str, unit: str) -> float:
+        name, own = self.header[column], self.units[column]
+        if own and unit and own != unit:
+            message = f"its header says [{own}], the options say {unit}: take one of them away"
+            raise MeasurementError(message, self.file, column=name)
+        unit = own or unit
+        known = {"angle": ANGLES, "length": LENGTHS, "joint": ANGLES | LENGTHS, "": {"1": 1.0, "-": 1.0}}[dimension]
+        if unit and unit.lower() not in known:
+            expected = ", ".join(name for name in known if name.isascii())
+            raise MeasurementError(f"unit [{unit}] is none of {expected}", self.file, column=name)
+        return known[unit.lower()] if unit else 1.0
+
+    def where(self, keep: np.ndarray) -> Table:
+        """Return the rows at which `keep` (m,) holds."""
+        return Table(self.file, self.header, self.units, tuple(cells[keep] for cells in self.cells), self.rows[keep])
+
+
+def read_table(path: str | Path, header: Sequence[str] | None = None, doubles: bool = False) -> Table:
+    """Read the CSV file at `path`; a 100 MB file of numbers takes some 5 s.
+
+    Args:
+        header: names for a file that has no header.
+        doubles: allow a name to occur twice in the header.
+
+    Raises:
+        MeasurementError: for a file that is missing, empty, not UTF-8, without a header, or with decimal commas; for
+            a name that occurs twice; for a row of another length than the header.
+    """
+    lines, separator, found = _open(path, header is None)
+    names, units = (tuple(header), ("",) * len(header)) if header is not None else _split_units(found)
+    if not doubles and len(set(names)) < len(names):
+        name = next(name for i, name in enumerate(names) if name in names[:i])
+        places = " and ".join(str(i + 1) for i, other in enumerate(names) if other == name)
+        raise MeasurementError(f"stands in the header more than once (columns {places})", path, column=name)
+    cells = _read_columns(lines, separator, names, path)
+    if not len(cells[0]):
+        raise MeasurementError("has a header but no data rows", path)
+    rows = frozen(np.arange(1, len(cells[0]) + 1), int)
+    if header is None and names[-1] == f"column {len(names)}" and not _filled(cells[-1]):
+        names, units, cells = names[:-1], units[:-1], cells[:-1]  # each line ends with a separator
+    return Table(str(path), names, units, cells, rows)
+
+
+def read_header(path: str | Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the column names and units of the CSV file at `path` without reading its rows."""
+    lines, _, found = _open(path, True)
+    lines.close()
+    return _split_units(found)
+
+
+def nearest(name: str, among: Sequence[str]) -> str:
+    """Return `` (did you mean '...'?)`` for the most similar name, or nothing."""
+    lower = {other.lower(): other for other in among}
+    close = difflib.get_close_matches(name.lower(), lower, 1, 0.6)
+    return f" (did you mean '{lower[close[0]]}'?)" if close else ""
+
+
+def _open(path: str | Path, headed: bool) -> tuple[IO[str], str, list[str]]:
+    """Open a file and return it behind its header line, with the separator and the header's cells."""
+    try:
+        file = open(path, encoding="utf-8-sig", newline="")
+    except OSError as error:
+        raise MeasurementError(f"cannot be read: {error.strerror}", path) from error
+    try:
+        comment, place = "", 0
+        for line in iter(file.readline, ""):
+            text = line.strip()
+            if text.startswith("#"):
+                comment = text
+            elif text:
+                separator = max(",;\t", key=line.count)
+                first = next(csv.reader([line.strip("\r\n")], delimiter=separator, skipinitialspace=True))
+                if all(_is_number(cell) for cell in first) or not headed:
+                    file.seek(place)
+                    first = _comment_header(comment, separator, len(first), path) if headed else first
+                return file, separator, [cell.strip() for cell in first]
+            place = file.tell()
+    except UnicodeDecodeError as error:
+        file.close()
+        raise _not_utf8(error, path) from error
+    file.close()
+    raise MeasurementError("is empty: no header and no rows", path)
+
+
+def _comment_header(comment: str, separator: str, width: int, path: str | Path) -> list[str]:
+    names = [name.strip() for name in comment.lstrip("# ").split(separator)]
+    if len(names) == width and not any(_is_number(name) for name in names if name):
+        return names
+    message = (
+        f"has no header: its first line is {width} numbers. Add a first line that names the columns "
+        "(q1,q2,...,x,y,z), or give `format` in the options where the file is of a known headerless form"
+    )
+    raise MeasurementError(message, path)
+
+
+def _split_units(cells: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    names, units = [], []
+    for i, cell in enumerate(cells):
+        match = _HEADING.match(cell)
+        names.append((match["name"] if match else cell) or f"column {i + 1}")
+        units.append(match["unit"].strip() if match else "")
+    return tuple(names), tuple(units)
+
+
+def _rows(lines: IO[str], separator: str) -> Iterator[list[str]]:
+    body = (line for line in lines if (text := line.lstrip()) and text[0] != "#")
+    return (row for row in csv.reader(body, delimiter=separator, skipinitialspace=True) if any(row))
+
+
+def _read_columns(lines: IO[str], separator: str, names: tuple[str, ...], path: str | Path) -> tuple[np.ndarray, ...]:
+    parts: list[list[np.ndarray]] = [[] for _ in names]
+    done = 0
+    try:
+        rows = _rows(lines, separator)
+        while chunk := list(islice(rows, _CHUNK)):
+            ragged = next((i for i, row in enumerate(chunk) if len(row) != len(names)), None)
+            if ragged is not None:
+                raise MeasurementError(_ragged(chunk[ragged], names, separator), path, done + ragged + 1)
+            for part, column in zip(parts, zip(*chunk)):
+                part.append(_convert(column))
+            done += len(chunk)
+    except UnicodeDecodeError as error:
+        raise _not_utf8(error, path) from error
+    except csv.Error as error:
+        raise MeasurementError(f"is no CSV: {error}", path, done + 1) from error
+    finally:
+        lines.close()
+    return tuple(_join(part) for part in parts)
+
+
+def _convert(column: Sequence[str]) -> np.ndarray:
+    """Return the cells as floats where all of them are numbers or empty, else as texts."""
+    try:
+        return np.array(column, dtype=float)
+    except ValueError:
+        if all(not cell.strip() or _is_number(cell) for cell in column):
+            return np.array([float(cell) if cell.strip() else math.nan for cell in column])
+        return np.array([cell.strip() for cell in column], dtype=object)
+
+
+def _join(parts: Sequence[np.ndarray]) -> np.ndarray:
+    if all(part.dtype == float for part in parts):
+        return frozen(np.concatenate(parts)) if parts else frozen([])
+    texts = [part if part.dtype == object else _as_texts(part) for part in parts]
+    joined = np.concatenate(texts)
+    joined.flags.writeable = False
+    return joined
+
+
+def _as_texts(part: np.ndarray) -> np.ndarray:
+    return np.array(["" if math.isnan(value) else f"{value:.12g}" for value in part], dtype=object)
+
+
+def _filled(cells: np.ndarray) -> bool:
+    return cells.dtype != float or not np.isnan(cells).all()
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _not_a_number(cell: str) -> str:
+    if _DECIMAL_COMMA.match(cell):
+        return f"found '{cell}', with a decimal comma: save the table with decimal points (1.5, not 1,5)"
+    return f"found '{cell}' where a number is needed"
+
+
+def _ragged(row: Sequence[str], names: Sequence[str], separator: str) -> str:
+    message = f"has {len(row)} cells where the header has {len(names)} columns"
+    if separator == "," and len(row) > 1.5 * len(names):
+        message += "; if these are decimal commas, save the table with decimal points and commas between columns"
+    return message
+
+
+def _not_utf8(error: UnicodeDecodeError, path: str | Path) -> MeasurementError:
+    byte = error.object[error.start]
+    return MeasurementError(f"is not UTF-8 text (byte 0x{byte:02x}): save it as 'CSV UTF-8'", path)
