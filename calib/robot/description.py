@@ -1,0 +1,191 @@
+"""The toolkit's own robot file, ``robot.toml``: any `Chain`, calibrated ones included, read back exactly.
+
+A chain with the form of an MDH table is written as one (schema in `calib.robot.mdh`), so that a person can read it. Any
+other chain is written element by element::
+
+    name = "ur10"
+    base = "base_link"
+    tip = "tool0"
+    gravity = [0.0, 0.0, -9.81]
+
+    [[joint]]                        # the actuated joints, in the order of q
+    name = "shoulder_pan_joint"
+    kind = "revolute"                # or "prismatic"
+    lower = -6.28                    # and upper, velocity, effort; inertia = [XX .. M]; link = its URDF link
+
+    [[element]]                      # base to tip: placement · exp(sign · axis · (value + ratio · q_joint))
+    name = "shoulder_pan_joint.x"
+    axis = "tx"                      # tx ty tz rx ry rz
+    value = 0.0
+    owner = 0                        # number of the joint it places, counted from 0
+    joint = 0                        # number of the joint that moves it; left out where it is constant
+    ratio = 1.0                      # left out where 1
+    sign = -1.0                      # left out where 1
+    placement = {xyz = [0, 0, 0.1273], rpy = [0, 0, 0]}   # or {matrix = [three rows of four]}; left out where none
+
+    [tail]
+    xyz = [0, 0, 0]
+    rpy = [0, 0, 0]
+
+Tables `station`, `tool` and `deflection` (and `truth`) may stand beside them: they belong to the callers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib import files
+from calib.errors import RobotError
+from calib.robot import mdh
+from calib.robot.chain import GRAVITY, Chain, Element, Joint
+from calib.robot.tables import check_keys, dumps, load, number, placement, placement_table, vector
+
+EXTRA = ("station", "tool", "deflection", "truth", "provenance")
+_TOP = ("name", "base", "tip", "gravity", "source", "joint", "element", "tail")
+_LIMITS = ("lower", "upper", "velocity", "effort")
+_JOINT = ("name", "kind", *_LIMITS, "link", "inertia")
+_ELEMENT = tuple(field.name for field in fields(Element))
+
+
+def read(path: str | Path, propose_beta: bool | None = None) -> Chain:
+    """Read a robot from TOML: an MDH table, or elements.
+
+    Args:
+        path: the file.
+        propose_beta: see `calib.robot.mdh`; by default only where the file does not say ``beta = "as written"``.
+
+    Raises:
+        RobotError: naming the table, the key and what is wrong with it.
+    """
+    table = load(path)
+    robot = {key: value for key, value in table.items() if key not in EXTRA}
+    written = robot.pop("beta", "proposed") == "as written"
+    if "element" not in robot:
+        return mdh.from_table(robot, str(path), not written if propose_beta is None else propose_beta)
+    return _from_elements(robot, str(path))
+
+
+def read_extra(path: str | Path) -> dict[str, Any]:
+    """Return the tables beside the robot (`EXTRA`) as plain dictionaries."""
+    return {key: value for key, value in load(path).items() if key in EXTRA}
+
+
+def write(path: str | Path, chain: Chain, extra: Mapping[str, Any] | None = None, source: str = "") -> Path:
+    """Write a chain, so that `read` returns the same one to the last bit.
+
+    Args:
+        path: the file.
+        chain: any chain.
+        extra: tables by name, of `EXTRA`, kept as they are.
+        source: where the numbers come from.
+    """
+    return files.write(path, text(chain, extra, source))
+
+
+def text(chain: Chain, extra: Mapping[str, Any] | None = None, source: str = "") -> str:
+    """Return what `write` writes."""
+    check_keys(extra or {}, EXTRA, f"robot '{chain.name}', extra tables")
+    as_rows = mdh.is_table(chain) and not chain.links
+    table = mdh.to_table(chain) if as_rows else _to_elements(chain)
+    head = {key: value for key, value in table.items() if not isinstance(value, (list, dict)) or key == "gravity"}
+    if as_rows:
+        head["beta"] = "as written"
+    if source:
+        head["source"] = source
+    return dumps({**head, **{key: value for key, value in table.items() if key not in head}, **(extra or {})})
+
+
+def _from_elements(table: Mapping[str, Any], where: str) -> Chain:
+    check_keys(table, _TOP, where)
+    joints, inertias, links = [], [], []
+    for index, entry in enumerate(_tables(table, "joint", where)):
+        place = f"{where}, [[joint]] number {index + 1}"
+        check_keys(entry, _JOINT, place)
+        limits = {key: number(entry[key], f"{place}, {key}") for key in _LIMITS if key in entry}
+        joints.append(Joint(str(_need(entry, "name", place)), entry.get("kind", "revolute"), **limits))
+        inertias.append(vector(entry["inertia"], 10, f"{place}, inertia") if "inertia" in entry else None)
+        links.append(entry.get("link"))
+    if any(entry is None for entry in inertias) != all(entry is None for entry in inertias):
+        raise RobotError(f"{where}: some joints have an inertia and some have none")
+    entries = _tables(table, "element", where)
+    return Chain(
+        name=str(_need(table, "name", where)),
+        joints=tuple(joints),
+        elements=tuple(
+            _element(entry, len(joints), f"{where}, [[element]] number {index + 1}")
+            for index, entry in enumerate(entries)
+        ),
+        base=table.get("base", "base"),
+        tip=table.get("tip", "tip"),
+        tail=placement(table["tail"], f"{where}, [tail]") if "tail" in table else np.eye(4),
+        inertias=None if inertias[0] is None else np.array(inertias),
+        gravity=vector(table.get("gravity", list(GRAVITY)), 3, f"{where}, gravity"),
+        links=tuple(links) if all(links) else (),
+    )
+
+
+def _element(entry: Mapping[str, Any], n: int, where: str) -> Element:
+    check_keys(entry, _ELEMENT, where)
+    name = str(_need(entry, "name", where))
+    where = f"{where} ('{name}')"
+    for key, most in (("owner", n), ("joint", n - 1)):
+        value = entry.get(key, 0)
+        if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= most:
+            raise RobotError(f"{where}: {key} {value!r} is not a whole number from 0 to {most}")
+    axis = str(_need(entry, "axis", where))
+    sign = number(entry.get("sign", 1.0), f"{where}, sign")
+    if abs(sign) != 1.0:
+        raise RobotError(f"{where}: sign {sign:g} is neither 1 nor -1")
+    return Element(
+        name=name,
+        axis=axis,
+        value=number(entry.get("value", 0.0), f"{where}, value", "length" if axis[:1] == "t" else "angle"),
+        owner=entry.get("owner", 0),
+        joint=entry.get("joint"),
+        ratio=number(entry.get("ratio", 1.0), f"{where}, ratio"),
+        sign=sign,
+        placement=placement(entry["placement"], f"{where}, placement") if "placement" in entry else None,
+    )
+
+
+def _to_elements(chain: Chain) -> dict[str, Any]:
+    table: dict[str, Any] = {"name": chain.name, "base": chain.base, "tip": chain.tip}
+    table["gravity"] = chain.gravity.tolist()
+    table["joint"], table["element"] = [], []
+    for index, joint in enumerate(chain.joints):
+        entry: dict[str, Any] = {"name": joint.name, "kind": joint.kind}
+        entry |= {key: getattr(joint, key) for key in _LIMITS if np.isfinite(getattr(joint, key))}
+        if chain.links:
+            entry["link"] = chain.links[index]
+        if chain.inertias is not None:
+            entry["inertia"] = chain.inertias[index].tolist()
+        table["joint"].append(entry)
+    for element in chain.elements:
+        entry = {"name": element.name, "axis": element.axis, "value": element.value, "owner": element.owner}
+        if element.joint is not None:
+            entry["joint"] = element.joint
+        entry |= {key: getattr(element, key) for key in ("ratio", "sign") if getattr(element, key) != 1.0}
+        if element.placement is not None:
+            entry["placement"] = placement_table(element.placement)
+        table["element"].append(entry)
+    if not np.array_equal(chain.tail, np.eye(4)):
+        table["tail"] = placement_table(chain.tail)
+    return table
+
+
+def _tables(table: Mapping[str, Any], key: str, where: str) -> list[Mapping[str, Any]]:
+    found = table.get(key)
+    if not isinstance(found, list) or not found or not all(isinstance(entry, Mapping) for entry in found):
+        raise RobotError(f"{where}: no [[{key}]] tables found")
+    return found
+
+
+def _need(table: Mapping[str, Any], key: str, where: str) -> Any:
+    if key not in table:
+        raise RobotError(f"{where}: '{key}' is missing")
+    return table[key]

@@ -1,0 +1,57 @@
+"""Find a robot by what a person types: a library name, a file, or a folder with a ``robot.toml``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from calib.errors import RobotError
+from calib.robot import description, library, urdf
+from calib.robot.chain import Chain
+from calib.robot.tables import nearest
+
+
+def load(
+    robot: str | Path, base: str | None = None, tip: str | None = None, joint_names: Sequence[str] | None = None
+) -> Chain:
+    """Return the chain that `robot` names.
+
+    Args:
+        robot: a library name, the path of a ``.urdf`` or ``.toml`` file, or a folder that holds ``robot.toml``.
+        base, tip: links of a URDF between which the arm runs.
+        joint_names: the joints a measurement file names (URDF).
+
+    Raises:
+        RobotError: where nothing of this kind is found, with the library's names and the nearest one.
+    """
+    path = resolve(robot)
+    if path.suffix == ".urdf":
+        return urdf.read(path, base, tip, joint_names)
+    chain = description.read(path)
+    for option, wanted, found in (("base", base, chain.base), ("tip", tip, chain.tip)):
+        if wanted is not None and wanted != found:
+            raise RobotError(
+                f"{path}: its {option} is '{found}', not '{wanted}'; --base and --tip choose links of a URDF"
+            )
+    return chain
+
+
+def resolve(robot: str | Path) -> Path:
+    """Return the file that `robot` names; a file in the working folder goes before the library."""
+    path, names = Path(robot), library.names()
+    known = f"a path of a .urdf or .toml file, a folder with robot.toml, or one of the library: {', '.join(names)}"
+    if path.is_dir():
+        if (path / "robot.toml").is_file():
+            return path / "robot.toml"
+        if str(robot) not in names:
+            raise RobotError(f"folder {path} holds no robot.toml; give {known}")
+    elif path.is_file():
+        if path.suffix in (".urdf", ".toml"):
+            return path
+        advice = "expand it first: xacro file.xacro > robot.urdf" if path.suffix == ".xacro" else f"give {known}"
+        raise RobotError(f"{path} is neither .urdf nor .toml; {advice}")
+    if str(robot) in names:
+        return library.path(str(robot))
+    if path.suffix in (".urdf", ".toml") or len(path.parts) > 1:
+        raise RobotError(f"no file {path}; give {known}")
+    raise RobotError(f"no robot '{robot}'{nearest(str(robot), names)}; give {known}")

@@ -1,0 +1,79 @@
+"""An XML tree that knows where each element stands in the text: for messages by line, and for edits in place.
+
+Python's ElementTree keeps no positions, and yourdfpy (our first choice for URDF) reads broken XML by skipping what it
+cannot parse, gives links without inertia the identity, and fails without a line number. Expat gives byte positions.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.parsers import expat
+
+from calib.errors import RobotError
+
+_DECLARED = re.compile(rb"""^\s*<\?xml[^>]*?encoding\s*=\s*["']([A-Za-z0-9._-]+)["']""")
+
+
+@dataclass(frozen=True)
+class Node:
+    """One element: tag, attributes, line (from 1), byte position of its ``<`` in the UTF-8 text, children."""
+
+    tag: str
+    attributes: dict[str, str]
+    line: int
+    start: int
+    children: list[Node] = field(default_factory=list)
+
+    def all(self, tag: str) -> Iterator[Node]:
+        """Yield the direct children with this tag."""
+        return (child for child in self.children if child.tag == tag)
+
+    def first(self, tag: str) -> Node | None:
+        """Return the first direct child with this tag, or None."""
+        return next(self.all(tag), None)
+
+
+def text(path: str | Path) -> tuple[str, str]:
+    """Return a file's text, line ends as they are, and its encoding as declared (UTF-8 otherwise).
+
+    Raises:
+        RobotError: where it cannot be read or decoded.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise RobotError(f"cannot read {path}: {error.strerror or error}") from error
+    declared = _DECLARED.match(data)
+    encoding = declared[1].decode() if declared else "utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8"
+    try:
+        return data.decode(encoding), encoding
+    except (LookupError, UnicodeDecodeError) as error:
+        raise RobotError(f"{path}: not readable as {encoding}: {error}") from error
+
+
+def parse(source: str, where: str) -> Node:
+    """Return the root element of an XML text.
+
+    Raises:
+        RobotError: where it is not well-formed, with the line and column.
+    """
+    parser = expat.ParserCreate()
+    root: list[Node] = []
+    stack: list[Node] = []
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        node = Node(tag, attributes, parser.CurrentLineNumber, parser.CurrentByteIndex)
+        (stack[-1].children if stack else root).append(node)
+        stack.append(node)
+
+    parser.StartElementHandler = start
+    parser.EndElementHandler = lambda tag: stack.pop()
+    try:
+        parser.Parse(source, True)
+    except expat.ExpatError as error:
+        reason = expat.ErrorString(error.code)
+        raise RobotError(f"{where}, line {error.lineno}, column {error.offset + 1}: not XML ({reason})") from None
+    return root[0]

@@ -1,0 +1,293 @@
+"""Modified Denavit-Hartenberg tables (Khalil and Kleinfinger, 1986), to and from a `Chain`.
+
+    row of a revolute joint:   Rot_x(alpha) Trans_x(d) [Rot_y(beta)] Trans_z(r) Rot_z(theta + q)
+    row of a prismatic joint:  Rot_x(alpha) Trans_x(d) [Rot_y(beta)] Rot_z(theta) Trans_z(r + q)
+    fixed row:                 as the revolute one, without q
+
+Khalil's ``alpha d theta r`` are Craig's ``alpha a theta d`` of the same row: Craig's a is our d, Craig's d is our r.
+The elements of row k are named ``alpha3 d3 beta3 r3 theta3`` and stand in the order of the product.
+
+Where an axis is nearly parallel to the moving axis before it (sine of the angle below 0.05), the common normal is ill
+defined and the row gets a rotation ``beta`` about y, zero at first (Hayati, 1983; that it stands behind Trans_x(d) is
+our choice). The first moving axis and fixed rows get none unless the row states one.
+
+The file, in TOML (numbers as in `calib.robot.tables`; angles in rad, lengths in m unless a unit is written)::
+
+    name = "myrobot"                 # required
+    base = "base"                    # names of the two ends, optional
+    tip = "flange"
+    gravity = [0, 0, -9.81]          # in the base frame [m/s²], optional
+    source = "where the numbers come from"
+
+    [[joint]]                        # one table per row, base to tip
+    name = "shoulder"                # default: joint<index>
+    kind = "revolute"                # or "prismatic", "fixed"; default "revolute"
+    index = 1                        # number in the elements' names; default: the row before plus one, from 1
+    alpha = "pi/2"                   # alpha, d, theta, r default to 0; beta: see above
+    d = 0.0
+    theta = 0.0
+    r = 0.4
+    lower = "-170 deg"               # limits; infinite where not given
+    upper = "170 deg"
+    velocity = "110 deg/s"
+    effort = 176                     # [N m] or [N]
+    inertia = [XX, XY, XZ, YY, YZ, ZZ, MX, MY, MZ, M]   # about the row's frame [kg m², kg m, kg]
+
+    [tail]                           # what follows the last row, optional
+    xyz = [0, 0, 0.1]
+    rpy = [0, 0, 0]
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.errors import RobotError
+from calib.robot.chain import GRAVITY, Chain, Element, Joint
+from calib.robot.tables import check_keys, load, number, placement, placement_table, spelled, vector
+
+PARALLEL = 0.05
+AXES = {"alpha": "rx", "d": "tx", "beta": "ry", "r": "tz", "theta": "rz"}
+TOP = ("name", "base", "tip", "gravity", "source", "joint", "tail")
+KINDS = ("revolute", "prismatic", "fixed")
+_LIMITS = ("lower", "upper", "velocity", "effort")
+_ROW = ("name", "kind", "index", "alpha", "d", "beta", "theta", "r", *_LIMITS, "inertia")
+_ELEMENT = re.compile(r"(alpha|d|beta|r|theta)(\d+)")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of the table; `beta` None where the row has no such element, `inertia` (10,) or None."""
+
+    name: str
+    index: int
+    kind: str = "revolute"
+    alpha: float = 0.0
+    d: float = 0.0
+    theta: float = 0.0
+    r: float = 0.0
+    beta: float | None = None
+    lower: float = -np.inf
+    upper: float = np.inf
+    velocity: float = np.inf
+    effort: float = np.inf
+    inertia: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise RobotError(f"row '{self.name}': kind '{self.kind}' is none of {', '.join(KINDS)}")
+
+
+def read(path: str | Path, propose_beta: bool = True) -> Chain:
+    """Read an MDH table from a TOML file (schema above).
+
+    Raises:
+        RobotError: naming the row, the key and what is wrong with it.
+    """
+    return from_table(load(path), str(path), propose_beta)
+
+
+def from_table(table: Mapping[str, Any], where: str, propose_beta: bool = True) -> Chain:
+    """Return the chain of a parsed table; `where` names it in messages."""
+    check_keys(table, TOP, where)
+    rows: list[Row] = []
+    if not isinstance(table.get("joint"), list) or not table["joint"]:
+        raise RobotError(f"{where}: no [[joint]] rows found; an MDH table needs one per axis")
+    for position, entry in enumerate(table["joint"]):
+        rows.append(_row(entry, rows[-1].index + 1 if rows else 1, f"{where}, [[joint]] number {position + 1}"))
+    return chain(
+        _text(table, "name", where),
+        rows,
+        base=_text(table, "base", where, "base"),
+        tip=_text(table, "tip", where, "tip"),
+        tail=placement(table["tail"], f"{where}, [tail]") if "tail" in table else None,
+        gravity=vector(table["gravity"], 3, f"{where}, gravity") if "gravity" in table else None,
+        propose_beta=propose_beta,
+    )
+
+
+def chain(
+    name: str,
+    rows: Sequence[Row],
+    base: str = "base",
+    tip: str = "tip",
+    tail: np.ndarray | None = None,
+    gravity: np.ndarray | None = None,
+    propose_beta: bool = True,
+) -> Chain:
+    """Return the chain of MDH rows.
+
+    Args:
+        rows: base to tip.
+        tail: (4, 4), what follows the last row.
+        gravity: (3,) in the base frame [m/s²].
+        propose_beta: add ``beta`` to moving rows whose axis is nearly parallel to the moving one before.
+    """
+    moving = [row for row in rows if row.kind != "fixed"]
+    if not moving:
+        raise RobotError(f"robot '{name}': every row is fixed; at least one has to be revolute or prismatic")
+    parallel = _parallel(rows) if propose_beta else set()
+    elements: list[Element] = []
+    owner = 0
+    for row in rows:
+        beta = 0.0 if row.beta is None and row.index in parallel else row.beta
+        elements += _elements(row, beta, owner)
+        owner += row.kind != "fixed"
+    known = [row.inertia is not None for row in moving]
+    if any(known) and not all(known):
+        raise RobotError(f"robot '{name}': row '{moving[known.index(False)].name}' has no inertia while others have")
+    return Chain(
+        name=name,
+        joints=tuple(Joint(row.name, row.kind, row.lower, row.upper, row.velocity, row.effort) for row in moving),
+        elements=tuple(elements),
+        base=base,
+        tip=tip,
+        tail=np.eye(4) if tail is None else tail,
+        inertias=np.array([row.inertia for row in moving], dtype=float) if all(known) else None,
+        gravity=np.array(GRAVITY) if gravity is None else gravity,
+    )
+
+
+def rows(chain: Chain) -> tuple[Row, ...]:
+    """Return the MDH rows of a chain that has that form.
+
+    Raises:
+        RobotError: where an element is none of an MDH table, or stands elsewhere than its row demands.
+    """
+    groups: dict[int, list[Element]] = {}
+    for element in chain.elements:
+        found = _ELEMENT.fullmatch(element.name)
+        plain = element.placement is None and element.sign == 1.0 and element.ratio == 1.0
+        if not found or not plain or AXES[found[1]] != element.axis:
+            raise RobotError(f"robot '{chain.name}' is no MDH table: element '{element.name}' does not belong to one")
+        groups.setdefault(int(found[2]), []).append(element)
+    result = tuple(_regroup(chain, index, group) for index, group in groups.items())
+    owner, expected = 0, []
+    for row in result:
+        expected += _elements(row, row.beta, owner)
+        owner += row.kind != "fixed"
+    if tuple(expected) != chain.elements:
+        raise RobotError(f"robot '{chain.name}' is no MDH table: its elements are not complete rows in order")
+    return result
+
+
+def is_table(chain: Chain) -> bool:
+    """Tell whether a chain has the form of an MDH table."""
+    try:
+        return bool(rows(chain))
+    except RobotError:
+        return False
+
+
+def to_table(chain: Chain) -> dict[str, Any]:
+    """Return the table (schema above) that `from_table` with ``propose_beta=False`` reads back exactly."""
+    table: dict[str, Any] = {"name": chain.name, "base": chain.base, "tip": chain.tip}
+    table["gravity"] = chain.gravity.tolist()
+    table["joint"] = [_entry(row, index + 1) for index, row in enumerate(rows(chain))]
+    if not np.array_equal(chain.tail, np.eye(4)):
+        table["tail"] = placement_table(chain.tail)
+    return table
+
+
+def _elements(row: Row, beta: float | None, owner: int) -> list[Element]:
+    """Return the elements of one row, in the order of the product."""
+    joint = None if row.kind == "fixed" else owner
+    order = ["alpha", "d", *([] if beta is None else ["beta"])]
+    order += ["theta", "r"] if row.kind == "prismatic" else ["r", "theta"]
+    values = {"alpha": row.alpha, "d": row.d, "beta": beta or 0.0, "r": row.r, "theta": row.theta}
+    return [
+        Element(f"{name}{row.index}", AXES[name], values[name], owner, joint if name == order[-1] else None)
+        for name in order
+    ]
+
+
+def _parallel(rows: Iterable[Row]) -> set[int]:
+    """Return the indices of moving rows whose axis is nearly parallel to the moving one before, at zero joints."""
+    found: set[int] = set()
+    turned: np.ndarray | None = None
+    for row in rows:
+        turned = None if turned is None else turned @ _turn(0, row.alpha) @ _turn(1, row.beta or 0.0)
+        if turned is not None and row.kind != "fixed" and np.hypot(turned[0, 2], turned[1, 2]) < PARALLEL:
+            found.add(row.index)
+        if row.kind != "fixed":
+            turned = np.eye(3)
+        elif turned is not None:
+            turned = turned @ _turn(2, row.theta)
+    return found
+
+
+def _turn(axis: int, angle: float) -> np.ndarray:
+    """Return the elementary rotation (3, 3) about x, y or z."""
+    one, two = (axis + 1) % 3, (axis + 2) % 3
+    result = np.eye(3)
+    result[one, one] = result[two, two] = np.cos(angle)
+    result[two, one] = np.sin(angle)
+    result[one, two] = -np.sin(angle)
+    return result
+
+
+def _row(entry: Any, index: int, where: str) -> Row:
+    """Return the row of one [[joint]] table."""
+    if not isinstance(entry, Mapping):
+        raise RobotError(f"{where}: expected a table, found {entry!r}")
+    index = entry.get("index", index)
+    if isinstance(index, bool) or not isinstance(index, int) or index < 0:
+        raise RobotError(f"{where}: index {index!r} is not a whole number from 0 on")
+    name = _text(entry, "name", where, f"joint{index}")
+    where = f"{where} ('{name}')"
+    check_keys(entry, _ROW, where)
+    kind = _text(entry, "kind", where, "revolute")
+    quantity = dict.fromkeys(("alpha", "beta", "theta", "lower", "upper"), "angle") | {"d": "length", "r": "length"}
+    quantity |= {"velocity": "angular speed", "effort": "torque"}
+    if kind == "prismatic":
+        quantity |= {"lower": "length", "upper": "length", "velocity": "speed", "effort": "force"}
+    if kind == "fixed" and (extra := [key for key in (*_LIMITS, "inertia") if key in entry]):
+        raise RobotError(f"{where}: a fixed row has no '{extra[0]}'")
+    numbers = {key: number(entry[key], f"{where}, {key}", quantity[key]) for key in quantity if key in entry}
+    inertia = tuple(vector(entry["inertia"], 10, f"{where}, inertia").tolist()) if "inertia" in entry else None
+    return Row(name=name, index=index, kind=kind, inertia=inertia, **numbers)
+
+
+def _text(table: Mapping[str, Any], key: str, where: str, default: str | None = None) -> str:
+    """Return a non-empty string from a table."""
+    value = table.get(key, default)
+    if value is None:
+        raise RobotError(f"{where}: '{key}' is missing")
+    if not isinstance(value, str) or not value:
+        raise RobotError(f"{where}: '{key}' has to be text, found {value!r}")
+    return value
+
+
+def _regroup(chain: Chain, index: int, group: list[Element]) -> Row:
+    """Return the row that a group of elements with one number makes; the caller checks order and completeness."""
+    values: dict[str, Any] = {element.name.removesuffix(str(index)): element.value for element in group}
+    moved = [element for element in group if element.joint is not None]
+    if not moved:
+        return Row(name=f"joint{index}", index=index, kind="fixed", **values)
+    position = moved[0].joint or 0
+    joint = chain.joints[position]
+    inertia = None if chain.inertias is None else tuple(chain.inertias[position].tolist())
+    limits = {key: getattr(joint, key) for key in _LIMITS}
+    return Row(name=joint.name, index=index, kind=joint.kind, inertia=inertia, **values, **limits)
+
+
+def _entry(row: Row, expected: int) -> dict[str, Any]:
+    """Return the [[joint]] table of a row; what is default there is left out, except the four parameters."""
+    entry: dict[str, Any] = {"name": row.name}
+    if row.kind != "revolute":
+        entry["kind"] = row.kind
+    if row.index != expected:
+        entry["index"] = row.index
+    for key in ("alpha", "d", "beta", "theta", "r"):
+        if (value := getattr(row, key)) is not None:
+            entry[key] = spelled(value) if AXES[key][0] == "r" else value
+    entry |= {key: getattr(row, key) for key in _LIMITS if np.isfinite(getattr(row, key))}
+    if row.inertia is not None:
+        entry["inertia"] = list(row.inertia)
+    return entry
