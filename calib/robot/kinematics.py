@@ -87,21 +87,25 @@ def forward(chain: Chain, q: np.ndarray, extra: np.ndarray | None = None) -> np.
     return sweep(chain, q, extra=extra).poses()
 
 
-def element_jacobian(chain: Chain, walked: Sweep, point: np.ndarray) -> np.ndarray:
-    """Return the derivative of `point`, carried by the flange, with respect to every element's value.
+def element_jacobian(chain: Chain, walked: Sweep, point: np.ndarray, index: np.ndarray | None = None) -> np.ndarray:
+    """Return the derivative of `point`, carried by the flange, with respect to the elements' values.
 
     For a rotation about z through o: [z × (point - o); z]; for a translation along z: [z; 0].
 
     Args:
         walked: what `sweep` returned.
         point: (3, m) [m], in the reference frame.
+        index: which elements; None for all K.
 
     Returns:
-        (K, 6, m): linear velocity of the point, then angular velocity, both in the reference frame.
+        (K, 6, m), or as many as `index` names: linear velocity of the point, then angular velocity, both in the reference frame.
     """
     angular = np.array([element.axis[0] == "r" for element in chain.elements])
+    z, origins = walked.directions, walked.origins
+    if index is not None:
+        angular, z, origins = angular[index], z[index], origins[index]
     jacobian = np.empty((len(angular), 6, point.shape[1]))
-    z, lever = walked.directions, point - walked.origins
+    lever = point - origins
     jacobian[:, 0] = z[:, 1] * lever[:, 2] - z[:, 2] * lever[:, 1]
     jacobian[:, 1] = z[:, 2] * lever[:, 0] - z[:, 0] * lever[:, 2]
     jacobian[:, 2] = z[:, 0] * lever[:, 1] - z[:, 1] * lever[:, 0]

@@ -1,0 +1,125 @@
+"""Which columns of an observation matrix carry information of their own: the same question in geometry and dynamics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from calib.arrays import frozen
+
+
+@dataclass(frozen=True, eq=False)
+class ColumnSplit:
+    """Columns of W split into independent ones and those that depend on them.
+
+    Attributes:
+        kept: (b,) indices of the base columns, in W's order.
+        dropped: (p - b,) the others, those without any effect included.
+        without_effect: indices of the columns that are zero.
+        coefficients: (b, p - b) with ``W[:, dropped] = W[:, kept] @ coefficients`` up to the tolerance.
+        singular_values: (p,) of the scaled W (its non-zero columns at unit norm, where no scale was given), falling.
+        tolerance: size below which what remains of a scaled column counts as nothing.
+    """
+
+    kept: np.ndarray
+    dropped: np.ndarray
+    without_effect: np.ndarray
+    coefficients: np.ndarray
+    singular_values: np.ndarray
+    tolerance: float
+
+    @property
+    def rank(self) -> int:
+        return len(self.kept)
+
+    @property
+    def gap(self) -> float:
+        """Smallest kept over largest dropped singular value; infinite where nothing is dropped."""
+        values = self.singular_values
+        if self.rank >= len(values) or values[self.rank] == 0.0:
+            return float("inf")
+        return float(values[self.rank - 1] / values[self.rank])
+
+
+def split_columns(
+    matrix: np.ndarray,
+    groups: Sequence[np.ndarray] | None = None,
+    tolerance: float = 1e-6,
+    scale: np.ndarray | None = None,
+) -> ColumnSplit:
+    """Choose independent columns of W by pivoted QR, groups of columns in order of preference.
+
+    Within a group the columns enter by pivoted QR (Gautier 1991); a later group only adds what the earlier ones leave.
+    Columns are scaled to unit norm first, except those of negligible norm, which have no effect (scaling a column of
+    1e-17 would turn rounding into information). With `scale` = the largest plausible deviation of each parameter, W
+    whitened and tolerance 1, a column is kept where the data tell its parameter, given those kept before, better than
+    plausibility does: σ < scale.
+
+    Args:
+        matrix: (rows, p), whitened or in one unit; only its R factor is used.
+        groups: index arrays, most preferred first; columns in none of them come last. None: one group.
+        tolerance: see `ColumnSplit`.
+        scale: (p,) multiplies the columns in place of unit norms.
+    """
+    p = matrix.shape[1]
+    factor = np.linalg.qr(matrix, mode="r") if matrix.shape[0] > p else np.asarray(matrix, dtype=float)
+    norms = np.linalg.norm(factor, axis=0)
+    silent = norms <= 1e-12 * norms.max(initial=0.0)
+    divisor = np.where(silent, 1.0, norms) if scale is None else 1.0 / scale
+    scaled = factor / divisor
+    scaled[:, silent] = 0.0
+    kept = _pick(scaled, _complete(groups, p), np.flatnonzero(silent), tolerance)
+    dropped = np.setdiff1d(np.arange(p), kept)
+    coefficients = np.linalg.lstsq(scaled[:, kept], scaled[:, dropped], rcond=None)[0]
+    coefficients = coefficients * divisor[dropped] / divisor[kept][:, None] if len(kept) else coefficients
+    values = np.linalg.svd(scaled, compute_uv=False)
+    values = np.concatenate([values, np.zeros(p - len(values))])
+    return ColumnSplit(
+        frozen(kept, int), frozen(dropped, int), frozen(np.flatnonzero(silent), int), frozen(coefficients),
+        frozen(values), tolerance,
+    )  # fmt: skip
+
+
+def _complete(groups: Sequence[np.ndarray] | None, p: int) -> list[np.ndarray]:
+    """Append the columns no group names."""
+    listed = [np.asarray(group, dtype=int) for group in groups] if groups is not None else []
+    named = np.concatenate(listed) if listed else np.array([], dtype=int)
+    return [*listed, np.setdiff1d(np.arange(p), named)]
+
+
+def _pick(scaled: np.ndarray, groups: list[np.ndarray], silent: np.ndarray, tolerance: float) -> np.ndarray:
+    """Return the sorted indices of independent columns, group after group."""
+    basis = np.zeros((scaled.shape[0], 0))
+    kept: list[int] = []
+    for group in groups:
+        candidates = np.setdiff1d(group, silent)
+        if len(candidates) == 0 or basis.shape[1] == scaled.shape[0]:
+            continue
+        rest = scaled[:, candidates]
+        for _ in range(2):  # twice is enough (Kahan): orthogonal to rounding
+            rest = rest - basis @ (basis.T @ rest)
+        q, r, order = scipy.linalg.qr(rest, mode="economic", pivoting=True)
+        count = int(np.sum(np.abs(np.diag(r)) > tolerance))
+        kept.extend(candidates[order[:count]])
+        basis = np.hstack([basis, q[:, :count]])
+    return np.array(sorted(kept), dtype=int)
+
+
+def weak_directions(matrix: np.ndarray, threshold: float = 1e-3) -> tuple[np.ndarray, np.ndarray]:
+    """Return the singular values below `threshold` of the largest and their right vectors, for unit-norm columns.
+
+    Args:
+        matrix: (rows, b), full column rank.
+
+    Returns:
+        ratios (w,), falling, and directions (w, b) in the scaled columns' coordinates.
+    """
+    factor = np.linalg.qr(matrix, mode="r")
+    scaled = factor / np.linalg.norm(factor, axis=0)
+    _, values, vt = np.linalg.svd(scaled)
+    ratios = values / values[0]
+    weak = ratios < threshold
+    return ratios[weak], vt[weak]

@@ -1,0 +1,56 @@
+"""What an estimation returns: values with their covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.arrays import frozen
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """p estimated parameters.
+
+    Attributes:
+        names, units: p strings each.
+        values: (p,) in their units.
+        covariance: (p, p).
+        residual_std: standard deviation of the whitened residuals (1 where the stated sigmas tell the whole story).
+        dof: degrees of freedom, rows minus parameters.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: np.ndarray
+    covariance: np.ndarray
+    residual_std: float
+    dof: int
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "values", frozen(self.values))
+        object.__setattr__(self, "covariance", frozen(self.covariance))
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """(p,) standard deviations."""
+        return np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
+
+    @property
+    def rsd(self) -> np.ndarray:
+        """(p,) relative standard deviations 100 σ / |value| [%]; infinite at zero."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(self.values == 0.0, np.inf, 100.0 * self.sigma / np.abs(self.values))
+
+
+def strong_correlations(estimate: Estimate, threshold: float = 0.95) -> list[tuple[str, str, float]]:
+    """Return pairs of parameters whose estimates correlate by more than `threshold`, strongest first."""
+    sigma = np.where(estimate.sigma > 0, estimate.sigma, 1.0)
+    correlation = estimate.covariance / np.outer(sigma, sigma)
+    rows, columns = np.triu_indices(len(sigma), 1)
+    strong = np.abs(correlation[rows, columns]) > threshold
+    pairs = [
+        (estimate.names[i], estimate.names[j], float(correlation[i, j])) for i, j in zip(rows[strong], columns[strong])
+    ]
+    return sorted(pairs, key=lambda pair: -abs(pair[2]))

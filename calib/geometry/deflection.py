@@ -1,0 +1,136 @@
+"""What the joint angles do not say: compliance under gravity, coupled axes, encoder and gear errors.
+
+Every effect is linear in its coefficients and adds to the displacement of one element of the chain:
+
+    δ_e(q) = Σ_terms c · b(q),    b one of
+
+    torque        τ_j(q), gravity torque at joint j [N m]: c is the compliance [rad/N m]
+    lever         (z_j × R_i e_a) · ĝ, what link i's first moment along its axis a (0 x, 1 y, 2 z) does to joint j
+    joint         q_i: gear ratio error (i = j) or coupling of another axis (i ≠ j)
+    cos, sin      cos(k q_i), sin(k q_i): harmonics of order k
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.errors import CalibError
+from calib.robot.chain import Chain
+from calib.robot.kinematics import joint_frames
+
+BASES = ("torque", "lever", "joint", "cos", "sin")
+
+
+@dataclass(frozen=True)
+class Term:
+    """One effect: element name it moves, basis, joint or link it comes from (index), order k (or axis of a lever)."""
+
+    element: str
+    basis: str
+    source: int
+    order: int = 0
+
+    def __post_init__(self) -> None:
+        if self.basis not in BASES:
+            raise CalibError(f"deflection basis '{self.basis}' is none of {', '.join(BASES)}")
+
+
+@dataclass(frozen=True, eq=False)
+class Deflection:
+    """Terms with their coefficients (E,); ``torque`` (m, n) comes with the poses where a term needs it.
+
+    Attributes:
+        terms: the E effects.
+        coefficients: (E,) [unit of the element per unit of the basis].
+        reference: the chain on which levers (and gravity torques) are evaluated: the nominal one, so that a basis does
+            not change while the geometry is fitted.
+    """
+
+    terms: tuple[Term, ...] = ()
+    coefficients: np.ndarray | tuple[float, ...] = ()
+    reference: Chain | None = None
+
+    def with_coefficients(self, values: np.ndarray) -> Deflection:
+        return replace(self, coefficients=np.asarray(values, dtype=float))
+
+
+def names(deflection: Deflection, chain: Chain) -> tuple[str, ...]:
+    """Return one readable name per term, e.g. ``theta3 per N·m``, ``theta3 sin 2 q4``."""
+    return tuple(_name(term, chain) for term in deflection.terms)
+
+
+def _name(term: Term, chain: Chain) -> str:
+    source = chain.joint_names[term.source]
+    if term.basis == "torque":
+        return f"{term.element} compliance"
+    if term.basis == "lever":
+        return f"{term.element} sag of {source} {'xyz'[term.order]}"
+    if term.basis == "joint":
+        return f"{term.element} per {source}"
+    return f"{term.element} {term.basis} {term.order} {source}"
+
+
+def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = None) -> np.ndarray:
+    """Return the bases b of every term at joint values q (m, n): (E, m).
+
+    Args:
+        deflection: the terms, with their reference chain.
+        q: (m, n).
+        torque: (m, n) gravity torques [N m], for terms of basis ``torque``.
+    """
+    result = np.empty((len(deflection.terms), len(q)))
+    levers = _levers(deflection, q) if any(term.basis == "lever" for term in deflection.terms) else {}
+    moving = _moved_by(deflection)
+    for e, term in enumerate(deflection.terms):
+        if term.basis == "torque":
+            if torque is None:
+                raise CalibError("a compliance needs gravity torques: give the robot masses, or ask for fitted ones")
+            result[e] = torque[:, term.source]
+        elif term.basis == "lever":
+            z, rotation, gravity = levers[moving[term.element]], levers[term.source], levers[-1]
+            result[e] = np.cross(z[1], rotation[0][:, :, term.order]) @ gravity
+        elif term.basis == "joint":
+            result[e] = q[:, term.source]
+        else:
+            result[e] = getattr(np, term.basis)(term.order * q[:, term.source])
+    return result
+
+
+def _moved_by(deflection: Deflection) -> dict[str, int]:
+    """Map element names to the joint that owns them."""
+    return {} if deflection.reference is None else {e.name: e.owner for e in deflection.reference.elements}
+
+
+def _levers(deflection: Deflection, q: np.ndarray) -> dict[int, tuple]:
+    """Return per joint (rotation of its link (m, 3, 3), its axis (m, 3)) on the reference chain; -1: gravity's unit."""
+    chain = deflection.reference
+    if chain is None:
+        raise CalibError("sag terms need the reference chain of the deflection")
+    frames = joint_frames(chain, q)
+    result: dict = {-1: chain.gravity / np.linalg.norm(chain.gravity)}
+    for j, k in enumerate(chain.moving):
+        element = chain.elements[k]
+        axis = "xyz".index(element.axis[1])
+        result[j] = (frames[j, :, :3, :3], element.sign * frames[j, :, :3, axis])
+    return result
+
+
+def extra_displacements(
+    chain: Chain, deflection: Deflection, q: np.ndarray, bases: np.ndarray | None = None
+) -> np.ndarray | None:
+    """Return what the deflection adds to each element's displacement, (K, m); None without terms."""
+    if not deflection.terms:
+        return None
+    bases = evaluate(deflection, q) if bases is None else bases
+    extra = np.zeros((len(chain.elements), len(q)))
+    where = target_elements(chain, deflection)
+    np.add.at(extra, where, np.asarray(deflection.coefficients)[:, None] * bases)
+    return extra
+
+
+def target_elements(chain: Chain, deflection: Deflection) -> np.ndarray:
+    """Return the index of the element each term moves, (E,)."""
+    table = {name: k for k, name in enumerate(chain.names)}
+    return np.array([table[term.element] for term in deflection.terms], dtype=int)

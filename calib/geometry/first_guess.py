@@ -1,0 +1,192 @@
+"""Where the instrument and the target stand: a first guess in closed form, so that no one has to be asked for it.
+
+With the arm's poses A_i = (R_i, a_i) from the nominal chain:
+
+* full pose  B_i = S A_i X: rotations by Shah (2013, "Solving the robot-world/hand-eye calibration problem using the
+  Kronecker product"), then the two translations linearly;
+* position   S⁻¹ y_i = R_i t + a_i: linear in S's rotation (9 numbers), its offset and t; the 9 are projected on SO(3);
+* sockets    R_i t + a_i constant within each group: linear in t.
+
+Each guess then gets a few robust Gauss–Newton steps on the frames alone (`calib.geometry.fit`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.data.measurements import PoseMeasurements
+from calib.errors import MeasurementError
+from calib.geometry.installation import Installation
+from calib.geometry.observation import has_instrument
+from calib.robot.chain import Chain
+from calib.robot.kinematics import forward
+from calib.transforms import invert, orthonormal, pose
+
+
+def install(chain: Chain, measured: Sequence[PoseMeasurements]) -> Installation:
+    """Return the nominal arm with stations and tools placed by the measurements.
+
+    A tool seen in several blocks takes its guess from the block that tells most (poses before positions before the
+    rest, then the most rows); a station likewise. Tools that no block can place start at the tip.
+
+    Raises:
+        MeasurementError: too few rows to place an instrument.
+    """
+    stations: dict[str, np.ndarray] = {}
+    tools: dict[str, np.ndarray] = {}
+    rank = {"pose": 0, "position": 1, "sockets": 2}
+    for block in sorted(measured, key=lambda b: (rank.get(b.kind, 3), -len(b))):
+        arm = forward(chain, block.q)
+        assert block.tool is not None
+        for number in np.unique(block.tool):
+            name, rows = block.tool_names[number], block.tool == number
+            station, tool = _guess(block, arm, rows, stations.get(block.station), tools.get(name))
+            tools.setdefault(name, tool)
+            if has_instrument(block) and station is not None:
+                stations.setdefault(block.station, station)
+    station_names = tuple(dict.fromkeys(b.station for b in measured if has_instrument(b))) or ("station",)
+    tool_names = tuple(dict.fromkeys(name for b in measured for name in b.tool_names))
+    return Installation(
+        chain,
+        np.array([stations.get(name, np.eye(4)) for name in station_names]),
+        np.array([tools.get(name, np.eye(4)) for name in tool_names]),
+        station_names,
+        tool_names,
+    )
+
+
+def _guess(
+    block: PoseMeasurements, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
+) -> tuple[np.ndarray | None, np.ndarray]:
+    """Place one target of a block, and its station where it is not placed yet."""
+    if block.kind == "pose":
+        assert block.position is not None and block.quaternion is not None
+        _enough(block, rows, 3)
+        seen = pose(Rotation.from_quat(block.quaternion[rows]).as_matrix(), block.position[rows])
+        if station is not None:
+            return station, average_pose(invert(arm[rows]) @ invert(station) @ seen)
+        if tool is not None:
+            return average_pose(seen @ invert(arm[rows] @ tool)), tool
+        return place_pose(arm[rows], seen)
+    if block.kind == "position":
+        assert block.position is not None
+        _enough(block, rows, 4)
+        return place_position(arm[rows], block.position[rows], station, tool)
+    if block.kind == "sockets" and tool is None:
+        assert block.group is not None
+        return None, pose(None, place_sockets(arm[rows], block.group[rows]))
+    return None, np.eye(4) if tool is None else tool
+
+
+def _enough(block: PoseMeasurements, rows: np.ndarray, needed: int) -> None:
+    if rows.sum() < needed:
+        raise MeasurementError(
+            f"{int(rows.sum())} usable rows: placing the instrument and the target takes at least {needed} different "
+            "poses, and a calibration some 20 or more; measure more poses",
+            block.file,
+        )
+
+
+def average_pose(poses: np.ndarray) -> np.ndarray:
+    """Return the mean (4, 4) of poses (m, 4, 4): chordal mean of the rotations, median of the positions."""
+    return pose(orthonormal(poses[:, :3, :3].mean(axis=0)), np.median(poses[:, :3, 3], axis=0))
+
+
+def place_pose(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Solve B_i = S A_i X for S and X (Shah 2013).
+
+    Args:
+        arm: (m, 4, 4) poses A_i of the tip in the base.
+        seen: (m, 4, 4) poses B_i of the target in the station's frame.
+
+    Returns:
+        station (4, 4) and tool (4, 4).
+    """
+    a, b = arm[:, :3, :3], seen[:, :3, :3]
+    # vec(R_S R_A R_X) = vec(R_B): the sum of R_B ⊗ R_A has vec(R_S) and vec(R_X) as its first singular pair
+    kernel = np.einsum("mij,mkl->ikjl", b, a).reshape(9, 9)
+    u, _, vt = np.linalg.svd(kernel)
+    station_rotation, tool_transposed = u[:, 0].reshape(3, 3), vt[0].reshape(3, 3)
+    station_rotation = orthonormal(station_rotation * np.sign(np.linalg.det(station_rotation)))
+    tool_rotation = orthonormal(tool_transposed * np.sign(np.linalg.det(tool_transposed))).T
+    # y_i - R_S a_i = R_S R_i t + p_S
+    turned = station_rotation @ a
+    matrix = np.concatenate([turned, np.broadcast_to(np.eye(3), turned.shape)], axis=2).reshape(-1, 6)
+    target = (seen[:, :3, 3] - arm[:, :3, 3] @ station_rotation.T).reshape(-1)
+    solution = np.linalg.lstsq(matrix, target, rcond=1e-9)[0]
+    return pose(station_rotation, solution[3:]), pose(tool_rotation, solution[:3])
+
+
+def place_position(
+    arm: np.ndarray, seen: np.ndarray, station: np.ndarray | None = None, tool: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Solve y_i = S (R_i t + a_i) for S and t, linearly; given S or t, for the other.
+
+    Of the linear solution and two plainer ones (target at the tip; target at the tip with the mean offset) the one with
+    the smallest median error is taken, since a small workspace ruins the linear one.
+
+    Args:
+        arm: (m, 4, 4).
+        seen: (m, 3) [m].
+    """
+    rotation, position = arm[:, :3, :3], arm[:, :3, 3]
+    if station is not None:
+        inside = (seen - station[:3, 3]) @ station[:3, :3]
+        offset = np.median(np.einsum("mji,mj->mi", rotation, inside - position), axis=0)
+        return station, pose(None, offset)
+    if tool is not None:
+        return _align(position + rotation @ tool[:3, 3], seen), tool
+    offsets = [np.zeros(3), _linear_offset(rotation, position, seen)]
+    best: tuple[float, np.ndarray, np.ndarray] | None = None
+    for offset in offsets:
+        for _ in range(5):  # alternate: placement by Kabsch, offset by its linear solution
+            placement = _align(position + rotation @ offset, seen)
+            inside = (seen - placement[:3, 3]) @ placement[:3, :3]
+            error = float(np.median(np.linalg.norm(inside - position - rotation @ offset, axis=1)))
+            if best is None or error < best[0]:
+                best = error, placement, offset
+            offset = np.median(np.einsum("mji,mj->mi", rotation, inside - position), axis=0)
+    assert best is not None
+    return best[1], pose(None, best[2])
+
+
+def _linear_offset(rotation: np.ndarray, position: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Return t of R_Sᵀ y - c - R t = a, linear in the nine numbers of R_Sᵀ, c and t."""
+    m = len(seen)
+    centre = seen.mean(axis=0)
+    rows = np.zeros((m, 3, 15))
+    for axis in range(3):
+        rows[:, axis, 3 * axis : 3 * axis + 3] = seen - centre
+    rows[:, :, 9:12] = np.eye(3)
+    rows[:, :, 12:] = -rotation
+    return np.linalg.lstsq(rows.reshape(-1, 15), position.reshape(-1), rcond=1e-6)[0][12:]
+
+
+def _align(points: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Return the pose S with seen ≈ S points (Kabsch 1976), after one pass of trimming the worst fifth."""
+    keep = np.ones(len(points), dtype=bool)
+    placement = np.eye(4)
+    for _ in range(2):
+        rotation, _ = Rotation.align_vectors(
+            seen[keep] - seen[keep].mean(axis=0), points[keep] - points[keep].mean(axis=0)
+        )
+        matrix = rotation.as_matrix()
+        placement = pose(matrix, seen[keep].mean(axis=0) - matrix @ points[keep].mean(axis=0))
+        error = np.linalg.norm(seen - points @ matrix.T - placement[:3, 3], axis=1)
+        keep = error <= max(np.quantile(error, 0.8), 1e-12)
+        if keep.sum() < 4:
+            break
+    return placement
+
+
+def place_sockets(arm: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """Return the offset t (3,) for which R_i t + a_i varies least within each group."""
+    rotation, position = arm[:, :3, :3].copy(), arm[:, :3, 3].copy()
+    for number in np.unique(group):
+        rows = group == number
+        rotation[rows] -= rotation[rows].mean(axis=0)
+        position[rows] -= position[rows].mean(axis=0)
+    return np.linalg.lstsq(rotation.reshape(-1, 3), -position.reshape(-1), rcond=1e-6)[0]

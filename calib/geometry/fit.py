@@ -1,0 +1,321 @@
+"""Fit the geometry: Levenberg–Marquardt on whitened residuals of every kind of measurement at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.data.measurements import PoseMeasurements
+from calib.errors import MeasurementError, UsageError
+from calib.estimation import robust
+from calib.estimation.columns import ColumnSplit, split_columns
+from calib.estimation.estimate import Estimate
+from calib.estimation.nonlinear import Solution, covariance, solve
+from calib.geometry.identifiability import base_columns, preference
+from calib.geometry.installation import Installation
+from calib.geometry.observation import Block, observe, prepare, stack
+from calib.geometry.parameters import layout, layout_counts, step
+from calib.geometry.residuals import Part
+
+PLAUSIBLE = {"m": 0.01, "rad": 0.05}  # how far a real arm may be from its nominal (our choice)
+FRAME_SCALE = 10.0  # frames are kept unless the data say nothing at all [m, rad]
+START_SIGMA = {"position": 1e-3, "orientation": 1e-3, "consistency": 1e-3, "distance": 1e-3, "plane": 1e-3}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to fit.
+
+    Attributes:
+        loss: ``none``, ``huber`` or ``cauchy``, on the size of each row's whitened residual.
+        loss_scale: the loss's constant, in sigmas; None for its usual one.
+        damping: first λ of Levenberg–Marquardt; 0 for the iterative linear least squares of eq. 11.
+        tolerance: relative size of a column that counts as dependent.
+        limit: linearisations at most, per pass.
+        passes: how often sigmas that are not stated (and robust weights) are estimated anew.
+    """
+
+    loss: str = "none"
+    loss_scale: float | None = None
+    damping: float = 1e-4
+    tolerance: float = 1e-6
+    limit: int = 50
+    passes: int = 3
+
+
+@dataclass(frozen=True, eq=False)
+class GeometricFit:
+    """The outcome of a fit.
+
+    Attributes:
+        cell: the calibrated installation.
+        start: the installation the fit began with.
+        free: (f,) positions of the fitted parameters in the full vector (`calib.geometry.parameters`).
+        estimate: values and covariance of the fitted parameters; stations and tools as displacements from the fitted
+            placement, hence with value 0.
+        split: which candidate columns were kept; None where the caller named the free ones.
+        candidates: what ``split`` indexes.
+        solution: the last Levenberg–Marquardt pass.
+        blocks, found: the prepared measurements and their residual parts at the solution.
+        sigmas: per part, the standard deviations used.
+        weights: per part, (m,) robust weights.
+    """
+
+    cell: Installation
+    start: Installation
+    free: np.ndarray
+    estimate: Estimate
+    split: ColumnSplit | None
+    candidates: np.ndarray
+    solution: Solution
+    blocks: list[Block]
+    found: list[Part]
+    sigmas: list[np.ndarray]
+    weights: list[np.ndarray]
+
+
+def fit(
+    cell: Installation,
+    measured: Sequence[PoseMeasurements],
+    candidates: np.ndarray | None = None,
+    *,
+    settings: Settings | None = None,
+    torques: Sequence[np.ndarray | None] | None = None,
+) -> GeometricFit:
+    """Fit what can be told of the parameters `candidates`; the others keep their nominal values.
+
+    Minimises Σ ‖(y - f(x)) / σ‖². Three passes: columns that are linear combinations of others are set aside; the rest
+    is fitted with a wide prior (`PLAUSIBLE`), which settles the sigmas; then every parameter that the data do not tell
+    better than half of what is plausible goes back to its nominal, and the others are fitted without any prior.
+
+    Args:
+        cell: where to start; frames placed (`calib.geometry.first_guess`).
+        measured: blocks of measurements.
+        candidates: (c,) positions in the parameter vector; None for all.
+        settings: see `Settings`.
+        torques: gravity torques (m, n) per block [N m], for compliance terms.
+
+    Raises:
+        MeasurementError: fewer rows than unknowns.
+    """
+    settings = settings or Settings()
+    table = layout(cell)
+    candidates = np.arange(len(table.names)) if candidates is None else np.asarray(candidates, dtype=int)
+    blocks = prepare(cell, measured, torques)
+    split = base_columns(cell, blocks, candidates, settings.tolerance)
+    free, plausible = candidates[split.kept], plausible_deviation(cell, candidates[split.kept])
+    start = cell
+    if np.isfinite(plausible).any():
+        rough = fit_with_prior(cell, blocks, free, plausible, settings=settings)
+        told = told_columns(rough, plausible)
+        nominal = parameter_values(cell)
+        values = parameter_values(rough.cell)
+        back = np.setdiff1d(candidates[: np.searchsorted(candidates, table.arm)], free[told])
+        start, free = step(rough.cell, back, nominal[back] - values[back]), free[told]
+    found = fit_with_prior(start, blocks, free, None, settings=settings)
+    return replace(found, start=cell, split=split, candidates=candidates)
+
+
+def fit_with_prior(
+    cell: Installation,
+    blocks: list[Block],
+    free: np.ndarray,
+    prior: np.ndarray | None = None,
+    *,
+    settings: Settings | None = None,
+) -> GeometricFit:
+    """Fit exactly the parameters `free`, minimising Σ ‖(y - f(x)) / σ‖² + Σ ((x - x_start) / σ_prior)².
+
+    Sigmas that no file states are estimated, one per file and nature (position, orientation …), and the fit repeated
+    until they settle; so are the weights of a robust loss.
+
+    Args:
+        cell: where to start, and what the prior draws to.
+        blocks: measurements prepared for this installation.
+        free: (f,) positions in the parameter vector.
+        prior: (f,) standard deviations about the start; infinite for none.
+        settings: see `Settings`.
+    """
+    settings = settings or Settings()
+    weigher = _Weigher(settings, cell, blocks, free, prior)
+    state, solution = cell, None
+    for number in range(settings.passes):
+        weigher.update(state, first=number == 0)
+        solution = solve(
+            weigher.linearise, lambda s, dx: step(s, free, dx), state,
+            damping=settings.damping, limit=settings.limit,
+        )  # fmt: skip
+        state = solution.state
+        if weigher.settled(state):
+            break
+    assert solution is not None
+    return weigher.result(cell, solution)
+
+
+def plausible_deviation(cell: Installation, columns: np.ndarray) -> np.ndarray:
+    """Return how far a real arm's parameter may lie from its nominal (c,); infinite for frames and deflections."""
+    table = layout(cell)
+    return np.array([PLAUSIBLE[table.units[k]] if k < table.arm else np.inf for k in columns])
+
+
+def told_columns(rough: GeometricFit, plausible: np.ndarray) -> np.ndarray:
+    """Return which of the fitted parameters the data tell to better than half the plausible deviation (indices)."""
+    arm = np.isfinite(plausible)
+    _, matrix = stack(rough.found, [sigma / np.sqrt(w) for sigma, w in zip(rough.sigmas, rough.weights)])
+    scale = np.where(arm, plausible, FRAME_SCALE) / max(rough.estimate.residual_std, 1e-12)
+    return split_columns(matrix, preference(rough.cell, rough.free), tolerance=2.0, scale=scale).kept
+
+
+class _Weigher:
+    """Holds what changes between passes: sigmas and robust weights of every part."""
+
+    def __init__(
+        self, settings: Settings, start: Installation, blocks: list[Block], free: np.ndarray, prior: np.ndarray | None
+    ):
+        self.settings, self.start, self.blocks, self.free = settings, start, blocks, free
+        self.prior = prior if prior is not None and np.isfinite(prior).any() else None
+        self.sigmas: list[np.ndarray] = []
+        self.weights: list[np.ndarray] = []
+
+    def parts(self, state: Installation, free: np.ndarray | None = None) -> list[Part]:
+        chosen = self.free if free is None else free
+        return [part for block in self.blocks for part in observe(state, block, chosen)]
+
+    def update(self, state: Installation, first: bool) -> None:
+        """Set sigmas and weights from the residuals at a state."""
+        found = self.parts(state, np.array([], dtype=int))
+        rows = sum(part.value.size for part in found)
+        unknown = len(self.free) + sum(part.nuisances for part in found)
+        if rows < unknown and self.prior is None:
+            raise MeasurementError(
+                f"{rows} measured numbers cannot determine {unknown} unknowns; measure more poses, or fit a smaller "
+                "model (--model frames or offsets)",
+                self.blocks[0].measured.file,
+            )
+        share = max(1.0 - unknown / rows, 0.05)
+        robustly = self.settings.loss != "none"
+        self.sigmas = [_sigma(part, share, first and not robustly, robustly) for part in found]
+        self.weights = [
+            robust.weights(_size(part, sigma), self.settings.loss, self.settings.loss_scale)
+            for part, sigma in zip(found, self.sigmas)
+        ]
+
+    def settled(self, state: Installation) -> bool:
+        """Say whether another pass would change the sigmas by less than 2 %."""
+        before, weights = self.sigmas, self.weights
+        self.update(state, first=False)
+        same = all(abs(np.mean(new / old) - 1.0) < 0.02 for new, old in zip(self.sigmas, before))
+        steady = all(np.abs(new - old).max(initial=0.0) < 0.02 for new, old in zip(self.weights, weights))
+        self.sigmas, self.weights = before, weights
+        return same and steady
+
+    def linearise(self, state: Installation) -> tuple[np.ndarray, np.ndarray]:
+        found = self.parts(state)
+        scales = [sigma / np.sqrt(weight) for sigma, weight in zip(self.sigmas, self.weights)]
+        residual, matrix = stack(found, scales)
+        if self.prior is not None:
+            pull = (parameter_values(self.start) - parameter_values(state))[self.free] / self.prior
+            held = np.isfinite(self.prior)
+            residual = np.concatenate([residual, pull[held]])
+            matrix = np.vstack([matrix, np.diag(1.0 / self.prior)[held]])
+        return residual, matrix
+
+    def result(self, cell: Installation, solution: Solution) -> GeometricFit:
+        state = solution.state
+        found = self.parts(state)
+        table = layout(cell)
+        rows = sum(part.value.size for part in found)
+        dof = rows - len(self.free) - sum(part.nuisances for part in found)
+        if self.prior is not None:
+            dof = max(dof + int(np.isfinite(self.prior).sum()), 1)
+        variance = solution.cost / max(dof, 1)
+        estimate = Estimate(
+            tuple(table.names[k] for k in self.free),
+            tuple(table.units[k] for k in self.free),
+            parameter_values(state)[self.free],
+            covariance(solution.factor, variance),
+            float(np.sqrt(variance)),
+            dof,
+        )
+        return GeometricFit(
+            state, cell, self.free, estimate, None, self.free, solution, self.blocks, found, self.sigmas, self.weights
+        )
+
+
+def parameter_values(cell: Installation) -> np.ndarray:
+    """Return the full parameter vector; frames count from their present placement, hence zeros."""
+    arm, stations, tools, _ = layout_counts(cell)
+    return np.concatenate([cell.chain.values, np.zeros(stations + tools), np.asarray(cell.deflection.coefficients)])
+
+
+def _sigma(part: Part, share: float, start: bool, robustly: bool) -> np.ndarray:
+    """Return the stated sigmas of a part, or one estimated from its residuals, as (rows, m)."""
+    if part.sigma is not None:
+        return part.sigma
+    if start:
+        return np.full(part.value.shape, START_SIGMA[part.label])
+    found = robust.spread(part.value) if robustly else float(np.sqrt(np.mean(part.value**2)))
+    return np.full(part.value.shape, max(found / np.sqrt(share), 1e-12))
+
+
+def _size(part: Part, sigma: np.ndarray) -> np.ndarray:
+    """Return each row's residual in sigmas, root mean square over its components (m,)."""
+    return np.sqrt(np.mean((part.value / sigma) ** 2, axis=0))
+
+
+def outliers(found: GeometricFit, threshold: float = 4.0) -> list[tuple[str, int, str, float]]:
+    """Return (file, row, label, size in robust sigmas) of rows that do not fit, worst first.
+
+    Sizes are measured against the robust spread of their own part (1.4826 · median), not against stated sigmas, so
+    that an optimistic instrument does not make every row an outlier.
+    """
+    result = []
+    start = 0
+    for block in found.blocks:
+        labels = _labels(block)
+        for part in found.found[start : start + labels]:
+            spread = max(robust.spread(part.value), 1e-15)
+            size = np.sqrt(np.mean(part.value**2, axis=0)) / spread
+            assert block.measured.rows is not None
+            rows = block.measured.rows[part.index]
+            result += [
+                (block.measured.file, int(rows[i]), part.label, float(size[i])) for i in np.flatnonzero(size > threshold)
+            ]
+        start += labels
+    return sorted(result, key=lambda item: -item[3])
+
+
+def _labels(block: Block) -> int:
+    """Return how many parts a block gives."""
+    if block.measured.kind == "pose":
+        return 2
+    return 2 if block.measured.kind == "sockets" and block.measured.links else 1
+
+
+def frames_only(cell: Installation) -> np.ndarray:
+    """Return the positions of all station and tool elements."""
+    return layout(cell).frame_index
+
+
+def polish_frames(
+    cell: Installation,
+    measured: Sequence[PoseMeasurements],
+    settings: Settings | None = None,
+    torques: Sequence[np.ndarray | None] | None = None,
+) -> GeometricFit:
+    """Fit stations and tools only, the arm staying as it is: what 'nominal' errors are measured with."""
+    return fit(cell, measured, frames_only(cell), settings=settings, torques=torques)
+
+
+def combine(settings: Settings, **changes: object) -> Settings:
+    """Return settings with some fields changed.
+
+    Raises:
+        UsageError: for a loss that does not exist.
+    """
+    result = replace(settings, **changes)  # type: ignore[arg-type]
+    if result.loss not in robust.LOSSES:
+        raise UsageError(f"loss '{result.loss}' is none of {', '.join(robust.LOSSES)}")
+    return result

@@ -1,0 +1,83 @@
+"""An arm as it stands in the cell: chain, instrument placements, tool placements and joint deflections."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from calib.arrays import frozen
+from calib.geometry.deflection import Deflection, extra_displacements
+from calib.robot.chain import Chain
+from calib.robot.kinematics import Sweep, sweep
+
+FRAME_AXES = ("x", "y", "z", "rx", "ry", "rz")
+
+
+@dataclass(frozen=True, eq=False)
+class Installation:
+    """T_i = station_{s(i)} · arm(q_i + deflection) · tool_{t(i)}.
+
+    Attributes:
+        chain: the arm, base to tip.
+        stations: (S, 4, 4) poses of the arm's base in each instrument's frame.
+        tools: (T, 4, 4) poses of each target in the tip's frame.
+        station_names, tool_names: S and T strings.
+        deflection: what q does not say (stiffness, coupling, harmonics).
+    """
+
+    chain: Chain
+    stations: np.ndarray = field(default_factory=lambda: np.eye(4)[None])
+    tools: np.ndarray = field(default_factory=lambda: np.eye(4)[None])
+    station_names: tuple[str, ...] = ("station",)
+    tool_names: tuple[str, ...] = ("tool",)
+    deflection: Deflection = field(default_factory=Deflection)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "stations", frozen(self.stations))
+        object.__setattr__(self, "tools", frozen(self.tools))
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """The targets as the instrument sees them, for m rows.
+
+    Attributes:
+        walked: the pass along the chain, in the station's frame.
+        point: (3, m) target positions [m].
+        rotation: (3, 3, m) target rotations, ``rotation[c]`` being column c.
+    """
+
+    walked: Sweep
+    point: np.ndarray
+    rotation: np.ndarray
+
+    def poses(self) -> np.ndarray:
+        """Return the target poses (m, 4, 4) in the station's frame."""
+        return replace(self.walked, rotation=self.rotation, position=self.point).poses()
+
+
+def see(
+    cell: Installation, q: np.ndarray, station: int = 0, tool: np.ndarray | int = 0, bases: np.ndarray | None = None
+) -> Seen:
+    """Predict what an instrument sees at joint values q (m, n).
+
+    Args:
+        cell: the installation.
+        q: (m, n) [rad or m].
+        station: index of the instrument placement.
+        tool: index of the target, one or (m,).
+        bases: (E, m) of the deflection's terms at q; evaluated here where None.
+    """
+    extra = extra_displacements(cell.chain, cell.deflection, q, bases)
+    walked = sweep(cell.chain, q, cell.stations[station], extra)
+    if len(cell.tools) == 1 or np.ndim(tool) == 0:
+        placement = cell.tools[0 if len(cell.tools) == 1 else int(np.asarray(tool))]
+        flat = walked.rotation.reshape(3, -1)
+        point = walked.position + (placement[:3, 3] @ flat).reshape(walked.position.shape)
+        rotation = (placement[:3, :3].T @ flat).reshape(walked.rotation.shape)
+    else:
+        placement = cell.tools[np.asarray(tool)]
+        point = walked.position + np.einsum("cdm,mc->dm", walked.rotation, placement[:, :3, 3])
+        rotation = np.einsum("cdm,mce->edm", walked.rotation, placement[:, :3, :3])
+    return Seen(walked, point, rotation)

@@ -1,0 +1,135 @@
+"""The observation matrix of an installation: residual parts and their Jacobian for every block of measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.data.measurements import PoseMeasurements
+from calib.errors import UsageError
+from calib.geometry import deflection
+from calib.geometry.installation import Installation, Seen, see
+from calib.geometry.parameters import layout_counts
+from calib.geometry.residuals import Part, parts
+from calib.robot.kinematics import element_jacobian
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Measurements made ready for an installation.
+
+    Attributes:
+        measured: m rows.
+        station: index of their station; unused by kinds without an instrument.
+        tool: (m,) index of each row's target among the installation's tools.
+        torque: (m, n) gravity torques [N m], or None.
+        bases: (E, m) the deflection's bases, evaluated once.
+    """
+
+    measured: PoseMeasurements
+    station: int
+    tool: np.ndarray
+    torque: np.ndarray | None = None
+    bases: np.ndarray | None = None
+
+
+def prepare(
+    cell: Installation, measured: Sequence[PoseMeasurements], torques: Sequence[np.ndarray | None] | None = None
+) -> list[Block]:
+    """Match measurements to the installation's stations and tools by name, and evaluate the deflection's bases.
+
+    Raises:
+        UsageError: for a station or tool the installation does not have.
+    """
+    blocks = []
+    for number, block in enumerate(measured):
+        torque = torques[number] if torques is not None else None
+        station = _index(cell.station_names, block.station, "station") if has_instrument(block) else 0
+        assert block.tool is not None
+        tools = np.array([_index(cell.tool_names, name, "tool") for name in block.tool_names])
+        bases = deflection.evaluate(cell.deflection, block.q, torque) if cell.deflection.terms else None
+        blocks.append(Block(block, station, tools[block.tool], torque, bases))
+    return blocks
+
+
+def has_instrument(measured: PoseMeasurements) -> bool:
+    """Say whether the rows are seen from a station whose placement matters."""
+    return measured.kind in ("pose", "position")
+
+
+def _index(names: tuple[str, ...], name: str, what: str) -> int:
+    if name not in names:
+        raise UsageError(f"{what} '{name}' is not part of the installation, which has {', '.join(names)}")
+    return names.index(name)
+
+
+def predict(cell: Installation, block: Block) -> Seen:
+    """Return what the instrument should see in a block."""
+    return see(cell, block.measured.q, block.station, block.tool, block.bases)
+
+
+def observe(cell: Installation, block: Block, free: np.ndarray) -> list[Part]:
+    """Return the residual parts of a block with their Jacobian with respect to the parameters `free` (f,)."""
+    seen = predict(cell, block)
+    return parts(block.measured, seen, target_jacobian(cell, block, seen, free))
+
+
+def target_jacobian(cell: Installation, block: Block, seen: Seen, free: np.ndarray) -> np.ndarray:
+    """Return [v; ω] of the targets per unit of each free parameter, (f, 6, m)."""
+    arm, stations, tools, terms = layout_counts(cell)
+    m = seen.point.shape[1]
+    jacobian = np.zeros((len(free), 6, m))
+    section = np.searchsorted(np.cumsum([arm, stations, tools]), free, side="right")
+    in_arm = np.flatnonzero(section == 0)
+    if len(in_arm) == len(free):
+        return element_jacobian(cell.chain, seen.walked, seen.point, free)
+    if len(in_arm):
+        jacobian[in_arm] = element_jacobian(cell.chain, seen.walked, seen.point, free[in_arm])
+    for place in np.flatnonzero(section == 1):
+        number, axis = divmod(int(free[place]) - arm, 6)
+        if number == block.station and has_instrument(block.measured):
+            _station_column(jacobian[place], cell.stations[number], seen, axis)
+    for place in np.flatnonzero(section == 2):
+        number, axis = divmod(int(free[place]) - arm - stations, 6)
+        rows = block.tool == number
+        jacobian[place][3 * (axis // 3) : 3 * (axis // 3) + 3] = np.where(rows, seen.rotation[axis % 3], 0.0)
+    in_terms = np.flatnonzero(section == 3)
+    if len(in_terms):
+        assert block.bases is not None
+        numbers = free[in_terms] - arm - stations - tools
+        targets = deflection.target_elements(cell.chain, cell.deflection)[numbers]
+        unique, inverse = np.unique(targets, return_inverse=True)
+        moved = element_jacobian(cell.chain, seen.walked, seen.point, unique)
+        jacobian[in_terms] = moved[inverse] * block.bases[numbers][:, None, :]
+    return jacobian
+
+
+def _station_column(column: np.ndarray, placement: np.ndarray, seen: Seen, axis: int) -> None:
+    """Fill the column (6, m) of one element of a station placement, at the end of that placement."""
+    direction = placement[:3, axis % 3]
+    if axis < 3:
+        column[:3] = direction[:, None]
+    else:
+        lever = (seen.point - placement[:3, 3:4]).T
+        column[:3] = np.cross(direction, lever).T
+        column[3:] = direction[:, None]
+
+
+def stack(found: Sequence[Part], sigmas: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Whiten and stack parts into r (rows,) and a column-major W (rows, f).
+
+    Args:
+        found: parts of all blocks.
+        sigmas: one array per part, broadcastable to its value (rows, m).
+    """
+    residual = np.concatenate([(part.value / sigma).ravel() for part, sigma in zip(found, sigmas)])
+    f = found[0].jacobian.shape[0]
+    matrix = np.empty((f, len(residual)))
+    start = 0
+    for part, sigma in zip(found, sigmas):
+        stop = start + part.value.size
+        np.divide(part.jacobian, sigma, out=matrix[:, start:stop].reshape(part.jacobian.shape))
+        start = stop
+    return residual, matrix.T

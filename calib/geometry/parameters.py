@@ -1,0 +1,113 @@
+"""The vector of everything a geometric fit may move, its names, and how a step is taken.
+
+Order: arm elements (K), six per station (x y z rx ry rz, in the station-to-base placement's own axes), six per tool (in
+the target's own axes), deflection coefficients (E).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.errors import UsageError
+from calib.geometry import deflection
+from calib.geometry.installation import FRAME_AXES, Installation
+from calib.transforms import displace
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where each kind of parameter stands in the full vector.
+
+    Attributes:
+        names, units: one per parameter.
+        arm, stations, tools, terms: how many of each.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    arm: int
+    stations: int
+    tools: int
+    terms: int
+
+    def group(self, index: int) -> str:
+        """Return 'arm', 'station', 'tool' or 'deflection' for a position in the vector."""
+        edges = np.cumsum([self.arm, self.stations, self.tools])
+        return ("arm", "station", "tool", "deflection")[int(np.searchsorted(edges, index, side="right"))]
+
+    @property
+    def arm_index(self) -> np.ndarray:
+        return np.arange(self.arm)
+
+    @property
+    def frame_index(self) -> np.ndarray:
+        return np.arange(self.arm, self.arm + self.stations + self.tools)
+
+    @property
+    def station_index(self) -> np.ndarray:
+        return np.arange(self.arm, self.arm + self.stations)
+
+    @property
+    def tool_index(self) -> np.ndarray:
+        return np.arange(self.arm + self.stations, self.arm + self.stations + self.tools)
+
+    @property
+    def term_index(self) -> np.ndarray:
+        return np.arange(self.arm + self.stations + self.tools, len(self.names))
+
+    def find(self, names: list[str] | tuple[str, ...]) -> np.ndarray:
+        """Return positions by name.
+
+        Raises:
+            UsageError: for a name that does not exist.
+        """
+        table = {name: k for k, name in enumerate(self.names)}
+        for name in names:
+            if name not in table:
+                raise UsageError(f"no geometric parameter '{name}'; there are {', '.join(self.names)}")
+        return np.array([table[name] for name in names], dtype=int)
+
+
+def layout(cell: Installation) -> Layout:
+    """Return the layout of an installation's parameters."""
+    units = ("m", "m", "m", "rad", "rad", "rad")
+    frames = [f"{name}.{axis}" for name in (*cell.station_names, *cell.tool_names) for axis in FRAME_AXES]
+    terms = cell.deflection.terms
+    element_units = dict(zip(cell.chain.names, cell.chain.units))
+    return Layout(
+        names=(*cell.chain.names, *frames, *deflection.names(cell.deflection, cell.chain)),
+        units=(*cell.chain.units, *(units * (len(frames) // 6)), *(_unit(element_units, term) for term in terms)),
+        arm=len(cell.chain.elements),
+        stations=6 * len(cell.stations),
+        tools=6 * len(cell.tools),
+        terms=len(terms),
+    )
+
+
+def _unit(units: dict[str, str], term: deflection.Term) -> str:
+    return units[term.element] + {"torque": "/(N m)", "joint": "/rad"}.get(term.basis, "")
+
+
+def step(cell: Installation, free: np.ndarray, change: np.ndarray) -> Installation:
+    """Return the installation moved by `change` (f,) along the parameters `free` (f,); frames move on the manifold."""
+    where = layout_counts(cell)
+    full = np.zeros(sum(where))
+    full[free] = change
+    arm, stations, tools, terms = np.split(full, np.cumsum(where)[:-1])
+    stations, tools = stations.reshape(-1, 6), tools.reshape(-1, 6)
+    return replace(
+        cell,
+        chain=cell.chain.with_values(cell.chain.values + arm) if arm.any() else cell.chain,
+        stations=np.array([displace(s, d) if d.any() else s for s, d in zip(cell.stations, stations)]),
+        tools=np.array([displace(t, d) if d.any() else t for t, d in zip(cell.tools, tools)]),
+        deflection=cell.deflection.with_coefficients(np.asarray(cell.deflection.coefficients) + terms)
+        if len(terms)
+        else cell.deflection,
+    )
+
+
+def layout_counts(cell: Installation) -> tuple[int, int, int, int]:
+    """Return how many parameters the arm, stations, tools and deflection have."""
+    return len(cell.chain.elements), 6 * len(cell.stations), 6 * len(cell.tools), len(cell.deflection.terms)

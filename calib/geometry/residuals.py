@@ -1,0 +1,199 @@
+"""What each kind of measurement says of the geometry: small residuals with their Jacobians.
+
+Each function takes what the instrument should see and returns parts; a part is r = measured - predicted with
+∂predicted/∂x. Unknown socket points, planes and bar centres are linear (or nearly so) nuisances: they take their best
+value in closed form and their columns are projected out (variable projection, Golub & Pereyra 1973; for planes and bars
+the Jacobian is Kaufman's 1975, whose gradient is exact).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.data.measurements import PoseMeasurements
+from calib.errors import MeasurementError
+from calib.geometry.installation import Seen
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Residuals of one nature: all in one unit.
+
+    Attributes:
+        label: ``position``, ``orientation``, ``consistency``, ``distance`` or ``plane``.
+        value: (rows, m) [m] or [rad].
+        jacobian: (f, rows, m) derivative of the prediction.
+        sigma: (rows, m) stated standard deviations; None where they are to be estimated.
+        nuisances: unknowns that were eliminated.
+        index: (m,) the measurement's rows these residuals belong to.
+    """
+
+    label: str
+    value: np.ndarray
+    jacobian: np.ndarray
+    sigma: np.ndarray | None
+    nuisances: int
+    index: np.ndarray
+
+
+def parts(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[Part]:
+    """Return the residual parts of one block.
+
+    Args:
+        measured: the block, m rows.
+        seen: the predicted targets.
+        jacobian: (f, 6, m), [v; ω] of the target.
+    """
+    return _KINDS[measured.kind](measured, seen, jacobian)
+
+
+def _pose(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[Part]:
+    """r = [y - p; log(R_y Rᵀ)]; d log = J_r⁻¹(r) ω."""
+    assert measured.quaternion is not None
+    predicted = Rotation.from_matrix(seen.rotation.transpose(2, 1, 0))
+    turn = (Rotation.from_quat(measured.quaternion) * predicted.inv()).as_rotvec().T
+    sigma = None if measured.sigma_rotation is None else measured.sigma_rotation.T
+    everywhere = np.arange(len(measured))
+    angular = _inverse_right_jacobian(turn, jacobian[:, 3:])
+    return [*_position(measured, seen, jacobian), Part("orientation", turn, angular, sigma, 0, everywhere)]
+
+
+def _position(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[Part]:
+    """r = y - p."""
+    assert measured.position is not None
+    sigma = None if measured.sigma is None else measured.sigma.T
+    everywhere = np.arange(len(measured))
+    return [Part("position", measured.position.T - seen.point, jacobian[:, :3], sigma, 0, everywhere)]
+
+
+def _distance(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[Part]:
+    """r = L - |p_a - p_b| for the two rows of each pair."""
+    assert measured.distance is not None and measured.group is not None
+    first, second = _pairs(measured)
+    gap = seen.point[:, first] - seen.point[:, second]
+    length = np.linalg.norm(gap, axis=0)
+    along = np.einsum("im,fim->fm", gap / length, jacobian[:, :3, first] - jacobian[:, :3, second])
+    sigma = None if measured.sigma is None else measured.sigma[first, :1].T
+    return [Part("distance", (measured.distance[first] - length)[None], along[:, None], sigma, 0, first)]
+
+
+def _pairs(measured: PoseMeasurements) -> tuple[np.ndarray, np.ndarray]:
+    """Return the row indices of the first and second pose of each pair."""
+    assert measured.group is not None and measured.rows is not None
+    order = np.argsort(measured.group, kind="stable")
+    groups, counts = np.unique(measured.group, return_counts=True)
+    if np.any(counts != 2):
+        odd = groups[counts != 2][0]
+        row = int(measured.rows[measured.group == odd][0])
+        raise MeasurementError(f"pair {odd} has {counts[counts != 2][0]} rows; a distance needs two", measured.file, row)
+    return order[0::2], order[1::2]
+
+
+def _sockets(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[Part]:
+    """r = mean of its group - p, and L - |mean_a - mean_b| for sockets whose distance is known."""
+    assert measured.group is not None
+    groups, inverse, counts = np.unique(measured.group, return_inverse=True, return_counts=True)
+    average = np.zeros((len(measured), len(groups)))
+    average[np.arange(len(measured)), inverse] = 1.0 / counts[inverse]
+    linear = jacobian[:, :3]
+    means, mean_jacobian = seen.point @ average, linear @ average
+    value, spread = means[:, inverse] - seen.point, linear - mean_jacobian[:, :, inverse]
+    sigma = None if measured.sigma is None else measured.sigma.T
+    everywhere = np.arange(len(measured))
+    result = [Part("consistency", value, spread, sigma, 3 * len(groups), everywhere)]
+    place = {int(group): k for k, group in enumerate(groups)}
+    known = [(place[a], place[b], d) for a, b, d in measured.links if a in place and b in place]
+    if known:
+        a, b = (np.array([link[side] for link in known]) for side in (0, 1))
+        gap = means[:, a] - means[:, b]
+        length = np.linalg.norm(gap, axis=0)
+        along = np.einsum("il,fil->fl", gap / length, mean_jacobian[:, :, a] - mean_jacobian[:, :, b])
+        short = np.array([link[2] for link in known]) - length
+        first = np.array([int(np.flatnonzero(inverse == k)[0]) for k in a])
+        result.append(Part("distance", short[None], along[:, None], None, 0, first))
+    return result
+
+
+def _plane(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[Part]:
+    """r = -n · (p - mean), n the normal of the best plane of each group."""
+    value, slope = np.zeros(len(measured)), np.zeros((len(jacobian), len(measured)))
+    groups = np.unique(measured.group)
+    for group in groups:
+        rows = np.flatnonzero(measured.group == group)
+        points = seen.point[:, rows] - seen.point[:, rows].mean(axis=1, keepdims=True)
+        axes = np.linalg.svd(points, full_matrices=False)[0]
+        value[rows] = -axes[:, 2] @ points
+        nuisance = np.column_stack([np.ones(len(rows)), points.T @ axes[:, :2]])
+        slope[:, rows] = _project(np.einsum("i,fim->fm", axes[:, 2], jacobian[:, :3, rows]), nuisance)
+    sigma = None if measured.sigma is None else measured.sigma[:, :1].T
+    return [Part("plane", value[None], slope[:, None], sigma, 3 * len(groups), np.arange(len(measured)))]
+
+
+def _bar(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[Part]:
+    """r = L - |p - c|, c the best centre of each group."""
+    assert measured.distance is not None
+    value, slope = np.zeros(len(measured)), np.zeros((len(jacobian), len(measured)))
+    groups = np.unique(measured.group)
+    for group in groups:
+        rows = np.flatnonzero(measured.group == group)
+        points, lengths = seen.point[:, rows], measured.distance[rows]
+        away = points - sphere_centre(points, lengths)[:, None]
+        unit = away / np.linalg.norm(away, axis=0)
+        value[rows] = lengths - np.linalg.norm(away, axis=0)
+        slope[:, rows] = _project(np.einsum("im,fim->fm", unit, jacobian[:, :3, rows]), unit.T)
+    sigma = None if measured.sigma is None else measured.sigma[:, :1].T
+    return [Part("distance", value[None], slope[:, None], sigma, 3 * len(groups), np.arange(len(measured)))]
+
+
+def sphere_centre(points: np.ndarray, lengths: np.ndarray, iterations: int = 20) -> np.ndarray:
+    """Return the point (3,) whose distances to points (3, m) come nearest to lengths (m,), by Gauss–Newton.
+
+    The start is linear: |p|² - L² = 2 p·c - |c|² (algebraic sphere fit).
+    """
+    matrix = np.column_stack([2.0 * points.T, -np.ones(points.shape[1])])
+    centre = np.linalg.lstsq(matrix, (points**2).sum(axis=0) - lengths**2, rcond=None)[0][:3]
+    for _ in range(iterations):
+        away = centre[:, None] - points
+        length = np.linalg.norm(away, axis=0)
+        change = np.linalg.lstsq((away / length).T, lengths - length, rcond=None)[0]
+        centre = centre + change
+        if np.linalg.norm(change) < 1e-13:
+            break
+    return centre
+
+
+def _project(rows: np.ndarray, nuisance: np.ndarray) -> np.ndarray:
+    """Remove from rows (f, m) what the nuisance columns (m, k) can explain."""
+    q, _ = np.linalg.qr(nuisance)
+    return rows - (rows @ q) @ q.T
+
+
+def _inverse_right_jacobian(turn: np.ndarray, angular: np.ndarray) -> np.ndarray:
+    """Return J_r⁻¹(r) ω for rotation vectors r (3, m) and angular velocities (f, 3, m).
+
+    J_r⁻¹(r) = I + [r]×/2 + (1/θ² - (1 + cos θ)/(2 θ sin θ)) [r]×²  (Chirikjian 2012, vol. 2, eq. 10.86). Here
+    log(R_y (exp(ω) R)ᵀ) = log(exp(r) exp(-ω)), so the prediction's share of the residual changes by J_r⁻¹(r) ω.
+    """
+    theta = np.linalg.norm(turn, axis=0)
+    if theta.max(initial=0.0) < 1e-9:
+        return angular
+    safe = np.where(theta < 1e-4, 1.0, theta)
+    exact = 1.0 / safe**2 - (1.0 + np.cos(safe)) / (2.0 * safe * np.sin(safe))
+    factor = np.where(theta < 1e-4, 1.0 / 12.0, exact)
+    once = np.cross(turn.T[None], angular.transpose(0, 2, 1))
+    twice = np.cross(turn.T[None], once)
+    return (angular.transpose(0, 2, 1) + 0.5 * once + factor[:, None] * twice).transpose(0, 2, 1)
+
+
+_KINDS: dict[str, Callable[[PoseMeasurements, Seen, np.ndarray], list[Part]]] = {
+    "pose": _pose,
+    "position": _position,
+    "distance": _distance,
+    "sockets": _sockets,
+    "plane": _plane,
+    "bar": _bar,
+}
