@@ -1,0 +1,216 @@
+"""The D-optimal relaxation: an upper bound on what any choice of poses can reach.
+
+Choosing m of N poses is relaxed to weights x in [0, 1] with Σ x = m (a pose at most once; without the cap, x ≤ m: poses
+may be repeated),
+
+    maximise  log det M(x),   M(x) = M_known + Σ x_i J_iᵀJ_i .
+
+**Certificate.** log det is concave, so for any M ≻ 0 and any feasible x
+
+    det M(x)^(1/p)  ≤  det M^(1/p) · T/p,   T = tr(M⁻¹ M_known) + Σ (m largest d_i),   d_i = tr(J_i M⁻¹ J_iᵀ)
+
+(without the cap: m · max d_i), the linearisation at the best multiple of M. At the optimum T = p: the general
+equivalence theorem (Kiefer & Wolfowitz 1960; Pukelsheim 1993, ch. 7; the capped form Wynn 1982). The bound holds for
+any weights whatsoever; good weights make it tight.
+
+**Method.** A few multiplicative steps x ← x d (Titterington 1976) show where the weight goes; then a primal-dual
+interior-point method (Boyd & Vandenberghe 2004, ch. 11) on the candidates with the largest d_i, and pricing: whatever
+candidate violates the certificate joins, until it is tight. Working on a few hundred candidates plays the part of the
+Harman & Pronzato (2007) deletion rule, which needs repeats to be allowed. The set and its growth are our choice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from poses.information import Candidates, log_det, prepared
+
+
+@dataclass(frozen=True)
+class Bound:
+    """An upper bound on det(WᵀW)^(1/p) over all choices of m poses, with its certificate.
+
+    Attributes:
+        weights: (N,) relaxed choice, Σ = m.
+        logdet: log det M(weights), in the caller's parameters.
+        upper: certified upper bound on det(M)^(1/p) of any m poses (with the poses already measured).
+        log_upper: its logarithm, times p: an upper bound on log det M.
+        gap: upper / det M(weights)^(1/p) − 1; what the bound may at most be loose against the relaxed optimum.
+        iterations: interior-point steps.
+        capped: True where no pose may be taken twice.
+        scores: (N,) d_i at the weights the bound was certified with; large ones are the promising candidates.
+    """
+
+    weights: np.ndarray
+    logdet: float
+    upper: float
+    log_upper: float
+    gap: float
+    iterations: int
+    capped: bool
+    scores: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Certified:
+    """A feasible x with the bound certified at M(x), in transformed coordinates."""
+
+    x: np.ndarray
+    scores: np.ndarray
+    logdet: float
+    log_upper: float
+
+
+def bound(
+    jacobians: ArrayLike, m: int, *, existing: ArrayLike | None = None, capped: bool = True, tolerance: float = 1e-3
+) -> Bound:
+    """Bound det(WᵀW)^(1/p) over all choices of m candidates from above.
+
+    Args:
+        jacobians: (N, rows, p) whitened Jacobians of the candidates.
+        m: number of poses.
+        existing: (k, rows, p) Jacobians of poses already measured; they count in full.
+        capped: False where poses may be repeated (a looser bound otherwise).
+        tolerance: relative gap to stop at.
+    """
+    return relaxed(prepared(jacobians, m, existing), m, capped=capped, tolerance=tolerance)
+
+
+def relaxed(candidates: Candidates, m: int, *, capped: bool = True, tolerance: float = 1e-3, rounds: int = 12) -> Bound:
+    """Solve the relaxation over prepared candidates; see `bound`."""
+    z, known = candidates.z, candidates.known
+    count, _, p = z.shape
+    cap = 1.0 if capped else float(m)
+    x, scores = _warm(z, known, m, cap)
+    best = _certify(z, known, x, m, capped)
+    active, iterations = _largest(scores, min(count, max(2 * m, 3 * p) + p)), 0
+    for _ in range(rounds):
+        if best.log_upper - best.logdet <= p * np.log1p(tolerance):
+            break
+        weights, price, steps = _interior(z[active], known, x[active], m, cap, tolerance)
+        iterations += steps
+        x = np.zeros(count)
+        x[active] = weights
+        now = _certify(z, known, x, m, capped)
+        best = _tighter(best, now)
+        active = _priced(now.scores, x, active, price, 2 * p)
+    gap = float(np.expm1((best.log_upper - best.logdet) / p))
+    log_upper = best.log_upper + candidates.shift
+    logdet = best.logdet + candidates.shift
+    return Bound(best.x, logdet, float(np.exp(log_upper / p)), log_upper, gap, iterations, capped, best.scores)
+
+
+def certificate(candidates: Candidates, x: np.ndarray, m: int, capped: bool = True) -> float:
+    """Return the upper bound on log det M that weights x (N,) certify, however bad they are (+inf if M is singular)."""
+    return _certify(candidates.z, candidates.known, x, m, capped).log_upper + candidates.shift
+
+
+def information_of(z: np.ndarray, known: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return M = known + Σ x_i z_iᵀz_i (p, p) from z (N, rows, p) and weights x (N,)."""
+    chosen = np.flatnonzero(x)
+    rows = z[chosen].reshape(-1, z.shape[2])
+    return known + rows.T @ (rows * np.repeat(x[chosen], z.shape[1])[:, None])
+
+
+def scores_of(z: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Return d_i = tr(z_i M⁻¹ z_iᵀ) (N,)."""
+    root = np.linalg.inv(np.linalg.cholesky(matrix))
+    spread = z.reshape(-1, z.shape[2]) @ root.T
+    return np.einsum("ij,ij->i", *(2 * (spread.reshape(len(z), -1),)))
+
+
+def _certify(z: np.ndarray, known: np.ndarray, x: np.ndarray, m: int, capped: bool) -> _Certified:
+    matrix = information_of(z, known, x)
+    logdet, p = float(log_det(matrix)), len(matrix)
+    if not np.isfinite(logdet) or np.linalg.eigvalsh(matrix)[0] <= 1e-12 * np.trace(matrix):
+        return _Certified(x, np.einsum("nrp,nrp->n", z, z), -np.inf, np.inf)
+    scores = scores_of(z, matrix)
+    top = np.partition(scores, len(scores) - m)[-m:].sum() if capped else m * scores.max()
+    total = float(np.trace(np.linalg.solve(matrix, known)) + top)
+    return _Certified(x, scores, logdet, logdet + p * float(np.log(total / p)))
+
+
+def _tighter(one: _Certified, other: _Certified) -> _Certified:
+    """Return the better weights of the two with the tighter bound of the two."""
+    upper = min(one.log_upper, other.log_upper)
+    better = other if other.logdet >= one.logdet else one
+    return _Certified(better.x, better.scores, better.logdet, upper)
+
+
+def _warm(z: np.ndarray, known: np.ndarray, m: int, cap: float, steps: int = 6) -> tuple[np.ndarray, np.ndarray]:
+    """Return weights after a few multiplicative steps, and the scores there."""
+    x = np.full(len(z), m / len(z))
+    scores = scores_of(z, information_of(z, known, x))
+    for _ in range(steps):
+        x = x * scores**1.5
+        for _ in range(3):
+            x = np.minimum(x * (m / x.sum()), cap)
+        scores = scores_of(z, information_of(z, known, x))
+    return x, scores
+
+
+def _largest(values: np.ndarray, count: int) -> np.ndarray:
+    """Return the sorted indices of the `count` largest values."""
+    return np.sort(np.argpartition(values, len(values) - count)[-count:])
+
+
+def _priced(scores: np.ndarray, x: np.ndarray, active: np.ndarray, price: float, most: int) -> np.ndarray:
+    """Return the next active set: those with weight or near the price, and the worst violators outside."""
+    keep = active[(x[active] > 1e-4) | (scores[active] > 0.9 * price)]
+    outside = scores.copy()
+    outside[keep] = -np.inf
+    wanted = min(most, int((outside > price).sum()))
+    return np.sort(np.concatenate([keep, _largest(outside, wanted)])) if wanted else keep
+
+
+def _interior(
+    z: np.ndarray, known: np.ndarray, x: np.ndarray, m: int, cap: float, tolerance: float, most: int = 30
+) -> tuple[np.ndarray, float, int]:
+    """Return optimal weights (K,) over few candidates, the price λ of the sum, and the steps taken.
+
+    With duals u of x ≥ 0 and v of x ≤ cap, Newton's step of the perturbed optimality conditions is
+
+        (Q + u/x + v/(cap−x)) dx + λ = d + τ/x − τ/(cap−x),  Σ dx = m − Σ x,   Q_ij = ‖z_i M⁻¹ z_jᵀ‖² .
+    """
+    count, _, p = z.shape
+    x = 0.9 * np.clip(x * (m / max(x.sum(), 1e-12)), 0.0, cap) + 0.1 * (m / count)
+    x = np.minimum(x, 0.95 * cap + 0.05 * m / count)
+    tau = 0.1 * p / count
+    u, v, price = tau / x, tau / (cap - x), 0.0
+    for step in range(1, most + 1):
+        scores, curvature = _newton_terms(z, information_of(z, known, x))
+        slack = cap - x
+        hessian = curvature + np.diag(u / x + v / slack)
+        right = scores + tau / x - tau / slack
+        solved = np.linalg.solve(hessian, np.stack([right, np.ones(count)], axis=1))
+        price = float((solved[:, 0].sum() - (m - x.sum())) / solved[:, 1].sum())
+        dx = solved[:, 0] - price * solved[:, 1]
+        du, dv = tau / x - u - u / x * dx, tau / slack - v + v / slack * dx
+        primal = min(1.0, 0.99 * _longest(x, dx), 0.99 * _longest(slack, -dx))
+        dual = min(1.0, 0.99 * _longest(u, du), 0.99 * _longest(v, dv))
+        x, u, v = x + primal * dx, u + dual * du, v + dual * dv
+        complementarity = float(x @ u + (cap - x) @ v)
+        if complementarity < 0.3 * p * tolerance and abs(x.sum() - m) < 1e-9 * m and primal > 0.5:
+            return x, price, step
+        tau = 0.1 * complementarity / (2 * count) if min(primal, dual) > 0.5 else 0.5 * complementarity / (2 * count)
+    return x * (m / x.sum()), price, most
+
+
+def _newton_terms(z: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return d (K,) and Q (K, K) of a few candidates."""
+    count, rows, p = z.shape
+    root = np.linalg.inv(np.linalg.cholesky(matrix))
+    spread = (z.reshape(-1, p) @ root.T).reshape(count, rows, p)
+    inner = np.einsum("nrp,nrq->npq", spread, spread, optimize=True).reshape(count, -1)
+    upper = np.triu_indices(p)
+    packed = inner.reshape(count, p, p)[:, upper[0], upper[1]] * np.where(upper[0] == upper[1], 1.0, np.sqrt(2.0))
+    return np.einsum("nrp,nrp->n", spread, spread), packed @ packed.T
+
+
+def _longest(value: np.ndarray, step: np.ndarray) -> float:
+    """Return the largest t with value + t step ≥ 0."""
+    falling = step < 0
+    return float((-value[falling] / step[falling]).min()) if falling.any() else np.inf

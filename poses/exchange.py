@@ -1,0 +1,117 @@
+"""Exchange over candidates for the determinant (O1): greedy start, pair exchange, DETMAX excursions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from poses.design import Design, Pool, best_addition, best_removal, design_of, with_added, with_removed
+
+Report = Callable[[Design], None]
+"""Called with every design of the wanted size that beats all before."""
+
+TOLERANCE = 1e-9
+"""A gain of log det below this counts as none: our choice."""
+
+
+def greedy(pool: Pool, m: int) -> Design:
+    """Add the candidate that raises det M most, m times, from the known information alone."""
+    design = design_of(pool, ())
+    for _ in range(m):
+        design = with_added(pool, design, best_addition(pool, design)[0])
+    return design_of(pool, design.members)
+
+
+def exchanged(pool: Pool, design: Design, report: Report | None = None, sweeps: int = 50) -> Design:
+    """Replace one member at a time by the best candidate until no replacement raises det M.
+
+    The modified Fedorov exchange (Fedorov 1972; one member after another: Cook & Nachtsheim 1980). The result is a
+    local optimum: no single exchange improves it.
+
+    Args:
+        pool: candidates.
+        design: start.
+        report: called with every improved design.
+        sweeps: most passes over all members.
+    """
+    for _ in range(sweeps):
+        before = design.logdet
+        for member in design.members:
+            thinned = with_removed(pool, design, member)
+            drop = thinned.logdet - design.logdet
+            other, gain = best_addition(pool, thinned, above=-drop + TOLERANCE)
+            if other >= 0 and gain + drop > TOLERANCE:
+                design = with_added(pool, thinned, other)
+                if report:
+                    report(design)
+        design = design_of(pool, design.members)
+        if design.logdet <= before + TOLERANCE:
+            return design
+    return design
+
+
+def detmax(
+    pool: Pool, design: Design, report: Report | None = None, *, longest: int = 6, failures: int = 40
+) -> Design:
+    """Improve det M by excursions to larger and smaller designs.
+
+    DETMAX (Mitchell 1974, section 3): an excursion leaves the design of m poses upwards (add the best candidate) or
+    downwards (remove the member that costs least) and comes back; designs seen on an excursion that failed form the
+    failure list, and meeting one of them lengthens the excursion, up to m ± `longest`. The method ends when an
+    excursion runs over that length in both directions, or after `failures` excursions in a row without gain (ours).
+
+    Args:
+        pool: candidates.
+        design: start, of m poses.
+        report: called with every improved design.
+        longest: k, the farthest the excursion goes from m.
+        failures: excursions in a row without gain.
+    """
+    failed: set[frozenset[int]] = set()
+    fruitless, over = 0, {True: False, False: False}
+    upwards = True
+    while fruitless < failures and not all(over.values()):
+        back, seen = _excursion(pool, design, upwards, longest, failed)
+        if back is not None and back.logdet > design.logdet + TOLERANCE:
+            design = exchanged(pool, design_of(pool, back.members), sweeps=1)
+            failed, fruitless, over = set(), 0, {True: False, False: False}
+            if report:
+                report(design)
+            continue
+        failed |= seen
+        over[upwards] = back is None
+        fruitless, upwards = fruitless + 1, not upwards
+    return design
+
+
+def _excursion(
+    pool: Pool, start: Design, upwards: bool, longest: int, failed: set[frozenset[int]]
+) -> tuple[Design | None, set[frozenset[int]]]:
+    """Return the design one excursion comes back with (None if it went too far) and the designs seen on the way."""
+    m, seen, design = len(start.members), set[frozenset[int]](), start
+    design = _step(pool, design, upwards)
+    while len(design.members) != m:
+        key, larger = frozenset(design.members), len(design.members) > m
+        outwards = key in failed or key in seen  # the second clause is ours: without it an excursion can circle
+        seen.add(key)
+        design = _step(pool, design, larger if outwards else not larger)
+        size = len(design.members)
+        if abs(size - m) > longest or size < 1 or size >= len(pool.z):
+            return None, seen
+    return design, seen
+
+
+def _step(pool: Pool, design: Design, add: bool) -> Design:
+    if add:
+        return with_added(pool, design, best_addition(pool, design)[0])
+    return with_removed(pool, design, best_removal(pool, design)[0])
+
+
+def starts(pool: Pool, m: int, weights: np.ndarray | None, count: int, seed: int) -> Iterator[Design]:
+    """Yield start designs: the rounded relaxation (its m largest weights), the greedy one, then random ones by seed."""
+    if weights is not None:
+        yield design_of(pool, tuple(int(i) for i in np.argsort(-weights, kind="stable")[:m]))
+    yield greedy(pool, m)
+    for generator in np.random.default_rng(seed).spawn(max(count - 2, 0)):
+        yield design_of(pool, tuple(int(i) for i in generator.choice(len(pool.z), m, replace=False)))
