@@ -36,15 +36,15 @@ def from_xyz_rpy(xyz: ArrayLike, rpy: ArrayLike) -> np.ndarray:
 
 
 def to_xyz_rpy(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return xyz [m] and roll-pitch-yaw [rad] of one pose (4, 4); at pitch ±90° roll takes what yaw would share.
+    """Return xyz [m] and roll-pitch-yaw [rad] of one pose (4, 4); the round trip stays exact near pitch ±90°, too.
 
-    At gimbal lock scipy warns and returns a valid triple of angles; the round trip stays exact there.
+    Roll is taken from Rz(-yaw) R instead of from R, so that it makes up for whatever yaw is where yaw is ill defined.
     """
-    import warnings
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        return poses[:3, 3].copy(), Rotation.from_matrix(poses[:3, :3]).as_euler("xyz")
+    rotation = poses[:3, :3]
+    yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
+    pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[0, 0], rotation[1, 0]))
+    across = np.cos(yaw) * rotation[1] - np.sin(yaw) * rotation[0]
+    return poses[:3, 3].copy(), np.array([np.arctan2(-across[2], across[1]), pitch, yaw])
 
 
 def from_quaternion(xyz: ArrayLike, xyzw: ArrayLike) -> np.ndarray:

@@ -52,21 +52,20 @@ _JOINT = ("name", "kind", *_LIMITS, "link", "inertia")
 _ELEMENT = tuple(field.name for field in fields(Element))
 
 
-def read(path: str | Path, propose_beta: bool | None = None) -> Chain:
+def read(path: str | Path, propose_beta: bool = True) -> Chain:
     """Read a robot from TOML: an MDH table, or elements.
 
     Args:
         path: the file.
-        propose_beta: see `calib.robot.mdh`; by default only where the file does not say ``beta = "as written"``.
+        propose_beta: see `calib.robot.mdh`; a file may switch it off itself.
 
     Raises:
         RobotError: naming the table, the key and what is wrong with it.
     """
     table = load(path)
     robot = {key: value for key, value in table.items() if key not in EXTRA}
-    written = robot.pop("beta", "proposed") == "as written"
     if "element" not in robot:
-        return mdh.from_table(robot, str(path), not written if propose_beta is None else propose_beta)
+        return mdh.from_table(robot, str(path), propose_beta)
     return _from_elements(robot, str(path))
 
 
@@ -93,8 +92,6 @@ def text(chain: Chain, extra: Mapping[str, Any] | None = None, source: str = "")
     as_rows = mdh.is_table(chain) and not chain.links
     table = mdh.to_table(chain) if as_rows else _to_elements(chain)
     head = {key: value for key, value in table.items() if not isinstance(value, (list, dict)) or key == "gravity"}
-    if as_rows:
-        head["beta"] = "as written"
     if source:
         head["source"] = source
     return dumps({**head, **{key: value for key, value in table.items() if key not in head}, **(extra or {})})

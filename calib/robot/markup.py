@@ -7,7 +7,7 @@ cannot parse, gives links without inertia the identity, and fails without a line
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.parsers import expat
@@ -15,6 +15,9 @@ from xml.parsers import expat
 from calib.errors import RobotError
 
 _DECLARED = re.compile(rb"""^\s*<\?xml[^>]*?encoding\s*=\s*["']([A-Za-z0-9._-]+)["']""")
+
+_ATTRIBUTE = re.compile(rb"""\s+([^\s=/>]+)\s*=\s*("[^"]*"|'[^']*')""")
+_BLANK = re.compile(rb"\s*")
 
 
 @dataclass(frozen=True)
@@ -77,3 +80,38 @@ def parse(source: str, where: str) -> Node:
         reason = expat.ErrorString(error.code)
         raise RobotError(f"{where}, line {error.lineno}, column {error.offset + 1}: not XML ({reason})") from None
     return root[0]
+
+
+def edited(source: str, changes: Iterable[tuple[int, int, str]]) -> str:
+    """Return the text with byte ranges (start, end, replacement) of its UTF-8 form replaced; they may not overlap."""
+    data = source.encode("utf-8")
+    for start, end, replacement in sorted(changes, reverse=True):
+        data = data[:start] + replacement.encode("utf-8") + data[end:]
+    return data.decode("utf-8")
+
+
+def set_attributes(source: str, node: Node, values: dict[str, str]) -> list[tuple[int, int, str]]:
+    """Return the changes (for `edited`) that give a node's attributes new values, in place or behind the last one."""
+    data = source.encode("utf-8")
+    found = {match[1].decode(): match for match in _attributes(data, node)}
+    end = max([match.end() for match in found.values()], default=node.start + 1 + len(node.tag.encode()))
+    changes = [(found[key].start(2) + 1, found[key].end(2) - 1, value) for key, value in values.items() if key in found]
+    fresh = "".join(f' {key}="{value}"' for key, value in values.items() if key not in found)
+    return [*changes, (end, end, fresh)] if fresh else changes
+
+
+def insert_child(source: str, node: Node, child: str) -> list[tuple[int, int, str]]:
+    """Return the change that puts a new first child into a node, indented as what follows its start tag."""
+    data = source.encode("utf-8")
+    last = max([match.end() for match in _attributes(data, node)], default=node.start)
+    place = data.index(b">", last) + 1
+    indent = _BLANK.match(data, place)
+    return [(place, place, (indent[0].decode() if indent else "") + child)]
+
+
+def _attributes(data: bytes, node: Node) -> Iterator[re.Match[bytes]]:
+    """Yield the attributes of a node's start tag: name and quoted value."""
+    place = node.start + 1 + len(node.tag.encode())
+    while match := _ATTRIBUTE.match(data, place):
+        yield match
+        place = match.end()

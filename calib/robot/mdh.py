@@ -18,6 +18,7 @@ The file, in TOML (numbers as in `calib.robot.tables`; angles in rad, lengths in
     tip = "flange"
     gravity = [0, 0, -9.81]          # in the base frame [m/s²], optional
     source = "where the numbers come from"
+    propose_beta = false             # keep the rows as they are written; default true, see above
 
     [[joint]]                        # one table per row, base to tip
     name = "shoulder"                # default: joint<index>
@@ -54,7 +55,7 @@ from calib.robot.tables import check_keys, load, number, placement, placement_ta
 
 PARALLEL = 0.05
 AXES = {"alpha": "rx", "d": "tx", "beta": "ry", "r": "tz", "theta": "rz"}
-TOP = ("name", "base", "tip", "gravity", "source", "joint", "tail")
+TOP = ("name", "base", "tip", "gravity", "source", "propose_beta", "joint", "tail")
 KINDS = ("revolute", "prismatic", "fixed")
 _LIMITS = ("lower", "upper", "velocity", "effort")
 _ROW = ("name", "kind", "index", "alpha", "d", "beta", "theta", "r", *_LIMITS, "inertia")
@@ -96,6 +97,8 @@ def read(path: str | Path, propose_beta: bool = True) -> Chain:
 def from_table(table: Mapping[str, Any], where: str, propose_beta: bool = True) -> Chain:
     """Return the chain of a parsed table; `where` names it in messages."""
     check_keys(table, TOP, where)
+    if not isinstance(proposed := table.get("propose_beta", True), bool):
+        raise RobotError(f"{where}: propose_beta has to be true or false, found {proposed!r}")
     rows: list[Row] = []
     if not isinstance(table.get("joint"), list) or not table["joint"]:
         raise RobotError(f"{where}: no [[joint]] rows found; an MDH table needs one per axis")
@@ -108,7 +111,7 @@ def from_table(table: Mapping[str, Any], where: str, propose_beta: bool = True) 
         tip=_text(table, "tip", where, "tip"),
         tail=placement(table["tail"], f"{where}, [tail]") if "tail" in table else None,
         gravity=vector(table["gravity"], 3, f"{where}, gravity") if "gravity" in table else None,
-        propose_beta=propose_beta,
+        propose_beta=propose_beta and proposed,
     )
 
 
@@ -186,9 +189,9 @@ def is_table(chain: Chain) -> bool:
 
 
 def to_table(chain: Chain) -> dict[str, Any]:
-    """Return the table (schema above) that `from_table` with ``propose_beta=False`` reads back exactly."""
+    """Return the table (schema above) that `from_table` reads back exactly."""
     table: dict[str, Any] = {"name": chain.name, "base": chain.base, "tip": chain.tip}
-    table["gravity"] = chain.gravity.tolist()
+    table |= {"gravity": chain.gravity.tolist(), "propose_beta": False}
     table["joint"] = [_entry(row, index + 1) for index, row in enumerate(rows(chain))]
     if not np.array_equal(chain.tail, np.eye(4)):
         table["tail"] = placement_table(chain.tail)

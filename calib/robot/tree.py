@@ -19,6 +19,8 @@ from calib.transforms import from_xyz_rpy
 
 MOVING = ("revolute", "continuous", "prismatic")
 KINDS = (*MOVING, "fixed", "floating", "planar")
+UNLIMITED = 1e9
+XACRO = "expand it first: xacro file.xacro > robot.urdf"
 
 
 @dataclass(frozen=True)
@@ -139,9 +141,8 @@ def read(source: str, where: str) -> Tree:
     root = parse(source, where)
     if root.tag != "robot":
         raise RobotError(f"{where}, line {root.line}: the root element is <{root.tag}>, a URDF has <robot>")
-    if macro := next((node for node in root.children if node.tag.startswith("xacro:")), None):
-        advice = "this is a xacro file; expand it first: xacro file.xacro > robot.urdf"
-        raise RobotError(f"{where}, line {macro.line}: found <{macro.tag}>: {advice}")
+    if macro := next((node for node in root.children if _is_macro(node)), None):
+        raise RobotError(f"{where}, line {macro.line}: found <{macro.tag}>: this is a xacro file; {XACRO}")
     bodies = {}
     for node in root.all("link"):
         bodies[_fresh(node, bodies, where)] = _body(node, where)
@@ -179,6 +180,11 @@ def transform_body(body: np.ndarray, pose: np.ndarray) -> np.ndarray:
 
 def _skew(v: np.ndarray) -> np.ndarray:
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def _is_macro(node: Node) -> bool:
+    """Tell a xacro call or include from what xacro leaves behind harmlessly."""
+    return node.tag.startswith("xacro:") and node.tag not in ("xacro:property", "xacro:arg")
 
 
 def _fresh(node: Node, known: Iterable[str], where: str) -> str:
@@ -254,7 +260,10 @@ def _mimic(node: Node, place: str) -> Mimic | None:
 
 
 def _limits(node: Node, kind: str, place: str) -> tuple[float, float, float, float]:
-    """Return lower, upper, velocity, effort; infinite where not given; 0 for the last two means not given."""
+    """Return lower, upper, velocity, effort; infinite where not given or beyond 1e9, the last two also where 0.
+
+    URDF demands velocity and effort, so 0 is what people write who do not know them, and 1e9 is what we write.
+    """
     found = node.first("limit")
     lower, upper, velocity, effort = -np.inf, np.inf, np.inf, np.inf
     if found is not None:
@@ -264,7 +273,9 @@ def _limits(node: Node, kind: str, place: str) -> tuple[float, float, float, flo
                 found_limits = f"lower limit {lower:g} is not below the upper {upper:g}"
                 raise RobotError(f"{place}: {found_limits}; correct them, or make the joint fixed or continuous")
         velocity, effort = _float(found, "velocity", 0.0, place), _float(found, "effort", 0.0, place)
-    return lower, upper, velocity if velocity > 0 else np.inf, effort if effort > 0 else np.inf
+    lower, upper = lower if lower > -UNLIMITED else -np.inf, upper if upper < UNLIMITED else np.inf
+    velocity, effort = (size if 0 < size < UNLIMITED else np.inf for size in (velocity, effort))
+    return lower, upper, velocity, effort
 
 
 def _body(node: Node, where: str) -> np.ndarray | None:
@@ -304,6 +315,10 @@ def _float(node: Node, key: str, default: float, place: str) -> float:
     if np.isnan(value):
         raise RobotError(f'{place}: {key}="{found}" of <{node.tag}> in line {node.line} is not a number')
     return value
+
+
+def _expand(found: str | None) -> str:
+    return f"; this is a xacro file, {XACRO}" if found and "${" in found else ""
 
 
 def _check_loops(tree: Tree) -> None:

@@ -98,7 +98,7 @@ def build(tree: Tree, base: str, tip: str) -> Chain:
         pending = pending @ joint.origin
         if not joint.moves:
             continue
-        leader, ratio, offset = _drive(tree, joint)
+        leader, ratio, offset = drive(tree, joint)
         turn = align(joint.axis)
         elements += _elements(joint, pending @ turn, passed, index[leader], ratio, offset)
         passed += joint.actuated
@@ -143,7 +143,7 @@ def _elements(
     return [*elements, Element(f"{joint.name}.offset", moving, offset, owner, mover, ratio, sign)]
 
 
-def _drive(tree: Tree, joint: JointTag) -> tuple[str, float, float]:
+def drive(tree: Tree, joint: JointTag) -> tuple[str, float, float]:
     """Return the actuated joint that moves `joint`, the ratio and the offset; followers of followers are resolved."""
     ratio, offset, name = 1.0, 0.0, joint.name
     seen = {name}
@@ -173,7 +173,7 @@ def _check_path(tree: Tree, path: list[JointTag], base: str, tip: str, joint_nam
         passed.add(joint.name)
         if not joint.moves or joint.actuated:
             continue
-        leader, ratio, _ = _drive(tree, joint)
+        leader, ratio, _ = drive(tree, joint)
         if leader not in passed:
             side = "comes after it" if leader in actuated else f"is not between '{base}' and '{tip}'"
             raise RobotError(f"{place}: the joint it mimics, '{leader}', {side}; choose other --base or --tip")
