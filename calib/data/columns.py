@@ -18,8 +18,8 @@ MATRIX = tuple(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))
 SIGMA = ("sigma_x", "sigma_y", "sigma_z")
 SIGMA_ROTATION = ("sigma_rx", "sigma_ry", "sigma_rz")
 LABELS = ("distance", "pair", "bar", "socket", "plane", "tool")
-OURS = (*POSITION, *QUATERNION, *MATRIX, *SIGMA, *SIGMA_ROTATION, *LABELS)
-UNIT_GROUPS = ("joints", "position", "distance", "sigma", "sigma_rotation")
+OURS = (*POSITION, *QUATERNION, *MATRIX, *SIGMA, *SIGMA_ROTATION, "sigma_distance", *LABELS)
+UNIT_GROUPS = ("joints", "position", "orientation", "distance", "sigma", "sigma_rotation")
 LABEL_OF = {"distance": "pair", "bar": "bar", "sockets": "socket", "plane": "plane"}
 _TARGET = re.compile(r"(sigma_)?[xyz]\d+")
 
@@ -35,7 +35,7 @@ class Layout:
         sigmas: the three sigmas of each target; () where not stated.
         orientation: four names (quaternion), nine (matrix), or none.
         sigma_rotation: three names or none.
-        distance, tool: one name or "".
+        distance, sigma_distance, tool: one name or "".
         group: the columns whose labels together name a row's group.
         notes: what a user should be told of the choice.
     """
@@ -47,13 +47,15 @@ class Layout:
     orientation: tuple[str, ...] = ()
     sigma_rotation: tuple[str, ...] = ()
     distance: str = ""
+    sigma_distance: str = ""
     tool: str = ""
     group: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
     def ignored(self, table: Table) -> tuple[str, ...]:
         """Return the columns of `table` that are not read, in its order."""
-        used = {*self.joints, *self.orientation, *self.sigma_rotation, *self.group, self.distance, self.tool}
+        used = {*self.joints, *self.orientation, *self.sigma_rotation, *self.group}
+        used |= {self.distance, self.sigma_distance, self.tool}
         used.update(name for names in (*self.positions, *self.sigmas) for name in names)
         return tuple(name for name in table.header if name not in used)
 
@@ -67,29 +69,42 @@ def find_layout(table: Table, options: FileOptions, joints: Sequence[str]) -> La
     check_names(table, options, joints)
     columns = find_joints(table, options, joints)
     kind = _find_kind(table, options)
-    tool = _find(table, options, "tool")
-    if kind not in ("pose", "position"):
-        label = LABEL_OF[kind]
-        required = ("distance", label) if kind in ("distance", "bar") else (label,)
-        for name in required:
-            table.index(options.columns.get(name, name))
-        extra = options.groups or tuple(name for name in ("tool_position",) if name in table)
-        group = (_find(table, options, label),) if kind in ("distance", "bar") else ()
-        group = group or (*(name for name in extra if name != label), _find(table, options, label))
-        distance = _find(table, options, "distance") if "distance" in required else ""
-        return Layout(kind, columns, distance=distance, tool=tool, group=group)
+    if kind in LABEL_OF:
+        return _grouped_layout(table, options, kind, columns)
     positions, sigmas, notes = _find_targets(table, options)
     if not positions:
         table.index("x")
-    orientation = find_orientation(table, options) if kind == "pose" else ()
-    if kind == "pose" and not orientation:
+    tool = _find(table, options, "tool")
+    if kind == "position":
+        return Layout(kind, columns, positions, sigmas, tool=tool, notes=notes)
+    orientation = find_orientation(table, options)
+    if not orientation:
         raise MeasurementError("kind 'pose' needs qx qy qz qw, or r11 to r33; the header has neither", table.file)
-    if kind == "pose" and len(positions) > 1:
-        raise MeasurementError("kind 'pose' allows one target per row, found numbered positions x1, x2", table.file)
-    rotation = _family(table, options, SIGMA_ROTATION) if kind == "pose" else ()
-    if orientation[:1] and orientation[0] not in (*QUATERNION, *MATRIX):
+    if len(positions) > 1:
+        message = "kind 'pose' allows one target per row, found numbered positions"
+        raise MeasurementError(message, table.file, column=positions[1][0])
+    if orientation[0] not in ("qx", "r11"):
         notes = (*notes, f"the orientation is read from {', '.join(orientation)}")
-    return Layout(kind, columns, positions, sigmas, orientation, rotation, "", tool, (), notes)
+    rotation = _family(table, options, SIGMA_ROTATION)
+    return Layout(kind, columns, positions, sigmas, orientation, rotation, tool=tool, notes=notes)
+
+
+def _grouped_layout(table: Table, options: FileOptions, kind: str, joints: tuple[str, ...]) -> Layout:
+    label = LABEL_OF[kind]
+    measured = kind in ("distance", "bar")
+    for name in (label, "distance") if measured else (label,):
+        table.index(options.columns.get(name, name))
+    own = _find(table, options, label)
+    fixture = tuple(name for name in ("tool_position",) if kind == "sockets" and name in table)
+    others = options.groups or fixture
+    return Layout(
+        kind,
+        joints,
+        distance=_find(table, options, "distance") if measured else "",
+        sigma_distance=_find(table, options, "sigma_distance") if measured else "",
+        tool=_find(table, options, "tool"),
+        group=(*(name for name in others if name != own), own),
+    )
 
 
 def check_names(table: Table, options: FileOptions, joints: Sequence[str]) -> None:
@@ -180,7 +195,7 @@ def _find_targets(table: Table, options: FileOptions) -> tuple[tuple, tuple, tup
 
 
 def _family(table: Table, options: FileOptions, names: Sequence[str], mark: str = "") -> tuple[str, ...]:
-    """Return the file's names of columns that belong together (plain, ``_meas``, ``_measured``); () if none is there."""
+    """Return the file's names of columns that go together (plain, ``_meas``, ``_measured``); () if none is there."""
     missing = ""
     for suffix in SUFFIXES:
         wanted = [name + mark + suffix for name in names]

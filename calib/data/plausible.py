@@ -8,15 +8,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from calib.data.options import FileOptions
-from calib.data.tables import Table
+from calib.data.tables import ANGLES, Table
 from calib.errors import MeasurementError
 
-TURN = 2.1 * math.pi  # a joint value beyond this needs limits that allow it; our choice
-FAR = 50.0  # no instrument measures a robot from further away [m]; our choice
+TURN = 2.1 * math.pi  # a joint value beyond this needs limits that allow it [rad]; our choice, as all of these
+FAR = 50.0  # no instrument measures a robot from further away [m]
 STILL = 1e-6  # a joint that moves less has not moved [rad or m]
 SLACK = 1e-3  # encoders stand a little beyond a limit [rad or m]
-NORM = 1e-3  # rounding of a quaternion or a matrix that we correct
-RADIANS = math.pi / 180
+NORM = 1e-3  # rounding of a quaternion or a matrix that is corrected
+DEGREE = math.pi / 180
 
 Limits = tuple[Sequence[float] | np.ndarray, Sequence[float] | np.ndarray]
 
@@ -38,108 +38,135 @@ def check_joints(
     Raises:
         MeasurementError: for degrees under a rad header, values outside the limits, a robot that never moved.
     """
-    if len(q) > 1 and np.ptp(q, axis=0).max() < STILL:
-        message = f"all {len(q)} rows have the same joint values: nothing can be learnt from one pose"
-        raise MeasurementError(message, table.file, column=columns[0])
     kinds = kinds or ["revolute"] * len(joints)
-    lower, upper = (np.asarray(side, dtype=float) for side in limits) if limits is not None else (None, None)
+    check_joint_units(table, columns, kinds)
+    if len(q) > 1 and np.ptp(q, axis=0).max() < STILL:
+        message = f"all {len(q)} rows have the same joint values: one pose tells nothing of the robot"
+        raise MeasurementError(message, table.file, int(table.rows[-1]), columns[0])
+    lower, upper = (np.full(len(joints), side) for side in (-np.inf, np.inf))
+    if limits is not None:
+        lower, upper = (np.asarray(side, dtype=float) for side in limits)
     notes = []
     for j, (column, joint, kind) in enumerate(zip(columns, joints, kinds)):
-        turns = kind == "revolute"
-        allowed = None if lower is None or upper is None else (lower[j], upper[j])
-        bounded = allowed is not None and np.isfinite(allowed).all()
-        if options.check_limits and bounded and allowed is not None:
-            _check_limits(q[:, j], table, column, joint, allowed, turns)
-        elif kind == "prismatic" and (np.abs(q[:, j]) > FAR).any():
-            row = int(np.argmax(np.abs(q[:, j]) > FAR))
-            message = f"{q[row, j]:g} m cannot be a joint's travel; if it is in mm, name the column '{column} [mm]'"
-            raise MeasurementError(message, table.file, int(table.rows[row]), column)
-        elif turns and not bounded and options.check_limits:
-            _check_turns(q[:, j], table, column, joint)
-        if allowed is not None and bounded:
-            beyond = np.maximum(allowed[0] - q[:, j], q[:, j] - allowed[1])
-            if (count := int((beyond > 0).sum())) > 0:
-                unit = "m" if kind == "prismatic" else "rad"
-                worst = int(np.argmax(beyond))
-                notes.append(
-                    f"{count} of {len(q)} values of {joint} are outside its limits, "
-                    f"row {table.rows[worst]} by {beyond[worst]:.2g} {unit}; kept"
-                )
-    revolute = [j for j, kind in enumerate(kinds) if kind in ("revolute", "continuous")]
-    stated = {table.units[table.index(columns[j])] for j in revolute}
-    if revolute and stated <= {"deg", "°", "degrees"} and np.abs(q[:, revolute]).max() < TURN * RADIANS:
-        notes.append("no joint goes beyond 6.6 deg: is the header's [deg] right, or are these radians?")
-    return tuple(notes)
+        span = (float(lower[j]), float(upper[j]))
+        bounded = bool(np.isfinite(span).all())
+        if options.check_limits and bounded:
+            _check_limits(q[:, j], table, column, joint, span, kind)
+        elif options.check_limits or kind == "prismatic":
+            _check_size(q[:, j], table, column, joint, kind)
+        if bounded:
+            notes += _beyond(q[:, j], table, joint, span, kind)
+    return (*notes, *_few_degrees(q, table, columns, kinds, options))
 
 
-def check_lengths(values: np.ndarray, table: Table, columns: Sequence[str], rows: np.ndarray) -> None:
+def check_joint_units(table: Table, columns: Sequence[str], kinds: Sequence[str]) -> None:
+    """Refuse a header whose unit does not suit the joint: mm for a revolute one, deg for a prismatic one."""
+    for name, kind in zip(columns, kinds):
+        unit = table.units[table.index(name)].lower()
+        if unit and (unit in ANGLES) == (kind == "prismatic"):
+            message = f"the unit [{unit}] does not suit a {kind} joint: is the column in its place?"
+            raise MeasurementError(message, table.file, column=name)
+
+
+def check_lengths(values: np.ndarray, table: Table, columns: Sequence[str]) -> None:
     """Refuse positions or distances (m, k) [m] beyond `FAR`."""
     far = np.argwhere(np.abs(values) > FAR)
     if len(far):
-        row, k = far[0]
+        row, k = (int(i) for i in far[0])
         message = f"found {values[row, k]:g} m; if it is in mm, name the column '{columns[k]} [mm]'"
-        raise MeasurementError(message, table.file, int(rows[row]), columns[k])
+        raise MeasurementError(message, table.file, int(table.rows[row]), columns[k])
 
 
-def unit_quaternions(values: np.ndarray, table: Table, columns: Sequence[str], rows: np.ndarray) -> np.ndarray:
+def unit_quaternions(values: np.ndarray, table: Table, columns: Sequence[str]) -> np.ndarray:
     """Return quaternions (m, 4) with norm 1; one that is off by more than `NORM` is refused."""
     norm = np.linalg.norm(values, axis=1)
     bad = np.abs(norm - 1) > NORM
     if bad.any():
         row = int(np.argmax(bad))
         message = f"the quaternion {', '.join(columns)} has norm {norm[row]:.4g}, not 1"
-        message += "; are the columns a quaternion, and none of them swapped or rounded away?"
-        raise MeasurementError(message, table.file, int(rows[row]), columns[0])
+        message += "; are these four columns a quaternion, and has none of them been rounded or swapped?"
+        raise MeasurementError(message, table.file, int(table.rows[row]), columns[0])
     return values / norm[:, None]
 
 
-def rotation_matrices(values: np.ndarray, table: Table, columns: Sequence[str], rows: np.ndarray) -> np.ndarray:
-    """Return matrices (m, 3, 3) that are orthonormal and right-handed within `NORM`; others are refused."""
+def rotation_matrices(values: np.ndarray, table: Table, columns: Sequence[str]) -> np.ndarray:
+    """Return matrices (m, 3, 3), given row by row (m, 9), that are rotations within `NORM`; others are refused."""
     matrices = values.reshape(-1, 3, 3)
     defect = np.abs(matrices @ np.swapaxes(matrices, 1, 2) - np.eye(3)).max(axis=(1, 2))
-    left = np.linalg.det(matrices) < 0
-    bad = (defect > 2 * NORM) | left
+    bad = (defect > 2 * NORM) | (np.linalg.det(matrices) < 0)
     if bad.any():
         row = int(np.argmax(bad))
         message = f"the matrix r11 to r33 is not orthonormal (R Rᵀ differs from 1 by {defect[row]:.2g})"
         if defect[row] <= 2 * NORM:
             message = "the matrix r11 to r33 is left-handed (determinant -1): an axis is mirrored, or two are swapped"
-        raise MeasurementError(message, table.file, int(rows[row]), columns[0])
+        raise MeasurementError(message, table.file, int(table.rows[row]), columns[0])
     return matrices
 
 
-def positive(values: np.ndarray, table: Table, columns: Sequence[str], rows: np.ndarray, what: str) -> None:
-    """Refuse values (m, k) that are not above zero."""
+def check_positive(values: np.ndarray, table: Table, columns: Sequence[str], advice: str) -> None:
+    """Refuse values (m, k) that are not above zero; NaN passes."""
     bad = np.argwhere(values <= 0)
     if len(bad):
-        row, k = bad[0]
-        raise MeasurementError(f"found {values[row, k]:g}: {what}", table.file, int(rows[row]), columns[k])
+        row, k = (int(i) for i in bad[0])
+        raise MeasurementError(f"found {values[row, k]:g}: {advice}", table.file, int(table.rows[row]), columns[k])
 
 
-def _check_turns(q: np.ndarray, table: Table, column: str, joint: str) -> None:
-    beyond = np.abs(q) > TURN
+def _units(kind: str) -> tuple[str, str, float]:
+    return ("m", "mm", 1e-3) if kind == "prismatic" else ("rad", "deg", DEGREE)
+
+
+def _check_size(q: np.ndarray, table: Table, column: str, joint: str, kind: str) -> None:
+    """Refuse values that no joint has, where there are no limits to hold against."""
+    if kind == "continuous":
+        return
+    beyond = np.abs(q) > (FAR if kind == "prismatic" else TURN)
     if beyond.any():
-        row = int(np.argmax(beyond))
-        message = f"{q[row]:g} rad is more than a turn of {joint} ({int(beyond.sum())} of {len(q)} rows are)"
-        message += f": looks like degrees; if so, name the column '{column} [deg]'"
-        raise MeasurementError(message, table.file, int(table.rows[row]), column)
+        row, (unit, other, _) = int(np.argmax(beyond)), _units(kind)
+        travel = "cannot be the travel" if kind == "prismatic" else "is more than a turn"
+        message = f"{q[row]:g} {unit} {travel} of {joint} ({_share(beyond)}): looks like {other}"
+        raise MeasurementError(
+            f"{message}; if so, name the column '{column} [{other}]'", table.file, int(table.rows[row]), column
+        )
 
 
-def _check_limits(
-    q: np.ndarray, table: Table, column: str, joint: str, limits: tuple[float, float], turns: bool
-) -> None:
-    outside = (q < limits[0] - SLACK) | (q > limits[1] + SLACK)
+def _check_limits(q: np.ndarray, table: Table, column: str, joint: str, span: tuple[float, float], kind: str) -> None:
+    outside = (q < span[0] - SLACK) | (q > span[1] + SLACK)
     if not outside.any():
         return
-    row = int(np.argmax(outside))
-    unit, other, factor = ("rad", "deg", RADIANS) if turns else ("m", "mm", 1e-3)
+    row, (unit, other, factor) = int(np.argmax(outside)), _units(kind)
     message = (
-        f"{q[row]:g} {unit} is outside the limits {limits[0]:g} to {limits[1]:g} {unit} of {joint} "
-        f"({int(outside.sum())} of {len(q)} rows are)"
+        f"{q[row]:g} {unit} is outside the limits {span[0]:g} to {span[1]:g} {unit} of {joint} ({_share(outside)})"
     )
     small = q * factor
-    if ((small >= limits[0] - SLACK) & (small <= limits[1] + SLACK)).all() and np.abs(q).max() > TURN:
+    if np.abs(q).max() > TURN and ((small >= span[0] - SLACK) & (small <= span[1] + SLACK)).all():
         message += f": looks like {other}; if so, name the column '{column} [{other}]'"
     else:
         message += "; if the robot does go there, correct its limits or set check_limits = false in the options"
     raise MeasurementError(message, table.file, int(table.rows[row]), column)
+
+
+def _beyond(q: np.ndarray, table: Table, joint: str, span: tuple[float, float], kind: str) -> list[str]:
+    beyond = np.maximum(span[0] - q, q - span[1])
+    if not (beyond > 0).any():
+        return []
+    worst = int(np.argmax(beyond))
+    where = f"most in row {table.rows[worst]}, by {beyond[worst]:.2g} {_units(kind)[0]}"
+    return [f"{joint} is outside its limits in {_share(beyond > 0)}, {where}; kept"]
+
+
+def _share(mask: np.ndarray) -> str:
+    return f"{int(mask.sum())} of {len(mask)} rows"
+
+
+def _few_degrees(
+    q: np.ndarray, table: Table, columns: Sequence[str], kinds: Sequence[str], options: FileOptions
+) -> list[str]:
+    turning = [j for j, kind in enumerate(kinds) if kind != "prismatic"]
+    stated = [table.units[table.index(columns[j])] or options.units.get("joints", "rad") for j in turning]
+    if (
+        turning
+        and all(unit in ("deg", "°", "degrees") for unit in stated)
+        and np.abs(q[:, turning]).max() < TURN * DEGREE
+    ):
+        return ["no joint goes beyond 6.6 deg: are these values really degrees, not radians?"]
+    return []

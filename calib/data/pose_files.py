@@ -2,35 +2,36 @@
 
 Columns by default (a unit in brackets is converted, ``q1 [deg]``, ``x [mm]``; plain headers are SI):
 
-=====================  ================================================================================================
-joints                 the robot's joint names, or ``q_<joint name>``, or ``q1`` to ``qn``
-position, pose         ``x y z``; with ``qx qy qz qw`` or ``r11`` to ``r33`` a pose; also with ``_meas``, ``_measured``
-several reflectors     ``x1 y1 z1 x2 y2 z2 ...``, each a row of its own; an empty triple is a reflector not seen
-sigmas                 ``sigma_x sigma_y sigma_z`` (numbered as the reflectors, or common), ``sigma_rx sigma_ry sigma_rz``
-distance               ``distance`` with ``pair`` (two rows share a label), or with ``bar`` (the unknown other end)
-sockets, plane         ``socket`` (grouped together with ``tool_position``), ``plane``
-tool                   ``tool``: label of the reflector that a row saw
-=====================  ================================================================================================
+==================  ===================================================================================================
+joints              the robot's joint names, or ``q_<joint name>``, or ``q1`` to ``qn``
+position, pose      ``x y z``; with ``qx qy qz qw`` or ``r11`` to ``r33`` a pose; also with ``_meas``, ``_measured``
+several reflectors  ``x1 y1 z1 x2 y2 z2 ...``, each a row of its own; an empty triple is a reflector not seen
+sigmas              ``sigma_x``, ``_y``, ``_z`` (numbered as the reflectors, or common), ``sigma_rx``, ``_ry``, ``_rz``
+distance            ``distance`` with ``pair`` (two rows share a label), or with ``bar`` (the unknown other end);
+                    ``sigma_distance``
+sockets, plane      ``socket`` (grouped together with ``tool_position``), ``plane``
+tool                ``tool``: label of the reflector that a row saw
+==================  ===================================================================================================
 
-All other columns are ignored and listed.
+All other columns are ignored and listed. Other forms: `calib.data.robodk`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.data import plausible
-from calib.data.columns import Layout, find_layout
+from calib.data import plausible, robodk
+from calib.data.columns import OURS, SUFFIXES, Layout, find_layout
+from calib.data.grouped import labels, read_groups
 from calib.data.measurements import PoseMeasurements
 from calib.data.options import FileOptions
 from calib.data.plausible import Limits
-from calib.data.tables import Table, nearest, read_header, read_table
+from calib.data.tables import Table, read_header, read_table
 from calib.errors import MeasurementError
 
 
@@ -57,13 +58,21 @@ def read_measurements(
         MeasurementError: for whatever cannot be what it claims to be, with row and column.
     """
     options = options or FileOptions()
-    return [measurements(read_table(path), joints, options, kinds=kinds, limits=limits)]
+    if options.format == "three_smr":
+        table, options, notes = robodk.read_three_smr(path, len(joints), options)
+    elif options.format == "robodk" or (not options.format and robodk.recognises(read_header(path)[0])):
+        table, options, notes = robodk.read_robodk(path, len(joints), options)
+    else:
+        table, notes = read_table(path), ()
+    block = measurements(table, joints, options, kinds=kinds, limits=limits)
+    return [replace(block, notes=(*notes, *block.notes))]
 
 
 def joint_columns(path: str | Path) -> tuple[str, ...]:
-    """Return the names in the header of `path` that may be joints: all but those we know as something else."""
-    from calib.data.columns import OURS, SUFFIXES
+    """Return the names in the header of `path` that may be joints (without ``q_``): all that we know as nothing else.
 
+    A caller holds them against the chains of a URDF, to see which of them was measured.
+    """
     known = {name + suffix for name in OURS for suffix in SUFFIXES}
     names, units = read_header(path)
     return tuple(
@@ -84,13 +93,11 @@ def measurements(
     """Return what `table` holds, as `read_measurements`."""
     table = select_rows(table, options)
     layout = find_layout(table, options, joints)
-    q = _numbers(table, options, layout.joints, "joint", "joints")
-    _joint_units(table, layout, kinds)
+    q = read_joints(table, options, layout.joints)
     notes = (*layout.notes, *plausible.check_joints(q, table, layout.joints, joints, options, kinds, limits))
-    block = _read_targets(table, options, layout, q) if layout.positions else _read_groups(table, options, layout, q)
+    block = (_read_targets if layout.positions else read_groups)(table, options, layout, q)
     station = options.station or Path(table.file).stem
-    ignored = layout.ignored(table)
-    return replace(block, station=station, ignored=ignored, notes=(*notes, *block.notes))
+    return replace(block, station=station, ignored=layout.ignored(table), notes=(*notes, *block.notes))
 
 
 def select_rows(table: Table, options: FileOptions) -> Table:
@@ -100,86 +107,72 @@ def select_rows(table: Table, options: FileOptions) -> Table:
         texts = table.texts(name)
         keep &= np.isin(texts, list(values))
         if not keep.any():
-            found = ", ".join(sorted(set(texts))[:10])
-            wanted = ", ".join(values)
-            raise MeasurementError(f"no row is left by where = {wanted}; found {found}", table.file, column=name)
+            found = ", ".join(list(dict.fromkeys(texts))[:10])
+            message = f"no row is left by where = {', '.join(values)}; found {found}"
+            raise MeasurementError(message, table.file, column=name)
     return table if keep.all() else table.where(keep)
 
 
+def read_joints(table: Table, options: FileOptions, columns: Sequence[str]) -> np.ndarray:
+    """Return joint values (m, n) [rad or m]."""
+    return _numbers(table, options, columns, "joint", "joints")
+
+
 def _numbers(
-    table: Table, options: FileOptions, names: Sequence[str], dimension: str, group: str, gaps: bool = False
+    table: Table, options: FileOptions, names: Sequence[str], dimension: str, family: str, gaps: bool = False
 ) -> np.ndarray:
-    """Read columns (m, k) in SI; the options may state a column's unit, or that of its family `group`."""
+    """Read columns (m, k) in SI; the options may state a column's unit, or that of its family."""
     ours = {theirs: name for name, theirs in options.columns.items()}
     units = options.units
-    stated = [units.get(ours.get(name, name), units.get(name, units.get(group, ""))) for name in names]
+    stated = [units.get(ours.get(name, name), units.get(name, units.get(family, ""))) for name in names]
     return np.stack([table.numbers(name, dimension, unit, gaps) for name, unit in zip(names, stated)], axis=1)
 
 
-def _joint_units(table: Table, layout: Layout, kinds: Sequence[str] | None) -> None:
-    from calib.data.tables import ANGLES
-
-    for name, kind in zip(layout.joints, kinds or ()):
-        unit = table.units[table.index(name)].lower()
-        if unit and (unit in ANGLES) == (kind == "prismatic"):
-            message = f"the unit [{unit}] does not suit a {kind} joint: is the column in its place?"
-            raise MeasurementError(message, table.file, column=name)
-
-
 def _read_targets(table: Table, options: FileOptions, layout: Layout, q: np.ndarray) -> PoseMeasurements:
-    """Read positions and poses; each target that was seen makes a row, rows in the file's order."""
+    """Read positions and poses; each target that was seen makes a row, in the file's order."""
     several = len(layout.positions) > 1
-    stack = [_numbers(table, options, names, "length", "position", gaps=several) for names in layout.positions]
-    position = np.stack(stack, axis=1)  # (m, targets, 3)
-    for k, names in enumerate(layout.positions):
-        _complete(table, names, position[:, k])
-        plausible.check_lengths(position[:, k], table, names, table.rows)
-    seen = ~np.isnan(position).any(axis=2)
+    position = np.stack([_position(table, options, names, several) for names in layout.positions], axis=1)
+    seen = np.asarray(~np.isnan(position).any(axis=2))
     index, target = np.nonzero(seen)
     if not len(index):
         raise MeasurementError("no target was seen in any row", table.file, column=layout.positions[0][0])
-    sigma = None
-    if layout.sigmas:
-        stack = [_numbers(table, options, names, "length", "sigma", gaps=several) for names in layout.sigmas]
-        sigma = np.stack(stack, axis=1)[index, target]
-        for k, names in enumerate(layout.sigmas):
-            plausible.positive(
-                sigma[target == k], table, names, table.rows[index[target == k]], "a sigma must be above 0"
-            )
-    elif options.sigma_position is not None:
-        sigma = np.tile(options.sigma_position, (len(index), 1))
-    names = tuple(f"{options.tool} {k + 1}" for k in range(len(layout.positions))) if several else (options.tool,)
-    if layout.tool and not several:
-        names, target = _labels(table, (layout.tool,))
-    block = PoseMeasurements(
+    names, tool = (options.tool,), target
+    if several:
+        names = tuple(f"{options.tool} {k + 1}" for k in range(len(layout.positions)))
+    elif layout.tool:
+        names, tool = labels(table, (layout.tool,))
+    sigma = _sigma(table, options, layout, seen)
+    return PoseMeasurements(
         layout.kind,
         q[index],
         layout.joints,
-        position[index, target if several else 0],
+        position[index, target],
         _orientation(table, options, layout),
-        sigma,
-        _sigma_rotation(table, options, layout, len(q)),
-        tool=target,
+        None if sigma is None else sigma[index, target],
+        _sigma_rotation(table, options, layout),
+        tool=tool,
         tool_names=names,
         file=table.file,
         rows=table.rows[index],
         notes=_unseen(seen, layout),
     )
-    return block
 
 
-def _complete(table: Table, names: Sequence[str], position: np.ndarray) -> None:
-    gaps = np.isnan(position)
-    partial = gaps.any(axis=1) & ~gaps.all(axis=1)
+def _position(table: Table, options: FileOptions, names: Sequence[str], gaps: bool) -> np.ndarray:
+    position = _numbers(table, options, names, "length", "position", gaps)
+    empty = np.isnan(position)
+    partial = empty.any(axis=1) & ~empty.all(axis=1)
     if partial.any():
         row = int(np.argmax(partial))
-        column = names[int(np.argmax(gaps[row]))]
+        column = names[int(np.argmax(empty[row]))]
         message = f"is empty while others of {', '.join(names)} are not; a target not seen has none of them"
         raise MeasurementError(message, table.file, int(table.rows[row]), column)
+    plausible.check_lengths(position, table, names)
+    return position
 
 
 def _unseen(seen: np.ndarray, layout: Layout) -> tuple[str, ...]:
-    counts = len(seen) - seen.sum(axis=0)
+    counts = len(seen) - np.sum(seen, axis=0)
     return tuple(
         f"{', '.join(names)}: not seen in {count} of {len(seen)} rows"
         for names, count in zip(layout.positions, counts)
@@ -192,101 +185,37 @@ def _orientation(table: Table, options: FileOptions, layout: Layout) -> np.ndarr
         return None
     values = _numbers(table, options, layout.orientation, "", "")
     if len(layout.orientation) == 4:
-        return plausible.unit_quaternions(values, table, layout.orientation, table.rows)
-    matrices = plausible.rotation_matrices(values, table, layout.orientation, table.rows)
-    return Rotation.from_matrix(matrices).as_quat(canonical=True)
+        return plausible.unit_quaternions(values, table, layout.orientation)
+    return Rotation.from_matrix(plausible.rotation_matrices(values, table, layout.orientation)).as_quat(canonical=True)
 
 
-def _sigma_rotation(table: Table, options: FileOptions, layout: Layout, m: int) -> np.ndarray | None:
+def _sigma(table: Table, options: FileOptions, layout: Layout, seen: np.ndarray) -> np.ndarray | None:
+    """Return sigmas (m, targets, 3) [m] from columns, else from the options, else None."""
+    if not layout.sigmas:
+        return None if options.sigma_position is None else np.tile(options.sigma_position, (*seen.shape, 1))
+    stack = []
+    for k, names in enumerate(layout.sigmas):
+        sigma = _numbers(table, options, names, "length", "sigma", gaps=not seen[:, k].all())
+        sigma = np.maximum(sigma, options.sigma_floor)
+        advice = "a sigma must be above 0; where it was rounded to 0, set sigma.floor in the options"
+        plausible.check_positive(np.where(seen[:, k : k + 1], sigma, np.nan), table, names, advice)
+        _no_gaps(sigma, seen[:, k], table, names)
+        stack.append(sigma)
+    return np.stack(stack, axis=1)
+
+
+def _no_gaps(sigma: np.ndarray, seen: np.ndarray, table: Table, names: Sequence[str]) -> None:
+    gaps = np.argwhere(np.isnan(sigma) & seen[:, None])
+    if len(gaps):
+        row, column = (int(i) for i in gaps[0])
+        raise MeasurementError("is empty where a target was seen", table.file, int(table.rows[row]), names[column])
+
+
+def _sigma_rotation(table: Table, options: FileOptions, layout: Layout) -> np.ndarray | None:
     if layout.kind != "pose":
         return None
-    if layout.sigma_rotation:
-        values = _numbers(table, options, layout.sigma_rotation, "angle", "sigma_rotation")
-        plausible.positive(values, table, layout.sigma_rotation, table.rows, "a sigma must be above 0")
-        return values
-    return None if options.sigma_orientation is None else np.tile(options.sigma_orientation, (m, 1))
-
-
-def _read_groups(table: Table, options: FileOptions, layout: Layout, q: np.ndarray) -> PoseMeasurements:
-    """Read distances, sockets and planes: rows that belong to groups."""
-    names, group = _labels(table, layout.group)
-    distance = None
-    if layout.distance:
-        values = _numbers(table, options, (layout.distance,), "length", "distance")
-        plausible.check_lengths(values, table, (layout.distance,), table.rows)
-        plausible.positive(values, table, (layout.distance,), table.rows, "a distance must be above 0")
-        distance = values[:, 0]
-        if layout.kind == "distance":
-            _check_pairs(table, layout, group, names, distance)
-    tool_names, tool = _labels(table, (layout.tool,)) if layout.tool else ((options.tool,), None)
-    sizes = np.bincount(group)
-    single = [name for name, size in zip(names, sizes) if size == 1]
-    notes = (f"only one row each, which tells nothing: {', '.join(single[:5])}",) if single else ()
-    sigma = None
-    if options.sigma_position is not None:
-        sigma = np.tile(options.sigma_position, (len(q), 1))
-    return PoseMeasurements(
-        layout.kind,
-        q,
-        layout.joints,
-        sigma=sigma,
-        distance=distance,
-        group=group,
-        group_names=names,
-        links=_links(table, options, layout, group) if layout.kind == "sockets" else (),
-        tool=tool,
-        tool_names=tool_names,
-        file=table.file,
-        rows=table.rows,
-        notes=notes,
-    )
-
-
-def _labels(table: Table, columns: Sequence[str]) -> tuple[tuple[str, ...], np.ndarray]:
-    """Return the distinct labels in order of appearance, joined by ``/``, and each row's index (m,) among them."""
-    texts = [table.texts(name) for name in columns]
-    for name, column in zip(columns, texts):
-        for row, text in zip(table.rows, column):
-            if text in ("", "nan"):
-                raise MeasurementError("found an empty cell where a label is needed", table.file, int(row), name)
-    joined = ["/".join(parts) for parts in zip(*texts)]
-    place = {name: i for i, name in enumerate(dict.fromkeys(joined))}
-    return tuple(place), np.array([place[name] for name in joined])
-
-
-def _check_pairs(table: Table, layout: Layout, group: np.ndarray, names: Sequence[str], distance: np.ndarray) -> None:
-    for number, name in enumerate(names):
-        members = np.flatnonzero(group == number)
-        first = int(table.rows[members[0]])
-        if len(members) != 2:
-            message = f"pair '{name}' has {len(members)} rows; a distance joins two"
-            raise MeasurementError(message, table.file, first, layout.group[0])
-        if abs(distance[members[0]] - distance[members[1]]) > 1e-9:
-            message = f"the rows of pair '{name}' state two distances: {distance[members[0]]:g} m and "
-            message += f"{distance[members[1]]:g} m (row {first})"
-            raise MeasurementError(message, table.file, int(table.rows[members[1]]), layout.distance)
-
-
-def _links(table: Table, options: FileOptions, layout: Layout, group: np.ndarray) -> tuple[tuple[int, int, float], ...]:
-    """Return the pairs of groups that share all labels but the socket's, with the known distance."""
-    if options.socket_distance is None:
-        return ()
-    socket = table.texts(layout.group[-1])
-    others = zip(*(table.texts(name) for name in layout.group[:-1])) if len(layout.group) > 1 else [()] * len(socket)
-    fixtures: dict[tuple[str, ...], dict[str, int]] = {}
-    for place, label, number in zip(others, socket, group):
-        fixtures.setdefault(tuple(place), {})[label] = int(number)
-    links = []
-    for place, sockets in fixtures.items():
-        pairs = options.socket_pairs or tuple(combinations(sockets, 2))
-        if len(sockets) > 2 and not options.socket_pairs:
-            message = f"fixture {'/'.join(place)} has {len(sockets)} sockets ({', '.join(sockets)})"
-            message += ": say in the options which of them are socket_distance apart (socket_pairs = [['0', '1']])"
-            raise MeasurementError(message, table.file, column=layout.group[-1])
-        links += [(sockets[a], sockets[b], options.socket_distance) for a, b in pairs if a in sockets and b in sockets]
-    if not links:
-        found = ", ".join(dict.fromkeys(socket))
-        wanted = " or ".join(f"{a} and {b}" for a, b in options.socket_pairs) or "two sockets"
-        message = f"no fixture position has {wanted}, so that socket_distance joins nothing; found {found}"
-        raise MeasurementError(message + nearest(wanted, socket), table.file, column=layout.group[-1])
-    return tuple(links)
+    if not layout.sigma_rotation:
+        return None if options.sigma_orientation is None else np.tile(options.sigma_orientation, (len(table), 1))
+    values = _numbers(table, options, layout.sigma_rotation, "angle", "sigma_rotation")
+    plausible.check_positive(values, table, layout.sigma_rotation, "a sigma must be above 0")
+    return values

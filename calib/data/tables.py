@@ -1,8 +1,8 @@
 """CSV tables: a header with units, columns in SI, and complaints that name the row and the column.
 
-Separator comma, semicolon or tab (the one that occurs most often in the header); UTF-8 with or without a byte order
-mark; lines that begin with ``#`` are comments; the decimal mark is a point. Where no line but a comment names the
-columns (numpy's savetxt), the last comment before the numbers is the header.
+Separator comma, semicolon or tab (the one that occurs most often in the header), or blanks between numbers alone; UTF-8
+with or without a byte order mark; lines that begin with ``#`` are comments; the decimal mark is a point. Where no line
+but a comment names the columns (numpy's savetxt), the last comment before the numbers is the header.
 """
 
 from __future__ import annotations
@@ -139,6 +139,13 @@ def read_header(path: str | Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
     return _split_units(found)
 
 
+def row_width(path: str | Path) -> int:
+    """Return the number of cells in the first line of the CSV file at `path`."""
+    lines, _, first = _open(path, False)
+    lines.close()
+    return len(first)
+
+
 def nearest(name: str, among: Sequence[str]) -> str:
     """Return `` (did you mean '...'?)`` for the most similar name, or nothing."""
     lower = {other.lower(): other for other in among}
@@ -149,7 +156,7 @@ def nearest(name: str, among: Sequence[str]) -> str:
 def _open(path: str | Path, headed: bool) -> tuple[IO[str], str, list[str]]:
     """Open a file and return it behind its header line, with the separator and the header's cells."""
     try:
-        file = open(path, encoding="utf-8-sig", newline="")
+        file = open(path, encoding="utf-8-sig", newline="")  # noqa: SIM115 (the caller reads on, and closes it)
     except OSError as error:
         raise MeasurementError(f"cannot be read: {error.strerror}", path) from error
     try:
@@ -159,7 +166,7 @@ def _open(path: str | Path, headed: bool) -> tuple[IO[str], str, list[str]]:
             if text.startswith("#"):
                 comment = text
             elif text:
-                separator = max(",;\t", key=line.count)
+                separator = _separator(text)
                 first = next(csv.reader([line.strip("\r\n")], delimiter=separator, skipinitialspace=True))
                 if all(_is_number(cell) for cell in first) or not headed:
                     file.seek(place)
@@ -171,6 +178,12 @@ def _open(path: str | Path, headed: bool) -> tuple[IO[str], str, list[str]]:
         raise _not_utf8(error, path) from error
     file.close()
     raise MeasurementError("is empty: no header and no rows", path)
+
+
+def _separator(line: str) -> str:
+    if not any(mark in line for mark in ",;\t") and all(_is_number(cell) for cell in line.split()):
+        return " "  # numpy's savetxt
+    return max(",;\t", key=line.count)
 
 
 def _comment_header(comment: str, separator: str, width: int, path: str | Path) -> list[str]:
