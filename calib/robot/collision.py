@@ -89,7 +89,7 @@ class Collision:
 
     def free(self, q: np.ndarray, margin: float = 0.0) -> np.ndarray:
         """Tell (m,) for which joint values q (m, n) every distance is larger than `margin` [m]."""
-        return (self.distances(q) > margin).all(axis=1)
+        return np.all(self.distances(q) > margin, axis=1)
 
 
 def from_urdf(

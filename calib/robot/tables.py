@@ -88,7 +88,7 @@ def number(value: Any, where: str, quantity: str | None = None) -> float:
         return _real(_evaluate(ast.parse(text, mode="eval").body) * factor, value, where)
     except (SyntaxError, ValueError, ZeroDivisionError, RecursionError):
         units = ", ".join(UNITS.get(quantity or "", {}))
-        hint = f" (a {quantity}: one of {units})" if units else ""
+        hint = f" (here an optional unit may follow: {units})" if units else ""
         raise RobotError(f"{where}: cannot read {value!r} as a number{hint}; try 0.4, 'pi/2' or '90 deg'") from None
 
 
