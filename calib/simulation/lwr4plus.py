@@ -1,0 +1,83 @@
+"""The KUKA LWR4+ of Kolyubin, Shiriaev & Jubien (2019), Int. J. Adv. Manuf. Technol. 101, 243-259: Tables 1, 2 and 3.
+
+Rows of Table 2 are frames 0 to 8, columns alpha [rad], d [m], theta [rad], r [m]; frames 0 and 1 (without q1) place the
+arm in the camera's frame, frame 8 places the LED fixture behind joint 7.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+from calib.robot import description, library
+from calib.robot.chain import Chain
+from calib.robot.kinematics import forward
+from calib.transforms import invert, pose
+
+COLUMNS = ("alpha", "d", "theta", "r")
+TABLE_3 = {
+    "nominal": {"position_mm": {"max": 9.6806, "mean": 5.9019}, "orientation_deg": {"max": 0.8058, "mean": 0.5636}},
+    "calibrated": {"position_mm": {"max": 1.7592, "mean": 0.7965}, "orientation_deg": {"max": 0.2268, "mean": 0.1042}},
+}
+POSES, BASE_PARAMETERS, CONDITION = 17, 32, 11.1878
+
+
+def transform(alpha: float, d: float, theta: float, r: float) -> np.ndarray:
+    """Return Rot_x(alpha) Trans_x(d) Rot_z(theta) Trans_z(r), (4, 4)."""
+    ca, sa, ct, st = np.cos(alpha), np.sin(alpha), np.cos(theta), np.sin(theta)
+    about_x = np.array([[1.0, 0.0, 0.0], [0.0, ca, -sa], [0.0, sa, ca]])
+    about_z = np.array([[ct, -st, 0.0], [st, ct, 0.0], [0.0, 0.0, 1.0]])
+    return pose(about_x, about_x @ [d, 0.0, 0.0]) @ pose(about_z, [0.0, 0.0, r])
+
+
+@cache
+def table_2() -> tuple[np.ndarray, np.ndarray]:
+    """Return Table 2, nominal and calibrated, each (9, 4)."""
+    geometry = description.read_extra(library.path("lwr4plus_truth"))["truth"]["geometry"]
+    return np.array(geometry["nominal"]), np.array(geometry["calibrated"])
+
+
+def nominal_chain() -> Chain:
+    """Return the library's arm."""
+    return description.read(library.path("lwr4plus"))
+
+
+def arm(table: np.ndarray) -> Chain:
+    """Return the library's arm with frames 2 to 7 of a table; frame 1 stays, it belongs to the base placement."""
+    values = {f"{column}{row}": table[row, position] for row in range(2, 8) for position, column in enumerate(COLUMNS)}
+    return nominal_chain().with_values(values)
+
+
+def station(table: np.ndarray) -> np.ndarray:
+    """Return the pose of the arm's base in the camera's frame (4, 4): frames 0 and 1, without q1."""
+    return transform(*table[0]) @ transform(*table[1])
+
+
+def tool(table: np.ndarray) -> np.ndarray:
+    """Return the pose of the LED fixture in the library arm's flange (4, 4): frame 8, the flange taken off."""
+    return invert(nominal_chain().tail) @ transform(*table[8])
+
+
+def constraint_values(chain: Chain, station: np.ndarray, tool: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Return Table 1 as values that have to be >= 0, (m, 6): roll and pitch above and below, distance, height.
+
+    The paper leaves open how roll and pitch are defined and where z is measured from; our reading: R = Rz Ry Rx of the
+    fixture in the camera's frame; distance from axis 1 and height above the floor plate, 0.31 m below the shoulder.
+    """
+    fixture = forward(chain, q) @ tool
+    rotation = station[:3, :3] @ fixture[:, :3, :3]
+    roll = np.arctan2(rotation[:, 2, 1], rotation[:, 2, 2])
+    pitch = np.arctan2(-rotation[:, 2, 0], np.hypot(rotation[:, 0, 0], rotation[:, 1, 0]))
+    across = np.hypot(fixture[:, 0, 3], fixture[:, 1, 3])
+    height = fixture[:, 2, 3] + 0.31
+    return np.column_stack(
+        [roll + 4 * np.pi / 9, 7 * np.pi / 18 - roll, pitch + np.pi / 4, np.pi / 4 - pitch, across - 0.2, height + 0.1]
+    )
+
+
+def feasible(chain: Chain, station: np.ndarray, tool: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Say which joint values q (m, 7) meet Table 1, joint angles included: (m,) bool."""
+    limits = np.deg2rad([170.0, 120.0, 170.0, 120.0, 170.0, 90.0, 170.0])
+    within = np.concatenate([limits - np.abs(q), constraint_values(chain, station, tool, q)], axis=1)
+    return np.all(within >= 0.0, axis=1)
