@@ -141,7 +141,8 @@ def _check_limits(q: np.ndarray, table: Table, column: str, joint: str, span: tu
     if np.abs(q).max() > TURN and ((small >= span[0] - SLACK) & (small <= span[1] + SLACK)).all():
         message += f": looks like {other}; if so, name the column '{column} [{other}]'"
     else:
-        message += "; if the robot does go there, correct its limits or set check_limits = false in the options"
+        message += ": are joint columns swapped? If the robot does go there, correct its limits or set"
+        message += " check_limits = false in the options"
     raise MeasurementError(message, table.file, int(table.rows[row]), column)
 
 

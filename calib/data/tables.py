@@ -1,7 +1,7 @@
 """CSV tables: a header with units, columns in SI, and complaints that name the row and the column.
 
-Separator comma, semicolon or tab (the one that occurs most often in the header), or blanks between numbers alone; UTF-8
-with or without a byte order mark; lines that begin with ``#`` are comments; the decimal mark is a point. Where no line
+Separator tab, semicolon or comma (the first of these that the header has), or blanks between numbers alone; UTF-8 with
+or without a byte order mark; lines that begin with ``#`` are comments; the decimal mark is a point. Where no line
 but a comment names the columns (numpy's savetxt), the last comment before the numbers is the header.
 """
 
@@ -168,7 +168,7 @@ def _open(path: str | Path, headed: bool) -> tuple[IO[str], str, list[str]]:
             elif text:
                 separator = _separator(text)
                 first = next(csv.reader([line.strip("\r\n")], delimiter=separator, skipinitialspace=True))
-                if all(_is_number(cell) for cell in first) or not headed:
+                if _headless(first, path) or not headed:
                     file.seek(place)
                     first = _comment_header(comment, separator, len(first), path) if headed else first
                 return file, separator, [cell.strip() for cell in first]
@@ -180,10 +180,17 @@ def _open(path: str | Path, headed: bool) -> tuple[IO[str], str, list[str]]:
     raise MeasurementError("is empty: no header and no rows", path)
 
 
+def _headless(cells: Sequence[str], path: str | Path) -> bool:
+    """Tell whether a first line is one of numbers."""
+    if sum(bool(_DECIMAL_COMMA.match(cell)) for cell in cells) > len(cells) / 2:
+        raise MeasurementError(_not_a_number(cells[0]), path, 1)
+    return sum(_is_number(cell) for cell in cells) > len(cells) / 2
+
+
 def _separator(line: str) -> str:
     if not any(mark in line for mark in ",;\t") and all(_is_number(cell) for cell in line.split()):
         return " "  # numpy's savetxt
-    return max(",;\t", key=line.count)
+    return next((mark for mark in "\t;" if mark in line), ",")
 
 
 def _comment_header(comment: str, separator: str, width: int, path: str | Path) -> list[str]:
@@ -191,7 +198,7 @@ def _comment_header(comment: str, separator: str, width: int, path: str | Path) 
     if len(names) == width and not any(_is_number(name) for name in names if name):
         return names
     message = (
-        f"has no header: its first line is {width} numbers. Add a first line that names the columns "
+        f"has no header: its first line is numbers, {width} cells. Add a first line that names the columns "
         "(q1,q2,...,x,y,z), or give `format` in the options where the file is of a known headerless form"
     )
     raise MeasurementError(message, path)

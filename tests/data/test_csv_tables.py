@@ -1,0 +1,162 @@
+"""CSV tables: separators, units, comments, and complaints that name row and column."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from calib.data.tables import read_header, read_table
+from calib.errors import MeasurementError
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t", ", "])
+def test_separators_give_the_same_table(write, separator):
+    path = write(separator.join(("a", "b [mm]", "c")), separator.join(("1", "2", "text")))
+    table = read_table(path)
+    assert table.header == ("a", "b", "c") and table.units == ("", "mm", "")
+    assert table.numbers("b", "length")[0] == pytest.approx(0.002)
+    assert table.texts("c") == ["text"]
+
+
+@pytest.mark.parametrize(
+    ("heading", "dimension", "factor"),
+    [
+        ("v [deg]", "angle", math.pi / 180),
+        ("v (deg)", "angle", math.pi / 180),
+        ("v[°]", "angle", math.pi / 180),
+        ("v [mrad]", "angle", 1e-3),
+        ("v [rad]", "angle", 1.0),
+        ("v", "angle", 1.0),
+        ("v [mm]", "length", 1e-3),
+        ("v(um)", "length", 1e-6),
+        ("v [µm]", "length", 1e-6),
+        ("v [in]", "length", 0.0254),
+        ("v [MM]", "joint", 1e-3),
+        ("v", "length", 1.0),
+    ],
+)
+def test_a_unit_in_the_header_is_converted(write, heading, dimension, factor):
+    table = read_table(write(f"{heading},w", "3,0"))
+    np.testing.assert_allclose(table.numbers("v", dimension), 3 * factor, rtol=1e-15)
+
+
+def test_byte_order_mark_comments_blank_lines_and_quotes(tmp_path):
+    path = tmp_path / "bom.csv"
+    path.write_bytes(
+        '\ufeff# by hand\n\n"a, first",b\r\n1,2\r\n# no row\r\n\r\n3,4\r\n,,\r\n'.replace(",,", ",").encode()
+    )
+    table = read_table(path)
+    assert table.header == ("a, first", "b")
+    np.testing.assert_array_equal(table.numbers("b"), [2, 4])
+    np.testing.assert_array_equal(table.rows, [1, 2])
+
+
+def test_a_comment_names_the_columns_where_nothing_else_does(tmp_path):
+    path = tmp_path / "savetxt.csv"
+    np.savetxt(path, [[1.0, 2.0], [3.0, 4.0]], delimiter=",", header="q1,x [mm]")
+    table = read_table(path)
+    assert table.header == ("q1", "x") and len(table) == 2
+    np.testing.assert_allclose(table.numbers("x", "length"), [0.002, 0.004])
+
+
+def test_a_separator_at_the_end_of_each_line_adds_no_column(write):
+    assert read_table(write("a,b,", "1,2,\n3,4,")).header == ("a", "b")
+
+
+def test_a_large_table_is_read_in_chunks_without_loss(write):
+    values = np.random.default_rng(1).normal(size=(50_000, 2))
+    path = write(
+        "a,b,c", "\n".join(f"{a!r},{b!r},{'' if i == 49_999 else 1}" for i, (a, b) in enumerate(values.tolist()))
+    )
+    table = read_table(path)
+    np.testing.assert_array_equal(np.stack([table.numbers("a"), table.numbers("b")], axis=1), values)
+    assert np.isnan(table.numbers("c", gaps=True)).sum() == 1
+    with pytest.raises(MeasurementError) as error:
+        table.numbers("c")
+    assert (error.value.row, error.value.column) == (50_000, "c")
+
+
+def test_a_column_that_turns_to_text_late_is_text(write):
+    table = read_table(write("a,b", "\n".join(["1,2"] * 25_000 + ["x,2"])))
+    assert table.texts("a")[0] == "1" and table.texts("a")[-1] == "x"
+    with pytest.raises(MeasurementError, match="'x' where a number is needed") as error:
+        table.numbers("a")
+    assert error.value.row == 25_001
+
+
+@pytest.mark.parametrize(
+    ("text", "words", "row", "column"),
+    [
+        ("", "is empty", None, None),
+        ("# only a comment\n", "is empty", None, None),
+        ("a,b\n", "no data rows", None, None),
+        ("a,b,a\n1,2,3\n", r"more than once \(columns 1 and 3\)", None, "a"),
+        ("a,b\n1,2\n1,2,3\n", "3 cells where the header has 2", 2, None),
+        ("a,b\n1,2\n1\n", "1 cells where the header has 2", 2, None),
+        ("a,b\n1,5,2,5\n", "decimal commas", 1, None),
+        ("1,2\n3,4\n", "has no header.*format", None, None),
+        ("left,1,2\nright,3,4\n", "has no header", None, None),
+        ("1,5;2,5\n3,5;4,5\n", "'1,5', with a decimal comma", 1, None),
+    ],
+)
+def test_a_file_that_is_no_table_is_refused(tmp_path, text, words, row, column):
+    path = tmp_path / "bad.csv"
+    path.write_text(text)
+    with pytest.raises(MeasurementError, match=words) as error:
+        read_table(path)
+    assert (error.value.file, error.value.row, error.value.column) == (path, row, column)
+
+
+@pytest.mark.parametrize(
+    ("cell", "words"),
+    [
+        ("12,5", "decimal comma"),
+        ("abc", "'abc' where a number is needed"),
+        ("", "empty or NaN"),
+        ("NaN", "empty or NaN"),
+        ("-inf", "-inf"),
+    ],
+)
+def test_a_cell_that_is_no_number_is_named(write, cell, words):
+    table = read_table(write("a;b", f"1;2\n3;{cell}"))
+    with pytest.raises(MeasurementError, match=words) as error:
+        table.numbers("b")
+    assert (error.value.row, error.value.column) == (2, "b")
+
+
+def test_files_that_cannot_be_decoded_or_found(tmp_path):
+    path = tmp_path / "latin.csv"
+    path.write_bytes("a,b [µm]\n1,2\n".encode("latin-1"))
+    with pytest.raises(MeasurementError, match=r"is not UTF-8 text.*0xb5"):
+        read_table(path)
+    with pytest.raises(MeasurementError, match="cannot be read: No such file"):
+        read_table(tmp_path / "missing.csv")
+
+
+@pytest.mark.parametrize(
+    ("heading", "dimension"), [("x [furlong]", "length"), ("x [deg]", "length"), ("x [m]", "angle")]
+)
+def test_a_unit_of_another_dimension_is_refused(write, heading, dimension):
+    with pytest.raises(MeasurementError, match="is none of") as error:
+        read_table(write(f"{heading},y", "1,2")).numbers("x", dimension)
+    assert error.value.column == "x"
+
+
+def test_the_unit_of_an_ignored_column_does_not_matter(write):
+    assert read_table(write("x,T [furlong]", "1,2")).numbers("x", "length")[0] == 1
+
+
+def test_header_and_options_that_disagree_on_a_unit(write):
+    with pytest.raises(MeasurementError, match=r"header says \[mm\], the options say m"):
+        read_table(write("x [mm]", "1")).numbers("x", "length", "m")
+
+
+def test_a_missing_column_names_the_nearest(write):
+    with pytest.raises(MeasurementError, match=r"'sigma_x' is missing .did you mean 'sigmax'"):
+        read_table(write("sigmax,y", "1,2")).index("sigma_x")
+
+
+def test_the_header_alone(write):
+    assert read_header(write("q1 [deg];x", "1;2")) == (("q1", "x"), ("deg", ""))

@@ -1,0 +1,100 @@
+"""The options file: every key is read, every unknown one refused by name."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from calib.data import options as module
+from calib.data.options import FitOptions, check_files, parse_options, read_options
+from calib.errors import UsageError
+
+
+def test_defaults_without_a_file():
+    options = read_options()
+    assert options == FitOptions() and options.model == "auto" and options.loss == "none"
+    assert options.for_file("any.csv") is options.every and options.every.check_limits
+
+
+def test_the_schema_of_the_docstring_is_valid_and_complete(tmp_path):
+    schema = (module.__doc__ or "").split("::\n", 1)[1]
+    path = tmp_path / "fit.toml"
+    path.write_text(re.sub(r"(?m)^    ", "", schema))
+    options = read_options(path)
+    every = options.every
+    assert every.kind == "position" and every.groups == ("tool_position",) and every.socket_pairs == (("0", "1"),)
+    assert every.sigma_position == (1e-5, 1e-5, 2e-5) and every.sigma_orientation == (1e-4,) * 3
+    assert (every.sigma_distance, every.sigma_floor) == (1e-5, 1e-6)
+    assert every.where == {"tool_position": ("back_left", "high")} and every.columns == {"x": "X_leica"}
+    assert options.prior == {"theta2": 1e-3} and options.harmonics.orders == (1, 2) and options.harmonics.ridge == 1e-4
+    assert options.fix == ("theta1",) and options.free == ("d3",) and options.loss_scale == 1.345
+    for key in (*module._FILE, *module._FIT):
+        assert re.search(rf"(?m)^    \[?{key}\b", schema), f"{key} is not in the docstring"
+
+
+def test_a_files_table_adds_to_what_holds_for_every_file():
+    text = {
+        "kind": "position",
+        "units": {"joints": "deg", "position": "mm"},
+        "sigma": {"position": 1e-5},
+        "files": {
+            "day2.csv": {"kind": "pose", "units": {"position": "m"}, "station": "B"},
+            "a/day3.csv": {"tool": "T"},
+        },
+    }
+    options = parse_options(text)
+    own = options.for_file("/data/day2.csv")
+    assert own.kind == "pose" and own.units == {"joints": "deg", "position": "m"} and own.station == "B"
+    assert own.sigma_position == (1e-5,) * 3
+    assert options.for_file("/data/a/day3.csv").tool == "T" and options.for_file("/data/day3.csv").tool == "tool"
+    assert options.for_file("/data/day1.csv").kind == "position"
+    check_files(options, ["/data/day2.csv", "a/day3.csv"])
+    with pytest.raises(UsageError, match=r'files."day2.csv" is none of the files given .did you mean .day_2.csv'):
+        check_files(options, ["day_2.csv", "a/day3.csv"])
+
+
+def test_harmonics_up_to_an_order():
+    assert parse_options({"harmonics": {"max": 3}}).harmonics.orders == (1, 2, 3)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ({"modle": "auto"}, "there is no key 'modle' .did you mean 'model'"),
+        ({"files": {"a.csv": {"model": "auto"}}}, "there is no key 'model'.*the keys are"),
+        ({"files": {"a": {"csv": {"kind": "pose"}}}}, "the dot needs quotes"),
+        ({"sigma": {"positon": 1e-5}}, "sigma: there is no key 'positon' .did you mean 'position'"),
+        ({"kind": "poses"}, "kind: expected one of pose.*did you mean 'pose'.*found 'poses'"),
+        ({"model": "stifness"}, "did you mean 'stiffness'"),
+        ({"loss": "l1"}, "loss: expected one of none, huber, cauchy"),
+        ({"units": {"x": "furlong"}}, "units.x: expected one of rad"),
+        ({"sigma": {"position": [1e-5, 1e-5]}}, "a number or three"),
+        ({"sigma": {"position": 20}}, "at most 0.1 .are these mm"),
+        ({"sigma": {"position": -1e-5}}, "a number above 0"),
+        ({"sigma": 1e-5}, "sigma: expected a table"),
+        ({"socket_distance": 50}, "socket_distance: expected m, at most 10 .are these mm"),
+        ({"socket_pairs": ["0", "1"]}, "pairs of socket labels"),
+        ({"check_limits": 0}, "check_limits: expected true or false, found 0"),
+        ({"fix": "theta1"}, "fix: expected a list of names"),
+        ({"fix": ["d3"], "free": ["d3"]}, "'d3' stands in fix and in free"),
+        ({"prior": {"d3": 0}}, "prior.d3: expected a number above 0"),
+        ({"harmonics": {"orders": [0, 1]}}, "whole numbers from 1 on"),
+        ({"harmonics": {"orders": [1], "max": 2}}, "orders and max"),
+        ({"harmonics": {"ordres": [1]}}, "did you mean 'orders'"),
+        ({"where": {"day": True}}, "where.day: expected a text or a number"),
+        ({"columns": {"x": 3}}, "columns.x: expected a text"),
+    ],
+)
+def test_what_a_key_cannot_be(text, words):
+    with pytest.raises(UsageError, match=words):
+        parse_options(text)
+
+
+def test_files_that_are_no_toml(tmp_path):
+    path = tmp_path / "fit.toml"
+    with pytest.raises(UsageError, match="cannot be read"):
+        read_options(path)
+    path.write_text("kind = position")
+    with pytest.raises(UsageError, match=r"fit.toml: is no TOML.*line 1"):
+        read_options(path)

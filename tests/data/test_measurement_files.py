@@ -1,0 +1,243 @@
+"""The measurement CSV: what is read, and how."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from measured_rows import JOINTS, POSE
+from scipy.spatial.transform import Rotation
+
+from calib.data.options import FileOptions, parse_options
+from calib.data.pose_files import joint_columns, read_all, read_measurements
+from calib.errors import UsageError
+
+
+def read(path, options=None, **more):
+    (block,) = read_measurements(path, JOINTS, options, **more)
+    return block
+
+
+def table(rows, names, wanted):
+    """Pick columns of the good rows by name."""
+    place = [names.split(",").index(name) for name in wanted.split(",")]
+    return [[row[i] for i in place] for row in rows]
+
+
+def test_poses(write, good):
+    block = read(write(POSE + ",temperature,note", [[*row, 20, "ok"] for row in good]))
+    values = np.array(good, dtype=float)
+    assert block.kind == "pose" and block.joint_names == ("q1", "q2", "q3") and block.station == "poses"
+    np.testing.assert_array_equal(block.q, values[:, :3])
+    np.testing.assert_array_equal(block.position, values[:, 3:6])
+    np.testing.assert_allclose(block.quaternion, values[:, 6:], atol=1e-8)
+    np.testing.assert_allclose(np.linalg.norm(block.quaternion, axis=1), 1, rtol=1e-15)
+    assert block.ignored == ("temperature", "note")
+    assert block.rows is not None and block.rows.tolist() == list(range(1, 11))
+    assert block.sigma is None and block.tool_names == ("tool",)
+
+
+@pytest.mark.parametrize("names", ["shoulder,elbow,wrist", "q_shoulder,q_elbow,q_wrist", "q1,q2,q3"])
+def test_joint_columns_by_name_in_any_order(write, good, names):
+    a, b, c = names.split(",")
+    rows = table(good, POSE, "q3,q1,q2,x,y,z")
+    block = read(write(f"{c},{a},{b},x,y,z", rows))
+    np.testing.assert_array_equal(block.q, np.array(good, dtype=float)[:, :3])
+    assert block.joint_names == (a, b, c)
+
+
+def test_degrees_and_millimetres(write, good):
+    values = np.array(good, dtype=float)
+    rows = np.hstack([np.rad2deg(values[:, :3]), 1e3 * values[:, 3:6], np.full((10, 3), 20.0)]).tolist()
+    header = "q1 [deg],q2 (deg),q3 [°],x [mm],y [mm],z [mm],sigma_x [um],sigma_y [um],sigma_z [um]"
+    block = read(write(header, rows))
+    np.testing.assert_allclose(block.q, values[:, :3], rtol=1e-14)
+    np.testing.assert_allclose(block.position, values[:, 3:6], rtol=1e-14)
+    np.testing.assert_allclose(block.sigma, 20e-6)
+    plain = read(
+        write("q1,q2,q3,x,y,z,a,b,c", rows),
+        FileOptions(units={"joints": "deg", "position": "mm"}),
+        limits=([-3] * 3, [3] * 3),
+    )
+    np.testing.assert_allclose(plain.q, block.q)
+    np.testing.assert_allclose(plain.position, block.position)
+
+
+def test_a_prismatic_joint_in_millimetres(write, good):
+    rows = [[1e3 * row[0], *row[1:6]] for row in good]
+    block = read(write("q1 [mm],q2,q3,x,y,z", rows), kinds=("prismatic", "revolute", "revolute"))
+    np.testing.assert_allclose(block.q, np.array(good, dtype=float)[:, :3])
+
+
+@pytest.mark.parametrize("suffix", ["_meas", "_measured"])
+def test_measured_columns_with_a_suffix_are_taken_and_said(write, good, suffix):
+    header = "q1,q2,q3," + ",".join(name + suffix for name in ["x", "y", "z", "qx", "qy", "qz", "qw"]) + ",x_target"
+    block = read(write(header, [[*row, 0] for row in good]))
+    assert block.kind == "pose" and block.ignored == ("x_target",)
+    assert any(f"x{suffix}" in note for note in block.notes) and any(f"qw{suffix}" in note for note in block.notes)
+
+
+def test_plain_columns_win_over_suffixed_ones(write, good):
+    rows = [[*row[:6], 9, 9, 9] for row in good]
+    block = read(write("q1,q2,q3,x,y,z,x_meas,y_meas,z_meas", rows))
+    np.testing.assert_array_equal(block.position, np.array(good, dtype=float)[:, 3:6])
+    assert block.ignored == ("x_meas", "y_meas", "z_meas")
+
+
+def test_rotation_matrices_give_the_same_as_quaternions(write, good):
+    matrices = Rotation.from_quat(np.array(good, dtype=float)[:, 6:]).as_matrix().reshape(-1, 9)
+    header = "q1,q2,q3,x,y,z," + ",".join(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))
+    block = read(write(header, [[*row[:6], *matrix] for row, matrix in zip(good, matrices)]))
+    turn = Rotation.from_quat(block.quaternion) * Rotation.from_quat(np.array(good, dtype=float)[:, 6:]).inv()
+    assert block.kind == "pose" and turn.magnitude().max() < 1e-7
+
+
+def test_several_reflectors_with_gaps(write, good):
+    rows = [[*row[:6], *row[3:6]] for row in good]
+    rows[1][3:6] = ["", "", ""]
+    rows[4][6:9] = ["NaN"] * 3
+    block = read(write("q1,q2,q3,x1,y1,z1,x2,y2,z2", rows), FileOptions(tool="ball", sigma_position=(1e-5, 1e-5, 2e-5)))
+    assert block.kind == "position" and len(block) == 18 and block.tool_names == ("ball 1", "ball 2")
+    assert block.rows is not None and block.rows.tolist()[:4] == [1, 1, 2, 3]
+    assert block.tool is not None and block.tool.tolist()[:4] == [0, 1, 1, 0]
+    np.testing.assert_array_equal(block.position, np.array(good, dtype=float)[block.rows - 1, 3:6])
+    np.testing.assert_array_equal(block.sigma, np.tile((1e-5, 1e-5, 2e-5), (18, 1)))
+    assert [note for note in block.notes if "not seen in 1 of 10 rows" in note] == list(block.notes)
+
+
+def test_sigmas_of_numbered_reflectors(write, good):
+    rows = [[*row[:6], *row[3:6], 1e-5, 2e-5, 3e-5, 4e-5, 5e-5, 6e-5] for row in good]
+    names = ",".join(f"sigma_{axis}{k}" for k in (1, 2) for axis in "xyz")
+    block = read(write(f"q1,q2,q3,x1,y1,z1,x2,y2,z2,{names}", rows))
+    np.testing.assert_array_equal(block.sigma[:2], [[1e-5, 2e-5, 3e-5], [4e-5, 5e-5, 6e-5]])
+
+
+def test_a_tool_column_separates_reflectors(write, good):
+    rows = [[*row[:6], "A" if i % 2 else "B"] for i, row in enumerate(good)]
+    block = read(write("q1,q2,q3,x,y,z,tool", rows))
+    assert block.tool_names == ("B", "A") and block.tool is not None and block.tool.tolist() == [0, 1] * 5
+
+
+def test_distances_between_two_poses(write, good):
+    rows = [[*row[:3], 0.1 * (1 + i // 2), f"p{i // 2}", 2e-5] for i, row in enumerate(good)]
+    block = read(write("q1,q2,q3,distance,pair,sigma_distance", rows))
+    assert block.kind == "distance" and block.group_names == tuple(f"p{i}" for i in range(5))
+    assert block.group is not None and block.group.tolist() == [i // 2 for i in range(10)]
+    np.testing.assert_allclose(block.distance, [row[3] for row in rows])
+    np.testing.assert_array_equal(block.sigma, np.full((10, 3), 2e-5))
+
+
+def test_distances_to_the_ends_of_bars(write, good):
+    rows = [[*row[:3], 500, i // 5] for i, row in enumerate(good)]
+    block = read(write("q1,q2,q3,distance [mm],bar", rows), FileOptions(sigma_distance=1e-5))
+    assert block.kind == "bar" and block.group_names == ("0", "1")
+    np.testing.assert_allclose(block.distance, 0.5)
+    np.testing.assert_array_equal(block.sigma, np.full((10, 3), 1e-5))
+
+
+def test_points_on_planes(write, good):
+    block = read(write("q1,q2,q3,plane", [[*row[:3], "table"] for row in good]))
+    assert block.kind == "plane" and block.group_names == ("table",) and block.position is None
+
+
+SOCKETS = "q1,q2,q3,tool_position,socket"
+
+
+def sockets(good):
+    return [[*row[:3], "left" if i < 5 else "right", i % 2] for i, row in enumerate(good)]
+
+
+def test_sockets_are_grouped_with_their_fixture(write, good):
+    block = read(write(SOCKETS, sockets(good)), FileOptions(socket_distance=0.05))
+    assert block.kind == "sockets" and block.group_names == ("left/0", "left/1", "right/1", "right/0")
+    assert block.links == ((0, 1, 0.05), (2, 3, 0.05))
+    assert read(write(SOCKETS, sockets(good))).links == ()
+
+
+def test_socket_groups_and_pairs_by_options(write, good):
+    rows = [[*row[:3], "left", i % 3, i // 3] for i, row in enumerate(good[:9])]
+    path = write(SOCKETS + ",day", rows)
+    block = read(path, FileOptions(socket_distance=0.05, socket_pairs=(("0", "2"),)))
+    assert block.links == ((0, 2, 0.05),)
+    block = read(path, FileOptions(groups=("day",), kind="sockets"))
+    assert block.group_names[:4] == ("0/0", "0/1", "0/2", "1/0")
+    assert any("one row alone" in note for note in block.notes)
+
+
+def test_where_keeps_rows_and_their_numbers(write, good):
+    block = read(write(SOCKETS, sockets(good)), FileOptions(where={"tool_position": ("right",), "socket": ("1",)}))
+    assert block.rows is not None and block.rows.tolist() == [6, 8, 10] and block.group_names == ("right/1",)
+
+
+def test_other_names_by_the_options(write, good):
+    header = "A1,A2,A3,X_leica,Y_leica,Z_leica,std1,std2,std3"
+    ours = ("q1", "elbow", "q3", "x", "y", "z", "sigma_x", "sigma_y", "sigma_z")
+    options = FileOptions(columns=dict(zip(ours, header.split(","))), units={"A1": "rad"})
+    block = read(write(header, [[*row[:6], 1e-5, 1e-5, 1e-5] for row in good]), options)
+    assert block.joint_names == ("A1", "A2", "A3") and block.ignored == ()
+    np.testing.assert_array_equal(block.position, np.array(good, dtype=float)[:, 3:6])
+    np.testing.assert_array_equal(block.sigma, np.full((10, 3), 1e-5))
+
+
+def test_the_options_choose_among_kinds(write, good):
+    path = write("q1,q2,q3,x,y,z,socket", [[*row[:6], 0] for row in good])
+    assert read(path, FileOptions(kind="sockets")).kind == "sockets"
+    position = read(path, FileOptions(kind="position"))
+    assert position.kind == "position" and position.ignored == ("socket",)
+    path = write(POSE, good)
+    assert read(path, FileOptions(kind="position")).ignored == ("qx", "qy", "qz", "qw")
+
+
+def test_sigmas_of_columns_win_and_are_raised_to_the_floor(write, good):
+    path = write(
+        POSE + ",sigma_x,sigma_y,sigma_z,sigma_rx,sigma_ry,sigma_rz", [[*row, 0, 2e-6, 1, 1, 1, 1] for row in good]
+    )
+    options = FileOptions(sigma_position=(1, 1, 1), sigma_orientation=(9, 9, 9), sigma_floor=1e-6)
+    block = read(path, options)
+    np.testing.assert_array_equal(block.sigma[0], [1e-6, 2e-6, 1])
+    np.testing.assert_array_equal(block.sigma_rotation, np.ones((10, 3)))
+
+
+def test_a_constant_quaternion_and_small_rounding_are_fine(write, good):
+    block = read(write(POSE, [[*row[:6], 0, 0, 0, 1.0005] for row in good]))
+    np.testing.assert_allclose(block.quaternion, np.tile([0, 0, 0, 1.0], (10, 1)))
+
+
+def test_joint_like_names_of_a_header(write):
+    path = write("id,q_S,q_L,x_meas,y_meas,z_meas,x1,sigma_x,socket,T [C]", "1,2,3,4,5,6,7,8,9,10")
+    assert joint_columns(path) == ("id", "S", "L")
+
+
+def test_a_little_beyond_a_limit_is_a_note(write, good):
+    limit = max(row[0] for row in good)
+    block = read(write(POSE, good), limits=([-3, -3, -3], [limit - 5e-4, 3, 3]))
+    assert any("shoulder is outside its limits in 1 of 10 rows" in note for note in block.notes)
+
+
+def test_radians_under_a_degree_header_are_noted(write, good):
+    block = read(write(POSE.replace("q1,q2,q3", "q1 [deg],q2 [deg],q3 [deg]"), good))
+    assert any("really degrees" in note for note in block.notes)
+
+
+def test_a_multi_turn_joint_passes_within_its_limits(write, good):
+    rows = [[row[0], row[1], 5 * row[2], *row[3:]] for row in good]
+    assert len(read(write(POSE, rows), limits=([-3, -3, -20], [3, 3, 20]))) == 10
+    assert len(read(write(POSE, rows), kinds=("revolute", "revolute", "continuous"))) == 10
+
+
+def test_several_files_with_stations_and_tools(tmp_path, write, good):
+    paths = [write(POSE, good, name=f"day{i}.csv") for i in (1, 2)]
+    blocks = read_all(paths, JOINTS)
+    assert [block.station for block in blocks] == ["day1", "day2"] and blocks[0].tool_names == blocks[1].tool_names
+    blocks = read_all(paths, JOINTS, stations="one", tools="each")
+    assert [block.station for block in blocks] == ["station"] * 2
+    assert [block.tool_names for block in blocks] == [("tool day1",), ("tool day2",)]
+    options = parse_options({"files": {"day2.csv": {"station": "A", "kind": "position"}}})
+    blocks = read_all(paths, JOINTS, options)
+    assert [block.station for block in blocks] == ["day1", "A"] and [b.kind for b in blocks] == ["pose", "position"]
+    (tmp_path / "again").mkdir()
+    twin = write(POSE, good, name="again/day1.csv")
+    assert len({block.station for block in read_all([paths[0], twin], JOINTS)}) == 2
+    with pytest.raises(UsageError, match="stations 'all' is neither"):
+        read_all(paths, JOINTS, stations="all")
+    with pytest.raises(UsageError, match=r"day2.csv. is none of the files given"):
+        read_all(paths[:1], JOINTS, options)
