@@ -225,7 +225,7 @@ def _gripper_joints(tree: Tree) -> set[str]:
     found: set[str] = set()
     for joint in tree.joints.values():
         leader = tree.joints.get(joint.mimic.leader) if joint.mimic else None
-        if leader is None or _hangs(tree, joint.child, leader.child):
+        if leader is None or _hangs(tree, joint.child, leader.child) or _hangs(tree, leader.child, joint.child):
             continue
         found.add(joint.name)
         if not any(other.actuated and _hangs(tree, other.child, leader.child) for other in tree.joints.values()):
