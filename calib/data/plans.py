@@ -129,8 +129,8 @@ def _explain(
 def _best_order(plan: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return which measured column (n,) best holds each planned joint, and with which sign (n,).
 
-    Each pair of columns is compared as two sets of numbers (median distance to the nearest one), so that order and
-    completeness of the rows do not matter; the assignment minimises the sum.
+    Each pair of columns is compared as two sets of numbers (mean distance to the nearest one, at most 1), so that order
+    and completeness of the rows do not matter; the assignment minimises the sum.
     """
     n = plan.shape[1]
     cost = np.empty((2, n, n))

@@ -160,3 +160,9 @@ def test_a_missing_column_names_the_nearest(write):
 
 def test_the_header_alone(write):
     assert read_header(write("q1 [deg];x", "1;2")) == (("q1", "x"), ("deg", ""))
+
+
+def test_a_ragged_row_far_down_keeps_its_number(write):
+    with pytest.raises(MeasurementError, match="1 cells where the header has 2") as error:
+        read_table(write("a,b", "1,2\n" * 40_002 + "3\n"))
+    assert error.value.row == 40_003
