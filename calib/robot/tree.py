@@ -302,7 +302,8 @@ def _floats(node: Node, key: str, default: str, place: str) -> np.ndarray:
         values = np.full(1, np.nan)
     if len(values) != 3 or not np.isfinite(values).all():
         found = node.attributes.get(key)
-        raise RobotError(f'{place}: {key}="{found}" of <{node.tag}> in line {node.line} is not three finite numbers')
+        what = f'{key}="{found}" of <{node.tag}> in line {node.line}'
+        raise RobotError(f"{place}: {what} is not three finite numbers{_expand(found)}")
     return values
 
 
@@ -313,7 +314,8 @@ def _float(node: Node, key: str, default: float, place: str) -> float:
     except ValueError:
         value = np.nan
     if np.isnan(value):
-        raise RobotError(f'{place}: {key}="{found}" of <{node.tag}> in line {node.line} is not a number')
+        what = f'{key}="{found}" of <{node.tag}> in line {node.line}'
+        raise RobotError(f"{place}: {what} is not a number{_expand(found)}")
     return value
 
 

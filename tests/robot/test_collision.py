@@ -1,0 +1,154 @@
+"""Distances on arms whose answers are known by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from robot_oracle import axis, joint, robot
+
+from calib.errors import RobotError
+from calib.robot import collision
+from calib.robot.chain import random_joints
+from calib.robot.collision import Obstacle
+from calib.robot.load import load
+from calib.transforms import pose
+
+
+def shape(inner: str, xyz: str = "0.5 0 0", rpy: str = "0 0 0") -> str:
+    return f'<collision><origin xyz="{xyz}" rpy="{rpy}"/><geometry>{inner}</geometry></collision>'
+
+
+def planar(*shapes: str) -> str:
+    """Return three links of 1 m in the x-y plane at z = 0.5, turning about z (the second about -z)."""
+    bodies = dict(zip(("base", "one", "two", "three"), shapes, strict=False))
+    return robot(
+        joint("a", "continuous", "base", "one", axis("0 0 1"), "0 0 0.5"),
+        joint("b", "revolute", "one", "two", axis("0 0 -1"), "1 0 0"),
+        joint("c", "revolute", "two", "three", axis("0 0 1"), "1 0 0"),
+        links="base one two three",
+        bodies=bodies,
+    )
+
+
+BALL = '<sphere radius="0.1"/>'
+
+
+@pytest.fixture
+def balls(tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text(planar("", *[shape(BALL)] * 3))
+    return path
+
+
+def test_distances_by_hand(balls):
+    wall = Obstacle("wall", "box", (0.2, 9.0, 9.0), pose(position=[3.0, 0, 0]))
+    ball = Obstacle("ball", "sphere", (0.2,), pose(position=[0.5, 1.0, 0.5]))
+    found = collision.from_urdf(balls, floor=0.1, obstacles=[wall, ball])
+    assert found.pairs[0] == ("one", "three") and ("one", "two") not in found.pairs
+    distances = dict(zip(found.pairs, found.distances(np.zeros((1, 3)))[0], strict=True))
+    assert distances["one", "three"] == pytest.approx(2.0 - 0.2)
+    assert distances["three", "wall"] == pytest.approx(2.9 - 2.5 - 0.1)
+    assert distances["two", "floor"] == pytest.approx(0.5 - 0.1 - 0.1)
+    assert distances["one", "ball"] == pytest.approx(1.0 - 0.3)
+    # the first two links stretched along y, the third folded back by 90 degrees about z and -z
+    q = np.array([[np.pi / 2, np.pi / 2, 0.0]])
+    distances = dict(zip(found.pairs, found.distances(q)[0], strict=True))
+    assert distances["two", "ball"] == pytest.approx(-0.3)
+    assert distances["one", "three"] == pytest.approx(np.hypot(1.5, 0.5) - 0.2)
+
+
+def test_free_and_margin(balls):
+    found = collision.from_urdf(
+        balls, obstacles=[Obstacle("rod", "cylinder", (0.1, 2.0), pose(position=[2.8, 0, 0.5]))]
+    )
+    q = np.array([[0.0, 0, 0], [np.pi, 0, 0]])
+    assert found.distances(q).shape == (2, len(found.pairs))
+    assert found.free(q).tolist() == [True, True]
+    assert found.free(q, 0.15).tolist() == [False, True]
+    assert found.free(np.zeros((0, 3))).shape == (0,)
+
+
+def test_every_primitive_and_a_mesh(tmp_path):
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "tetrahedron.obj").write_text(
+        "v 0 0 0\nv 100 0 0\nv 0 100 0\nv 0 0 100\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    )
+    mesh = '<mesh filename="package://arm/meshes/tetrahedron.obj" scale="0.001 0.001 0.001"/>'
+    lost = '<mesh filename="package://arm/meshes/absent.stl"/>'
+    source = planar(
+        shape('<box size="0.1 0.1 0.1"/>', "0 0 0"),
+        shape('<cylinder radius="0.1" length="0.4"/>') + shape(lost),
+        shape('<capsule radius="0.1" length="0.4"/>'),
+        shape(mesh, "0 0 0"),
+    )
+    (tmp_path / "arm.urdf").write_text(source)
+    found = collision.from_urdf(tmp_path / "arm.urdf", floor=0.0)
+    assert found.missing == ("package://arm/meshes/absent.stl",)
+    distances = dict(zip(found.pairs, found.distances(np.zeros((1, 3)))[0], strict=True))
+    assert distances["one", "floor"] == pytest.approx(0.5 - 0.2)
+    assert distances["two", "floor"] == pytest.approx(0.5 - 0.3)
+    assert distances["three", "floor"] == pytest.approx(0.5)
+    assert distances["one", "three"] == pytest.approx(2.0 - 0.6, abs=1e-6)
+    assert ("base", "floor") not in found.pairs and ("base", "two") in found.pairs
+
+
+def test_pairs_that_always_touch_are_left_out_and_listed(tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text(planar("", *[shape('<sphere radius="2"/>')] * 3))
+    found = collision.from_urdf(path)
+    assert (found.pairs, found.excluded) == ((), (("one", "three"),))
+    assert found.free(np.zeros((2, 3))).tolist() == [True, True]
+
+
+def test_capsules_along_a_chain():
+    chain = load("ur10")
+    wall = Obstacle("wall", "box", (0.1, 4.0, 4.0), pose(position=[-1.4, 0, 0]))
+    found = collision.from_chain(chain, 0.05, floor=-0.1, obstacles=[wall])
+    distances = dict(zip(found.pairs, found.distances(np.zeros((1, 6)))[0], strict=True))
+    # at q = 0 the UR10 lies along -x: the forearm ends at x = -0.612 - 0.5723
+    assert distances["elbow_joint_link", "wall"] == pytest.approx(1.35 - 1.1843 - 0.05, abs=1e-6)
+    assert distances["shoulder_lift_joint_link", "floor"] == pytest.approx(0.1 + 0.1273 - 0.05, abs=1e-6)
+    free = found.free(random_joints(chain, 200), 0.01)
+    assert 0.05 < free.mean() < 0.95
+
+
+def test_continuous_and_mimic_joints_move_the_shapes(tmp_path):
+    path = tmp_path / "arm.urdf"
+    follow = axis("0 0 1") + '<mimic joint="a" multiplier="-2" offset="0.3"/>'
+    path.write_text(
+        robot(
+            joint("a", "continuous", "base", "one", axis("0 0 1")),
+            joint("b", "revolute", "one", "two", follow, "1 0 0"),
+            links="base one two",
+            bodies={"two": shape(BALL, "1 0 0")},
+        )
+    )
+    found = collision.from_urdf(path, obstacles=[Obstacle("ball", "sphere", (0.1,), pose(position=[9.0, 0, 0]))])
+    turned = 0.4 + (-2 * 0.4 + 0.3)
+    centre = np.array([np.cos(0.4) + np.cos(turned), np.sin(0.4) + np.sin(turned)])
+    assert found.distances(np.array([[0.4]]))[0, 0] == pytest.approx(np.hypot(9 - centre[0], centre[1]) - 0.2)
+
+
+@pytest.mark.parametrize(
+    "inner, message",
+    [
+        ("", r"no usable <collision> shape; give mesh_folders, or use capsules"),
+        (shape('<mesh filename="absent.stl"/>'), r"no usable .* \(1 meshes were not found, e\.g\. absent\.stl\)"),
+        (shape('<box size="1 1"/>'), r"link 'one': <box> in line \d+ needs size with 3 finite number"),
+        (shape('<torus radius="1"/>'), r"<torus> is none of box, sphere"),
+        (shape(""), r"<collision> without a shape"),
+    ],
+)
+def test_bad_shapes(inner, message, tmp_path):
+    (tmp_path / "arm.urdf").write_text(planar("", inner))
+    with pytest.raises(RobotError, match=message):
+        collision.from_urdf(tmp_path / "arm.urdf")
+
+
+def test_bad_obstacles(balls):
+    for kind, size, message in (
+        ("cone", (1.0,), "kind 'cone' is none of"),
+        ("box", (1.0, 2.0), "a box has 3 positive"),
+    ):
+        with pytest.raises(RobotError, match=message):
+            collision.from_urdf(balls, obstacles=[Obstacle("o", kind, size, np.eye(4))])
