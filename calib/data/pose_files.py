@@ -29,10 +29,10 @@ from calib.data import plausible, robodk
 from calib.data.columns import OURS, SUFFIXES, Layout, find_layout
 from calib.data.grouped import labels, read_groups
 from calib.data.measurements import PoseMeasurements
-from calib.data.options import FileOptions, FitOptions, check_files
+from calib.data.options import FileOptions
 from calib.data.plausible import Limits
 from calib.data.tables import Table, read_header, read_table
-from calib.errors import MeasurementError, UsageError
+from calib.errors import MeasurementError
 
 
 def read_measurements(
@@ -66,39 +66,6 @@ def read_measurements(
         table, notes = read_table(path), ()
     block = measurements(table, joints, options, kinds=kinds, limits=limits)
     return [replace(block, notes=(*notes, *block.notes))]
-
-
-def read_all(
-    paths: Sequence[str | Path],
-    joints: Sequence[str],
-    options: FitOptions | None = None,
-    *,
-    stations: str = "each",
-    tools: str = "one",
-    kinds: Sequence[str] | None = None,
-    limits: Limits | None = None,
-) -> list[PoseMeasurements]:
-    """Read several files, for one fit.
-
-    Args:
-        stations: ``each`` file an instrument placement of its own, or ``one`` for all; a name in the options wins.
-        tools: ``one`` for all files, or ``each`` file its own.
-        paths, joints, options, kinds, limits: as for `read_measurements`; options per file as `FitOptions.for_file`.
-    """
-    options = options or FitOptions()
-    for choice, what in ((stations, "stations"), (tools, "tools")):
-        if choice not in ("each", "one"):
-            raise UsageError(f"{what} '{choice}' is neither 'each' nor 'one'")
-    check_files(options, paths)
-    names = [Path(path).stem for path in paths]
-    names = [name if names.count(name) == 1 else str(Path(path).with_suffix("")) for name, path in zip(names, paths)]
-    blocks = []
-    for path, name in zip(paths, names):
-        own = options.for_file(path)
-        station = own.station or (name if stations == "each" else "station")
-        tool = f"{own.tool} {name}" if tools == "each" else own.tool
-        blocks += read_measurements(path, joints, replace(own, station=station, tool=tool), kinds=kinds, limits=limits)
-    return blocks
 
 
 def joint_columns(path: str | Path) -> tuple[str, ...]:

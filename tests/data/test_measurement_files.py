@@ -7,9 +7,8 @@ import pytest
 from measured_rows import JOINTS, POSE
 from scipy.spatial.transform import Rotation
 
-from calib.data.options import FileOptions, parse_options
-from calib.data.pose_files import joint_columns, read_all, read_measurements
-from calib.errors import UsageError
+from calib.data.options import FileOptions
+from calib.data.pose_files import joint_columns, read_measurements
 
 
 def read(path, options=None, **more):
@@ -222,22 +221,3 @@ def test_a_multi_turn_joint_passes_within_its_limits(write, good):
     rows = [[row[0], row[1], 5 * row[2], *row[3:]] for row in good]
     assert len(read(write(POSE, rows), limits=([-3, -3, -20], [3, 3, 20]))) == 10
     assert len(read(write(POSE, rows), kinds=("revolute", "revolute", "continuous"))) == 10
-
-
-def test_several_files_with_stations_and_tools(tmp_path, write, good):
-    paths = [write(POSE, good, name=f"day{i}.csv") for i in (1, 2)]
-    blocks = read_all(paths, JOINTS)
-    assert [block.station for block in blocks] == ["day1", "day2"] and blocks[0].tool_names == blocks[1].tool_names
-    blocks = read_all(paths, JOINTS, stations="one", tools="each")
-    assert [block.station for block in blocks] == ["station"] * 2
-    assert [block.tool_names for block in blocks] == [("tool day1",), ("tool day2",)]
-    options = parse_options({"files": {"day2.csv": {"station": "A", "kind": "position"}}})
-    blocks = read_all(paths, JOINTS, options)
-    assert [block.station for block in blocks] == ["day1", "A"] and [b.kind for b in blocks] == ["pose", "position"]
-    (tmp_path / "again").mkdir()
-    twin = write(POSE, good, name="again/day1.csv")
-    assert len({block.station for block in read_all([paths[0], twin], JOINTS)}) == 2
-    with pytest.raises(UsageError, match="stations 'all' is neither"):
-        read_all(paths, JOINTS, stations="all")
-    with pytest.raises(UsageError, match=r"day2.csv. is none of the files given"):
-        read_all(paths[:1], JOINTS, options)
