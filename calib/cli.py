@@ -1,0 +1,139 @@
+"""The command ``calib``: commands only, no mathematics. Exit codes: 0 done, 1 done but the verdict is fail, 2 input or
+usage, 3 not identifiable or not converged."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import click
+import typer
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Calibrate a robot: choose poses, fit the geometry, validate on unseen poses, export.",
+)
+
+Robot = Annotated[str, typer.Argument(help="a .urdf, an MDH .toml, a library name, or the folder of an earlier fit")]
+Base = Annotated[str | None, typer.Option(help="URDF: the link the arm starts at")]
+Tip = Annotated[str | None, typer.Option(help="URDF: the link the arm ends at")]
+Seed = Annotated[int, typer.Option(help="reproduces everything random")]
+
+
+@app.callback()
+def options(
+    debug: Annotated[bool, typer.Option("--debug", help="show tracebacks (or set CALIB_DEBUG)")] = False,
+) -> None:
+    if debug:
+        os.environ["CALIB_DEBUG"] = "1"
+
+
+@app.command()
+def fit(
+    robot: Robot,
+    measured: Annotated[list[Path], typer.Argument(help="CSV files of measured poses")],
+    out: Annotated[Path, typer.Option(help="folder for the calibrated robot and its report")],
+    validate: Annotated[list[Path] | None, typer.Option(help="CSV file of unseen poses; may be repeated")] = None,
+    holdout: Annotated[float, typer.Option(help="share of each file's poses kept from the fit")] = 0.0,
+    refit_frames: Annotated[bool, typer.Option(help="validation files: base and tool placement of their own")] = False,
+    options: Annotated[Path | None, typer.Option(help="TOML: column names, units, kinds, how to fit")] = None,
+    model: Annotated[
+        str | None, typer.Option(help="auto, frames, offsets, geometry, stiffness, coupling or harmonics")
+    ] = None,
+    loss: Annotated[str | None, typer.Option(help="none, huber or cauchy")] = None,
+    stations: Annotated[str, typer.Option(help="base placement: each file its own, or one for all")] = "each",
+    tools: Annotated[str, typer.Option(help="one tool for all files, or each its own")] = "one",
+    base: Base = None,
+    tip: Tip = None,
+    seed: Seed = 0,
+) -> None:
+    """Fit the geometry of ROBOT to measured poses, and say how far to trust it."""
+    from calib.data.options import MODELS, read_options
+    from calib.errors import UsageError
+    from calib.procedure import fitting, inputs, outputs, show
+
+    if model is not None and model not in MODELS:
+        raise UsageError(f"--model {model}: expected one of {', '.join(MODELS)}")
+    chosen = read_options(options)
+    outputs.check_target(out)
+    found = inputs.gather(
+        robot, measured, validate or [], options=chosen, holdout=holdout, stations=stations, tools=tools,
+        refit_frames=refit_frames, base=base, tip=tip, seed=seed,
+    )  # fmt: skip
+    outputs.check_target(out, found.source)
+    console = _console()
+    for line in show.read_lines(found):
+        console.print(line, soft_wrap=True)
+    with _progress() as say:
+        outcome = fitting.run(found, chosen, model=model, loss=loss, seed=seed, progress=say)
+        say("writing")
+        outputs.write_folder(outcome, out)
+    for line in show.outcome_lines(outcome):
+        console.print(line, soft_wrap=True)
+    console.print(f"written to {out}", soft_wrap=True, markup=False)
+    if outcome.verdict.level == "fail":
+        raise typer.Exit(1)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line and exit with one of the codes above."""
+    sys.exit(run(arguments))
+
+
+def run(arguments: list[str] | None = None) -> int:
+    """Run the command line and return its exit code; errors become one message on stderr."""
+    try:
+        return int(app(args=arguments, standalone_mode=False) or 0)
+    except click.exceptions.Exit as stop:
+        return stop.exit_code
+    except click.ClickException as error:
+        error.show()
+        return 2
+    except (KeyboardInterrupt, click.Abort):
+        return _complain("interrupted; nothing was left half-written", 130)
+    except Exception as error:
+        code = _code(error)
+        if code is None or os.environ.get("CALIB_DEBUG"):
+            raise
+        return _complain(str(error), code)
+
+
+def _code(error: Exception) -> int | None:
+    """Return the exit code of an error raised on purpose; None for any other."""
+    from calib.errors import CalibError, NotConverged, Unidentifiable
+
+    if isinstance(error, (NotConverged, Unidentifiable)):
+        return 3
+    if isinstance(error, CalibError):
+        return 2
+    module = sys.modules.get("poses.errors")
+    if module is not None and isinstance(error, module.NotIdentifiable):
+        return 3
+    if type(error).__module__.split(".")[0] in ("poses", "trajectories"):
+        return 2
+    return None
+
+
+def _complain(message: str, code: int) -> int:
+    print(f"calib: {message}", file=sys.stderr)
+    return code
+
+
+def _console(**options: Any) -> Any:
+    from rich.console import Console
+
+    return Console(highlight=False, **options)
+
+
+@contextmanager
+def _progress() -> Iterator[Any]:
+    """Show on stderr what is being done, where stderr is a terminal."""
+    console = _console(stderr=True)
+    with console.status("") as status:
+        yield lambda words: status.update(str(words))

@@ -1,0 +1,159 @@
+"""How far an installation's predictions lie from what was measured: the numbers a certificate prints.
+
+    position      |y - p| where positions are measured; |mean of the socket's points - p| for sockets; distance from the
+                  plane for planes [m]
+    orientation   angle of R_y Rᵀ [rad]
+    distance      | |p_a - p_b| - known | for distances, bars and sockets a known distance apart; for sockets without
+                  one, the deviation of |m_a - m_b| from its mean over the fixture's positions [m]
+
+``rms`` is sqrt(mean |e|²) of the vector's norm, not per axis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from calib.data.measurements import PoseMeasurements
+from calib.geometry.installation import Installation
+from calib.geometry.observation import Block, observe, predict, prepare
+from calib.geometry.residuals import Part
+
+NATURE = {
+    "position": "position",
+    "consistency": "position",
+    "plane": "position",
+    "orientation": "orientation",
+    "distance": "distance",
+}
+"""Which error each residual part (by its label) counts as."""
+
+Torques = Sequence[np.ndarray | None] | None
+_NONE = np.array([], dtype=int)
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Sizes of errors, one per measured row (or pair); None where nothing of the kind was measured.
+
+    Attributes:
+        position: [m].
+        orientation: [rad].
+        distance: [m].
+    """
+
+    position: np.ndarray | None
+    orientation: np.ndarray | None
+    distance: np.ndarray | None
+
+    @property
+    def main(self) -> np.ndarray:
+        """The errors to judge by: positions, or distances where there are no positions."""
+        chosen = self.position if self.position is not None else self.distance
+        return np.zeros(0) if chosen is None else chosen
+
+
+def residual_parts(
+    cell: Installation, measured: Sequence[PoseMeasurements], torques: Torques = None
+) -> list[list[Part]]:
+    """Return the residual parts of each block, without Jacobians."""
+    return [observe(cell, block, _NONE) for block in prepare(cell, measured, torques)]
+
+
+def errors(cell: Installation, measured: Sequence[PoseMeasurements], torques: Torques = None) -> Errors:
+    """Return the size of every error.
+
+    Args:
+        cell: the installation that predicts; it has the stations and tools of the measurements.
+        measured: blocks of any kinds.
+        torques: gravity torques (m, n) per block [N m], for compliance terms.
+    """
+    found: dict[str, list[np.ndarray]] = {"position": [], "orientation": [], "distance": []}
+    for block in prepare(cell, measured, torques):
+        for part in observe(cell, block, _NONE):
+            found[NATURE[part.label]].append(np.linalg.norm(part.value, axis=0))
+        if block.measured.kind == "sockets" and not block.measured.links:
+            found["distance"].append(_socket_spread(cell, block))
+    joined = {name: np.concatenate(sizes) if sizes else np.zeros(0) for name, sizes in found.items()}
+    return Errors(**{name: sizes if len(sizes) else None for name, sizes in joined.items()})
+
+
+def summary(found: Errors) -> dict[str, dict[str, float] | None]:
+    """Return ``position_mm``, ``orientation_deg`` and, where distances are measured, ``distance_mm``.
+
+    Each holds mean, rms, p95 and max; None where nothing of the kind was measured.
+    """
+    result: dict[str, dict[str, float] | None] = {
+        "position_mm": statistics(found.position, 1e3),
+        "orientation_deg": statistics(found.orientation, np.degrees(1.0)),
+    }
+    if found.distance is not None:
+        result["distance_mm"] = statistics(found.distance, 1e3)
+    return result
+
+
+def statistics(sizes: np.ndarray | None, factor: float = 1.0) -> dict[str, float] | None:
+    """Return mean, rms, 95 % quantile and maximum of sizes times `factor`; None for None."""
+    if sizes is None:
+        return None
+    scaled = factor * sizes
+    return {
+        "mean": float(scaled.mean()),
+        "rms": float(np.sqrt(np.mean(scaled**2))),
+        "p95": float(np.percentile(scaled, 95)),
+        "max": float(scaled.max()),
+    }
+
+
+def pair_errors(
+    cell: Installation,
+    measured: Sequence[PoseMeasurements],
+    torques: Torques = None,
+    limit: int = 20000,
+    seed: int = 0,
+) -> np.ndarray:
+    """Return | |p_i - p_j| - |y_i - y_j| | of pairs of measured positions [m]: immune to where the station stands.
+
+    Pairs are taken within a block; where there are more than `limit`, that many are drawn by seed.
+    """
+    generator = np.random.default_rng(seed)
+    result = [np.zeros(0)]
+    for block in prepare(cell, measured, torques):
+        if block.measured.position is None or len(block.measured) < 2:
+            continue
+        first, second = _pairs(len(block.measured), limit, generator)
+        point, seen = predict(cell, block).point.T, block.measured.position
+        predicted = np.linalg.norm(point[first] - point[second], axis=1)
+        result.append(np.abs(predicted - np.linalg.norm(seen[first] - seen[second], axis=1)))
+    return np.concatenate(result)
+
+
+def _pairs(m: int, limit: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    if m * (m - 1) // 2 <= limit:
+        first, second = np.triu_indices(m, 1)
+        return first, second
+    first = generator.integers(0, m, limit)
+    return first, (first + generator.integers(1, m, limit)) % m
+
+
+def _socket_spread(cell: Installation, block: Block) -> np.ndarray:
+    """Return how far the distance of the same two sockets is from its mean over the fixture's positions [m].
+
+    A group's name is ``<fixture position>/<socket>``; empty where no pair of sockets occurs in two positions.
+    """
+    measured = block.measured
+    assert measured.group is not None
+    point = predict(cell, block).point
+    sockets: dict[str, dict[str, np.ndarray]] = {}
+    for number in np.unique(measured.group):
+        name = measured.group_names[number] if measured.group_names else str(number)
+        place, _, socket = name.rpartition("/")
+        sockets.setdefault(place, {})[socket] = point[:, measured.group == number].mean(axis=1)
+    lengths: dict[tuple[str, str], list[float]] = {}
+    for means in sockets.values():
+        for pair in combinations(sorted(means), 2):
+            lengths.setdefault(pair, []).append(float(np.linalg.norm(means[pair[0]] - means[pair[1]])))
+    return np.concatenate([np.zeros(0), *(np.abs(np.array(d) - np.mean(d)) for d in lengths.values() if len(d) > 1)])

@@ -1,0 +1,107 @@
+"""A calibrated installation as tables of ``robot.toml``, and back.
+
+Beside the robot itself (`calib.robot.description`)::
+
+    [[station]]                      # pose of the arm's base in the instrument's frame
+    name = "day1"
+    xyz = [1.0, 0.0, 0.3]            # and rpy; or matrix
+    [[tool]]                         # pose of the target in the tip's frame
+    name = "tool"
+    [deflection]                     # what q does not say; formula in `calib.geometry.deflection`
+    reference = [0.0, 0.1, ...]      # element values of the chain that levers are taken from (the nominal one)
+    [[deflection.term]]
+    element = "q3.offset"            # the element it moves
+    basis = "sin"                    # torque, lever, joint, cos, sin
+    joint = "q4"                     # the joint (or the body behind it) it comes from
+    order = 2                        # k of sin and cos; axis of a lever (0 x, 1 y, 2 z)
+    coefficient = 1.2e-5
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.errors import RobotError
+from calib.geometry.deflection import Deflection, Term
+from calib.geometry.installation import Installation
+from calib.robot import description
+from calib.robot.chain import Chain
+from calib.robot.tables import check_keys, number, placement, placement_table, vector
+
+
+def tables(cell: Installation) -> dict[str, Any]:
+    """Return the tables ``station``, ``tool`` and, where there are terms, ``deflection`` of an installation."""
+    result: dict[str, Any] = {
+        "station": [{"name": n, **placement_table(t)} for n, t in zip(cell.station_names, cell.stations)],
+        "tool": [{"name": n, **placement_table(t)} for n, t in zip(cell.tool_names, cell.tools)],
+    }
+    if cell.deflection.terms:
+        result["deflection"] = _deflection_table(cell)
+    return result
+
+
+def _deflection_table(cell: Installation) -> dict[str, Any]:
+    table: dict[str, Any] = {}
+    if cell.deflection.reference is not None:
+        table["reference"] = cell.deflection.reference.values.tolist()
+    table["term"] = [
+        {
+            "element": term.element,
+            "basis": term.basis,
+            "joint": cell.chain.joint_names[term.source],
+            "order": term.order,
+            "coefficient": float(value),
+        }
+        for term, value in zip(cell.deflection.terms, np.asarray(cell.deflection.coefficients))
+    ]
+    return table
+
+
+def read(path: str | Path) -> Installation:
+    """Read the installation that a fit has written, deflections included.
+
+    Args:
+        path: the folder of a fit, or its ``robot.toml``; any other robot file gives identity frames.
+    """
+    path = Path(path) / "robot.toml" if Path(path).is_dir() else Path(path)
+    chain, extra, where = description.read(path), description.read_extra(path), str(path)
+    stations, tools = (_frames(extra.get(name, []), f"{where}, {name}") for name in ("station", "tool"))
+    given: dict[str, Any] = (
+        {"deflection": _deflection(extra["deflection"], chain, where)} if "deflection" in extra else {}
+    )
+    if stations:
+        given |= {"station_names": tuple(stations), "stations": np.array(list(stations.values()))}
+    if tools:
+        given |= {"tool_names": tuple(tools), "tools": np.array(list(tools.values()))}
+    return Installation(chain, **given)
+
+
+def _frames(entries: Any, where: str) -> dict[str, np.ndarray]:
+    if not isinstance(entries, list) or not all(isinstance(entry, Mapping) for entry in entries):
+        raise RobotError(f"{where}: expected [[...]] tables, each with a name, xyz and rpy")
+    return {
+        str(entry.get("name", f"{k + 1}")): placement({key: v for key, v in entry.items() if key != "name"}, where)
+        for k, entry in enumerate(entries)
+    }
+
+
+def _deflection(table: Any, chain: Chain, where: str) -> Deflection:
+    where = f"{where}, deflection"
+    check_keys(table, ("reference", "term"), where)
+    terms, coefficients = [], []
+    for entry in table.get("term", []):
+        check_keys(entry, ("element", "basis", "joint", "order", "coefficient"), where)
+        for key, known in (("element", chain.names), ("joint", chain.joint_names)):
+            if entry.get(key) not in known:
+                raise RobotError(f"{where}: {key} {entry.get(key)!r} is none of the robot's")
+        source = chain.joint_names.index(entry["joint"])
+        terms.append(Term(entry["element"], entry.get("basis", ""), source, int(entry.get("order", 0))))
+        coefficients.append(number(entry.get("coefficient"), f"{where}, coefficient"))
+    reference = chain
+    if "reference" in table:
+        reference = chain.with_values(vector(table["reference"], len(chain.elements), f"{where}, reference"))
+    return Deflection(tuple(terms), np.array(coefficients), reference)

@@ -1,0 +1,79 @@
+"""The fitted parameters as a person reads them: frames as placements, not as displacements from themselves.
+
+The fit moves a frame T by a step in its own axes, T · Trans(d) · Exp(w). In the table stand T's own position and
+rotation vector r, so that the covariance of (d, w) goes through  position = R d,  r' = J_r⁻¹(r) w.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.geometry.fit import GeometricFit, parameter_values
+from calib.geometry.installation import Installation
+from calib.geometry.parameters import layout
+
+HEADER = ("name", "unit", "nominal", "value", "sigma", "rsd")
+
+
+@dataclass(frozen=True, eq=False)
+class EstimateTable:
+    """Rows of ``estimate.csv``, and their covariance (rows, rows)."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    nominal: np.ndarray
+    values: np.ndarray
+    covariance: np.ndarray
+
+    def rows(self) -> list[tuple[str, str, float, float, float, float | None]]:
+        """Return name, unit, nominal, value, σ and RSD [%] of each row; no RSD at a value of 0."""
+        sigma = np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
+        numbers = zip(self.names, self.units, self.nominal, self.values, sigma)
+        return [
+            (name, unit, float(n), float(v), float(s), float(100.0 * s / abs(v)) if v else None)
+            for name, unit, n, v, s in numbers
+        ]
+
+
+def estimate_table(found: GeometricFit, nominal: Installation) -> EstimateTable:
+    """Return what a fit has moved: arm elements, placements, deflection coefficients.
+
+    Args:
+        found: the fit.
+        nominal: the nominal arm with its frames fitted; whose values stand in the column ``nominal``.
+    """
+    table = layout(found.cell)
+    full = np.zeros((len(table.names), len(found.free)))
+    full[found.free, np.arange(len(found.free))] = 1.0
+    values, before = parameter_values(found.cell), np.zeros(len(table.names))
+    before[: table.arm] = nominal.chain.values
+    start = table.arm
+    for after, first in zip((*found.cell.stations, *found.cell.tools), (*nominal.stations, *nominal.tools)):
+        block = slice(start, start + 6)
+        full[block] = _to_parent(after) @ full[block]
+        values[block], before[block] = _elements(after), _elements(first)
+        start += 6
+    shown = np.flatnonzero(np.abs(full).max(axis=1, initial=0.0) > 1e-9)
+    full = full[shown]
+    covariance = full @ found.estimate.covariance @ full.T
+    names, units = (tuple(part[k] for k in shown) for part in (table.names, table.units))
+    return EstimateTable(names, units, before[shown], values[shown], covariance)
+
+
+def _elements(placement: np.ndarray) -> np.ndarray:
+    return np.concatenate([placement[:3, 3], Rotation.from_matrix(placement[:3, :3]).as_rotvec()])
+
+
+def _to_parent(placement: np.ndarray) -> np.ndarray:
+    """Return ∂(position, rotation vector)/∂(d, w) (6, 6)."""
+    result = np.zeros((6, 6))
+    result[:3, :3] = placement[:3, :3]
+    vector = Rotation.from_matrix(placement[:3, :3]).as_rotvec()
+    angle = float(np.linalg.norm(vector))
+    cross = np.array([[0, -vector[2], vector[1]], [vector[2], 0, -vector[0]], [-vector[1], vector[0], 0]])
+    factor = 1 / 12 if angle < 1e-4 else 1 / angle**2 - (1 + np.cos(angle)) / (2 * angle * np.sin(angle))
+    result[3:, 3:] = np.eye(3) + cross / 2 + factor * cross @ cross
+    return result

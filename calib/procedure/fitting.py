@@ -1,0 +1,131 @@
+"""The fit as the guided procedure runs it: climb the models, judge on unseen rows, say what came of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.data.measurements import PoseMeasurements
+from calib.data.options import FitOptions
+from calib.errors import NotConverged
+from calib.geometry.first_guess import install
+from calib.geometry.fit import Settings, combine, outliers
+from calib.procedure.climbing import Climb, climb
+from calib.procedure.comparing import Comparison, compare, compare_unseen
+from calib.procedure.inputs import Inputs
+from calib.procedure.verdict import Verdict, judge
+from calib.robot.chain import Chain
+
+Progress = Callable[[str], None]
+ELSEWHERE = 20.0  # nominal errors this many times the fit's: the instrument must have stood elsewhere (our choice)
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What a fit came to.
+
+    Attributes:
+        inputs: what it worked on.
+        climb: the rungs, the chosen model, and the fits of the nominal and the calibrated arm.
+        fit: the two arms on the fit rows.
+        validation: the two arms on unseen rows, by file name.
+        outliers: (file, row, nature, size in robust sigmas) of fit rows that do not fit, worst first.
+        unclear: what the data cannot tell, in words.
+        warnings: what a user should know.
+        verdict: pass, marginal or fail, with its reason.
+        seed: that reproduces it.
+    """
+
+    inputs: Inputs
+    climb: Climb
+    fit: Comparison
+    validation: Mapping[str, Comparison]
+    outliers: Sequence[tuple[str, int, str, float]]
+    unclear: tuple[str, ...]
+    warnings: tuple[str, ...]
+    verdict: Verdict
+    seed: int = 0
+
+
+def run(
+    inputs: Inputs,
+    options: FitOptions | None = None,
+    *,
+    model: str | None = None,
+    loss: str | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Outcome:
+    """Fit, compare on all rows, and judge.
+
+    Args:
+        inputs: see `calib.procedure.inputs.gather`.
+        options: the fit options file's content.
+        model, loss: in place of the options'.
+        seed: for everything random.
+        progress: called with a few words at each stage.
+
+    Raises:
+        NotConverged: where the chosen model's fit did not come to an end.
+    """
+    options, say = options or FitOptions(), progress or (lambda words: None)
+    settings = combine(Settings(), loss=loss or options.loss, loss_scale=options.loss_scale)
+    asked = model or options.model
+    say("placing the instrument and the tool")
+    start = install(inputs.chain, inputs.fit)
+    torques = [gravity_of(inputs.chain, block) for block in inputs.fit]
+    found = climb(start, inputs.fit, asked, options, settings, torques, seed, say)
+    status = found.fit.solution.status
+    if not status.good:
+        raise NotConverged(f"the fit of model '{found.chosen}' did not converge: {status.value}", found.fit)
+    say("comparing on unseen poses")
+    nominal, calibrated = found.nominal.cell, found.fit.cell
+    fitted = compare(nominal, calibrated, inputs.fit, torques, "fitted on these rows", False, seed)
+    validation = {
+        name: compare_unseen(nominal, calibrated, unseen, lambda b: gravity_of(inputs.chain, b), settings, seed)
+        for name, unseen in inputs.unseen.items()
+    }
+    named = outliers(found.fit)
+    rows = sum(len(block) for block in inputs.fit)
+    verdict = judge(
+        fitted,
+        validation,
+        model=found.chosen,
+        asked=asked,
+        cross_validated=next((rung.cross_validated for rung in found.rungs if rung.model == found.chosen), None),
+        outlier_share=len({(file, row) for file, row, _, _ in named}) / rows,
+        reach=reach(inputs.chain),
+    )
+    warnings = (*inputs.notes, *(note for b in inputs.fit for note in b.notes), *elsewhere(fitted, validation))
+    return Outcome(
+        inputs, found, fitted, validation, named, found.unclear(), warnings, verdict, seed
+    )  # fmt: skip
+
+
+def gravity_of(chain: Chain, block: PoseMeasurements) -> np.ndarray | None:
+    """Return gravity torques (m, n) [N m] of a block; None where the robot's masses are not known."""
+    if chain.inertias is None or sum(element.joint is not None for element in chain.elements) != chain.n:
+        return None
+    from calib.dynamics.gravity import gravity_torques
+
+    return gravity_torques(chain, block.q)
+
+
+def reach(chain: Chain) -> float:
+    """Return how long the stretched arm is at most [m]: the sum of its constant offsets."""
+    total = sum(abs(e.value) for e in chain.elements if e.axis[0] == "t" and e.joint is None)
+    placed = sum(float(np.linalg.norm(e.placement[:3, 3])) for e in chain.elements if e.placement is not None)
+    return max(total + placed + float(np.linalg.norm(chain.tail[:3, 3])), 0.1)
+
+
+def elsewhere(fit: Comparison, validation: Mapping[str, Comparison]) -> list[str]:
+    """Name validation files whose errors look like another placement of the instrument, not like an arm's."""
+    usual = float(np.median(fit.errors[0].main)) if len(fit.errors[0].main) else np.inf
+    return [
+        f"{name}: nominal errors of {1e3 * np.median(found.errors[0].main):.3g} mm look like an instrument (or "
+        "tool) that stood elsewhere; give --refit-frames"
+        for name, found in validation.items()
+        if np.median(found.errors[0].main) > ELSEWHERE * usual
+    ]

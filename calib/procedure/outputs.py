@@ -1,0 +1,262 @@
+"""The folder of a fit: written whole, beside its place, then moved there."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from calib import files
+from calib.errors import UsageError
+from calib.geometry.accuracy import NATURE
+from calib.geometry.deflection import Deflection
+from calib.geometry.observation import observe, prepare
+from calib.procedure import calibrated
+from calib.procedure.comparing import Comparison
+from calib.procedure.estimates import HEADER, estimate_table
+from calib.procedure.fitting import Outcome
+from calib.robot import description, urdf_write
+from calib.robot.chain import Chain
+
+OURS = (
+    "robot.toml", "robot.urdf", "estimate.csv", "covariance.csv", "residuals.csv", "joint_corrections.csv",
+    "joint_corrections.txt", "metrics.json",
+)  # fmt: skip
+"""Files of an earlier fit that a new one replaces; besides plots, ``plot_*.png``."""
+
+CORRECTIONS = """Joint corrections that a URDF cannot hold.
+
+At joint values q, add to the joint (or element) of each row of joint_corrections.csv
+
+    delta = sum over its rows of  coefficient * b(q)
+
+    basis   b(q)
+    torque  gravity torque of `joint` at q [N m] (of the robot's masses; a static arm's drives show +g(q))
+    lever   component along gravity of  z_element x (axis `order` of the body behind `joint`; 0 x, 1 y, 2 z)
+    joint   q of `joint` [rad or m]
+    cos     cos(order * q of `joint`)
+    sin     sin(order * q of `joint`)
+
+To make the arm stand where the calibrated model says: predict with q + delta(q) in robot.urdf; to command a joint
+position for which robot.urdf wants q, send q - delta(q) (one step is enough; delta is small).
+robot.toml holds the same terms, and `calib.procedure.calibrated.read` reads them.
+"""
+
+_NONE = np.array([], dtype=int)
+
+
+def check_target(out: Path, source: Path | None = None) -> None:
+    """Refuse, before any work is done, a folder that cannot be written or whose files are not ours to replace."""
+    if out.exists() and not out.is_dir():
+        raise UsageError(f"{out} is a file; --out needs a folder")
+    if source is not None and source.resolve().parent == out.resolve() and source.name in OURS:
+        raise UsageError(f"{out} holds the robot that is to be calibrated; choose another folder for --out")
+    present = [name for name in OURS if (out / name).exists()]
+    if present and not (out / "metrics.json").exists():
+        raise UsageError(f"{out} holds {', '.join(present)} which no earlier fit has left there; choose another --out")
+    folder = out if out.is_dir() else next(parent for parent in out.absolute().parents if parent.exists())
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise UsageError(f"cannot write to {folder}: {error.strerror or error}; nothing was changed there") from error
+
+
+def write_folder(outcome: Outcome, out: Path, plots: Callable[[Outcome, Path], None] | None = None) -> Path:
+    """Write all files of a fit into a temporary folder beside `out` and move them there.
+
+    A folder that is not there appears whole; in one from an earlier fit each file is replaced, its own other files
+    (an old joint correction table) go, and what else lies there stays.
+    """
+    check_target(out, outcome.inputs.source)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        staging = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}.", suffix=".part"))
+    except OSError as error:
+        raise UsageError(f"cannot write beside {out}: {error.strerror or error}; nothing was changed there") from error
+    try:
+        _write_all(outcome, staging)
+        if plots is not None:
+            plots(outcome, staging)
+        os.chmod(staging, 0o777 & ~_umask())
+        if out.exists():
+            _move_files(staging, out)
+        else:
+            os.replace(staging, out)
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+    return out
+
+
+def _write_all(outcome: Outcome, folder: Path) -> None:
+    fit, chain = outcome.climb.fit, outcome.inputs.chain
+    extra = calibrated.tables(fit.cell) | {"provenance": _provenance(outcome)}
+    description.write(folder / "robot.toml", fit.cell.chain, extra, source=f"calibrated from {outcome.inputs.source}")
+    if outcome.inputs.source.suffix == ".urdf":
+        urdf_write.edit_file(outcome.inputs.source, folder / "robot.urdf", chain, fit.cell.chain)
+    else:
+        files.write(folder / "robot.urdf", urdf_write.write_new(fit.cell.chain))
+    table = estimate_table(fit, outcome.climb.nominal.cell)
+    files.write_table(folder / "estimate.csv", HEADER, table.rows())
+    rows = ([name, *map(float, row)] for name, row in zip(table.names, table.covariance))
+    files.write_table(folder / "covariance.csv", ("name", *table.names), rows)
+    write_residuals(outcome, folder / "residuals.csv")
+    if fit.cell.deflection.terms:
+        write_corrections(fit.cell.chain, fit.cell.deflection, folder)
+    files.write_json(folder / "metrics.json", metrics(outcome))
+
+
+def metrics(outcome: Outcome) -> dict[str, object]:
+    """Return the content of ``metrics.json``."""
+    return {
+        "fit": {"parameters": len(outcome.climb.fit.free), **outcome.fit.table()},
+        "validation": {name: comparison.table() for name, comparison in outcome.validation.items()},
+        "model": outcome.climb.chosen,
+        "ladder": [
+            {
+                "model": rung.model,
+                "parameters": rung.parameters,
+                "cross_validated_mm": None if rung.cross_validated is None else 1e3 * rung.cross_validated,
+                "note": rung.note,
+            }
+            for rung in outcome.climb.rungs
+        ],
+        "seed": outcome.seed,
+        "status": outcome.climb.fit.solution.status.name.lower(),
+        "verdict": outcome.verdict.level,
+        "reason": outcome.verdict.reason,
+        "warnings": list(outcome.warnings),
+        "not_identifiable": list(outcome.unclear),
+        "outliers": [
+            {"file": file, "row": row, "nature": nature, "sigmas": size} for file, row, nature, size in outcome.outliers
+        ],
+    }
+
+
+def _provenance(outcome: Outcome) -> dict[str, object]:
+    return {
+        "robot": str(outcome.inputs.source),
+        "files": [block.file for block in outcome.inputs.fit],
+        "model": outcome.climb.chosen,
+        "seed": outcome.seed,
+        "verdict": f"{outcome.verdict.level}: {outcome.verdict.reason}",
+        "covariance": "covariance.csv",
+    }
+
+
+COMPONENTS = {
+    "position": ("dx [mm]", "dy [mm]", "dz [mm]"),
+    "orientation": ("drx [deg]", "dry [deg]", "drz [deg]"),
+    "distance": ("ddistance [mm]",),
+}
+
+
+def write_residuals(outcome: Outcome, path: Path) -> Path:
+    """Write measured minus predicted of every row, fitted (with its robust weight) and unseen."""
+    named = {(file, row) for file, row, _, _ in outcome.outliers}
+    weights = _weights(outcome)
+    rows: list[list[object]] = []
+    sets = [("fit", outcome.fit)]
+    sets += [
+        ("held out" if u.held_out else "validation", outcome.validation[n]) for n, u in outcome.inputs.unseen.items()
+    ]
+    for label, comparison in sets:
+        rows += _residual_rows(label, comparison, named, weights if label == "fit" else {})
+    joints = outcome.inputs.chain.joints
+    header = ["set", "file", "row", "station", "tool", *(f"{joint.name} [{joint.unit}]" for joint in joints)]
+    header += [name for names in COMPONENTS.values() for name in names]
+    return files.write_table(path, [*header, "size [mm]", "nominal size [mm]", "weight", "outlier"], rows)
+
+
+def _weights(outcome: Outcome) -> dict[tuple[str, int, str], float]:
+    """Return the robust weight of each fitted residual by file, row and tool; the least of its natures."""
+    fit, result, start = outcome.climb.fit, {}, 0
+    for block in fit.blocks:
+        count = len(observe(fit.cell, block, _NONE))
+        for part, weight in zip(fit.found[start : start + count], fit.weights[start : start + count]):
+            for i, w in zip(part.index, weight):
+                key = _key(block.measured, int(i))
+                result[key] = min(float(w), result.get(key, np.inf))
+        start += count
+    return result
+
+
+def _key(measured, i: int) -> tuple[str, int, str]:
+    return measured.file, int(measured.rows[i]), measured.tool_names[measured.tool[i]]
+
+
+def _residual_rows(label: str, comparison: Comparison, named: set, weights: dict) -> list[list[object]]:
+    nominal, cell = comparison.cells
+    result = []
+    pairs = zip(
+        prepare(nominal, comparison.blocks, comparison.torques), prepare(cell, comparison.blocks, comparison.torques)
+    )
+    for before, block in pairs:
+        measured, m = block.measured, len(block.measured)
+        columns = {nature: np.full((len(names), m), np.nan) for nature, names in COMPONENTS.items()}
+        for part in observe(cell, block, _NONE):
+            nature = NATURE[part.label]
+            factor = np.degrees(1.0) if nature == "orientation" else 1e3
+            columns[nature][: len(part.value), part.index] = factor * part.value
+        first = np.full(m, np.nan)
+        for part in observe(nominal, before, _NONE):
+            if NATURE[part.label] == "position" or np.isnan(first[part.index]).all():
+                first[part.index] = 1e3 * np.linalg.norm(part.value, axis=0)
+        sizes = _row_sizes(columns)
+        for i in range(m):
+            key = _key(measured, i)
+            station = measured.station if measured.kind in ("pose", "position") else ""
+            row: list[object] = [label, key[0], key[1], station, key[2], *map(float, measured.q[i])]
+            row += [_number(value) for values in columns.values() for value in values[:, i]]
+            row += [_number(sizes[i]), _number(first[i]), weights.get(key), int(key[:2] in named and label == "fit")]
+            result.append(row)
+    return result
+
+
+def _row_sizes(columns: dict[str, np.ndarray]) -> np.ndarray:
+    """Return the length of each row's position residual [mm], or its distance residual."""
+    position, distance = columns["position"], columns["distance"]
+    size = np.sqrt(np.nansum(position**2, axis=0))
+    return np.where(np.isnan(position).all(axis=0), np.abs(distance[0]), size)
+
+
+def _number(value: float) -> float | None:
+    return None if np.isnan(value) else float(value)
+
+
+def write_corrections(chain: Chain, deflection: Deflection, folder: Path) -> None:
+    """Write what a URDF cannot hold: the joint correction table and how to read it."""
+    units = dict(zip(chain.names, chain.units))
+    owners = {element.name: element.joint for element in chain.elements}
+    rows = []
+    for term, value in zip(deflection.terms, np.asarray(deflection.coefficients)):
+        joint = owners[term.element]
+        target = term.element if joint is None else chain.joint_names[joint]
+        rows.append([target, units[term.element], term.basis, chain.joint_names[term.source], term.order, float(value)])
+    files.write_table(
+        folder / "joint_corrections.csv", ("corrected", "unit", "basis", "joint", "order", "coefficient"), rows
+    )
+    files.write(folder / "joint_corrections.txt", CORRECTIONS)
+
+
+def _move_files(staging: Path, out: Path) -> None:
+    """Replace the files of an earlier fit one by one, the metrics last, since they say that the rest is there."""
+    fresh = sorted(path.name for path in staging.iterdir())
+    stale = {name for name in OURS if name not in fresh} | {path.name for path in out.glob("plot_*.png")} - set(fresh)
+    try:
+        for name in sorted(fresh, key=lambda name: name == "metrics.json"):
+            os.replace(staging / name, out / name)
+        for name in stale:
+            (out / name).unlink(missing_ok=True)
+    except OSError as error:
+        raise UsageError(f"cannot write to {out}: {error.strerror or error}") from error
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

@@ -1,0 +1,96 @@
+"""What a fit says on the console: tables and sentences for rich to print; nothing is printed here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from rich.console import RenderableType
+from rich.markup import escape
+from rich.table import Table
+
+from calib.procedure.comparing import Comparison
+from calib.procedure.fitting import Outcome
+from calib.procedure.inputs import Inputs
+
+COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
+MANY = 8  # how many outliers or merged parameters are listed
+
+
+def read_lines(inputs: Inputs) -> Iterator[RenderableType]:
+    """Say what was read."""
+    chain = inputs.chain
+    yield f"robot [bold]{escape(chain.name)}[/]: {chain.n} joints, {escape(chain.base)} to {escape(chain.tip)}"
+    for block in inputs.fit:
+        tools = f", {len(block.tool_names)} targets" if len(block.tool_names) > 1 else ""
+        ignored = f"; ignored: {', '.join(block.ignored)}" if block.ignored else ""
+        sigma = "stated" if block.sigma is not None else "estimated"
+        yield escape(f"{block.file}: {len(block)} rows of kind {block.kind}{tools}, sigmas {sigma}{ignored}")
+    for name, unseen in inputs.unseen.items():
+        role = "held out" if unseen.held_out else "validation"
+        yield escape(f"{name}: {len(unseen.block)} rows of kind {unseen.block.kind} unseen ({role})")
+
+
+def outcome_lines(outcome: Outcome) -> Iterator[RenderableType]:
+    """Say what came of a fit."""
+    yield ladder_table(outcome)
+    yield error_table(outcome)
+    unclear = outcome.unclear
+    for line in unclear[:MANY]:
+        yield f"[yellow]not identifiable[/]: {escape(line)}"
+    if len(unclear) > MANY:
+        yield f"... and {len(unclear) - MANY} more in metrics.json"
+    for line in outcome.warnings:
+        yield f"[yellow]note[/]: {escape(line)}"
+    if outcome.outliers:
+        worst = ", ".join(
+            f"{file} row {row} ({size:.1f} sigma, {what})" for file, row, what, size in outcome.outliers[:MANY]
+        )
+        count = len({(file, row) for file, row, _, _ in outcome.outliers})
+        yield f"[yellow]outliers[/]: {count} rows beyond 4 robust sigma, kept in the fit; worst: {escape(worst)}"
+    verdict = outcome.verdict
+    yield f"verdict: [bold {COLOURS[verdict.level]}]{verdict.level}[/]: {escape(verdict.reason)}"
+
+
+def ladder_table(outcome: Outcome) -> Table:
+    """Return the rungs with their error on rows left out."""
+    table = Table("model", title="ladder of models", title_justify="left")
+    for name in ("parameters", "cross-validated rms [mm]"):
+        table.add_column(name, justify="right")
+    table.add_column("")
+    for rung in outcome.climb.rungs:
+        error = "" if rung.cross_validated is None else f"{1e3 * rung.cross_validated:.4f}"
+        mark = "chosen" if rung.model == outcome.climb.chosen else ""
+        note = ", ".join(part for part in (mark, rung.note) if part)
+        table.add_row(rung.model, str(rung.parameters), error, escape(note), style="bold" if mark else "")
+    return table
+
+
+def error_table(outcome: Outcome) -> Table:
+    """Return nominal and calibrated errors, fitted and unseen."""
+    table = Table("rows", "error", "arm", title="errors", title_justify="left")
+    for name in ("mean", "rms", "95 %", "max"):
+        table.add_column(name, justify="right")
+    _add(table, f"fitted, {outcome.fit.poses} poses", outcome.fit)
+    for name, comparison in outcome.validation.items():
+        _add(table, f"{name}, {comparison.poses} poses unseen", comparison)
+    return table
+
+
+def _add(table: Table, label: str, comparison: Comparison) -> None:
+    found = comparison.table()
+    kinds = {"position_mm": "position [mm]", "orientation_deg": "orientation [deg]", "distance_mm": "distance [mm]"}
+    label = escape(label)
+    for kind, words in kinds.items():
+        for arm in ("nominal", "calibrated"):
+            numbers = found[arm].get(kind)  # type: ignore[attr-defined]
+            if numbers is None:
+                continue
+            cells = [f"{numbers[key]:.4f}" for key in ("mean", "rms", "p95", "max")]
+            table.add_row(label, words if arm == "nominal" else "", arm, *cells)
+            label = ""
+    pairs = found.get("pair_distance_mm")
+    if isinstance(pairs, dict):
+        for arm in ("nominal", "calibrated"):
+            cells = [f"{pairs[arm][key]:.4f}" for key in ("mean", "rms", "p95", "max")]
+            table.add_row("", "pair distance [mm]" if arm == "nominal" else "", arm, *cells, style="dim")
+    table.add_section()
