@@ -51,9 +51,7 @@ def exchanged(pool: Pool, design: Design, report: Report | None = None, sweeps: 
     return design
 
 
-def detmax(
-    pool: Pool, design: Design, report: Report | None = None, *, longest: int = 6, failures: int = 40
-) -> Design:
+def detmax(pool: Pool, design: Design, report: Report | None = None, *, longest: int = 6, failures: int = 40) -> Design:
     """Improve det M by excursions to larger and smaller designs.
 
     DETMAX (Mitchell 1974, section 3): an excursion leaves the design of m poses upwards (add the best candidate) or
@@ -82,6 +80,40 @@ def detmax(
         failed |= seen
         over[upwards] = back is None
         fruitless, upwards = fruitless + 1, not upwards
+    return design
+
+
+def kicked(
+    pool: Pool, design: Design, rounds: int, seed: int, report: Report | None = None, *, size: int = 3, weights=None
+) -> Design:
+    """Leave local optima by kicks: exchange `size` random members for random candidates, exchange again, keep the better.
+
+    Iterated local search (Lourenço, Martin & Stützle 2003). Newcomers are drawn by their relaxed weights where known;
+    size and law are our choice.
+
+    Args:
+        pool: candidates.
+        design: start.
+        rounds: kicks.
+        seed: of the draws.
+        report: called with every improved design.
+        size: members replaced by one kick.
+        weights: (N,) relaxed weights, None for equal ones.
+    """
+    generator = np.random.default_rng(seed)
+    m, count = len(design.members), len(pool.z)
+    share = np.full(count, 1.0) if weights is None else weights + 1e-3 * m / count
+    size = min(size, m, count - m)
+    for _ in range(rounds if size > 0 else 0):
+        leaving = set(generator.choice(design.members, size, replace=False).tolist())
+        free = np.flatnonzero(~design.taken)
+        coming = generator.choice(free, size, replace=False, p=share[free] / share[free].sum())
+        members = [k for k in design.members if k not in leaving] + coming.tolist()
+        trial = exchanged(pool, design_of(pool, tuple(members)))
+        if trial.logdet > design.logdet + TOLERANCE:
+            design = trial
+            if report:
+                report(design)
     return design
 
 

@@ -63,7 +63,7 @@ def gradient(W: ArrayLike, index: Index = "O1", m: int | None = None) -> tuple[f
     stacked, poses = _stacked(W, index, m)
     u, s, vt = np.linalg.svd(stacked, full_matrices=False)
     value = float(index_of_singular_values(s, index, poses))
-    return value, ((u * (value * _log_slope(s, index))) @ vt).reshape(np.shape(W))
+    return value, ((u * (value * log_slope(s, index))) @ vt).reshape(np.shape(W))
 
 
 def merit(W: np.ndarray, index: Index) -> tuple[float, np.ndarray]:
@@ -80,7 +80,7 @@ def merit(W: np.ndarray, index: Index) -> tuple[float, np.ndarray]:
         return -np.inf, np.zeros_like(W)
     sign = -1.0 if index == "cond" else 1.0
     value = sign * float(np.log(index_of_singular_values(s, index, 1)))
-    return value, (u * (sign * _log_slope(s, index))) @ vt
+    return value, (u * (sign * log_slope(s, index))) @ vt
 
 
 def index_of_singular_values(s: np.ndarray, index: Index, m: int) -> np.ndarray:
@@ -115,7 +115,7 @@ def is_better(value: float, than: float, index: Index) -> bool:
     return value < than if index == "cond" else value > than
 
 
-def _log_slope(s: np.ndarray, index: Index) -> np.ndarray:
+def log_slope(s: np.ndarray, index: Index) -> np.ndarray:
     """Return ∂ log O / ∂s (p,)."""
     slope = np.zeros_like(s)
     if index == "O1":
@@ -136,7 +136,9 @@ def _stacked(W: ArrayLike, index: Index, m: int | None) -> tuple[np.ndarray, int
     if array.ndim not in (2, 3) or not array.size:
         raise BadInput(f"W: expected (m, rows, p) or (m rows, p), found {array.shape}")
     if not np.isfinite(array).all():
-        raise BadInput("W holds values that are not finite; look for poses outside the model's domain or failed divisions")
+        raise BadInput(
+            "W holds values that are not finite; look for poses outside the model's domain or failed divisions"
+        )
     if array.ndim == 2 and m is None and index == "O1":
         raise BadInput("O1 of a stacked W needs the number of poses: give m, or W as (m, rows, p)")
     poses = m if m is not None else len(array)

@@ -1,0 +1,61 @@
+"""Candidates: low-discrepancy poses within limits that keep every constraint and predicate."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.stats import qmc
+
+from poses.errors import BadInput, NothingFeasible
+
+
+def draw_candidates(
+    lower: ArrayLike,
+    upper: ArrayLike,
+    count: int,
+    feasible: Callable[[np.ndarray], np.ndarray] | None = None,
+    *,
+    seed: int | np.random.Generator = 0,
+    most: int | None = None,
+    block: int = 2048,
+) -> np.ndarray:
+    """Draw feasible poses from a scrambled Sobol sequence (Sobol 1967; Owen 1998), block by block.
+
+    Args:
+        lower, upper: (n,) joint limits [rad or m].
+        count: feasible poses wanted, N.
+        feasible: predicate (m, n) -> (m,) bool; None accepts all.
+        seed: integer or generator; the same seed gives the same poses.
+        most: poses drawn at most; default 200 N, at least 100 000.
+        block: poses per call of the predicate.
+
+    Returns:
+        (N, n) joint values, in the order of the sequence.
+
+    Raises:
+        NothingFeasible: where `most` draws hold fewer than N feasible poses; the message gives their share.
+    """
+    low, high = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
+    if low.ndim != 1 or low.shape != high.shape or not (low < high).all():
+        raise BadInput(f"limits: expected two (n,) arrays with lower < upper, found {low} and {high}")
+    if count < 1:
+        raise BadInput(f"count = {count}: ask for at least one candidate")
+    most = max(200 * count, 100_000) if most is None else most
+    block = 1 << max(int(block - 1).bit_length(), 0)  # Sobol points keep their balance in powers of two
+    sequence = qmc.Sobol(len(low), scramble=True, rng=np.random.default_rng(seed))
+    kept, found, drawn = list[np.ndarray](), 0, 0
+    while found < count and drawn < most:
+        q = low + (high - low) * sequence.random(block)
+        drawn += block
+        kept.append(q if feasible is None else q[np.asarray(feasible(q), dtype=bool)])
+        found += len(kept[-1])
+    if found < count:
+        raise NothingFeasible(
+            f"{found} of {drawn} drawn poses are feasible ({100 * found / drawn:.3g} %), {count} were wanted: loosen the "
+            "narrowest constraint, check the frames it is written in, draw more, or ask for fewer candidates",
+            found,
+            drawn,
+        )
+    return np.concatenate(kept)[:count]

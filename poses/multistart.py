@@ -1,0 +1,66 @@
+"""Multistart: the local search from several sets of feasible candidates, on as many cores as `map` brings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+
+from poses.indices import Index
+from poses.local import Improved, improved
+from poses.space import SearchSpace
+
+
+def random_starts(q: np.ndarray, m: int, count: int, seed: int) -> list[np.ndarray]:
+    """Return `count` random sets of m out of the candidates q (N, n), each from its own child of the seed."""
+    return [q[g.choice(len(q), m, replace=False)] for g in np.random.default_rng(seed).spawn(count)]
+
+
+def multistart(
+    space: SearchSpace,
+    starts: Sequence[np.ndarray],
+    index: Index = "O1",
+    existing: np.ndarray | None = None,
+    *,
+    evaluations: int = 300,
+    map: Callable = map,
+    report: Callable[[int, Improved], None] | None = None,
+) -> Improved:
+    """Run the local search from every start and return the best result (ties: the first).
+
+    Args:
+        space: limits, constraints, Jacobian; must pickle where `map` runs in other processes.
+        starts: sets (m, n) [rad or m].
+        index: what to improve.
+        existing: (k, rows, p) Jacobians of poses already measured.
+        evaluations: most evaluations per start.
+        map: the builtin, or one that spreads the work; results in order.
+        report: called after each start with its number and result.
+    """
+    best, spent, history, interrupted = None, 0, list[float](), False
+    work = partial(_one, space, index, existing, evaluations)
+    try:
+        for number, run in enumerate(map(work, starts)):
+            spent += run.evaluations
+            if best is None or run.merit > best.merit:
+                best = run
+            history.append(best.merit)
+            interrupted |= run.interrupted
+            if report:
+                report(number, run)
+            if run.interrupted:
+                break
+    except KeyboardInterrupt:
+        if best is None:
+            raise
+        interrupted = True
+    if best is None:
+        raise ValueError("multistart needs at least one start")
+    return Improved(best.q, best.merit, tuple(history), spent, interrupted)
+
+
+def _one(
+    space: SearchSpace, index: Index, existing: np.ndarray | None, evaluations: int, start: np.ndarray
+) -> Improved:
+    return improved(space, start, index, existing, evaluations=evaluations)

@@ -1,0 +1,329 @@
+"""One verb for every way of choosing poses, and what it returns."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from poses.by_index import exchanged_by_index, merits
+from poses.candidates import draw_candidates
+from poses.convex import Bound, relaxed
+from poses.design import Design, Pool, design_of
+from poses.errors import BadInput, NotIdentifiable
+from poses.exchange import detmax, exchanged, greedy, kicked
+from poses.indices import Index, merit, observability
+from poses.information import Candidates, checked, log_det, prepared
+from poses.local import Improved, improved
+from poses.multistart import multistart, random_starts
+from poses.space import SearchSpace, is_feasible
+from poses.tabu import TabuRule, tabu
+
+Method = Literal["detmax", "local", "multistart", "tabu"]
+Progress = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Chosen poses and how good they are.
+
+    Attributes:
+        q: (m, n) joint values [rad or m]; None where candidates came without joint values.
+        indices: (m,) into the candidates, rising; None for methods that leave the candidates.
+        index: name of the index the search improved.
+        value: that index of the chosen poses together with the poses measured before (m counts both).
+        history: values of the index as the search improved it; the last is `value`.
+        efficiency: det(WᵀW)^(1/p) over the certified bound of the *candidates*. At most 1 for detmax; methods that
+            leave the candidates may exceed 1.
+        bound: the convex relaxation with its certificate.
+        random_baseline: best value of the index among 1000 random sets of the candidates.
+        seconds: wall-clock time, bound and baseline included.
+        evaluations: designs accepted (detmax) or evaluations of the index (the others).
+        seed, method: what reproduces it.
+        interrupted: True after Ctrl-C: the best found until then.
+    """
+
+    q: np.ndarray | None
+    indices: np.ndarray | None
+    index: Index
+    value: float
+    history: np.ndarray
+    efficiency: float
+    bound: Bound
+    random_baseline: float
+    seconds: float
+    evaluations: int
+    seed: int
+    method: Method
+    interrupted: bool = False
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """What a method hands back: members or joint values, merits on the way, work done."""
+
+    members: tuple[int, ...] | None
+    q: np.ndarray | None
+    merits: tuple[float, ...]
+    evaluations: int
+    interrupted: bool
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What every method needs: the candidates, their relaxation, and the request."""
+
+    jacobians: np.ndarray
+    q: np.ndarray | None
+    candidates: Candidates
+    bound: Bound
+    m: int
+    index: Index
+    seed: int
+    before: np.ndarray | None
+    space: SearchSpace | None
+    progress: Progress
+
+
+def select(
+    jacobians: ArrayLike | None,
+    m: int,
+    *,
+    q: ArrayLike | None = None,
+    space: SearchSpace | None = None,
+    index: Index = "O1",
+    method: Method = "detmax",
+    existing: ArrayLike | None = None,
+    count: int = 2000,
+    seed: int = 0,
+    kicks: int = 10,
+    starts: int = 8,
+    evaluations: int = 300,
+    rule: TabuRule = TabuRule(),  # noqa: B008 (frozen)
+    map: Callable = map,
+    progress: Progress | None = None,
+) -> Selection:
+    """Select m poses that make the parameters as observable as possible.
+
+    * ``detmax`` chooses among the candidates: rounded relaxation and greedy start, pair exchange, DETMAX excursions,
+      kicks (`poses.exchange`); other indices than O1 go on from there by `poses.by_index`.
+    * ``local`` moves all joint values of the detmax set at once (`poses.local`).
+    * ``multistart`` does that from the detmax set and `starts` − 1 random sets (`poses.multistart`).
+    * ``tabu`` is IMHATR, the two-stage meta-heuristic (`poses.tabu`).
+
+    O1 is the default because its ranking of sets does not depend on the units of the parameters.
+
+    Args:
+        jacobians: (N, rows, p) whitened observation Jacobians of the candidates in base columns; None takes them at q,
+            or at `count` feasible Sobol poses of the space where q is None too.
+        m: number of poses to choose; none is taken twice by detmax.
+        q: (N, n) joint values of the candidates [rad or m].
+        space: needed by local, multistart and tabu.
+        index: "O1" ... "O5", "cond".
+        method: see above.
+        existing: (k, rows, p) whitened Jacobians of poses already measured; their information counts.
+        count: candidates to draw where none are given.
+        seed: of every random draw; the same seed gives the same selection.
+        kicks: random restarts of detmax around its best set.
+        starts: sets of multistart.
+        evaluations: most evaluations of one local search.
+        rule: numbers of the tabu search.
+        map: where multistart spreads its starts.
+        progress: called with (done, total, message).
+
+    Raises:
+        BadInput, TooFewCandidates, NothingFeasible, NotIdentifiable
+    """
+    began = time.perf_counter()
+    if method not in get_args(Method):
+        raise BadInput(f"method '{method}' is not known; take one of {', '.join(get_args(Method))}")
+    if method != "detmax" and space is None:
+        raise BadInput(f"method '{method}' leaves the candidates: give space, with limits and a Jacobian")
+    array, joints = _candidates(jacobians, q, space, count, seed)
+    before = None if existing is None else checked(existing, "existing")
+    report = progress or (lambda done, total, message: None)
+    report(0, 1, "convex bound")
+    candidates = prepared(array, m, before)
+    task = _Task(array, joints, candidates, relaxed(candidates, m), m, index, seed, before, space, report)
+    baseline = random_baseline(array, m, index, before, seed=seed)
+    if method == "tabu":
+        chosen = _tabu(task, rule)
+    else:
+        chosen = _exchange(task, kicks)
+        if method != "detmax" and not chosen.interrupted:
+            chosen = _continuous(task, chosen, starts if method == "multistart" else 1, evaluations, map)
+    return _selection(task, chosen, method, baseline, began)
+
+
+def random_baseline(
+    jacobians: np.ndarray, m: int, index: Index = "O1", existing: np.ndarray | None = None, *, seed: int = 0, sets=1000
+) -> float:
+    """Return the best index among random sets of m candidates: what choosing without thought would reach.
+
+    Args:
+        jacobians: (N, rows, p) candidates.
+        m: poses per set.
+        index: "O1" ... "O5", "cond".
+        existing: (k, rows, p) Jacobians that count in every set.
+        seed, sets: of the draw.
+    """
+    generator = np.random.default_rng(seed)
+    count, _, p = jacobians.shape
+    known = np.zeros((p, p)) if existing is None else existing.reshape(-1, p).T @ existing.reshape(-1, p)
+    best, best_set = -np.inf, np.arange(m)
+    chunk = max(1, 2_000_000 // (m * jacobians.shape[1] * p))
+    for first in range(0, sets, chunk):
+        drawn = np.array([generator.choice(count, m, replace=False) for _ in range(min(chunk, sets - first))])
+        rows = jacobians[drawn].reshape(len(drawn), -1, p)
+        matrices = known + rows.transpose(0, 2, 1) @ rows
+        values = log_det(matrices) if index == "O1" else merits(matrices, index)
+        if values.max() > best:
+            best, best_set = float(values.max()), drawn[values.argmax()]
+    return _value(jacobians[best_set], existing, index)
+
+
+def _candidates(
+    jacobians: ArrayLike | None, q: ArrayLike | None, space: SearchSpace | None, count: int, seed: int
+) -> tuple[np.ndarray, np.ndarray | None]:
+    joints = None if q is None else np.asarray(q, dtype=float)
+    if jacobians is None:
+        if space is None:
+            raise BadInput("no candidates: give jacobians, or a space to take them from")
+        if joints is None:
+            joints = draw_candidates(space.lower, space.upper, count, lambda x: is_feasible(space, x), seed=seed)
+        jacobians = space.jacobian(joints)
+    array = checked(jacobians)
+    if joints is not None and (joints.ndim != 2 or len(joints) != len(array)):
+        raise BadInput(f"q: expected ({len(array)}, n) joint values for {len(array)} candidates, found {joints.shape}")
+    return array, joints
+
+
+def _exchange(task: _Task, kicks: int) -> _Chosen:
+    """Choose among the candidates; after Ctrl-C return the best so far."""
+    candidates, m, p = task.candidates, task.m, task.jacobians.shape[2]
+    whole = Pool(candidates.z, candidates.known)
+    # Candidates of small score at the relaxed optimum are hardly ever chosen: search the promising ones (1000 at least,
+    # our choice), and polish among all at the end.
+    short = np.sort(np.argsort(-task.bound.scores, kind="stable")[: max(1000, 15 * m)])
+    pool, weights = Pool(candidates.z[short], candidates.known), task.bound.weights[short]
+    best: list[tuple[tuple[int, ...], float]] = []
+
+    def keep(design: Design, where: np.ndarray = short) -> None:
+        if not best or design.logdet > best[-1][1]:
+            best.append((tuple(int(where[i]) for i in design.members), design.logdet))
+
+    def stage(number: int, message: str) -> None:
+        task.progress(number, 5, message)
+
+    interrupted = False
+    try:
+        stage(1, "exchange from the rounded relaxation")
+        rounded = design_of(pool, tuple(int(i) for i in np.argsort(-weights, kind="stable")[:m]))
+        keep(rounded)
+        designs = [exchanged(pool, rounded, keep)]
+        stage(2, "greedy start and exchange")
+        designs.append(exchanged(pool, greedy(pool, m), keep))
+        stage(3, "DETMAX excursions and kicks")
+        design = detmax(pool, max(designs, key=lambda d: d.logdet), keep)
+        design = kicked(pool, design, kicks, task.seed, keep, weights=weights)
+        keep(design)
+        stage(4, "exchange among all candidates")
+        polished = exchanged(whole, design_of(whole, best[-1][0]), lambda d: keep(d, np.arange(len(candidates.z))))
+        keep(polished, np.arange(len(candidates.z)))
+    except KeyboardInterrupt:
+        if not best:
+            raise
+        interrupted = True
+    rising = tuple((logdet + candidates.shift) / (2 * p) for _, logdet in best)
+    chosen = _Chosen(best[-1][0], None, rising, len(best), interrupted)
+    if task.index != "O1" and not interrupted:
+        chosen = _by_index(task, chosen.members or ())
+    stage(5, "done")
+    return chosen
+
+
+def _by_index(task: _Task, members: tuple[int, ...]) -> _Chosen:
+    """Go on from the D-optimal set by exchanges for another index."""
+    p = task.jacobians.shape[2]
+    past = np.zeros((0, p)) if task.before is None else task.before.reshape(-1, p)
+    known = past.T @ past
+    rows = np.concatenate([past, task.jacobians[list(members)].reshape(-1, p)])
+    best = [(members, merit(rows, task.index)[0])]
+    interrupted = False
+    try:
+        exchanged_by_index(task.jacobians, known, members, task.index, lambda found, value: best.append((found, value)))
+    except KeyboardInterrupt:
+        interrupted = True
+    return _Chosen(best[-1][0], None, tuple(value for _, value in best), len(best), interrupted)
+
+
+def _continuous(task: _Task, chosen: _Chosen, starts: int, evaluations: int, map: Callable) -> _Chosen:
+    """Improve the exchanged set, and random ones beside it, over all joint values."""
+    space, joints = task.space, task.q
+    if space is None or joints is None:
+        raise BadInput("local and multistart move joint values: give q with jacobians, or leave jacobians out")
+    sets = [joints[sorted(chosen.members or ())], *random_starts(joints, task.m, starts - 1, task.seed)]
+    if starts == 1:
+        run = improved(space, sets[0], task.index, task.before, evaluations=evaluations)
+    else:
+        done = [0]
+
+        def report(number: int, _: Improved) -> None:
+            done[0] = number + 1
+            task.progress(number + 1, starts, "local searches")
+
+        run = multistart(space, sets, task.index, task.before, evaluations=evaluations, map=map, report=report)
+    return _of(run)
+
+
+def _tabu(task: _Task, rule: TabuRule) -> _Chosen:
+    if task.space is None:
+        raise BadInput("tabu draws its own poses: give space")
+
+    def report(chosen: int, _: float) -> None:
+        task.progress(chosen, task.m, "poses constructed")
+
+    return _of(tabu(task.space, task.m, task.index, task.before, seed=task.seed, rule=rule, report=report))
+
+
+def _of(run: Improved) -> _Chosen:
+    return _Chosen(None, run.q, run.history, run.evaluations, run.interrupted)
+
+
+def _selection(task: _Task, chosen: _Chosen, method: Method, baseline: float, began: float) -> Selection:
+    indices = None
+    if chosen.members is not None:
+        indices = np.array(sorted(chosen.members))
+        jacobians, q = task.jacobians[indices], None if task.q is None else task.q[indices]
+    else:
+        q = chosen.q
+        jacobians = np.asarray(task.space.jacobian(q), dtype=float) if task.space else task.jacobians[:0]
+    value = _value(jacobians, task.before, task.index)
+    if not value > 0 or not np.isfinite(value):
+        raise NotIdentifiable(
+            f"no set of {task.m} poses of full rank was found, though all candidates together have it: ask for more poses"
+        )
+    poses = task.m + (0 if task.before is None else len(task.before))
+    p = jacobians.shape[2]
+    o1 = _value(jacobians, task.before, "O1")
+    efficiency = o1**2 * poses / task.bound.upper
+    history = np.exp(np.array(chosen.merits) * (-1.0 if task.index == "cond" else 1.0))
+    history = history / np.sqrt(poses) if task.index == "O1" else history
+    history = np.append(history[:-1], value)
+    out = Selection(
+        q, indices, task.index, value, history, efficiency, task.bound, baseline, 0.0, chosen.evaluations, task.seed,
+        method, chosen.interrupted,
+    )  # fmt: skip
+    return replace(out, seconds=time.perf_counter() - began)
+
+
+def _value(jacobians: np.ndarray, existing: np.ndarray | None, index: Index) -> float:
+    """Return an index of chosen Jacobians together with those measured before."""
+    p = jacobians.shape[2]
+    poses = len(jacobians) + (0 if existing is None else len(existing))
+    past = np.zeros((0, p)) if existing is None else existing.reshape(-1, p)
+    return observability(np.concatenate([jacobians.reshape(-1, p), past]), index, poses)

@@ -1,0 +1,94 @@
+"""Where poses may lie when a search leaves the candidates: limits, constraints, predicate, and the Jacobian there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from poses.errors import BadInput
+
+STEP = 1e-5
+"""Step of central differences [rad or m]: our choice; error about 1e-10 of the values, both of truncation and rounding."""
+
+
+@dataclass(frozen=True)
+class Constraint:
+    """Inequalities a pose must keep.
+
+    Attributes:
+        name: what a message calls it.
+        function: (m, n) -> (m, k), feasible where ≤ 0; a pose's values depend on that pose only.
+        gradient: (m, n) -> (m, k, n); None takes central differences of `function` in one batch.
+    """
+
+    name: str
+    function: Callable[[np.ndarray], np.ndarray]
+    gradient: Callable[[np.ndarray], np.ndarray] | None = None
+
+
+@dataclass(frozen=True)
+class SearchSpace:
+    """The continuous problem.
+
+    Attributes:
+        jacobian: (m, n) -> (m, rows, p) whitened observation Jacobians in base columns.
+        lower, upper: (n,) joint limits [rad or m].
+        jacobian_product: (q: (m, n), G: (m, rows, p)) -> (m, n), Σ_rp G[i,r,p] ∂J[i,r,p]/∂q[i,k]; None takes central
+            differences of `jacobian` in one batch of 2 m n poses.
+        constraints: inequalities kept by the searches and by the candidates.
+        feasible: (m, n) -> (m,) bool, what has no gradient (collision, visibility by ray casting).
+    """
+
+    jacobian: Callable[[np.ndarray], np.ndarray]
+    lower: np.ndarray
+    upper: np.ndarray
+    jacobian_product: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
+    constraints: tuple[Constraint, ...] = ()
+    feasible: Callable[[np.ndarray], np.ndarray] | None = None
+
+    def __post_init__(self):
+        lower, upper = np.asarray(self.lower, dtype=float), np.asarray(self.upper, dtype=float)
+        if lower.ndim != 1 or lower.shape != upper.shape or not np.isfinite([lower, upper]).all():
+            raise BadInput(f"limits: expected two finite (n,) arrays, found shapes {lower.shape} and {upper.shape}")
+        if not (lower < upper).all():
+            joint = int(np.argmax(lower >= upper))
+            raise BadInput(f"limits of joint {joint}: lower {lower[joint]} is not below upper {upper[joint]}")
+        object.__setattr__(self, "lower", lower)
+        object.__setattr__(self, "upper", upper)
+
+
+def is_feasible(space: SearchSpace, q: np.ndarray, tolerance: float = 1e-8) -> np.ndarray:
+    """Return whether each pose (m, n) keeps limits, constraints and predicate (m,)."""
+    good = ((q >= space.lower - tolerance) & (q <= space.upper + tolerance)).all(1)
+    for constraint in space.constraints:
+        if good.any():
+            good[good] = (np.asarray(constraint.function(q[good])) <= tolerance).all(1)
+    if space.feasible is not None and good.any():
+        good[good] = np.asarray(space.feasible(q[good]), dtype=bool)
+    return good
+
+
+def product(space: SearchSpace, q: np.ndarray, G: np.ndarray) -> np.ndarray:
+    """Return Σ_rp G[i,r,p] ∂J[i,r,p]/∂q[i,k] (m, n): exact where the space knows it, else central differences."""
+    if space.jacobian_product is not None:
+        return np.asarray(space.jacobian_product(q, G), dtype=float)
+    return np.einsum("mrp,mkrp->mk", G, central_difference(space.jacobian, q))
+
+
+def constraint_gradient(constraint: Constraint, q: np.ndarray) -> np.ndarray:
+    """Return ∂c/∂q (m, k, n)."""
+    if constraint.gradient is not None:
+        return np.asarray(constraint.gradient(q), dtype=float)
+    return central_difference(constraint.function, q).transpose(0, 2, 1)
+
+
+def central_difference(function: Callable[[np.ndarray], np.ndarray], q: np.ndarray) -> np.ndarray:
+    """Return ∂f_i/∂q_ik (m, n, ...) of a function (m, n) -> (m, ...) that treats every pose by itself, in one batch."""
+    m, n = q.shape
+    steps = STEP * np.eye(n)
+    both = np.concatenate([q[:, None] + steps, q[:, None] - steps], axis=1).reshape(-1, n)
+    values = np.asarray(function(both), dtype=float)
+    values = values.reshape(m, 2, n, *values.shape[1:])
+    return (values[:, 0] - values[:, 1]) / (2 * STEP)

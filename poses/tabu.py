@@ -1,0 +1,170 @@
+"""IMHATR: the iterative meta-heuristic with a tabu rule, in two stages.
+
+The LWR4+ study names it after its reference [8] (most likely Daney, Papegay & Madeline, IJRR 24(6), 2005: poses chosen
+one after another, a tabu list against local minima) and gives no details. This is our reconstruction, and all numbers
+are ours:
+
+1. *Construct.* Until there are m poses: draw N_c random feasible poses outside the tabu list, take the best to add,
+   improve that one pose by local search with the others fixed, add it; start and end become tabu.
+2. *Exchange.* Drop the pose whose removal hurts least, look for its replacement as in stage 1, keep it where the index
+   improves; visited and rejected poses become tabu (first in, first out). After `patience` failures in a row, stop. A
+   pose whose replacement failed is spared until something else improves, so that every pose has its turn.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from poses.candidates import draw_candidates
+from poses.indices import Index, merit
+from poses.local import Improved, improved
+from poses.space import SearchSpace, is_feasible
+
+
+@dataclass(frozen=True)
+class TabuRule:
+    """Numbers of the tabu search, all ours.
+
+    Attributes:
+        candidates: N_c, random poses per addition.
+        radius: a pose is tabu within this largest joint difference of a listed one [rad or m].
+        length: of the list.
+        patience: failures in a row to stop after, as a multiple of m.
+        evaluations: most evaluations of one pose's local search.
+    """
+
+    candidates: int = 100
+    radius: float = 0.15
+    length: int = 100
+    patience: float = 2.0
+    evaluations: int = 40
+
+
+def tabu(
+    space: SearchSpace,
+    m: int,
+    index: Index = "O1",
+    existing: np.ndarray | None = None,
+    *,
+    seed: int = 0,
+    rule: TabuRule = TabuRule(),  # noqa: B008 (frozen)
+    report: Callable[[int, float], None] | None = None,
+) -> Improved:
+    """Choose m poses by IMHATR; see the head of this module.
+
+    Args:
+        space: limits, constraints, predicate, Jacobian.
+        m: number of poses.
+        index: what to improve.
+        existing: (k, rows, p) Jacobians of poses already measured.
+        seed: of all draws.
+        rule: its numbers.
+        report: called after every step with the poses chosen so far and the merit.
+    """
+    generator = np.random.default_rng(seed)
+    listed: deque[np.ndarray] = deque(maxlen=rule.length)
+    chosen, history, spent, interrupted = list[np.ndarray](), list[float](), 0, False
+    try:
+        while len(chosen) < m:
+            pose, evaluations = _newcomer(space, chosen, index, existing, generator, listed, rule)
+            chosen.append(pose)
+            spent += evaluations
+            history.append(_merit(space, np.array(chosen), index, existing))
+            if report:
+                report(len(chosen), history[-1])
+        spared, failures = set[int](), 0
+        while failures < rule.patience * m:
+            out = _least_useful(space, np.array(chosen), index, existing, spared)
+            rest = chosen[:out] + chosen[out + 1 :]
+            pose, evaluations = _newcomer(space, rest, index, existing, generator, listed, rule)
+            spent += evaluations
+            value = _merit(space, np.array([*rest, pose]), index, existing)
+            if value > history[-1] + 1e-9:
+                chosen[out], spared, failures = pose, set[int](), 0
+                history.append(value)
+                if report:
+                    report(m, value)
+            else:
+                failures += 1
+                spared = {out} if len(spared) + 1 >= m else spared | {out}
+    except KeyboardInterrupt:
+        if len(chosen) < m:
+            raise
+        interrupted = True
+    return Improved(np.array(chosen), history[-1], tuple(history[m - 1 :]), spent, interrupted)
+
+
+def _newcomer(
+    space: SearchSpace,
+    others: list[np.ndarray],
+    index: Index,
+    existing: np.ndarray | None,
+    generator: np.random.Generator,
+    listed: deque[np.ndarray],
+    rule: TabuRule,
+) -> tuple[np.ndarray, int]:
+    """Return a pose to add to `others`, improved by itself, and the evaluations spent; puts start and end on the list."""
+
+    def allowed(q: np.ndarray) -> np.ndarray:
+        good = is_feasible(space, q)
+        if listed:
+            good &= (np.abs(q[:, None] - np.array(listed)).max(2) > rule.radius).all(1)
+        return good
+
+    draws = draw_candidates(space.lower, space.upper, rule.candidates, allowed, seed=generator, block=256)
+    fixed = _fixed(space, others, existing)
+    jacobians = np.asarray(space.jacobian(draws), dtype=float)
+    rows = fixed.reshape(-1, jacobians.shape[2]) if fixed is not None else np.zeros((0, jacobians.shape[2]))
+    full = len(rows) + jacobians.shape[1] >= jacobians.shape[2]
+    values = np.array([merit(np.concatenate([rows, j]), index)[0] for j in jacobians]) if full else np.array([-np.inf])
+    if not np.isfinite(values).any():  # not of full rank yet: what spans most, by a slightly regular determinant
+        pose = draws[int(_spanning(rows, jacobians).argmax())]
+        listed.append(pose)
+        return pose, len(draws)
+    start = draws[int(values.argmax())]
+    run = improved(space, start[None], index, fixed, evaluations=rule.evaluations, tolerance=1e-4)
+    if run.interrupted:
+        raise KeyboardInterrupt
+    listed.extend([start, run.q[0]])
+    return run.q[0], len(draws) + run.evaluations
+
+
+def _spanning(rows: np.ndarray, jacobians: np.ndarray) -> np.ndarray:
+    """Return log det(εI + information) of rows with each Jacobian (K,), columns scaled by their size over the draws."""
+    scale = np.sqrt((jacobians**2).mean((0, 1)))
+    scale = np.where(scale > 0, scale, 1.0)
+    z, known = jacobians / scale, rows / scale
+    matrix = known.T @ known + 1e-6 * np.eye(len(scale))
+    return np.linalg.slogdet(matrix + z.transpose(0, 2, 1) @ z)[1]
+
+
+def _least_useful(
+    space: SearchSpace, q: np.ndarray, index: Index, existing: np.ndarray | None, spared: set[int]
+) -> int:
+    """Return the pose whose removal leaves the largest merit, among those not spared."""
+    jacobians = np.asarray(space.jacobian(q), dtype=float)
+    before = np.zeros((0, jacobians.shape[2])) if existing is None else existing.reshape(-1, jacobians.shape[2])
+    left = np.full(len(q), -np.inf)
+    open_ = [i for i in range(len(q)) if i not in spared]
+    for i in open_:
+        kept = np.delete(jacobians, i, axis=0).reshape(-1, jacobians.shape[2])
+        left[i] = merit(np.concatenate([before, kept]), index)[0]
+    return open_[int(left[open_].argmax())]
+
+
+def _fixed(space: SearchSpace, others: list[np.ndarray], existing: np.ndarray | None) -> np.ndarray | None:
+    """Return the rows (R, p) of the other poses and of those measured before."""
+    if not others:
+        return existing
+    jacobians = np.asarray(space.jacobian(np.array(others)), dtype=float)
+    rows = jacobians.reshape(-1, jacobians.shape[2])
+    return rows if existing is None else np.concatenate([rows, existing.reshape(-1, rows.shape[1])])
+
+
+def _merit(space: SearchSpace, q: np.ndarray, index: Index, existing: np.ndarray | None) -> float:
+    rows = _fixed(space, list(q), existing)
+    return merit(rows, index)[0] if rows is not None else -np.inf
