@@ -161,14 +161,18 @@ class Chain:
             if unknown:
                 raise RobotError(f"robot '{self.name}' has no element '{sorted(unknown)[0]}'")
             values = np.array([values.get(element.name, element.value) for element in self.elements])
-        elements = tuple(replace(element, value=float(value)) for element, value in zip(self.elements, values, strict=True))
+        elements = tuple(
+            replace(element, value=float(value)) for element, value in zip(self.elements, values, strict=True)
+        )
         return replace(self, elements=elements)
 
 
 def sampling_limits(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
     """Return finite lower and upper joint limits (n,), ±π or ±1 m standing in where a joint has none."""
     reach = np.array([np.pi if joint.kind == "revolute" else 1.0 for joint in chain.joints])
-    return np.where(np.isfinite(chain.lower), chain.lower, -reach), np.where(np.isfinite(chain.upper), chain.upper, reach)
+    return np.where(np.isfinite(chain.lower), chain.lower, -reach), np.where(
+        np.isfinite(chain.upper), chain.upper, reach
+    )
 
 
 def random_joints(chain: Chain, count: int, seed: int | np.random.Generator = 0) -> np.ndarray:

@@ -43,7 +43,7 @@ from calib import files
 from calib.errors import RobotError
 from calib.robot import mdh
 from calib.robot.chain import GRAVITY, Chain, Element, Joint
-from calib.robot.tables import check_keys, dumps, load, number, placement, placement_table, vector
+from calib.robot.tables import check_keys, dumps, load, number, placement, placement_table, vector, word
 
 EXTRA = ("station", "tool", "deflection", "truth", "provenance")
 _TOP = ("name", "base", "tip", "gravity", "source", "joint", "element", "tail")
@@ -104,21 +104,21 @@ def _from_elements(table: Mapping[str, Any], where: str) -> Chain:
         place = f"{where}, [[joint]] number {index + 1}"
         check_keys(entry, _JOINT, place)
         limits = {key: number(entry[key], f"{place}, {key}") for key in _LIMITS if key in entry}
-        joints.append(Joint(str(_need(entry, "name", place)), entry.get("kind", "revolute"), **limits))
+        joints.append(Joint(word(entry, "name", place), word(entry, "kind", place, "revolute"), **limits))
         inertias.append(vector(entry["inertia"], 10, f"{place}, inertia") if "inertia" in entry else None)
-        links.append(entry.get("link"))
+        links.append(word(entry, "link", place) if "link" in entry else None)
     if any(entry is None for entry in inertias) != all(entry is None for entry in inertias):
         raise RobotError(f"{where}: some joints have an inertia and some have none")
     entries = _tables(table, "element", where)
     return Chain(
-        name=str(_need(table, "name", where)),
+        name=word(table, "name", where),
         joints=tuple(joints),
         elements=tuple(
             _element(entry, len(joints), f"{where}, [[element]] number {index + 1}")
             for index, entry in enumerate(entries)
         ),
-        base=table.get("base", "base"),
-        tip=table.get("tip", "tip"),
+        base=word(table, "base", where, "base"),
+        tip=word(table, "tip", where, "tip"),
         tail=placement(table["tail"], f"{where}, [tail]") if "tail" in table else np.eye(4),
         inertias=None if inertias[0] is None else np.array(inertias),
         gravity=vector(table.get("gravity", list(GRAVITY)), 3, f"{where}, gravity"),
@@ -128,13 +128,13 @@ def _from_elements(table: Mapping[str, Any], where: str) -> Chain:
 
 def _element(entry: Mapping[str, Any], n: int, where: str) -> Element:
     check_keys(entry, _ELEMENT, where)
-    name = str(_need(entry, "name", where))
+    name = word(entry, "name", where)
     where = f"{where} ('{name}')"
     for key, most in (("owner", n), ("joint", n - 1)):
         value = entry.get(key, 0)
         if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= most:
             raise RobotError(f"{where}: {key} {value!r} is not a whole number from 0 to {most}")
-    axis = str(_need(entry, "axis", where))
+    axis = word(entry, "axis", where)
     sign = number(entry.get("sign", 1.0), f"{where}, sign")
     if abs(sign) != 1.0:
         raise RobotError(f"{where}: sign {sign:g} is neither 1 nor -1")
@@ -180,9 +180,3 @@ def _tables(table: Mapping[str, Any], key: str, where: str) -> list[Mapping[str,
     if not isinstance(found, list) or not found or not all(isinstance(entry, Mapping) for entry in found):
         raise RobotError(f"{where}: no [[{key}]] tables found")
     return found
-
-
-def _need(table: Mapping[str, Any], key: str, where: str) -> Any:
-    if key not in table:
-        raise RobotError(f"{where}: '{key}' is missing")
-    return table[key]

@@ -98,7 +98,8 @@ def element_jacobian(chain: Chain, walked: Sweep, point: np.ndarray, index: np.n
         index: which elements; None for all K.
 
     Returns:
-        (K, 6, m), or as many as `index` names: linear velocity of the point, then angular velocity, both in the reference frame.
+        (K, 6, m), or as many as `index` names: linear velocity of the point, then angular velocity, both in the
+        reference frame.
     """
     angular = np.array([element.axis[0] == "r" for element in chain.elements])
     z, origins = walked.directions, walked.origins

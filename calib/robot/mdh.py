@@ -51,7 +51,7 @@ import numpy as np
 
 from calib.errors import RobotError
 from calib.robot.chain import GRAVITY, Chain, Element, Joint
-from calib.robot.tables import check_keys, load, number, placement, placement_table, spelled, vector
+from calib.robot.tables import check_keys, load, number, placement, placement_table, spelled, vector, word
 
 PARALLEL = 0.05
 AXES = {"alpha": "rx", "d": "tx", "beta": "ry", "r": "tz", "theta": "rz"}
@@ -105,10 +105,10 @@ def from_table(table: Mapping[str, Any], where: str, propose_beta: bool = True) 
     for position, entry in enumerate(table["joint"]):
         rows.append(_row(entry, rows[-1].index + 1 if rows else 1, f"{where}, [[joint]] number {position + 1}"))
     return chain(
-        _text(table, "name", where),
+        word(table, "name", where),
         rows,
-        base=_text(table, "base", where, "base"),
-        tip=_text(table, "tip", where, "tip"),
+        base=word(table, "base", where, "base"),
+        tip=word(table, "tip", where, "tip"),
         tail=placement(table["tail"], f"{where}, [tail]") if "tail" in table else None,
         gravity=vector(table["gravity"], 3, f"{where}, gravity") if "gravity" in table else None,
         propose_beta=propose_beta and proposed,
@@ -242,10 +242,10 @@ def _row(entry: Any, index: int, where: str) -> Row:
     index = entry.get("index", index)
     if isinstance(index, bool) or not isinstance(index, int) or index < 0:
         raise RobotError(f"{where}: index {index!r} is not a whole number from 0 on")
-    name = _text(entry, "name", where, f"joint{index}")
+    name = word(entry, "name", where, f"joint{index}")
     where = f"{where} ('{name}')"
     check_keys(entry, _ROW, where)
-    kind = _text(entry, "kind", where, "revolute")
+    kind = word(entry, "kind", where, "revolute")
     quantity = dict.fromkeys(("alpha", "beta", "theta", "lower", "upper"), "angle") | {"d": "length", "r": "length"}
     quantity |= {"velocity": "angular speed", "effort": "torque"}
     if kind == "prismatic":
@@ -255,16 +255,6 @@ def _row(entry: Any, index: int, where: str) -> Row:
     numbers = {key: number(entry[key], f"{where}, {key}", quantity[key]) for key in quantity if key in entry}
     inertia = tuple(vector(entry["inertia"], 10, f"{where}, inertia").tolist()) if "inertia" in entry else None
     return Row(name=name, index=index, kind=kind, inertia=inertia, **numbers)
-
-
-def _text(table: Mapping[str, Any], key: str, where: str, default: str | None = None) -> str:
-    """Return a non-empty string from a table."""
-    value = table.get(key, default)
-    if value is None:
-        raise RobotError(f"{where}: '{key}' is missing")
-    if not isinstance(value, str) or not value:
-        raise RobotError(f"{where}: '{key}' has to be text, found {value!r}")
-    return value
 
 
 def _regroup(chain: Chain, index: int, group: list[Element]) -> Row:

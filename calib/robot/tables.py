@@ -116,6 +116,20 @@ def _evaluate(node: ast.expr) -> float:
     raise ValueError(ast.dump(node))
 
 
+def word(table: Mapping[str, Any], key: str, where: str, default: str | None = None) -> str:
+    """Return a non-empty text from a table.
+
+    Raises:
+        RobotError: where it is something else, or missing without a default.
+    """
+    value = table.get(key, default)
+    if value is None:
+        raise RobotError(f"{where}: '{key}' is missing")
+    if not isinstance(value, str) or not value:
+        raise RobotError(f"{where}: '{key}' has to be text, found {value!r}")
+    return value
+
+
 def vector(value: Any, count: int, where: str, quantity: str | None = None) -> np.ndarray:
     """Return (count,) numbers in SI units from a TOML list."""
     if not isinstance(value, (list, tuple)) or len(value) != count:

@@ -145,10 +145,12 @@ def read(source: str, where: str) -> Tree:
         raise RobotError(f"{where}, line {macro.line}: found <{macro.tag}>: this is a xacro file; {XACRO}")
     bodies = {}
     for node in root.all("link"):
-        bodies[_fresh(node, bodies, where)] = _body(node, where)
+        name = _fresh(node, bodies, where)
+        bodies[name] = _body(node, where)
     joints: dict[str, JointTag] = {}
     for node in root.all("joint"):
-        joints[_fresh(node, joints, where)] = _joint(node, bodies, where)
+        name = _fresh(node, joints, where)
+        joints[name] = _joint(node, bodies, where)
     above: dict[str, JointTag] = {}
     below: dict[str, list[JointTag]] = {link: [] for link in bodies}
     for joint in joints.values():

@@ -110,6 +110,10 @@ def test_complaints_about_the_whole(tmp_path):
     path = tmp_path / "robot.toml"
     for text, message in (
         ('[[joint]]\nname="a"\n[[element]]\nname="e"\naxis="rz"\njoint=0', r"'name' is missing"),
+        (
+            'name="x"\nbase=5\n[[joint]]\nname="a"\n[[element]]\nname="e"\naxis="rz"\njoint=0',
+            r"'base' has to be text, found 5",
+        ),
         ('name="x"\n[[element]]\nname="e"\naxis="rz"\njoint=0', r"no \[\[joint\]\] tables found"),
         ('name="x"\n[[joint]]\nname="a"\n[[element]]\nname="e"\naxis="rz"', r"every joint has to move"),
         ('name="x"\n[[joint]]\nname="a"\nkinds=1\n[[element]]\naxis="rz"', r"unknown key 'kinds'; did you mean 'kind'"),

@@ -184,6 +184,7 @@ BASE = '<robot name="x"><link name="a"/><link name="b"/><link name="c"/>\n'
         ("<robot name='x'><link name='a'/></robot>", r"no actuated joint \(revolute, continuous or prismatic\) found"),
         ("<robot name='x'><link name='a'/><link name='a'/></robot>", r"line 1: a second link named 'a'"),
         ("<robot name='x'><link/></robot>", r"line 1: a <link> without a name"),
+        ("<robot name='x'><link name='a'/><joint type='fixed'/></robot>", r"line 1: a <joint> without a name"),
         (
             BASE + joint("j", "revolut", "a", "b") + "</robot>",
             r"line 2, joint 'j': type 'revolut' is none of .*'revolute'",
@@ -346,3 +347,10 @@ def test_real_robots_against_pinocchio(path):
     source, chain = path.read_text(), urdf.read(path)
     if chain.inertias is not None:
         np.testing.assert_allclose(chain.inertias, pinocchio_inertias(source, chain), atol=1e-12)
+
+
+def test_a_file_cut_short_is_always_a_clear_error():
+    source = gripper()
+    for end in range(0, len(source) - len("</robot>") - 1, 7):
+        with pytest.raises(RobotError, match="not XML"):
+            urdf.parse(source[:end])
