@@ -54,12 +54,13 @@ def fit(
     seed: Seed = 0,
 ) -> None:
     """Fit the geometry of ROBOT to measured poses, and say how far to trust it."""
-    from calib.data.options import MODELS, read_options
+    from calib.data.options import read_options
     from calib.errors import UsageError
+    from calib.geometry.effects import MODELS
     from calib.procedure import fitting, inputs, outputs, show
 
-    if model is not None and model not in MODELS:
-        raise UsageError(f"--model {model}: expected one of {', '.join(MODELS)}")
+    if model not in (None, "auto", *MODELS):
+        raise UsageError(f"--model {model}: expected auto, {', '.join(MODELS)}")
     chosen = read_options(options)
     outputs.check_target(out)
     found = inputs.gather(

@@ -12,7 +12,9 @@ from calib.data.options import FitOptions
 from calib.errors import NotConverged
 from calib.geometry.first_guess import install
 from calib.geometry.fit import Settings, combine, outliers
-from calib.procedure.climbing import Climb, climb
+from calib.geometry.installation import Installation
+from calib.geometry.ladder import Climb, climb
+from calib.geometry.parameters import layout
 from calib.procedure.comparing import Comparison, compare, compare_unseen
 from calib.procedure.inputs import Inputs
 from calib.procedure.verdict import Verdict, judge
@@ -76,7 +78,16 @@ def run(
     say("placing the instrument and the tool")
     start = install(inputs.chain, inputs.fit)
     torques = [gravity_of(inputs.chain, block) for block in inputs.fit]
-    found = climb(start, inputs.fit, asked, options, settings, torques, seed, say)
+    found = climb(
+        start,
+        inputs.fit,
+        asked,
+        settings=settings,
+        torques=torques,
+        fixed=fixed_parameters(start, options),
+        seed=seed,
+        progress=lambda done, total, what: say(f"fitting: {what}"),
+    )
     status = found.fit.solution.status
     if not status.good:
         raise NotConverged(f"the fit of model '{found.chosen}' did not converge: {status.value}", found.fit)
@@ -94,14 +105,31 @@ def run(
         validation,
         model=found.chosen,
         asked=asked,
-        cross_validated=next((rung.cross_validated for rung in found.rungs if rung.model == found.chosen), None),
+        cross_validated=cross_validated(found),
         outlier_share=len({(file, row) for file, row, _, _ in named}) / rows,
         reach=reach(inputs.chain),
     )
     warnings = (*inputs.notes, *(note for b in inputs.fit for note in b.notes), *elsewhere(fitted, validation))
     return Outcome(
-        inputs, found, fitted, validation, named, found.unclear(), warnings, verdict, seed
+        inputs, found, fitted, validation, named, (), warnings, verdict, seed
     )  # fmt: skip
+
+
+def fixed_parameters(start: Installation, options: FitOptions) -> np.ndarray:
+    """Return the positions of parameters that stay at their nominal: those in ``fix``, or all but those in ``free``.
+
+    ``free`` speaks of the arm; frames are always fitted.
+    """
+    table = layout(start)
+    fixed = table.find(options.fix)
+    if options.free:
+        fixed = np.union1d(fixed, np.setdiff1d(table.arm_index, table.find(options.free)))
+    return fixed
+
+
+def cross_validated(found: Climb) -> float:
+    """Return the error of the chosen model on rows left out [m]: that of the last rung kept."""
+    return [rung.cross_validated for rung in found.rungs if rung.kept][-1]
 
 
 def gravity_of(chain: Chain, block: PoseMeasurements) -> np.ndarray | None:

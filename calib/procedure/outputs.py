@@ -120,7 +120,8 @@ def metrics(outcome: Outcome) -> dict[str, object]:
             {
                 "model": rung.model,
                 "parameters": rung.parameters,
-                "cross_validated_mm": None if rung.cross_validated is None else 1e3 * rung.cross_validated,
+                "cross_validated_mm": 1e3 * rung.cross_validated,
+                "kept": rung.kept,
                 "note": rung.note,
             }
             for rung in outcome.climb.rungs

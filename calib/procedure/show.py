@@ -58,10 +58,9 @@ def ladder_table(outcome: Outcome) -> Table:
         table.add_column(name, justify="right")
     table.add_column("")
     for rung in outcome.climb.rungs:
-        error = "" if rung.cross_validated is None else f"{1e3 * rung.cross_validated:.4f}"
-        mark = "chosen" if rung.model == outcome.climb.chosen else ""
-        note = ", ".join(part for part in (mark, rung.note) if part)
-        table.add_row(rung.model, str(rung.parameters), error, escape(note), style="bold" if mark else "")
+        style = "bold" if rung.kept else "dim"
+        table.add_row(rung.model, str(rung.parameters), f"{1e3 * rung.cross_validated:.4f}", escape(rung.note), style=style)
+    table.caption = f"chosen: {outcome.climb.chosen}"
     return table
 
 
