@@ -20,8 +20,8 @@ class ColumnSplit:
         dropped: (p - b,) the others, those without any effect included.
         without_effect: indices of the columns that are zero.
         coefficients: (b, p - b) with ``W[:, dropped] = W[:, kept] @ coefficients`` up to the tolerance.
-        singular_values: (p,) of the scaled W (its non-zero columns at unit norm, where no scale was given), falling.
-        tolerance: size below which what remains of a scaled column counts as nothing.
+        singular_values: (p,) of W with its non-zero columns scaled to unit norm, falling.
+        tolerance: relative size below which what remains of a scaled column counts as nothing.
     """
 
     kept: np.ndarray
@@ -45,30 +45,24 @@ class ColumnSplit:
 
 
 def split_columns(
-    matrix: np.ndarray,
-    groups: Sequence[np.ndarray] | None = None,
-    tolerance: float = 1e-6,
-    scale: np.ndarray | None = None,
+    matrix: np.ndarray, groups: Sequence[np.ndarray] | None = None, tolerance: float = 1e-6
 ) -> ColumnSplit:
     """Choose independent columns of W by pivoted QR, groups of columns in order of preference.
 
     Within a group the columns enter by pivoted QR (Gautier 1991); a later group only adds what the earlier ones leave.
     Columns are scaled to unit norm first, except those of negligible norm, which have no effect (scaling a column of
-    1e-17 would turn rounding into information). With `scale` = the largest plausible deviation of each parameter, W
-    whitened and tolerance 1, a column is kept where the data tell its parameter, given those kept before, better than
-    plausibility does: σ < scale.
+    1e-17 would turn rounding into information).
 
     Args:
         matrix: (rows, p), whitened or in one unit; only its R factor is used.
         groups: index arrays, most preferred first; columns in none of them come last. None: one group.
         tolerance: see `ColumnSplit`.
-        scale: (p,) multiplies the columns in place of unit norms.
     """
     p = matrix.shape[1]
     factor = np.linalg.qr(matrix, mode="r") if matrix.shape[0] > p else np.asarray(matrix, dtype=float)
     norms = np.linalg.norm(factor, axis=0)
     silent = norms <= 1e-12 * norms.max(initial=0.0)
-    divisor = np.where(silent, 1.0, norms) if scale is None else 1.0 / scale
+    divisor = np.where(silent, 1.0, norms)
     scaled = factor / divisor
     scaled[:, silent] = 0.0
     kept = _pick(scaled, _complete(groups, p), np.flatnonzero(silent), tolerance)

@@ -78,9 +78,9 @@ def solve(
     retract: Callable[[State, np.ndarray], State],
     start: State,
     *,
-    damping: float = 1e-4,
-    tolerance: float = 1e-4,
-    limit: int = 50,
+    damping: float = 1e-8,
+    tolerance: float = 1e-3,
+    limit: int = 300,
 ) -> Solution[State]:
     """Minimise ‖y - f(state)‖² by Levenberg–Marquardt with the paper's damping rule.
 

@@ -5,7 +5,8 @@ Every effect is linear in its coefficients and adds to the displacement of one e
     δ_e(q) = Σ_terms c · b(q),    b one of
 
     torque        τ_j(q), gravity torque at joint j [N m]: c is the compliance [rad/N m]
-    lever         (z_j × R_i e_a) · ĝ, what link i's first moment along its axis a (0 x, 1 y, 2 z) does to joint j
+    lever         (z_e × R_i e_a) · ĝ, the moment about the element's axis z_e of a first moment of link i along its
+                  axis a (0 x, 1 y, 2 z), gravity being a unit vector: sag where the masses are not known
     joint         q_i: gear ratio error (i = j) or coupling of another axis (i ≠ j)
     cos, sin      cos(k q_i), sin(k q_i): harmonics of order k
 """
@@ -18,7 +19,7 @@ import numpy as np
 
 from calib.errors import CalibError
 from calib.robot.chain import Chain
-from calib.robot.kinematics import joint_frames
+from calib.robot.kinematics import joint_frames, sweep
 
 BASES = ("torque", "lever", "joint", "cos", "sin")
 
@@ -81,16 +82,15 @@ def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = 
         torque: (m, n) gravity torques [N m], for terms of basis ``torque``.
     """
     result = np.empty((len(deflection.terms), len(q)))
-    levers = _levers(deflection, q) if any(term.basis == "lever" for term in deflection.terms) else {}
-    moving = _moved_by(deflection)
+    levers = _Levers(deflection, q) if any(term.basis == "lever" for term in deflection.terms) else None
     for e, term in enumerate(deflection.terms):
         if term.basis == "torque":
             if torque is None:
                 raise CalibError("a compliance needs gravity torques: give the robot masses, or ask for fitted ones")
             result[e] = torque[:, term.source]
         elif term.basis == "lever":
-            z, rotation, gravity = levers[moving[term.element]], levers[term.source], levers[-1]
-            result[e] = np.cross(z[1], rotation[0][:, :, term.order]) @ gravity
+            assert levers is not None
+            result[e] = levers.moment(term)
         elif term.basis == "joint":
             result[e] = q[:, term.source]
         else:
@@ -98,23 +98,22 @@ def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = 
     return result
 
 
-def _moved_by(deflection: Deflection) -> dict[str, int]:
-    """Map element names to the joint that owns them."""
-    return {} if deflection.reference is None else {e.name: e.owner for e in deflection.reference.elements}
+class _Levers:
+    """Directions of the elements and links of the reference chain, for one batch of poses."""
 
+    def __init__(self, deflection: Deflection, q: np.ndarray):
+        chain = deflection.reference
+        if chain is None:
+            raise CalibError("sag terms need the reference chain of the deflection")
+        self.gravity = chain.gravity / np.linalg.norm(chain.gravity)
+        self.directions = sweep(chain, q).directions
+        self.links = joint_frames(chain, q)[:, :, :3, :3]
+        self.index = {name: k for k, name in enumerate(chain.names)}
 
-def _levers(deflection: Deflection, q: np.ndarray) -> dict[int, tuple]:
-    """Return per joint (rotation of its link (m, 3, 3), its axis (m, 3)) on the reference chain; -1: gravity's unit."""
-    chain = deflection.reference
-    if chain is None:
-        raise CalibError("sag terms need the reference chain of the deflection")
-    frames = joint_frames(chain, q)
-    result: dict = {-1: chain.gravity / np.linalg.norm(chain.gravity)}
-    for j, k in enumerate(chain.moving):
-        element = chain.elements[k]
-        axis = "xyz".index(element.axis[1])
-        result[j] = (frames[j, :, :3, :3], element.sign * frames[j, :, :3, axis])
-    return result
+    def moment(self, term: Term) -> np.ndarray:
+        """Return (z × u) · ĝ = (ĝ × z) · u for every pose (m,)."""
+        across = np.cross(self.gravity, self.directions[self.index[term.element]].T)
+        return np.einsum("mi,mi->m", across, self.links[term.source, :, :, term.order])
 
 
 def extra_displacements(

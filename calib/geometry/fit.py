@@ -10,17 +10,17 @@ import numpy as np
 from calib.data.measurements import PoseMeasurements
 from calib.errors import MeasurementError, UsageError
 from calib.estimation import robust
-from calib.estimation.columns import ColumnSplit, split_columns
+from calib.estimation.columns import ColumnSplit
 from calib.estimation.estimate import Estimate
 from calib.estimation.nonlinear import Solution, covariance, solve
-from calib.geometry.identifiability import base_columns, preference
+from calib.geometry.identifiability import base_columns
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, observe, prepare, stack
 from calib.geometry.parameters import layout, layout_counts, step
 from calib.geometry.residuals import Part
 
 PLAUSIBLE = {"m": 0.01, "rad": 0.05}  # how far a real arm may be from its nominal (our choice)
-FRAME_SCALE = 10.0  # frames are kept unless the data say nothing at all [m, rad]
+RETRIES = 4
 START_SIGMA = {"position": 1e-3, "orientation": 1e-3, "consistency": 1e-3, "distance": 1e-3, "plane": 1e-3}
 
 
@@ -39,9 +39,9 @@ class Settings:
 
     loss: str = "none"
     loss_scale: float | None = None
-    damping: float = 1e-4
+    damping: float = 1e-8
     tolerance: float = 1e-6
-    limit: int = 50
+    limit: int = 300
     passes: int = 3
 
 
@@ -105,17 +105,28 @@ def fit(
     candidates = np.arange(len(table.names)) if candidates is None else np.asarray(candidates, dtype=int)
     blocks = prepare(cell, measured, torques)
     split = base_columns(cell, blocks, candidates, settings.tolerance)
-    free, plausible = candidates[split.kept], plausible_deviation(cell, candidates[split.kept])
-    start = cell
-    if np.isfinite(plausible).any():
-        rough = fit_with_prior(cell, blocks, free, plausible, settings=settings)
-        told = told_columns(rough, plausible)
-        nominal = parameter_values(cell)
-        values = parameter_values(rough.cell)
-        back = np.setdiff1d(candidates[: np.searchsorted(candidates, table.arm)], free[told])
-        start, free = step(rough.cell, back, nominal[back] - values[back]), free[told]
-    found = fit_with_prior(start, blocks, free, None, settings=settings)
+    free = candidates[split.kept]
+    plausible = plausible_deviation(cell, free)
+    start, found = cell, None
+    for prior in (plausible, *[None] * RETRIES):
+        if prior is not None and not np.isfinite(prior).any():
+            continue
+        found = fit_with_prior(start, blocks, free, prior, settings=settings)
+        told = told_columns(found, plausible)
+        if prior is None and len(told) == len(free):
+            break
+        start, free, plausible = _back_to_nominal(found.cell, cell, candidates, free[told]), free[told], plausible[told]
+    assert found is not None
     return replace(found, start=cell, split=split, candidates=candidates)
+
+
+def _back_to_nominal(
+    cell: Installation, nominal: Installation, candidates: np.ndarray, free: np.ndarray
+) -> Installation:
+    """Return `cell` with the arm's candidates that are not free at their nominal values again."""
+    arm = candidates[candidates < layout(cell).arm]
+    back = np.setdiff1d(arm, free)
+    return step(cell, back, nominal.chain.values[back] - cell.chain.values[back])
 
 
 def fit_with_prior(
@@ -160,12 +171,24 @@ def plausible_deviation(cell: Installation, columns: np.ndarray) -> np.ndarray:
     return np.array([PLAUSIBLE[table.units[k]] if k < table.arm else np.inf for k in columns])
 
 
-def told_columns(rough: GeometricFit, plausible: np.ndarray) -> np.ndarray:
-    """Return which of the fitted parameters the data tell to better than half the plausible deviation (indices)."""
-    arm = np.isfinite(plausible)
-    _, matrix = stack(rough.found, [sigma / np.sqrt(w) for sigma, w in zip(rough.sigmas, rough.weights)])
-    scale = np.where(arm, plausible, FRAME_SCALE) / max(rough.estimate.residual_std, 1e-12)
-    return split_columns(matrix, preference(rough.cell, rough.free), tolerance=2.0, scale=scale).kept
+def told_columns(found: GeometricFit, plausible: np.ndarray) -> np.ndarray:
+    """Return which of the fitted parameters the data tell (indices): σ below half the plausible deviation.
+
+    Backward elimination: the worst told parameter goes back to its nominal, which changes the covariance C of the
+    others to C - c cᵀ / c_k (c its column), until all that remain are told.
+    """
+    _, matrix = stack(found.found, [sigma / np.sqrt(w) for sigma, w in zip(found.sigmas, found.weights)])
+    factor = np.linalg.qr(matrix, mode="r")
+    norms = np.linalg.norm(factor, axis=0)
+    left = covariance(factor / norms, found.estimate.residual_std**2) / np.outer(norms, norms)
+    told = np.ones(len(plausible), dtype=bool)
+    while True:
+        ratio = np.where(told, np.sqrt(np.clip(np.diag(left), 0.0, None)) / plausible, 0.0)
+        worst = int(np.argmax(ratio))
+        if ratio[worst] <= 0.5:
+            return np.flatnonzero(told)
+        told[worst] = False
+        left = left - np.outer(left[:, worst], left[worst]) / left[worst, worst]
 
 
 class _Weigher:
@@ -265,6 +288,17 @@ def _size(part: Part, sigma: np.ndarray) -> np.ndarray:
     return np.sqrt(np.mean((part.value / sigma) ** 2, axis=0))
 
 
+def used_sigmas(found: GeometricFit) -> list[dict[str, float]]:
+    """Return per block the rms standard deviation used for each label, scaled to the residuals actually left."""
+    result, start = [], 0
+    for block in found.blocks:
+        count = _labels(block)
+        parts = zip(found.found[start : start + count], found.sigmas[start : start + count])
+        result.append({part.label: float(np.sqrt(np.mean(sigma**2))) for part, sigma in parts})
+        start += count
+    return result
+
+
 def outliers(found: GeometricFit, threshold: float = 4.0) -> list[tuple[str, int, str, float]]:
     """Return (file, row, label, size in robust sigmas) of rows that do not fit, worst first.
 
@@ -281,7 +315,8 @@ def outliers(found: GeometricFit, threshold: float = 4.0) -> list[tuple[str, int
             assert block.measured.rows is not None
             rows = block.measured.rows[part.index]
             result += [
-                (block.measured.file, int(rows[i]), part.label, float(size[i])) for i in np.flatnonzero(size > threshold)
+                (block.measured.file, int(rows[i]), part.label, float(size[i]))
+                for i in np.flatnonzero(size > threshold)
             ]
         start += labels
     return sorted(result, key=lambda item: -item[3])

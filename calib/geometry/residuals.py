@@ -89,7 +89,9 @@ def _pairs(measured: PoseMeasurements) -> tuple[np.ndarray, np.ndarray]:
     if np.any(counts != 2):
         odd = groups[counts != 2][0]
         row = int(measured.rows[measured.group == odd][0])
-        raise MeasurementError(f"pair {odd} has {counts[counts != 2][0]} rows; a distance needs two", measured.file, row)
+        raise MeasurementError(
+            f"pair {odd} has {counts[counts != 2][0]} rows; a distance needs two", measured.file, row
+        )
     return order[0::2], order[1::2]
 
 

@@ -1,0 +1,106 @@
+"""The effects a ladder of models may add to the geometry, each a family of deflection terms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.geometry.deflection import Term
+from calib.robot.chain import Chain
+
+MAX_ORDER = 60
+WOBBLE_ORDER = 2
+
+
+@dataclass(frozen=True)
+class Effect:
+    """A rung of the ladder above the geometry.
+
+    Attributes:
+        name: as ``--model`` knows it.
+        says: what it is, for people.
+        terms: chain, are gravity torques known -> terms; terms that share a key get one ridge.
+
+    """
+
+    name: str
+    says: str
+    terms: Callable[[Chain, bool], list[Term]]
+
+
+def stiffness(chain: Chain, known: bool) -> list[Term]:
+    """Return the deflection of each joint about its axis under gravity: by known torques, else by fitted moments."""
+    names = chain.names
+    if known:
+        return [Term(names[k], "torque", j) for j, k in enumerate(chain.moving) if chain.joints[j].kind == "revolute"]
+    return [term for k in chain.moving if chain.elements[k].axis[0] == "r" for term in _sag(chain, int(k))]
+
+
+def bending(chain: Chain, known: bool) -> list[Term]:
+    """Return the tilt of each joint's frame across its axis under gravity: bearings and links give way too."""
+    moving = set(chain.moving.tolist())
+    places = [k for k, e in enumerate(chain.elements) if e.axis[0] == "r" and k not in moving and e.owner < chain.n]
+    return [term for k in places for term in _sag(chain, k)]
+
+
+def _sag(chain: Chain, place: int) -> list[Term]:
+    element = chain.elements[place]
+    return [Term(element.name, "lever", i, a) for i in range(element.owner, chain.n) for a in range(3)]
+
+
+def coupling(chain: Chain, known: bool) -> list[Term]:
+    """Return what a joint's own reading and its neighbours' add to it: gear ratio and coupled transmissions."""
+    names = chain.names
+    near = [(j, i) for j in range(chain.n) for i in (j - 1, j, j + 1) if 0 <= i < chain.n]
+    return [Term(names[chain.moving[j]], "joint", i) for j, i in near]
+
+
+def harmonics(chain: Chain, known: bool) -> list[Term]:
+    """Return sin and cos of k q_j on each revolute joint, k = 1 … `MAX_ORDER`: encoder and gear errors."""
+    return [
+        Term(chain.names[k], basis, j, order)
+        for j, k in enumerate(chain.moving)
+        if chain.joints[j].kind == "revolute"
+        for order in range(1, MAX_ORDER + 1)
+        for basis in ("cos", "sin")
+    ]
+
+
+def wobble(chain: Chain, known: bool) -> list[Term]:
+    """Return low harmonics of q_j on every other element of joint j: its axis wobbles as it turns."""
+    moving = set(chain.moving.tolist())
+    return [
+        Term(element.name, basis, element.owner, order)
+        for k, element in enumerate(chain.elements)
+        if k not in moving and element.owner < chain.n and chain.joints[element.owner].kind == "revolute"
+        for order in range(1, WOBBLE_ORDER + 1)
+        for basis in ("cos", "sin")
+    ]
+
+
+EFFECTS = (
+    Effect("stiffness", "sag of the joints about their axes", stiffness),
+    Effect("bending", "sag across the axes: bearings and links", bending),
+    Effect("coupling", "gear ratios and coupling of neighbouring axes", coupling),
+    Effect("harmonics", "errors repeating with a joint's turn", harmonics),
+    Effect("wobble", "axes that wobble as they turn", wobble),
+)
+MODELS = ("frames", "offsets", "geometry", *(effect.name for effect in EFFECTS))
+
+
+def term_groups(terms: tuple[Term, ...]) -> np.ndarray:
+    """Return the ridge each term shares (E,): cos and sin of one order go together, all else stands alone."""
+    keys: dict[tuple, int] = {}
+    result = []
+    for term in terms:
+        paired = term.basis in ("cos", "sin")
+        key = (term.element, "turn" if paired else term.basis, term.source, term.order)
+        result.append(keys.setdefault(key, len(keys)))
+    return np.array(result, dtype=int)
+
+
+def term_sizes(terms: tuple[Term, ...]) -> np.ndarray:
+    """Return the first guess of each coefficient's size (E,)."""
+    return np.array([3e-5 if term.basis in ("cos", "sin") else 1e-4 for term in terms])
