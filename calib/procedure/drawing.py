@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 from matplotlib.axes import Axes
@@ -18,7 +19,7 @@ from calib import files
 BEFORE, AFTER, MARK, QUIET, INK = "#e2a26b", "#17486e", "#b3261e", "#8a8f98", "#22262b"
 HEAT = "cividis_r"
 WIDE, HALF = 7.4, 3.6
-STYLE = {
+STYLE: Any = {
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans", "Helvetica", "Arial", "sans-serif"],
     "font.size": 8.5,
@@ -79,6 +80,5 @@ def png_uri(figure: Figure, dpi: int = 150) -> str:
 def _bytes(figure: Figure, form: str, dpi: int, salt: str = "calib") -> bytes:
     buffer = io.BytesIO()
     with styled(), matplotlib.rc_context({"svg.hashsalt": salt}):
-        dated = {"metadata": {"Date": None}} if form == "svg" else {}
-        figure.savefig(buffer, format=form, dpi=dpi, **dated)
+        figure.savefig(buffer, format=form, dpi=dpi, metadata={"Date": None} if form == "svg" else None)
     return buffer.getvalue()

@@ -119,9 +119,8 @@ def error_map(points: np.ndarray, sizes: np.ndarray, names: str = "xyz") -> Figu
     top = 1e3 * float(np.max(sizes, initial=1e-9))
     with styled():
         figure, axes = sheet(1, 2, WIDE, 3.1)
-        dots = None
         for plot, (i, j) in zip(axes, ((0, 1), (0, 2))):
-            dots = plot.scatter(
+            plot.scatter(
                 points[order, i], points[order, j], c=1e3 * sizes[order], cmap=HEAT, vmin=0.0, vmax=top, s=16,
                 edgecolors=QUIET, linewidths=0.25, rasterized=len(points) > 500,
             )  # fmt: skip
@@ -131,7 +130,7 @@ def error_map(points: np.ndarray, sizes: np.ndarray, names: str = "xyz") -> Figu
             plot.set_title("from above" if j == 1 else "from the side", fontweight="normal")
             plot.grid(True)
             plot.set_axisbelow(True)
-        figure.colorbar(dots, ax=axes, label="remaining error [mm]", fraction=0.03, pad=0.02)
+        figure.colorbar(axes[0].collections[0], ax=axes, label="remaining error [mm]", fraction=0.03, pad=0.02)
     return figure
 
 
@@ -202,41 +201,41 @@ def singular_values(values: np.ndarray, rank: int) -> Figure:
 
 
 def ladder(
-    models: Sequence[str], parameters: Sequence[int], unseen: Sequence[float], chosen: str, noise: float | None = None
+    models: Sequence[str],
+    parameters: Sequence[int],
+    unseen: Sequence[float],
+    kept: Sequence[bool],
+    noise: float | None = None,
 ) -> Figure:
-    """Draw the error on rows left out against the size of the model: the climb ends where the gain ends.
+    """Draw the error on rows left out, rung by rung: the climb ends where the gain ends.
 
     Args:
         models: names of the rungs.
         parameters: fitted by each.
-        unseen: cross-validated rms [m]; NaN where it was not computed.
-        chosen: name of the rung that was taken.
+        unseen: cross-validated rms [m].
+        kept: whether the climb went on from there; the last one kept is the model chosen.
         noise: rms of the instrument's own error [m].
     """
-    errors = 1e3 * np.asarray(unseen, dtype=float)
-    known = np.isfinite(errors)
-    x = np.arange(len(models))[known]
+    errors, x, taken = 1e3 * np.asarray(unseen, dtype=float), np.arange(len(models)), np.flatnonzero(kept)
     with styled():
-        figure, (axes,) = sheet(width=HALF, height=2.4)
-        axes.plot(x, errors[known], color=QUIET, linewidth=1.0, zorder=1)
+        figure, (axes,) = sheet(width=WIDE, height=2.3)
+        axes.plot(x[taken], errors[taken], color=AFTER, linewidth=1.0, zorder=1)
         for place in x:
-            taken = models[place] == chosen
-            axes.plot(place, errors[place], "o", color=AFTER if taken else BEFORE, markersize=7 if taken else 5)
+            last, face = place == taken[-1] if len(taken) else False, AFTER if kept[int(place)] else "white"
+            axes.plot(place, errors[place], "o", color=AFTER, markerfacecolor=face, markersize=8 if last else 5)
             axes.annotate(
-                f"{errors[place]:.3g}", (place, errors[place]), xytext=(0, 7), textcoords="offset points", ha="center",
-                fontsize=7.5, fontweight="bold" if taken else "normal",
+                f"{errors[place]:.3g}", (place, errors[place]), xytext=(0, 8), textcoords="offset points", ha="center",
+                fontsize=7.5, fontweight="bold" if last else "normal",
             )  # fmt: skip
         if noise:
             axes.axhline(1e3 * noise, color=QUIET, linewidth=0.9, linestyle=":")
-        if len(x) and errors[known].min() > 0:
-            axes.set_yscale("log")
-            axes.set_ylim(0.6 * errors[known].min(), 2.2 * errors[known].max())
-            axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-            axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if str(f"{value:.0e}")[0] in "25" else "")
-        labels = [f"{models[k]}\n{parameters[k]}" for k in x]
-        axes.set_xticks(x, labels, fontsize=6.8)
-        axes.set(ylabel="error on rows left out [mm]", xlim=(-0.5, len(models) - 0.5))
-        axes.set_xlabel("model, parameters")
+            axes.text(-0.45, 1.05e3 * noise, "instrument", color=QUIET, fontsize=6.5, va="bottom")
+        axes.set_yscale("log")
+        axes.set_ylim(0.7 * min(errors.min(), 1e3 * (noise or np.inf)), 2.4 * errors.max())
+        axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in "25" else "")
+        axes.set_xticks(x, [f"{model}\n{count}" for model, count in zip(models, parameters)], fontsize=7)
+        axes.set(ylabel="error on rows left out [mm]", xlabel="model, parameters", xlim=(-0.5, len(models) - 0.5))
         axes.grid(axis="y", which="both")
     return figure
 
@@ -280,7 +279,7 @@ def correlation_map(names: Sequence[str], correlation: np.ndarray, threshold: fl
         chosen = np.argsort(-off)[:6]
     chosen = np.sort(chosen[np.argsort(-off[chosen])][:most])
     block = correlation[np.ix_(chosen, chosen)]
-    labels = [names[k] for k in chosen]
+    labels = [str(names[k]) for k in chosen]
     with styled():
         figure, (axes,) = sheet(width=HALF, height=3.2)
         image = axes.imshow(block, cmap="PuOr", vmin=-1.0, vmax=1.0)

@@ -16,10 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from calib.arrays import shaped
 from calib.data.measurements import PoseMeasurements
+from calib.dynamics.gravity import gravity_torques
 from calib.geometry.deflection import evaluate
 from calib.geometry.installation import Installation, see
 from calib.robot.chain import Chain
-from calib.simulation.gravity import gravity_torques
 from calib.transforms import invert, pose
 
 
@@ -74,7 +74,9 @@ def true_poses(cell: Cell, q: np.ndarray, hidden: bool = True) -> np.ndarray:
         hidden: with the deflections; without, the rigid truth.
     """
     q = shaped(q, (None, cell.truth.chain.n), "joint values")
-    bases = evaluate(cell.truth.deflection, q, gravity_torques(cell.truth.chain, q))
+    arm = cell.truth.chain
+    torque = np.zeros(q.shape) if arm.inertias is None else gravity_torques(arm, q)
+    bases = evaluate(cell.truth.deflection, q, torque)
     return see(cell.truth, q, bases=bases if hidden else np.zeros_like(bases)).poses()
 
 

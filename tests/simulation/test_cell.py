@@ -11,12 +11,11 @@ from scipy.spatial.transform import Rotation
 from calib.geometry.first_guess import install
 from calib.geometry.fit import GeometricFit, Settings, fit, polish_frames
 from calib.robot.chain import random_joints
-from calib.robot.kinematics import forward, joint_frames
+from calib.robot.kinematics import forward
 from calib.robot.load import load
 from calib.simulation import lwr4plus
 from calib.simulation.cell import Cell, Instrument, measure, true_poses
 from calib.simulation.cells import lwr4plus_cell, perturbed_cell, rigid, virtual_cell
-from calib.simulation.gravity import gravity_torques
 from calib.transforms import invert, rotation_vector
 
 
@@ -103,23 +102,6 @@ def test_same_seed_same_measurement() -> None:
     one, two, other = (measure(cell, q, seed).position for seed in (7, 7, 8))
     np.testing.assert_array_equal(one, two)
     assert np.abs(one - other).max() > 1e-6
-
-
-def test_gravity_torque_is_the_gradient_of_potential_energy() -> None:
-    chain = load("lwr4plus")
-    q, step = random_joints(chain, 6, 2), 1e-6
-    slopes = np.empty_like(q)
-    for j in range(chain.n):
-        shift = step * np.eye(chain.n)[j]
-        slopes[:, j] = (potential(chain, q + shift) - potential(chain, q - shift)) / (2 * step)
-    np.testing.assert_allclose(gravity_torques(chain, q), slopes, atol=1e-6)
-
-
-def potential(chain, q: np.ndarray) -> np.ndarray:
-    frames = joint_frames(chain, q)
-    moments = np.einsum("nmij,nj->nmi", frames[..., :3, :3], chain.inertias[:, 6:9])
-    moments += chain.inertias[:, 9][:, None, None] * frames[..., :3, 3]
-    return -moments.sum(axis=0) @ chain.gravity
 
 
 def test_table_2_as_frames_and_arm_is_table_2_as_one_product() -> None:

@@ -1,0 +1,269 @@
+"""The certificate: one HTML page without any outside reference, for the screen and for paper.
+
+A page is a head, stages (geometry today, dynamics tomorrow) and an end; a stage is a verdict and blocks; a block is a
+table, a text or a picture. The template knows blocks only, so that a new stage needs no new page.
+"""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import metadata, resources
+from typing import TYPE_CHECKING, Any
+
+import jinja2
+
+from calib.procedure.report import Report
+
+if TYPE_CHECKING:
+    from calib.procedure.figures import Drawn
+
+WORDS = {"pass": "PASS", "marginal": "MARGINAL", "fail": "FAIL"}
+KINDS = {
+    "position_mm": ("position", "mm"),
+    "orientation_deg": ("orientation", "deg"),
+    "distance_mm": ("distance", "mm"),
+}
+ARMS = ("nominal", "calibrated")
+MOST_ROWS = 90
+CONVENTIONS = (
+    "Units: m, rad, s, kg, N·m in all files unless a header names another; this page prints mm, deg and mrad.",
+    "Modified Denavit-Hartenberg rows (Khalil and Kleinfinger): Rot_x(alpha) Trans_x(d) Trans_z(r) Rot_z(theta + q).",
+    "Quaternions are x y z w; roll-pitch-yaw is R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF.",
+    "A station is the pose of the arm's base in the instrument's frame, a tool that of the target in the tip's frame.",
+    "Nominal errors are those of the nominal arm with station and tool fitted on the same rows, so that arms are "
+    "compared and not installations.",
+    "rms is the root mean square of the error vector's length over poses, not per axis.",
+)
+LIMITATIONS = (
+    "Sigmas state what the measurements' noise leaves open under the chosen model; they do not cover effects that no "
+    "parameter of the model holds (see the residual plots for trends).",
+    "The figures hold for the region, payload and temperature of the measured poses.",
+)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of text under a header; `strong` names rows to set in bold; numeric columns stand to the right."""
+
+    title: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    note: str = ""
+    strong: frozenset[int] = frozenset()
+    kind: str = "table"
+
+
+@dataclass(frozen=True)
+class Text:
+    """Sentences, as a list."""
+
+    title: str
+    lines: Sequence[str]
+    kind: str = "text"
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Figures as SVG, each with its caption; wide ones take the whole line."""
+
+    title: str
+    items: Sequence[tuple[str, str, bool]]
+    kind: str = "pictures"
+
+
+Block = Table | Text | Pictures
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One judged stage of the calibration."""
+
+    title: str
+    verdict: str
+    reason: str
+    figures: Sequence[tuple[str, str, str]] = ()
+    blocks: Sequence[Block] = ()
+
+
+@dataclass(frozen=True)
+class Page:
+    """The whole certificate.
+
+    Attributes:
+        title, subtitle: its head.
+        setup: label and value of what was calibrated, with what, when, by which command.
+        stages: see `Stage`.
+        files: name, role, size, SHA-256.
+    """
+
+    title: str
+    subtitle: str
+    setup: Sequence[tuple[str, str]]
+    stages: Sequence[Stage]
+    files: Sequence[Sequence[str]] = ()
+    limitations: Sequence[str] = LIMITATIONS
+    conventions: Sequence[str] = CONVENTIONS
+    extra: Mapping[str, str] = field(default_factory=dict)
+
+
+def render(page: Page) -> str:
+    """Return the page as HTML."""
+    here = resources.files("calib.procedure")
+    source = here.joinpath("certificate.html").read_text(encoding="utf-8")
+    style = here.joinpath("certificate.css").read_text(encoding="utf-8")
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    return environment.from_string(source).render(page=page, style=style, words=WORDS)
+
+
+def of_fit(report: Report, drawn: Mapping[str, Drawn], setup: Sequence[tuple[str, str]] = ()) -> Page:
+    """Return the certificate of a fit alone, without a session around it."""
+    given = setup or (
+        ("robot", f"{report.robot}, {report.base} to {report.tip}, {len(report.joints)} joints"),
+        ("seed", str(report.metrics["seed"])),
+        ("toolkit", versions()),
+    )
+    return Page(f"Calibration of {report.robot}", "Geometry", given, [geometry_stage(report, drawn)])
+
+
+def versions() -> str:
+    """Return the toolkit's version and those of what its numbers depend on."""
+    names = ("armature-calib", "numpy", "scipy")
+    known = ", ".join(f"{name} {metadata.version(name)}" for name in names)
+    return f"{known}, Python {platform.python_version()}"
+
+
+def geometry_stage(report: Report, drawn: Mapping[str, Drawn]) -> Stage:
+    """Return the stage of the geometric fit: errors, ladder, parameters, identifiability, figures, outliers."""
+    metrics = report.metrics
+    blocks: list[Block] = [error_table(metrics)]
+    if any(rung["cross_validated_mm"] is not None for rung in metrics["ladder"]):
+        blocks += [ladder_table(metrics), _pictures("", drawn, ("ladder",))]
+    blocks.append(_pictures("Before and after", drawn, ("position", "orientation", "distance")))
+    blocks.append(_pictures("What remains", drawn, ("joints", "map")))
+    blocks.append(Text("What the poses can tell", identifiability(report)))
+    blocks.append(_pictures("Parameters", drawn, ("parameters", "singular_values", "correlations")))
+    blocks.append(parameter_table(report))
+    if metrics["outliers"]:
+        blocks.append(outlier_table(metrics))
+    if metrics["warnings"]:
+        blocks.append(Text("Notes", metrics["warnings"]))
+    return Stage("Geometry", metrics["verdict"], metrics["reason"], key_figures(metrics), blocks)
+
+
+def key_figures(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Return up to four numbers for the head of a stage: label, value, what it was before."""
+    proof = next(iter(metrics["validation"].values()), metrics["fit"])
+    where = "unseen poses" if metrics["validation"] else "fitted poses"
+    result = []
+    for key, (label, unit) in KINDS.items():
+        if proof["calibrated"].get(key):
+            before, after = (proof[arm][key]["rms"] for arm in ARMS)
+            result.append((f"{label}, rms on {where}", f"{after:.3g} {unit}", f"nominal {before:.3g} {unit}"))
+    worst = proof["calibrated"].get("position_mm") or proof["calibrated"].get("distance_mm")
+    if worst:
+        result.append(
+            (f"largest of {proof['poses']} {where}", f"{worst['max']:.3g} mm", f"95 % below {worst['p95']:.3g} mm")
+        )
+    result.append(("parameters fitted", str(metrics["fit"]["parameters"]), f"on {metrics['fit']['poses']} poses"))
+    return result[:4]
+
+
+def error_table(metrics: Mapping[str, Any]) -> Table:
+    """Return errors of both arms, fitted and unseen."""
+    header = ("rows", "error", "arm", "mean", "rms", "95 %", "max")
+    sets = [(f"fitted, {metrics['fit']['poses']} poses", metrics["fit"])]
+    sets += [(f"{name}, {found['poses']} poses, unseen", found) for name, found in metrics["validation"].items()]
+    rows, strong = [], set()
+    for label, found in sets:
+        lines = [
+            (f"{words} [{unit}]", arm, found[arm][key])
+            for key, (words, unit) in KINDS.items()
+            for arm in ARMS
+            if found[arm].get(key)
+        ]
+        pairs = found.get("pair_distance_mm")
+        lines += [("distance of pairs [mm]", arm, pairs[arm]) for arm in ARMS] if pairs else []
+        for number, (words, arm, numbers) in enumerate(lines):
+            if arm == "calibrated":
+                strong.add(len(rows))
+            cells = [f"{numbers[key]:.3f}" for key in ("mean", "rms", "p95", "max")]
+            rows.append((label if number == 0 else "", words if arm == "nominal" else "", arm, *cells))
+    note = "Distances of pairs do not depend on where instrument and tool are placed."
+    return Table("Errors", header, rows, note, frozenset(strong))
+
+
+def ladder_table(metrics: Mapping[str, Any]) -> Table:
+    """Return the rungs and their error on rows left out."""
+    rows, strong = [], set()
+    for rung in metrics["ladder"]:
+        error = rung["cross_validated_mm"]
+        if not rung["note"]:
+            strong.add(len(rows))
+        rows.append(
+            (rung["model"], str(rung["parameters"]), "" if error is None else f"{error:.4f}", rung.get("note", ""))
+        )
+    header = ("model", "parameters", "cross-validated rms [mm]", "remark")
+    return Table("Ladder of models", header, rows, f"Chosen: {metrics['model']}.", frozenset(strong))
+
+
+def parameter_table(report: Report) -> Table:
+    """Return the fitted parameters; of many joint corrections only the arm and the frames are printed."""
+    shown = [row for row in report.parameters if len(report.parameters) <= MOST_ROWS or row[6] != "deflection"]
+    rows = []
+    for name, unit, nominal, value, sigma, rsd, _ in shown:
+        factor, printed = {"m": (1e3, "mm"), "rad": (1e3, "mrad")}.get(unit, (1.0, unit))
+        digits = ".3f" if factor > 1 else ".4g"
+        numbers = [f"{factor * number:{digits}}" for number in (nominal, value)]
+        relative = "" if rsd is None or rsd > 999 else f"{rsd:.2g} %"
+        change = f"{factor * (value - nominal):+{digits}}"
+        rows.append((name, printed, *numbers, change, f"{factor * sigma:.2g}", relative))
+    left = len(report.parameters) - len(shown)
+    note = f"{left} joint corrections stand in joint_corrections.csv." if left else ""
+    if report.kept:
+        note = f"Not fitted, kept at their nominal values: {', '.join(report.kept)}. {note}"
+    header = ("parameter", "unit", "nominal", "calibrated", "change", "σ", "RSD")
+    return Table("Fitted parameters", header, rows, note.strip())
+
+
+def outlier_table(metrics: Mapping[str, Any], most: int = 20) -> Table:
+    """Return the rows that do not fit, worst first."""
+    found = metrics["outliers"]
+    rows = [(o["file"], str(o["row"]), o["nature"], f"{o['sigmas']:.1f}") for o in found[:most]]
+    note = "Rows beyond 4 robust sigmas. They were kept in the fit unless a robust loss was asked for."
+    if len(found) > most:
+        note += f" {len(found) - most} more in metrics.json."
+    return Table("Rows that do not fit", ("file", "row", "residual", "robust sigmas"), rows, note)
+
+
+def identifiability(report: Report) -> list[str]:
+    """Return what the poses can and cannot tell, in words."""
+    values, rank = report.singular_values, report.rank
+    lines = []
+    if values:
+        line = f"Of {len(values)} candidate parameters the poses tell {rank} apart"
+        if rank < len(values):
+            dropped = max(values[rank], 1e-300)
+            gap = values[rank - 1] / dropped
+            line += f"; the gap in the singular values behind them is {'10¹² or more' if gap > 1e12 else f'{gap:.2g}'}"
+        lines.append(line + ".")
+    fitted = report.metrics["fit"]["parameters"]
+    if values and fitted < rank:
+        lines.append(
+            f"{fitted} of them are fitted: the others are told less exactly than an arm of this kind may be off, so "
+            "they keep their nominal values."
+        )
+    lines += [f"{line[0].upper()}{line[1:]}" for line in report.metrics["not_identifiable"]]
+    strong = [f"{a} with {b} ({c:+.2f})" for a, b, c in report.correlations[:8]]
+    if strong:
+        lines.append(f"Told apart only weakly (correlation above 0.9): {', '.join(strong)}.")
+    else:
+        lines.append("No two parameters correlate by more than 0.9.")
+    return lines
+
+
+def _pictures(title: str, drawn: Mapping[str, Drawn], names: Sequence[str]) -> Pictures:
+    from calib.procedure.drawing import svg
+
+    return Pictures(title, [(svg(drawn[n].figure, n), drawn[n].caption, drawn[n].wide) for n in names if n in drawn])
