@@ -57,7 +57,7 @@ def fit(
     from calib.data.options import read_options
     from calib.errors import UsageError
     from calib.geometry.effects import MODELS
-    from calib.procedure import fitting, inputs, outputs, show
+    from calib.procedure import fitting, inputs, outputs, report, show
 
     if model not in (None, "auto", *MODELS):
         raise UsageError(f"--model {model}: expected auto, {', '.join(MODELS)}")
@@ -74,7 +74,7 @@ def fit(
     with _progress() as say:
         outcome = fitting.run(found, chosen, model=model, loss=loss, seed=seed, progress=say)
         say("writing")
-        outputs.write_folder(outcome, out)
+        outputs.write_folder(outcome, out, report.write)
     for line in show.outcome_lines(outcome):
         console.print(line, soft_wrap=True)
     console.print(f"written to {out}", soft_wrap=True, markup=False)

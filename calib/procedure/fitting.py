@@ -11,11 +11,12 @@ from calib.data.measurements import PoseMeasurements
 from calib.data.options import FitOptions
 from calib.errors import NotConverged
 from calib.geometry.first_guess import install
-from calib.geometry.fit import Settings, combine, outliers
+from calib.geometry.fit import Settings, combine
 from calib.geometry.installation import Installation
 from calib.geometry.ladder import Climb, climb
 from calib.geometry.parameters import layout
 from calib.procedure.comparing import Comparison, compare, compare_unseen
+from calib.procedure.diagnosis import Outlier, named_outliers, plateau, set_up_changes
 from calib.procedure.inputs import Inputs
 from calib.procedure.verdict import Verdict, judge
 from calib.robot.chain import Chain
@@ -33,7 +34,7 @@ class Outcome:
         climb: the rungs, the chosen model, and the fits of the nominal and the calibrated arm.
         fit: the two arms on the fit rows.
         validation: the two arms on unseen rows, by file name.
-        outliers: (file, row, nature, size in robust sigmas) of fit rows that do not fit, worst first.
+        outliers: rows of the fit that do not fit, worst first.
         unclear: what the data cannot tell, in words.
         warnings: what a user should know.
         verdict: pass, marginal or fail, with its reason.
@@ -44,7 +45,7 @@ class Outcome:
     climb: Climb
     fit: Comparison
     validation: Mapping[str, Comparison]
-    outliers: Sequence[tuple[str, int, str, float]]
+    outliers: Sequence[Outlier]
     unclear: tuple[str, ...]
     warnings: tuple[str, ...]
     verdict: Verdict
@@ -98,21 +99,20 @@ def run(
         name: compare_unseen(nominal, calibrated, unseen, lambda b: gravity_of(inputs.chain, b), settings, seed)
         for name, unseen in inputs.unseen.items()
     }
-    named = outliers(found.fit)
-    rows = sum(len(block) for block in inputs.fit)
+    named = named_outliers(found.fit)
+    unexplained = plateau(found, reach(inputs.chain))
     verdict = judge(
         fitted,
         validation,
         model=found.chosen,
         asked=asked,
         cross_validated=cross_validated(found),
-        outlier_share=len({(file, row) for file, row, _, _ in named}) / rows,
-        reach=reach(inputs.chain),
+        outlier_share=len({(each.file, each.row) for each in named}) / sum(len(block) for block in inputs.fit),
+        unexplained=unexplained,
     )
-    warnings = (*inputs.notes, *(note for b in inputs.fit for note in b.notes), *elsewhere(fitted, validation))
-    return Outcome(
-        inputs, found, fitted, validation, named, (), warnings, verdict, seed
-    )  # fmt: skip
+    notes = (*inputs.notes, *(note for block in inputs.fit for note in block.notes), *elsewhere(fitted, validation))
+    warnings = (*notes, *((unexplained,) if unexplained else ()), *set_up_changes(fitted))
+    return Outcome(inputs, found, fitted, validation, named, (), warnings, verdict, seed)
 
 
 def fixed_parameters(start: Installation, options: FitOptions) -> np.ndarray:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 from rich.console import RenderableType
 from rich.markup import escape
@@ -13,6 +15,12 @@ from calib.procedure.fitting import Outcome
 from calib.procedure.inputs import Inputs
 
 COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
+KINDS = {
+    "position_mm": "position [mm]",
+    "orientation_deg": "orientation [deg]",
+    "distance_mm": "distance [mm]",
+    "pair": "pairs' distance [mm]",
+}
 MANY = 8  # how many outliers or merged parameters are listed
 
 
@@ -24,7 +32,7 @@ def read_lines(inputs: Inputs) -> Iterator[RenderableType]:
         tools = f", {len(block.tool_names)} targets" if len(block.tool_names) > 1 else ""
         ignored = f"; ignored: {', '.join(block.ignored)}" if block.ignored else ""
         sigma = "stated" if block.sigma is not None else "estimated"
-        yield escape(f"{block.file}: {len(block)} rows of kind {block.kind}{tools}, sigmas {sigma}{ignored}")
+        yield escape(f"{Path(block.file).name}: {len(block)} rows of kind {block.kind}{tools}, sigmas {sigma}{ignored}")
     for name, unseen in inputs.unseen.items():
         role = "held out" if unseen.held_out else "validation"
         yield escape(f"{name}: {len(unseen.block)} rows of kind {unseen.block.kind} unseen ({role})")
@@ -42,11 +50,10 @@ def outcome_lines(outcome: Outcome) -> Iterator[RenderableType]:
     for line in outcome.warnings:
         yield f"[yellow]note[/]: {escape(line)}"
     if outcome.outliers:
-        worst = ", ".join(
-            f"{file} row {row} ({size:.1f} sigma, {what})" for file, row, what, size in outcome.outliers[:MANY]
-        )
-        count = len({(file, row) for file, row, _, _ in outcome.outliers})
-        yield f"[yellow]outliers[/]: {count} rows beyond 4 robust sigma, kept in the fit; worst: {escape(worst)}"
+        count = len({(each.file, each.row) for each in outcome.outliers})
+        worst = "; ".join(each.words for each in outcome.outliers[:MANY])
+        more = "; ..." if len(outcome.outliers) > MANY else ""
+        yield f"[yellow]outliers[/]: {count} rows beyond 4 robust sigma, kept in the fit: {escape(worst)}{more}"
     verdict = outcome.verdict
     yield f"verdict: [bold {COLOURS[verdict.level]}]{verdict.level}[/]: {escape(verdict.reason)}"
 
@@ -59,37 +66,34 @@ def ladder_table(outcome: Outcome) -> Table:
     table.add_column("")
     for rung in outcome.climb.rungs:
         style = "bold" if rung.kept else "dim"
-        table.add_row(rung.model, str(rung.parameters), f"{1e3 * rung.cross_validated:.4f}", escape(rung.note), style=style)
+        table.add_row(
+            rung.model, str(rung.parameters), f"{1e3 * rung.cross_validated:.4f}", escape(rung.note), style=style
+        )
     table.caption = f"chosen: {outcome.climb.chosen}"
     return table
 
 
 def error_table(outcome: Outcome) -> Table:
     """Return nominal and calibrated errors, fitted and unseen."""
-    table = Table("rows", "error", "arm", title="errors", title_justify="left")
+    table = Table("errors", "arm", title="nominal and calibrated arm", title_justify="left")
     for name in ("mean", "rms", "95 %", "max"):
         table.add_column(name, justify="right")
-    _add(table, f"fitted, {outcome.fit.poses} poses", outcome.fit)
+    _add(table, f"fitted: {outcome.fit.poses} poses", outcome.fit)
     for name, comparison in outcome.validation.items():
-        _add(table, f"{name}, {comparison.poses} poses unseen", comparison)
+        seen = "unseen" if comparison.proves else "NOT unseen"
+        _add(table, f"{seen}: {name}, {comparison.poses} poses", comparison)
     return table
 
 
 def _add(table: Table, label: str, comparison: Comparison) -> None:
-    found = comparison.table()
-    kinds = {"position_mm": "position [mm]", "orientation_deg": "orientation [deg]", "distance_mm": "distance [mm]"}
-    label = escape(label)
-    for kind, words in kinds.items():
+    """Add the rows of one set, under a line that names it."""
+    found: dict[str, Any] = comparison.table()
+    pairs = found.get("pair_distance_mm", {})
+    table.add_row(f"[bold]{escape(label)}[/]")
+    for kind, words in KINDS.items():
         for arm in ("nominal", "calibrated"):
-            numbers = found[arm].get(kind)  # type: ignore[attr-defined]
-            if numbers is None:
-                continue
-            cells = [f"{numbers[key]:.4f}" for key in ("mean", "rms", "p95", "max")]
-            table.add_row(label, words if arm == "nominal" else "", arm, *cells)
-            label = ""
-    pairs = found.get("pair_distance_mm")
-    if isinstance(pairs, dict):
-        for arm in ("nominal", "calibrated"):
-            cells = [f"{pairs[arm][key]:.4f}" for key in ("mean", "rms", "p95", "max")]
-            table.add_row("", "pair distance [mm]" if arm == "nominal" else "", arm, *cells, style="dim")
+            numbers = pairs.get(arm) if kind == "pair" else found[arm].get(kind)
+            if numbers is not None:
+                cells = [f"{numbers[key]:.4f}" for key in ("mean", "rms", "p95", "max")]
+                table.add_row(f"  {escape(words)}" if arm == "nominal" else "", arm, *cells)
     table.add_section()

@@ -10,9 +10,8 @@ import numpy as np
 from calib.procedure.comparing import Comparison
 
 GAIN = 0.10  # a smaller gain in rms on the unseen is no gain worth a new robot file
-TRANSFER = 2.0  # unseen errors this many times the fit's own: the fit does not transfer
+TRANSFER = 3.0  # unseen errors this many times the fit's own: the fit does not transfer
 OUTLIERS = 0.05  # more rows than this share that do not fit: something is wrong with the measurements or the model
-FLOOR = 4e-4  # rms per metre of reach: what no rigid geometry of a sound arm leaves
 
 
 @dataclass(frozen=True)
@@ -31,7 +30,7 @@ def judge(
     asked: str,
     cross_validated: float | None,
     outlier_share: float,
-    reach: float,
+    unexplained: str = "",
 ) -> Verdict:
     """Judge a calibration by the rows it has not seen.
 
@@ -40,9 +39,9 @@ def judge(
     1. only frames were asked for: pass, with nothing claimed of the arm;
     2. on any unseen file the calibrated arm is not better than the nominal one: fail;
     3. no unseen rows and no cross-validation: marginal;
-    4. the gain on the unseen is below `GAIN`: marginal;
-    5. unseen errors above `TRANSFER` times the fit's own: marginal;
-    6. errors above `FLOOR` times the reach remain: marginal, since no rigid geometry of a sound arm leaves so much;
+    4. no rigid geometry explains the measurements (`calib.procedure.diagnosis.plateau`): marginal at best;
+    5. the gain on the unseen is below `GAIN`: marginal;
+    6. unseen errors above `TRANSFER` times the fit's own: marginal;
     7. more than `OUTLIERS` of the rows do not fit: marginal;
     8. else pass.
 
@@ -52,7 +51,7 @@ def judge(
         model, asked: the model chosen, and the one asked for.
         cross_validated: error of the chosen model on rows left out [m], where it was computed.
         outlier_share: of the fit's rows.
-        reach: of the arm [m].
+        unexplained: the sentence of rule 4, or empty.
     """
     proofs = {name: comparison for name, comparison in validation.items() if comparison.proves}
     own = _rms(fit.errors[1].main)
@@ -81,16 +80,12 @@ def judge(
         before, after = (_rms(found.main) for found in proofs[name].errors)
         where = f"on {name}, unseen"
     both = _both(before, after)
+    if unexplained:
+        return Verdict("marginal", f"{unexplained}; {where}: {both}")
     if after > (1.0 - GAIN) * before:
         return Verdict("marginal", f"{where}, the gain is small: {both}; the arm may be calibrated already")
     if after > TRANSFER * own:
         return Verdict("marginal", f"{where}, errors are {after / own:.1f} times those on the fitted poses: {both}")
-    if after > FLOOR * reach:
-        return Verdict(
-            "marginal",
-            f"{where}, better but far from explained: {both}; a rigid geometry of a sound arm leaves less than "
-            f"{1e3 * FLOOR * reach:.2f} mm at this reach, so look for play, a changed set-up or wrong joint angles",
-        )
     if outlier_share > OUTLIERS:
         return Verdict(
             "marginal", f"{where}: {both}; but {100 * outlier_share:.0f} % of the fitted rows do not fit (outliers)"
