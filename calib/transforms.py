@@ -1,7 +1,7 @@
 """Rigid transforms as (..., 4, 4) arrays; rotations are scipy's wherever scipy has them.
 
-A pose maps coordinates of its own frame to its reference: p_ref = T @ [p; 1]. Quaternions are x, y, z, w; roll-pitch-yaw
-is URDF's: R = Rz(yaw) Ry(pitch) Rx(roll).
+A pose maps coordinates of its own frame to its reference: p_ref = T @ [p; 1]. Quaternions are x, y, z, w;
+roll-pitch-yaw is URDF's: R = Rz(yaw) Ry(pitch) Rx(roll).
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def rotation_vector(matrices: np.ndarray) -> np.ndarray:
 
 
 def displace(placement: np.ndarray, step: ArrayLike) -> np.ndarray:
-    """Return ``placement · Trans(step[:3]) · Exp(step[3:])``: a placement (4, 4) moved by six small elements [m, rad]."""
+    """Return ``placement · Trans(step[:3]) · Exp(step[3:])``: a placement (4, 4) moved by six elements [m, rad]."""
     step = np.asarray(step, dtype=float)
     return placement @ pose(Rotation.from_rotvec(step[3:]).as_matrix(), step[:3])
 

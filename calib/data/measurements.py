@@ -47,14 +47,14 @@ class PoseMeasurements:
     sigma: np.ndarray | None = None
     sigma_rotation: np.ndarray | None = None
     distance: np.ndarray | None = None
-    group: np.ndarray | None = None
+    group: np.ndarray = None  # type: ignore[assignment]  # set below
     group_names: tuple[str, ...] = ()
     links: tuple[tuple[int, int, float], ...] = ()
-    tool: np.ndarray | None = None
+    tool: np.ndarray = None  # type: ignore[assignment]  # set below
     tool_names: tuple[str, ...] = ("tool",)
     station: str = "station"
     file: str = ""
-    rows: np.ndarray | None = None
+    rows: np.ndarray = None  # type: ignore[assignment]  # set below
     ignored: tuple[str, ...] = field(default=())
     notes: tuple[str, ...] = field(default=())
 

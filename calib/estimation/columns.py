@@ -95,7 +95,7 @@ def _pick(scaled: np.ndarray, groups: list[np.ndarray], silent: np.ndarray, tole
         rest = scaled[:, candidates]
         for _ in range(2):  # twice is enough (Kahan): orthogonal to rounding
             rest = rest - basis @ (basis.T @ rest)
-        q, r, order = scipy.linalg.qr(rest, mode="economic", pivoting=True)
+        q, r, order = (np.asarray(x) for x in scipy.linalg.qr(rest, mode="economic", pivoting=True))
         count = int(np.sum(np.abs(np.diag(r)) > tolerance))
         kept.extend(candidates[order[:count]])
         basis = np.hstack([basis, q[:, :count]])

@@ -59,7 +59,7 @@ def triangle(residual: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.n
     stacked = np.empty((len(residual), p + 1), order="F")
     stacked[:, :p] = matrix
     stacked[:, p] = residual
-    (factor,) = scipy.linalg.qr(stacked, mode="r", overwrite_a=True, check_finite=False)
+    factor = np.asarray(scipy.linalg.qr(stacked, mode="r", overwrite_a=True, check_finite=False)[0])
     return np.triu(factor[:p, :p]), factor[:p, p], float(residual @ residual)
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
+from scipy.linalg.lapack import dpotri  # type: ignore[attr-defined]
 
 NEVER = 30.0  # a prior this many times as precise as the data on its columns: the group is out
 
@@ -80,7 +81,7 @@ def relevance(data: Gram, groups: np.ndarray, start: np.ndarray, iterations: int
         effective = float(gamma.sum())
         misfit = data.total - 2.0 * solution @ data.cross[index]
         misfit += solution @ data.square[np.ix_(index, index)] @ solution
-        beta = max(data.rows - effective - int((~ridged).sum()), 1.0) / max(misfit, 1e-300)
+        beta = max(data.rows - effective - int((~ridged).sum()), 1.0) / max(float(misfit), 1e-300)
     values, ridge = np.zeros(len(groups)), np.where(ridged, 0.0, np.inf)
     values[index] = solution
     kept = index[ridged[index]]
@@ -96,5 +97,5 @@ def _posterior(data: Gram, index: np.ndarray, penalty: np.ndarray, beta: float) 
     system[np.diag_indices(len(index))] += penalty * scale**2
     factor = scipy.linalg.cho_factor(system + 1e-12 * np.eye(len(index)), lower=True, check_finite=False)
     solution = scale * scipy.linalg.cho_solve(factor, scale * beta * data.cross[index], check_finite=False)
-    inverse, _ = scipy.linalg.lapack.dpotri(factor[0], lower=1)
+    inverse, _ = dpotri(factor[0], lower=1)
     return solution, np.diag(inverse) * scale**2

@@ -145,7 +145,6 @@ def _socket_spread(cell: Installation, block: Block) -> np.ndarray:
     A group's name is ``<fixture position>/<socket>``; empty where no pair of sockets occurs in two positions.
     """
     measured = block.measured
-    assert measured.group is not None
     point = predict(cell, block).point
     sockets: dict[str, dict[str, np.ndarray]] = {}
     for number in np.unique(measured.group):

@@ -40,7 +40,6 @@ def install(chain: Chain, measured: Sequence[PoseMeasurements]) -> Installation:
     rank = {"pose": 0, "position": 1, "sockets": 2}
     for block in sorted(measured, key=lambda b: (rank.get(b.kind, 3), -len(b))):
         arm = forward(chain, block.q)
-        assert block.tool is not None
         for number in np.unique(block.tool):
             name, rows = block.tool_names[number], block.tool == number
             station, tool = _guess(block, arm, rows, stations.get(block.station), tools.get(name))
@@ -76,7 +75,6 @@ def _guess(
         _enough(block, rows, 4)
         return place_position(arm[rows], block.position[rows], station, tool)
     if block.kind == "sockets" and tool is None:
-        assert block.group is not None
         return None, pose(None, place_sockets(arm[rows], block.group[rows]))
     return None, np.eye(4) if tool is None else tool
 
@@ -170,10 +168,8 @@ def _align(points: np.ndarray, seen: np.ndarray) -> np.ndarray:
     keep = np.ones(len(points), dtype=bool)
     placement = np.eye(4)
     for _ in range(2):
-        rotation, _ = Rotation.align_vectors(
-            seen[keep] - seen[keep].mean(axis=0), points[keep] - points[keep].mean(axis=0)
-        )
-        matrix = rotation.as_matrix()
+        turned = Rotation.align_vectors(seen[keep] - seen[keep].mean(axis=0), points[keep] - points[keep].mean(axis=0))
+        matrix = turned[0].as_matrix()
         placement = pose(matrix, seen[keep].mean(axis=0) - matrix @ points[keep].mean(axis=0))
         error = np.linalg.norm(seen - points @ matrix.T - placement[:3, 3], axis=1)
         keep = error <= max(np.quantile(error, 0.8), 1e-12)

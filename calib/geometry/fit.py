@@ -269,7 +269,7 @@ class _Weigher:
 
 def parameter_values(cell: Installation) -> np.ndarray:
     """Return the full parameter vector; frames count from their present placement, hence zeros."""
-    arm, stations, tools, _ = layout_counts(cell)
+    _, stations, tools, _ = layout_counts(cell)
     return np.concatenate([cell.chain.values, np.zeros(stations + tools), np.asarray(cell.deflection.coefficients)])
 
 
@@ -312,7 +312,6 @@ def outliers(found: GeometricFit, threshold: float = 4.0) -> list[tuple[str, int
         for part in found.found[start : start + labels]:
             spread = max(robust.spread(part.value), 1e-15)
             size = np.sqrt(np.mean(part.value**2, axis=0)) / spread
-            assert block.measured.rows is not None
             rows = block.measured.rows[part.index]
             result += [
                 (block.measured.file, int(rows[i]), part.label, float(size[i]))

@@ -65,7 +65,7 @@ def region_folds(
     scaled = q[:, spread > 1e-9] / spread[spread > 1e-9]
     regions = int(np.clip(len(q) // 12, 2, regions))
     count = min(folds, regions)
-    _, label = kmeans2(scaled, regions, seed=seed, minit="++", missing="warn")
+    _, label = kmeans2(scaled, regions, rng=seed, minit="++", missing="warn")
     order = {int(old): new for new, old in enumerate(np.argsort(-np.bincount(label, minlength=regions)))}
     fold = np.array([order[int(k)] for k in label]) % count
     members = np.split(fold, np.cumsum([len(block) for block in measured])[:-1])
@@ -76,14 +76,12 @@ def _whole(block: PoseMeasurements, fold: np.ndarray) -> np.ndarray:
     """Keep the two rows of a distance in one fold."""
     if block.kind != "distance":
         return fold
-    assert block.group is not None
     _, first, inverse = np.unique(block.group, return_index=True, return_inverse=True)
     return fold[first][inverse]
 
 
 def _fixtures(block: PoseMeasurements) -> Folds | None:
     """Return folds of whole fixtures, sockets tied by known distances counting as one; None for fewer than three."""
-    assert block.group is not None
     root = {int(group): int(group) for group in np.unique(block.group)}
     for a, b, _ in block.links:
         if a in root and b in root:

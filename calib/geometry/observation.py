@@ -47,7 +47,6 @@ def prepare(
     for number, block in enumerate(measured):
         torque = torques[number] if torques is not None else None
         station = _index(cell.station_names, block.station, "station") if has_instrument(block) else 0
-        assert block.tool is not None
         tools = np.array([_index(cell.tool_names, name, "tool") for name in block.tool_names])
         bases = deflection.evaluate(cell.deflection, block.q, torque) if cell.deflection.terms else None
         blocks.append(Block(block, station, tools[block.tool], torque, bases))
@@ -78,7 +77,7 @@ def observe(cell: Installation, block: Block, free: np.ndarray) -> list[Part]:
 
 def target_jacobian(cell: Installation, block: Block, seen: Seen, free: np.ndarray) -> np.ndarray:
     """Return [v; ω] of the targets per unit of each free parameter, (f, 6, m)."""
-    arm, stations, tools, terms = layout_counts(cell)
+    arm, stations, tools, _ = layout_counts(cell)
     m = seen.point.shape[1]
     jacobian = np.zeros((len(free), 6, m))
     section = np.searchsorted(np.cumsum([arm, stations, tools]), free, side="right")

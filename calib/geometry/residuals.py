@@ -72,7 +72,7 @@ def _position(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> l
 
 def _distance(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[Part]:
     """r = L - |p_a - p_b| for the two rows of each pair."""
-    assert measured.distance is not None and measured.group is not None
+    assert measured.distance is not None
     first, second = _pairs(measured)
     gap = seen.point[:, first] - seen.point[:, second]
     length = np.linalg.norm(gap, axis=0)
@@ -97,7 +97,6 @@ def _pairs(measured: PoseMeasurements) -> tuple[np.ndarray, np.ndarray]:
 
 def _sockets(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[Part]:
     """r = mean of its group - p, and L - |mean_a - mean_b| for sockets whose distance is known."""
-    assert measured.group is not None
     groups, inverse, counts = np.unique(measured.group, return_inverse=True, return_counts=True)
     average = np.zeros((len(measured), len(groups)))
     average[np.arange(len(measured)), inverse] = 1.0 / counts[inverse]

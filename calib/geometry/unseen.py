@@ -15,7 +15,7 @@ import numpy as np
 from calib.data.measurements import PoseMeasurements, take
 from calib.estimation.relevance import Gram, gram, relevance
 from calib.geometry.deflection import Deflection, Term
-from calib.geometry.fit import GeometricFit, used_sigmas, plausible_deviation
+from calib.geometry.fit import GeometricFit, plausible_deviation, used_sigmas
 from calib.geometry.folds import Folds
 from calib.geometry.installation import Installation
 from calib.geometry.observation import has_instrument, observe, prepare
@@ -56,7 +56,7 @@ class Judge:
         rigid: number of geometry columns.
         groups: (E,) ridge group of each term.
         sizes: (E,) first guess of each coefficient.
-        plausible: (rigid,) wide prior on the geometry columns, so that a fold that cannot tell one stays at the optimum.
+        plausible: (rigid,) wide prior on the geometry, so that what a fold cannot tell stays at the optimum.
         training: per fold, statistics of the other folds' rows, whitened.
         held_out: per fold, statistics of its rows [m], and how many.
         rows: per fold.
@@ -72,7 +72,7 @@ class Judge:
     total: Gram
 
     def problem(self, terms: np.ndarray, fold: int | None = None) -> tuple[Gram, np.ndarray, np.ndarray]:
-        """Return statistics, ridge groups and first sizes for the geometry and some terms; all rows, or without a fold."""
+        """Return statistics, ridge groups and first sizes for geometry and terms: of all rows, or without a fold."""
         data = self.total if fold is None else self.training[fold]
         index = np.concatenate([np.arange(self.rigid), self.rigid + terms])
         square = data.square[np.ix_(index, index)]

@@ -1,0 +1,93 @@
+"""Whether the measurements and the model belong together: set-ups that change, errors no rigid geometry explains."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from calib.geometry.fit import GeometricFit
+from calib.geometry.observation import Block
+from calib.geometry.residuals import Part
+
+FEWEST = 30  # rows below which no pattern is looked for (our choice)
+
+
+def diagnose(found: GeometricFit) -> list[str]:
+    """Return warnings on each block: rows that look like another set-up, and residuals that are not noise."""
+    lines = []
+    for block, part in lengths(found):
+        if len(block.measured) >= FEWEST:
+            lines += [*_setup_change(block, part), *_systematic(block, part)]
+    return lines
+
+
+def lengths(found: GeometricFit) -> list[tuple[Block, Part]]:
+    """Return per block its first part, which is in metres for every kind of measurement."""
+    result, start = [], 0
+    for block in found.blocks:
+        result.append((block, found.found[start]))
+        start += 2 if block.measured.kind == "pose" else 1
+        start += int(block.measured.kind == "sockets" and bool(block.measured.links))
+    return result
+
+
+def _setup_change(block: Block, part: Part) -> list[str]:
+    """Compare the rows before and after every cut: a run of rows twice as bad as the rest is another set-up."""
+    size = np.linalg.norm(part.value, axis=0)
+    m = len(size)
+    cuts = np.arange(max(10, m // 20), m - max(10, m // 20))
+    energy = np.cumsum(size**2)
+    before = np.sqrt(energy[cuts - 1] / cuts)
+    after = np.sqrt((energy[-1] - energy[cuts - 1]) / (m - cuts))
+    ratio = np.maximum(before / np.maximum(after, 1e-15), after / np.maximum(before, 1e-15))
+    weight = np.minimum(cuts, m - cuts)
+    best = int(np.argmax((ratio - 1.0) * np.sqrt(weight)))
+    if ratio[best] < 1.6:
+        return []
+    cut, first_worse = int(cuts[best]), before[best] > after[best]
+    rows = block.measured.rows[part.index]
+    bad = (rows[0], rows[cut - 1]) if first_worse else (rows[cut], rows[-1])
+    worse, rest = (before[best], after[best]) if first_worse else (after[best], before[best])
+    return [
+        f"{block.measured.file or 'measurements'}: rows {bad[0]}–{bad[1]} fit worse than the rest ({1e3 * worse:.2f} "
+        f"against {1e3 * rest:.2f} mm rms) and behave like another set-up: was the instrument, the tool or the robot's "
+        "mastering touched, or was it cold? Fit them apart (two files, --stations each) or leave them out."
+    ]
+
+
+def _systematic(block: Block, part: Part) -> list[str]:
+    """Compare residuals of neighbouring poses: noise differs between neighbours, a missing effect does not."""
+    floor, rms = neighbour_floor(block.measured.q, part), float(np.sqrt(np.mean(np.sum(part.value**2, axis=0))))
+    stated = None if part.sigma is None else float(np.sqrt(np.mean(np.sum(part.sigma**2, axis=0))))
+    lines = []
+    if floor is not None and floor < 0.6 * rms:
+        lines.append(
+            f"{block.measured.file or 'measurements'}: the remaining {1e3 * rms:.3f} mm rms are mostly systematic "
+            f"(neighbouring poses differ by only {1e3 * floor:.3f} mm): this model does not explain them all."
+        )
+    if stated is not None and rms > 5.0 * stated:
+        lines.append(
+            f"{block.measured.file or 'measurements'}: the residual ({1e3 * rms:.3f} mm rms) is {rms / stated:.0f} times "
+            f"the stated uncertainty ({1e3 * stated:.3f} mm): no geometry of this form explains the measurements to the "
+            "instrument's accuracy. The σ of the parameters are scaled up accordingly, yet such errors are not random."
+        )
+    return lines
+
+
+def neighbour_floor(q: np.ndarray, part: Part) -> float | None:
+    """Return the rms of residual differences between nearest neighbours in q, over √2 [m]: an estimate of the noise.
+
+    (von Neumann's mean square successive difference, 1941, with neighbours in joint space in place of time.) None where
+    neighbours are further apart than a third of the joints' spread, so that they share nothing.
+    """
+    spread = q.std(axis=0)
+    moving = spread > 1e-9
+    if len(q) != part.value.shape[1] or not moving.any():
+        return None
+    scaled = q[:, moving] / spread[moving]
+    distance, index = KDTree(scaled).query(scaled, k=2)
+    near = distance[:, 1] < np.sqrt(moving.sum()) / 3.0
+    if near.sum() < FEWEST:
+        return None
+    change = part.value[:, near] - part.value[:, np.asarray(index)[near, 1]]
+    return float(np.sqrt(np.mean(np.sum(change**2, axis=0)) / 2.0))
