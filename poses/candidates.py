@@ -53,8 +53,8 @@ def draw_candidates(
         found += len(kept[-1])
     if found < count:
         raise NothingFeasible(
-            f"{found} of {drawn} drawn poses are feasible ({100 * found / drawn:.3g} %), {count} were wanted: loosen the "
-            "narrowest constraint, check the frames it is written in, draw more, or ask for fewer candidates",
+            f"{found} of {drawn} drawn poses are feasible ({100 * found / drawn:.3g} %), {count} were wanted: "
+            "loosen the narrowest constraint, check the frames it is written in, draw more, or ask for fewer",
             found,
             drawn,
         )

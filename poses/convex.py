@@ -144,7 +144,7 @@ def _warm(z: np.ndarray, known: np.ndarray, m: int, cap: float, steps: int = 6) 
     """Return weights after a few multiplicative steps, and the scores there."""
     x = np.full(len(z), m / len(z))
     scores = scores_of(z, information_of(z, known, x))
-    for _ in range(steps):
+    for _ in range(steps if len(z) * cap > m else 0):  # with no choice left x = 1 is the answer
         x = x * scores**1.5
         for _ in range(3):
             x = np.minimum(x * (m / x.sum()), cap)
@@ -160,6 +160,8 @@ def _largest(values: np.ndarray, count: int) -> np.ndarray:
 def _priced(scores: np.ndarray, x: np.ndarray, active: np.ndarray, price: float, most: int) -> np.ndarray:
     """Return the next active set: those with weight or near the price, and the worst violators outside."""
     keep = active[(x[active] > 1e-4) | (scores[active] > 0.9 * price)]
+    if len(keep) < x.sum() + 2:  # all at the cap: leave the interior point room to move
+        keep = active
     outside = scores.copy()
     outside[keep] = -np.inf
     wanted = min(most, int((outside > price).sum()))

@@ -86,7 +86,7 @@ def detmax(pool: Pool, design: Design, report: Report | None = None, *, longest:
 def kicked(
     pool: Pool, design: Design, rounds: int, seed: int, report: Report | None = None, *, size: int = 3, weights=None
 ) -> Design:
-    """Leave local optima by kicks: exchange `size` random members for random candidates, exchange again, keep the better.
+    """Leave local optima by kicks: swap `size` random members for random candidates, exchange, keep the better.
 
     Iterated local search (Lourenço, Martin & Stützle 2003). Newcomers are drawn by their relaxed weights where known;
     size and law are our choice.
@@ -121,17 +121,18 @@ def _excursion(
     pool: Pool, start: Design, upwards: bool, longest: int, failed: set[frozenset[int]]
 ) -> tuple[Design | None, set[frozenset[int]]]:
     """Return the design one excursion comes back with (None if it went too far) and the designs seen on the way."""
-    m, seen, design = len(start.members), set[frozenset[int]](), start
-    design = _step(pool, design, upwards)
-    while len(design.members) != m:
-        key, larger = frozenset(design.members), len(design.members) > m
+    m, seen, design, larger = len(start.members), set[frozenset[int]](), start, upwards
+    while True:
+        size = len(design.members) + (1 if larger else -1)
+        if abs(size - m) > longest or size < 1 or size > len(pool.z):
+            return None, seen
+        design = _step(pool, design, larger)
+        if size == m:
+            return design, seen
+        key = frozenset(design.members)
         outwards = key in failed or key in seen  # the second clause is ours: without it an excursion can circle
         seen.add(key)
-        design = _step(pool, design, larger if outwards else not larger)
-        size = len(design.members)
-        if abs(size - m) > longest or size < 1 or size >= len(pool.z):
-            return None, seen
-    return design, seen
+        larger = (size > m) == outwards
 
 
 def _step(pool: Pool, design: Design, add: bool) -> Design:

@@ -1,6 +1,7 @@
 """Observability indices of a set of poses, with their gradients.
 
-``s1 >= ... >= sp`` are the singular values of the whitened observation matrix W of m poses, U and V its singular vectors.
+``s1 >= ... >= sp`` are the singular values of the whitened observation matrix W of m poses, U and V its singular
+vectors.
 
 ========  =========================  =========  ===========================================================
 index     formula                    direction  source

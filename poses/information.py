@@ -11,7 +11,7 @@ from scipy.linalg import solve_triangular
 from poses.errors import BadInput, NotIdentifiable, TooFewCandidates
 
 RANK_TOLERANCE = 1e-7
-"""Smallest accepted ratio of singular values of the column-scaled candidates: our choice, the Gram matrix resolves 1e-8."""
+"""Smallest accepted ratio of singular values of the column-scaled candidates: our choice (Gram matrices see 1e-8)."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def _check_counts(count: int, rows: int, p: int, m: int, measured: int) -> None:
     if m * rows + measured < p:
         raise NotIdentifiable(
             f"{m} poses of {rows} rows{f' and {measured} rows measured before' if measured else ''} give "
-            f"{m * rows + measured} equations for {p} parameters: at least {-(-(p - measured) // rows)} poses are needed"
+            f"{m * rows + measured} equations for {p} parameters: at least {-(-(p - measured) // rows)} poses needed"
         )
 
 

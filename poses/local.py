@@ -12,7 +12,7 @@ from poses.indices import Index, merit
 from poses.space import SearchSpace, constraint_gradient, is_feasible, product
 
 LARGE = 300
-"""Above so many variables constrained searches use MMA, because SLSQP solves a dense problem of that size every step."""
+"""Above so many variables constrained searches use MMA, because SLSQP solves a dense problem that large every step."""
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from poses.information import Candidates, checked, log_det, prepared
 from poses.local import Improved, improved
 from poses.multistart import multistart, random_starts
 from poses.space import SearchSpace, is_feasible
-from poses.tabu import TabuRule, tabu
+from poses.tabu import DEFAULT_RULE, TabuRule, tabu
 
 Method = Literal["detmax", "local", "multistart", "tabu"]
 Progress = Callable[[int, int, str], None]
@@ -103,7 +103,7 @@ def select(
     kicks: int = 10,
     starts: int = 8,
     evaluations: int = 300,
-    rule: TabuRule = TabuRule(),  # noqa: B008 (frozen)
+    rule: TabuRule = DEFAULT_RULE,
     map: Callable = map,
     progress: Progress | None = None,
 ) -> Selection:
@@ -128,7 +128,7 @@ def select(
         existing: (k, rows, p) whitened Jacobians of poses already measured; their information counts.
         count: candidates to draw where none are given.
         seed: of every random draw; the same seed gives the same selection.
-        kicks: random restarts of detmax around its best set.
+        kicks: random restarts of detmax around its best set; left out where at most 0.5 % can be won.
         starts: sets of multistart.
         evaluations: most evaluations of one local search.
         rule: numbers of the tabu search.
@@ -229,7 +229,9 @@ def _exchange(task: _Task, kicks: int) -> _Chosen:
         designs.append(exchanged(pool, greedy(pool, m), keep))
         stage(3, "DETMAX excursions and kicks")
         design = detmax(pool, max(designs, key=lambda d: d.logdet), keep)
-        design = kicked(pool, design, kicks, task.seed, keep, weights=weights)
+        # Kicks are skipped where the certificate leaves less than half a percent to win.
+        left = (task.bound.log_upper - candidates.shift - design.logdet) / p
+        design = kicked(pool, design, kicks if left > 0.005 else 0, task.seed, keep, weights=weights)
         keep(design)
         stage(4, "exchange among all candidates")
         polished = exchanged(whole, design_of(whole, best[-1][0]), lambda d: keep(d, np.arange(len(candidates.z))))
@@ -295,20 +297,19 @@ def _of(run: Improved) -> _Chosen:
 
 
 def _selection(task: _Task, chosen: _Chosen, method: Method, baseline: float, began: float) -> Selection:
-    indices = None
-    if chosen.members is not None:
-        indices = np.array(sorted(chosen.members))
+    indices, q = None, chosen.q
+    if q is None:
+        indices = np.array(sorted(chosen.members or ()))
         jacobians, q = task.jacobians[indices], None if task.q is None else task.q[indices]
     else:
-        q = chosen.q
         jacobians = np.asarray(task.space.jacobian(q), dtype=float) if task.space else task.jacobians[:0]
     value = _value(jacobians, task.before, task.index)
     if not value > 0 or not np.isfinite(value):
         raise NotIdentifiable(
-            f"no set of {task.m} poses of full rank was found, though all candidates together have it: ask for more poses"
+            f"no set of {task.m} poses of full rank was found, though all candidates together have it: ask for more "
+            "poses"
         )
     poses = task.m + (0 if task.before is None else len(task.before))
-    p = jacobians.shape[2]
     o1 = _value(jacobians, task.before, "O1")
     efficiency = o1**2 * poses / task.bound.upper
     history = np.exp(np.array(chosen.merits) * (-1.0 if task.index == "cond" else 1.0))

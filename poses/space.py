@@ -10,7 +10,7 @@ import numpy as np
 from poses.errors import BadInput
 
 STEP = 1e-5
-"""Step of central differences [rad or m]: our choice; error about 1e-10 of the values, both of truncation and rounding."""
+"""Step of central differences [rad or m]: our choice; truncation and rounding both cost about 1e-10 of the values."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,8 @@ class SearchSpace:
 
 def is_feasible(space: SearchSpace, q: np.ndarray, tolerance: float = 1e-8) -> np.ndarray:
     """Return whether each pose (m, n) keeps limits, constraints and predicate (m,)."""
-    good = ((q >= space.lower - tolerance) & (q <= space.upper + tolerance)).all(1)
+    good = np.all((q >= space.lower - tolerance) & (q <= space.upper + tolerance), axis=1)
+    good = np.asarray(good, dtype=bool)
     for constraint in space.constraints:
         if good.any():
             good[good] = (np.asarray(constraint.function(q[good])) <= tolerance).all(1)

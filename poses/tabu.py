@@ -44,6 +44,9 @@ class TabuRule:
     evaluations: int = 40
 
 
+DEFAULT_RULE = TabuRule()
+
+
 def tabu(
     space: SearchSpace,
     m: int,
@@ -51,7 +54,7 @@ def tabu(
     existing: np.ndarray | None = None,
     *,
     seed: int = 0,
-    rule: TabuRule = TabuRule(),  # noqa: B008 (frozen)
+    rule: TabuRule = DEFAULT_RULE,
     report: Callable[[int, float], None] | None = None,
 ) -> Improved:
     """Choose m poses by IMHATR; see the head of this module.
@@ -107,7 +110,7 @@ def _newcomer(
     listed: deque[np.ndarray],
     rule: TabuRule,
 ) -> tuple[np.ndarray, int]:
-    """Return a pose to add to `others`, improved by itself, and the evaluations spent; puts start and end on the list."""
+    """Return a pose to add to `others`, improved by itself, and the evaluations spent; start and end become tabu."""
 
     def allowed(q: np.ndarray) -> np.ndarray:
         good = is_feasible(space, q)

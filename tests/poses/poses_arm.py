@@ -1,6 +1,6 @@
 """A 7R arm with the LWR4+ geometry for the tests: poses of the tool and its observation Jacobian, in plain numpy.
 
-Khalil rows Rot_x(alpha) Trans_x(d) Rot_z(theta + q) Trans_z(r), nine frames; alpha8 = 0.3 keeps all 34 directions alive.
+Khalil rows Rot_x(alpha) Trans_x(d) Rot_z(theta + q) Trans_z(r), nine frames; alpha8 = 0.3 keeps all 34 alive.
 """
 
 import numpy as np

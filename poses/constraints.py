@@ -1,0 +1,124 @@
+"""Constraints on a measurement pose: tool height, distance from the axis, orientation seen by an instrument, sight.
+
+The quantities of the LWR4+ study's Table 1, and the line of sight. None knows a robot: they take the caller's forward
+kinematics as a callable, ``tool(q: (m, n)) -> (rotation (m, 3, 3), position (m, 3))`` in whatever frame the limits are
+written in, and, for exact gradients, ``tool_jacobian(q) -> (m, 6, n)``: velocity of that point, then angular velocity,
+both in that same frame. Every constraint is smooth where stated, and pickles if the callables do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from poses.space import Constraint
+
+Tool = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+ToolJacobian = Callable[[np.ndarray], np.ndarray]
+
+
+def height(tool: Tool, lowest: float, highest: float = np.inf, jacobian: ToolJacobian | None = None) -> Constraint:
+    """Keep lowest ≤ z ≤ highest [m] of the tool's point."""
+    limits = tuple((sign, bound) for sign, bound in ((-1.0, lowest), (1.0, highest)) if np.isfinite(bound))
+    slope = None if jacobian is None else partial(_height_gradient, jacobian, limits)
+    return Constraint("height", partial(_height, tool, limits), slope)
+
+
+def axis_distance(tool: Tool, least: float, jacobian: ToolJacobian | None = None) -> Constraint:
+    """Keep d_xy = √(x² + y²) ≥ least [m], written least² − x² − y² ≤ 0, which is smooth on the axis too."""
+    slope = None if jacobian is None else partial(_axis_gradient, tool, jacobian)
+    return Constraint("distance from the axis", partial(_axis, tool, least), slope)
+
+
+def reach(tool: Tool, most: float, centre: ArrayLike = (0, 0, 0), jacobian: ToolJacobian | None = None) -> Constraint:
+    """Keep the tool's point within `most` [m] of a centre (3,) [m]: ‖x − c‖² − most² ≤ 0."""
+    point = np.asarray(centre, dtype=float)
+    slope = None if jacobian is None else partial(_reach_gradient, tool, jacobian, point)
+    return Constraint("reach", partial(_reach, tool, most, point), slope)
+
+
+def orientation(tool: Tool, camera: ArrayLike, roll: tuple[float, float], pitch: tuple[float, float]) -> Constraint:
+    """Keep roll and pitch of the tool seen from the camera within limits [rad].
+
+    R_camera^T R = Rot_z(yaw) Rot_y(pitch) Rot_x(roll). The convention is our reading of Table 1, which does not state
+    it. Gradients are central differences. Not smooth where roll jumps by 2π, nor at a pitch of ±π/2.
+
+    Args:
+        tool: forward kinematics.
+        camera: (3, 3) orientation of the camera in the tool's reference frame.
+        roll, pitch: (lowest, highest) [rad].
+    """
+    return Constraint("orientation", partial(_orientation, tool, np.asarray(camera, dtype=float), roll, pitch))
+
+
+def line_of_sight(
+    tool: Tool, instrument: ArrayLike, axis: ArrayLike, half_angle: float, jacobian: ToolJacobian | None = None
+) -> Constraint:
+    """Keep the instrument in the target's cone of acceptance: cos(half_angle) − (R a)·u ≤ 0, u = (s − x)/‖s − x‖.
+
+    Args:
+        tool: forward kinematics of the target's centre x and orientation R.
+        instrument: (3,) s, where the tracker or camera stands [m].
+        axis: (3,) a, the direction the target faces, in the tool's frame.
+        half_angle: of the cone [rad] (a retroreflector accepts about 0.5 rad).
+        jacobian: for the exact gradient.
+    """
+    station, facing = np.asarray(instrument, dtype=float), np.asarray(axis, dtype=float)
+    facing = facing / np.linalg.norm(facing)
+    slope = None if jacobian is None else partial(_sight_gradient, tool, jacobian, station, facing)
+    return Constraint("line of sight", partial(_sight, tool, station, facing, half_angle), slope)
+
+
+def _height(tool, limits, q):
+    z = tool(q)[1][:, 2]
+    return np.stack([sign * (z - bound) for sign, bound in limits], axis=1)
+
+
+def _height_gradient(jacobian, limits, q):
+    row = jacobian(q)[:, 2]
+    return np.stack([sign * row for sign, _ in limits], axis=1)
+
+
+def _axis(tool, least, q):
+    x = tool(q)[1]
+    return least**2 - (x[:, :2] ** 2).sum(1, keepdims=True)
+
+
+def _axis_gradient(tool, jacobian, q):
+    return -2 * np.einsum("mi,min->mn", tool(q)[1][:, :2], jacobian(q)[:, :2])[:, None]
+
+
+def _reach(tool, most, centre, q):
+    return ((tool(q)[1] - centre) ** 2).sum(1, keepdims=True) - most**2
+
+
+def _reach_gradient(tool, jacobian, centre, q):
+    return 2 * np.einsum("mi,min->mn", tool(q)[1] - centre, jacobian(q)[:, :3])[:, None]
+
+
+def _orientation(tool, camera, roll, pitch, q):
+    seen = camera.T @ tool(q)[0]
+    phi = np.arctan2(seen[:, 2, 1], seen[:, 2, 2])
+    theta = np.arcsin(np.clip(-seen[:, 2, 0], -1, 1))
+    return np.stack([roll[0] - phi, phi - roll[1], pitch[0] - theta, theta - pitch[1]], axis=1)
+
+
+def _sight(tool, station, facing, half_angle, q):
+    rotation, x = tool(q)
+    away = station - x
+    u = away / np.linalg.norm(away, axis=1, keepdims=True)
+    return np.cos(half_angle) - ((rotation @ facing) * u).sum(1, keepdims=True)
+
+
+def _sight_gradient(tool, jacobian, station, facing, q):
+    rotation, x = tool(q)
+    away, face = station - x, rotation @ facing
+    length = np.linalg.norm(away, axis=1, keepdims=True)
+    u = away / length
+    across = (face - (face * u).sum(1, keepdims=True) * u) / length  # ∂(face·u)/∂x = −across; ∂/∂ω = face × u
+    slope = jacobian(q)
+    moved = np.einsum("mi,min->mn", across, slope[:, :3])
+    return (moved - np.einsum("mi,min->mn", np.cross(face, u), slope[:, 3:]))[:, None]

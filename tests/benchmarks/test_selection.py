@@ -1,0 +1,40 @@
+"""Speed of pose selection: run with `pytest tests/benchmarks/test_selection.py --benchmark-only -s`.
+
+Set OPENBLAS_NUM_THREADS=1 on a shared machine: matrices this small lose by threads, under load by a factor of thirty.
+"""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "poses"))
+import poses_arm
+
+from poses.convex import bound
+from poses.select import select
+
+CASES = {
+    "17 of 2000, pose": (2000, 17, poses_arm.jacobian),
+    "30 of 2000, position only": (2000, 30, poses_arm.point_jacobian),
+    "100 of 20000, pose": (20000, 100, poses_arm.jacobian),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_select(benchmark, case):
+    count, m, function = CASES[case]
+    jacobians = function(poses_arm.random_poses(count, 0))
+    chosen = benchmark.pedantic(select, (jacobians, m), rounds=3 if count < 5000 else 1, warmup_rounds=1)
+    random = chosen.efficiency * (chosen.random_baseline / chosen.value) ** 2
+    figures = {"efficiency": chosen.efficiency, "random": random, "bound_gap": chosen.bound.gap}
+    benchmark.extra_info.update(figures)
+    print(f"\n{case}: efficiency {chosen.efficiency:.4f}, best of 1000 random sets {random:.4f} of the bound")
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_bound(benchmark, case):
+    count, m, function = CASES[case]
+    jacobians = function(poses_arm.random_poses(count, 0))
+    result = benchmark.pedantic(bound, (jacobians, m), rounds=3 if count < 5000 else 1, warmup_rounds=1)
+    benchmark.extra_info["gap"] = result.gap

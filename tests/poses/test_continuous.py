@@ -1,0 +1,149 @@
+"""Claims on the searches that leave the candidates, on a planar arm with closed-form derivatives."""
+
+import pickle
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import planar
+import pytest
+
+from poses import constraints
+from poses.errors import BadInput
+from poses.local import improved, merit_of
+from poses.select import select
+from poses.space import Constraint, SearchSpace, central_difference, is_feasible
+from poses.tabu import TabuRule
+
+SPACE = SearchSpace(planar.jacobian, planar.LOWER, planar.UPPER, planar.product)
+LOW = Constraint("height", planar.height, planar.height_gradient)
+Q = np.random.default_rng(0).uniform(planar.LOWER, planar.UPPER, (200, 3))
+QUICK = TabuRule(candidates=30, patience=0.5, evaluations=20)
+
+
+def outside_the_wedge(q):
+    return np.abs(q[:, 0]) > 0.3
+
+
+@pytest.mark.parametrize("index", ["O1", "O2", "O3", "O4", "O5", "cond"])
+@pytest.mark.parametrize("exact", [True, False])
+def test_gradient_in_joint_values_is_the_central_difference(index, exact):
+    space = SPACE if exact else replace(SPACE, jacobian_product=None)
+    q, existing = Q[:6], planar.jacobian(Q[10:12])
+    slope = merit_of(space, q, index, existing)[1]
+    for k in np.ndindex(q.shape):
+        step = np.zeros_like(q)
+        step[k] = 1e-6
+        difference = (
+            merit_of(space, q + step, index, existing)[0] - merit_of(space, q - step, index, existing)[0]
+        ) / 2e-6
+        assert slope[k] == pytest.approx(difference, rel=1e-5, abs=1e-7)
+
+
+@pytest.mark.parametrize(
+    "constraint",
+    [
+        LOW,
+        constraints.height(planar.tool, -0.3, 0.9, planar.tool_jacobian),
+        constraints.axis_distance(planar.tool, 0.2, planar.tool_jacobian),
+        constraints.reach(planar.tool, 0.9, (0.1, 0, 0.2), planar.tool_jacobian),
+        constraints.line_of_sight(planar.tool, (2, 1, 1), (1, 0, 0.2), 0.6, planar.tool_jacobian),
+    ],
+    ids=lambda c: c.name,
+)
+def test_constraint_gradients(constraint):
+    assert constraint.gradient is not None
+    expected = central_difference(constraint.function, Q).transpose(0, 2, 1)
+    np.testing.assert_allclose(constraint.gradient(Q), expected, atol=1e-8)
+    verdicts = (constraint.function(Q) <= 0).all(1)
+    assert verdicts.any() and not verdicts.all()
+    pickle.loads(pickle.dumps(constraint))
+
+
+def test_line_of_sight_is_a_cone():
+    seen = constraints.line_of_sight(planar.tool, (5, 0.1, 0), (1, 0, 0), 0.5)
+    turned = np.array([[0, 0, 0.4], [0, 0, 0.6]])
+    assert (seen.function(turned)[:, 0] <= 0).tolist() == [True, False]
+
+
+def test_orientation_limits_roll_and_pitch():
+    level = constraints.orientation(planar.tool, np.eye(3), (-0.1, 0.1), (-0.5, 0.5))
+    poses = np.array([[0, 0, 0.4], [0, 0, 0.6], [0, 0, -0.6]])  # these turn about −y: pitch −0.4, −0.6, 0.6
+    values = level.function(poses)
+    assert ((values <= 0).all(1)).tolist() == [True, False, False]
+    np.testing.assert_allclose(values[:, 3], [-0.9, -1.1, 0.1], atol=1e-12)
+
+
+@pytest.mark.parametrize("bound", [(), (LOW,), (replace(LOW, gradient=None),)], ids=["box", "exact", "differences"])
+def test_local_search_improves_and_stays_feasible(bound):
+    space = replace(SPACE, constraints=bound)
+    start = (0.3 * Q)[is_feasible(space, 0.3 * Q)][:5]  # clustered: much to win
+    run = improved(space, start)
+    assert run.merit > merit_of(space, start, "O1")[0] + 0.05
+    assert is_feasible(space, run.q, 1e-6).all()
+    if not bound:  # stationary: no gradient left but against a limit
+        slope = merit_of(space, run.q, "O1")[1]
+        inside = (run.q > planar.LOWER + 1e-6) & (run.q < planar.UPPER - 1e-6)
+        assert np.abs(slope[inside]).max() < 1e-2
+
+
+def test_a_predicate_is_kept_where_the_gradient_leads_into_it():
+    space = replace(SPACE, feasible=outside_the_wedge)
+    start = Q[is_feasible(space, Q)][:6]
+    run = improved(space, start)
+    assert is_feasible(space, run.q, 1e-6).all()
+    assert run.merit > merit_of(space, start, "O1")[0]
+
+
+@pytest.mark.parametrize("method", ["local", "multistart", "tabu"])
+def test_methods_keep_constraints_repeat_by_seed_and_beat_random_sets(method):
+    space = replace(SPACE, constraints=(LOW,), feasible=outside_the_wedge)
+    runs = [
+        select(None, 6, space=space, method=method, count=300, seed=4, starts=3, evaluations=60, rule=QUICK)
+        for _ in range(2)
+    ]
+    assert (runs[0].q == runs[1].q).all() and runs[0].value == runs[1].value
+    assert is_feasible(space, runs[0].q, 1e-6).all() and runs[0].q.shape == (6, 3)
+    assert runs[0].value > runs[0].random_baseline
+    assert runs[0].indices is None
+    assert runs[0].history[-1] == runs[0].value and (np.diff(runs[0].history) >= -1e-9).all()
+
+
+def test_leaving_the_candidates_beats_staying_among_few():
+    kept = select(planar.jacobian(Q[:40]), 5, q=Q[:40])
+    moved = select(None, 5, q=Q[:40], space=SPACE, method="local")
+    spread = select(None, 5, q=Q[:40], space=SPACE, method="multistart", starts=4)
+    assert kept.value < moved.value <= spread.value
+    assert kept.efficiency <= 1
+
+
+def test_multistart_on_other_processes_gives_the_same_poses():
+    here = select(None, 5, q=Q, space=SPACE, method="multistart", starts=3)
+    with ProcessPoolExecutor(2) as pool:
+        there = select(None, 5, q=Q, space=SPACE, method="multistart", starts=3, map=pool.map)
+    assert (here.q == there.q).all()
+
+
+def test_interrupted_local_search_returns_the_best_so_far():
+    calls = [0]
+
+    def jacobian(q):
+        calls[0] += 1
+        if calls[0] == 12:
+            raise KeyboardInterrupt
+        return planar.jacobian(q)
+
+    start = Q[:5]
+    run = improved(replace(SPACE, jacobian=jacobian), start)
+    assert run.interrupted and run.merit > merit_of(SPACE, start, "O1")[0]
+
+
+def test_existing_rows_of_another_instrument_count():
+    position = planar.jacobian(Q[50:60])[:, :1]
+    chosen = select(None, 3, q=Q, space=SPACE, method="tabu", rule=QUICK, existing=position)
+    assert chosen.q.shape == (3, 3) and chosen.value > chosen.random_baseline
+
+
+def test_limits_must_be_limits():
+    with pytest.raises(BadInput, match="joint 1"):
+        SearchSpace(planar.jacobian, np.zeros(3), np.array([1.0, 0.0, 1.0]))
