@@ -145,7 +145,7 @@ def test_the_iteration_limit_is_said():
 
 
 def test_what_damping_does_not_reach_is_not_called_converged():
-    """Eq. 12 scales by the present diag(WᵀW); where the residual stays large it crawls (Moré's running maximum cures it).
+    """Eq. 12 scales by the present diag(WᵀW); where the residual stays large it crawls (Moré's maximum cures it).
 
     The point of this test is the verdict: far from the optimum (85822.2) the status is not ``converged``.
     """
