@@ -82,6 +82,99 @@ def fit(
         raise typer.Exit(1)
 
 
+@app.command()
+def select(
+    robot: Robot,
+    out: Annotated[Path, typer.Option(help="CSV file of the chosen joint values, rad")],
+    m: Annotated[int, typer.Option("-m", help="how many poses")] = 30,
+    kind: Annotated[str, typer.Option(help="what will be measured: pose or position")] = "pose",
+    tool: Annotated[
+        list[str] | None, typer.Option(help="x,y,z of a target in the tip's frame [m]; may be repeated")
+    ] = None,
+    index: Annotated[str, typer.Option(help="O1 to O5, or cond")] = "O1",
+    method: Annotated[str, typer.Option(help="detmax, multistart, tabu or local")] = "detmax",
+    constraints: Annotated[Path | None, typer.Option(help="TOML: limits, sight, height, collision")] = None,
+    candidates: Annotated[int, typer.Option(help="poses to choose from")] = 2000,
+    existing: Annotated[Path | None, typer.Option(help="CSV of poses measured before, which count")] = None,
+    sigma: Annotated[
+        str | None, typer.Option(help="of a position [m] and an orientation [rad], e.g. 1e-4,1e-4")
+    ] = None,
+    workers: Annotated[str, typer.Option(help="local processes, or the address of a Dask scheduler")] = "1",
+    base: Base = None,
+    tip: Tip = None,
+    seed: Seed = 0,
+) -> None:
+    """Choose the poses at which the geometry of ROBOT shows best."""
+    from calib import workers as work
+    from calib.procedure import selecting
+
+    targets = [_numbers(text, 3, "--tool") for text in tool or []]
+    sigmas = None if sigma is None else _numbers(sigma, 2, "--sigma")
+    with work.workers(workers) as mapped, _progress() as say:
+        chosen = selecting.choose(
+            robot, m, kind=kind, tools=targets, index=index, method=method, constraints=constraints, existing=existing,
+            candidates=candidates, sigmas=(sigmas[0], sigmas[1]) if sigmas else None, base=base, tip=tip, seed=seed,
+            map=mapped, progress=lambda done, total, what: say(f"{what} ({done} of {total})"),
+        )  # fmt: skip
+    selecting.write(chosen, out)
+    console = _console()
+    for words, number in selecting.table(chosen):
+        console.print(f"{words:38} {number}", soft_wrap=True, markup=False)
+    for note in chosen.notes:
+        console.print(f"note: {note}", soft_wrap=True, markup=False)
+    console.print(f"{m} poses written to {out}", soft_wrap=True, markup=False)
+
+
+@app.command()
+def export(
+    folder: Annotated[Path, typer.Argument(help="the folder of a fit")],
+    urdf: Annotated[
+        Path | None, typer.Option(help="the URDF to put the calibrated geometry into (it stays as it is)")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="the URDF to write")] = None,
+    ur_kinematics: Annotated[Path | None, typer.Option(help="write ur_description's kinematics YAML")] = None,
+    offsets: Annotated[Path | None, typer.Option(help="write a CSV of joint offsets")] = None,
+) -> None:
+    """Write the calibrated geometry for other programs."""
+    from calib.errors import UsageError
+    from calib.procedure import exporting
+
+    if (urdf is None) != (out is None) or not (urdf or ur_kinematics or offsets):
+        raise UsageError("nothing to write: give --urdf SOURCE.urdf --out FILE.urdf, --ur-kinematics or --offsets")
+    found = exporting.read(folder)
+    console = _console()
+    if urdf and out:
+        exporting.export_urdf(found, urdf, out)
+        console.print(
+            f"{out}: joint origins of {urdf} calibrated, all else kept; base link and flange stay where the source has "
+            "them; Pinocchio reads the same poses to 1e-9", soft_wrap=True, markup=False,
+        )  # fmt: skip
+    if ur_kinematics:
+        exporting.export_ur_kinematics(found, ur_kinematics)
+        console.print(f"{ur_kinematics}: for kinematics_params_file of ur_description", soft_wrap=True, markup=False)
+    if offsets:
+        exporting.export_offsets(found, offsets)
+        console.print(
+            f"{offsets}: offset of each joint, the rest of the geometry left out; --model offsets fits the best ones",
+            soft_wrap=True, markup=False,
+        )  # fmt: skip
+    if found.corrected:
+        note = f"note: the corrections in {folder}/joint_corrections.csv are in none of these files"
+        console.print(note, soft_wrap=True, markup=False)
+
+
+def _numbers(text: str, count: int, option: str) -> list[float]:
+    from calib.errors import UsageError
+
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count:
+        raise UsageError(f"{option} {text}: expected {count} numbers with commas between them")
+    return values
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit with one of the codes above."""
     sys.exit(run(arguments))

@@ -10,13 +10,15 @@ import numpy as np
 from calib.data.measurements import PoseMeasurements
 from calib.data.options import FitOptions
 from calib.errors import NotConverged
+from calib.geometry.diagnosis import diagnose
+from calib.geometry.explanation import explain
 from calib.geometry.first_guess import install
 from calib.geometry.fit import Settings, combine
 from calib.geometry.installation import Installation
 from calib.geometry.ladder import Climb, climb
 from calib.geometry.parameters import layout
 from calib.procedure.comparing import Comparison, compare, compare_unseen
-from calib.procedure.diagnosis import Outlier, named_outliers, plateau, set_up_changes
+from calib.procedure.diagnosis import Outlier, named_outliers, plateau
 from calib.procedure.inputs import Inputs
 from calib.procedure.verdict import Verdict, judge
 from calib.robot.chain import Chain
@@ -111,8 +113,8 @@ def run(
         unexplained=unexplained,
     )
     notes = (*inputs.notes, *(note for block in inputs.fit for note in block.notes), *elsewhere(fitted, validation))
-    warnings = (*notes, *((unexplained,) if unexplained else ()), *set_up_changes(fitted))
-    return Outcome(inputs, found, fitted, validation, named, (), warnings, verdict, seed)
+    warnings = (*notes, *((unexplained,) if unexplained else ()), *diagnose(found.fit))
+    return Outcome(inputs, found, fitted, validation, named, tuple(explain(found.fit)), warnings, verdict, seed)
 
 
 def fixed_parameters(start: Installation, options: FitOptions) -> np.ndarray:

@@ -133,15 +133,17 @@ def load_robot(
 
 def read_file(path: Path, chain: Chain, options: FitOptions) -> list[PoseMeasurements]:
     """Read one measurement file for a chain, held against its limits."""
-    kinds = [_kind(chain, joint) for joint in chain.joints]
     limits = (chain.lower, chain.upper)
-    return read_measurements(path, chain.joint_names, options.for_file(path), kinds=kinds, limits=limits)
+    return read_measurements(path, chain.joint_names, options.for_file(path), kinds=joint_kinds(chain), limits=limits)
 
 
-def _kind(chain: Chain, joint: Joint) -> str:
-    """Return URDF's name of a joint's kind: a revolute one without limits is continuous there."""
-    unlimited = joint.kind == "revolute" and not np.isfinite([joint.lower, joint.upper]).any()
-    return "continuous" if unlimited and chain.links else joint.kind
+def joint_kinds(chain: Chain) -> list[str]:
+    """Return URDF's names of the joints' kinds: a revolute joint of a URDF without limits is continuous there."""
+    return ["continuous" if chain.links and _unlimited(joint) else joint.kind for joint in chain.joints]
+
+
+def _unlimited(joint: Joint) -> bool:
+    return joint.kind == "revolute" and not np.isfinite([joint.lower, joint.upper]).any()
 
 
 def hold_out(block: PoseMeasurements, share: float, seed: int) -> tuple[PoseMeasurements, PoseMeasurements | None]:

@@ -143,9 +143,12 @@ def metrics(outcome: Outcome) -> dict[str, object]:
 
 
 def _provenance(outcome: Outcome) -> dict[str, object]:
+    inputs = outcome.inputs
+    earlier = description.read_extra(inputs.source) if inputs.source.suffix == ".toml" else {}
     return {
-        "robot": str(outcome.inputs.source),
-        "files": [block.file for block in outcome.inputs.fit],
+        "robot": str(inputs.source),
+        "nominal": earlier.get("provenance", {}).get("nominal", inputs.chain.values.tolist()),
+        "files": [block.file for block in inputs.fit],
         "model": outcome.climb.chosen,
         "seed": outcome.seed,
         "verdict": f"{outcome.verdict.level}: {outcome.verdict.reason}",

@@ -44,7 +44,7 @@ def outcome_lines(outcome: Outcome) -> Iterator[RenderableType]:
     yield error_table(outcome)
     unclear = outcome.unclear
     for line in unclear[:MANY]:
-        yield f"[yellow]not identifiable[/]: {escape(line)}"
+        yield f"[yellow]identifiability[/]: {escape(line)}"
     if len(unclear) > MANY:
         yield f"... and {len(unclear) - MANY} more in metrics.json"
     for line in outcome.warnings:

@@ -9,6 +9,7 @@ import numpy as np
 
 from calib.procedure.comparing import Comparison
 
+WORSE = 1.01  # calibrated over nominal rms on the unseen from which on it is worse, not only no better
 GAIN = 0.10  # a smaller gain in rms on the unseen is no gain worth a new robot file
 TRANSFER = 3.0  # unseen errors this many times the fit's own: the fit does not transfer
 OUTLIERS = 0.05  # more rows than this share that do not fit: something is wrong with the measurements or the model
