@@ -40,8 +40,13 @@ Read = tuple[Table, FileOptions, tuple[str, ...]]
 
 
 def recognises(header: Sequence[str]) -> bool:
-    """Tell whether a header is RoboDK's: J1 to J6 first."""
-    return [_plain(name) for name in header[:6]] in ([f"j{i}" for i in range(1, 7)], [f"joint{i}" for i in range(1, 7)])
+    """Tell whether a header is RoboDK's: J1 to J6 (or ``Joint 1`` to ``Joint 6``) first.
+
+    ``joint1`` in one word is a name that robots have: such a file is read by its names.
+    """
+    first = [name.split("(")[0].split("[")[0].strip().lower() for name in header[:6]]
+    named = first in ([f"j{i}" for i in range(1, 7)], [f"joint {i}" for i in range(1, 7)])
+    return named and _plain(header[6] if len(header) > 6 else "") not in ("j7", "joint7")
 
 
 def read_robodk(path: str | Path, joints: int, options: FileOptions) -> Read:
