@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg
 from scipy.linalg.lapack import dpotri  # type: ignore[attr-defined]
 
-NEVER = 30.0  # a prior this many times as precise as the data on its columns: the group is out
+OUTWEIGHED = 1.0  # a group is out once its prior is this many times as precise as the data on its columns (our choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ def relevance(data: Gram, groups: np.ndarray, start: np.ndarray, iterations: int
         gamma = np.bincount(own, told, count + 1)
         size = np.bincount(own, solution**2, count + 1)
         lam[:count] = np.where(alive, np.maximum(gamma, 1e-12) / np.maximum(size, 1e-300), lam)[:count]
-        alive[:count] &= (lam < NEVER * beta * np.maximum(information, 1e-300))[:count]
+        alive[:count] &= (lam < OUTWEIGHED * beta * np.maximum(information, 1e-300))[:count]
         effective = float(gamma.sum())
         misfit = data.total - 2.0 * solution @ data.cross[index]
         misfit += solution @ data.square[np.ix_(index, index)] @ solution
