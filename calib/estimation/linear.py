@@ -1,0 +1,177 @@
+"""Least squares of y = W x + ρ from triangles: ordinary, weighted per group, and with a prior.
+
+Covariances are those of the stated model of the noise. Filtered and decimated residuals are not white, and a covariance
+that counts every row as news is too small; `inflation` corrects it: group g counts as rows_g / inflation_g rows. It is
+the integrated autocorrelation 1 + 2 Σ ρ_k of the residuals (`whiteness.inflation`), or the sampling rate over twice the
+band that was kept. That is exact for columns which vary slowly against the residuals and cautious for the others. The
+values do not depend on it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from calib.arrays import frozen, shaped
+from calib.errors import CalibError, NotConverged, Unidentifiable
+from calib.estimation.columns import split_columns
+from calib.estimation.estimate import Estimate
+from calib.estimation.triangles import Triangles, combine, residual_squares, retriangulate, solve_triangle
+
+
+@dataclass(frozen=True, eq=False)
+class LinearFit:
+    """A linear estimate and what it rests on.
+
+    Attributes:
+        estimate: values, covariance, standard deviation of the weighted residuals, degrees of freedom.
+        group_std: (g,) standard deviation of the residuals of each group, in units of y.
+        condition: condition number of W as solved (rows weighted, columns in their units).
+        condition_normalised: the same with columns of unit norm.
+    """
+
+    estimate: Estimate
+    group_std: np.ndarray
+    condition: float
+    condition_normalised: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "group_std", frozen(self.group_std))
+
+
+def ols(data: Triangles, inflation: np.ndarray | None = None) -> LinearFit:
+    """Estimate x = argmin ‖y - W x‖² with covariance σ² (WᵀW)⁻¹, σ² = ‖ρ‖² / (r - p).
+
+    The covariance holds where all groups have the same noise; otherwise use `wls`.
+
+    Args:
+        data: triangles of W and y.
+        inflation: (g,) >= 1, see the module; None: every row counts.
+    """
+    return _fit(data, np.ones(data.groups), inflation, stated=False)
+
+
+def wls(data: Triangles, std: np.ndarray | None = None, inflation: np.ndarray | None = None) -> LinearFit:
+    """Estimate x = (Wᵀ R⁻¹ W)⁻¹ Wᵀ R⁻¹ y with R = diag(σ_g² I), covariance (Wᵀ R⁻¹ W)⁻¹.
+
+    Kolyubin et al. (2019), eq. 22 and 25; the RSD of eq. 26 is ``fit.estimate.rsd``.
+
+    Args:
+        data: triangles of W and y, one group per standard deviation.
+        std: (g,) in units of y; `subsystem_std` is the study's choice. None: `settled_std`.
+        inflation: (g,) >= 1, see the module.
+    """
+    return _fit(data, settled_std(data) if std is None else np.asarray(std, dtype=float), inflation, stated=True)
+
+
+def ridge(data: Triangles, mean: np.ndarray, covariance: np.ndarray, std: np.ndarray | None = None) -> LinearFit:
+    """Estimate x from the data and a prior x ~ N(mean, covariance), by QR of [R; L⁻¹] with L Lᵀ = covariance.
+
+    The covariance of the result is that of the posterior. `condition` is that of the data with the prior.
+
+    Args:
+        data: triangles of W and y.
+        mean: (p,).
+        covariance: (p, p); an infinite diagonal entry says that nothing is known beforehand.
+        std: (g,) noise of each group in units of y; None: `settled_std` of the data, which must then determine x alone.
+    """
+    p = data.parameters
+    mean = shaped(mean, (p,), "prior mean")
+    known = np.isfinite(np.diag(covariance))
+    root = np.linalg.cholesky(shaped(np.asarray(covariance)[np.ix_(known, known)], (None, None), "prior covariance"))
+    rows = np.zeros((int(known.sum()), p + 1))
+    rows[:, np.flatnonzero(known)] = scipy.linalg.solve_triangular(root, np.eye(len(root)), lower=True)
+    rows[:, p] = rows[:, :p] @ mean
+    sigma = settled_std(data) if std is None else np.asarray(std, dtype=float)
+    factor = retriangulate(np.vstack([combine(data, sigma), rows]))
+    values, inverse, conditions = solve_triangle(factor, data.names)
+    return _pack(data, values, inverse @ inverse.T, sigma, np.ones(data.groups), inverse, conditions)
+
+
+def subsystem_std(data: Triangles) -> np.ndarray:
+    """Return σ_g of each group fitted alone, σ_g² = ‖ρ_g‖² / (r_g - rank W_g) (Kolyubin et al. 2019, after eq. 22)."""
+    p = data.parameters
+    result = np.empty(data.groups)
+    for g, factor in enumerate(data.factors):
+        own = split_columns(factor[:, :p], tolerance=1e-8).kept
+        if data.rows[g] <= len(own):
+            raise CalibError(
+                f"group {g} has {data.rows[g]} rows for {len(own)} parameters of its own: no residual is left to tell "
+                "its noise; state the standard deviations"
+            )
+        rest = retriangulate(factor[:, np.append(own, p)])[-1, -1]
+        result[g] = abs(rest) / np.sqrt(data.rows[g] - len(own))
+    return _floored(result)
+
+
+def settled_std(data: Triangles, tolerance: float = 1e-6, limit: int = 200) -> np.ndarray:
+    """Return σ_g that reproduce themselves: σ_g² = ‖y_g - W_g x‖² / (r_g - h_g), x the WLS estimate with them.
+
+    h_g = ‖W_g R⁻¹‖² / σ_g² is the group's share of the p parameters; the fixed point is the restricted maximum
+    likelihood (Patterson & Thompson 1971). Starts from `subsystem_std`.
+    """
+    std = subsystem_std(data)
+    for _ in range(limit):
+        values, inverse, _ = solve_triangle(combine(data, std), data.names)
+        left = data.rows - _leverage(data, std, inverse)
+        new = _floored(np.sqrt(residual_squares(data, values) / np.maximum(left, 1e-9)))
+        change, std = float(np.max(np.abs(new / std - 1.0))), new
+        if change < tolerance:
+            return std
+    raise NotConverged(
+        f"the standard deviations of the groups still change by {change:.1g} after {limit} rounds; a group with few "
+        "rows may be fitted exactly: state the standard deviations",
+        std,
+    )
+
+
+def _fit(data: Triangles, std: np.ndarray, inflation: np.ndarray | None, stated: bool) -> LinearFit:
+    """Solve with rows divided by std; `stated`: the covariance takes std as the noise, otherwise up to a factor."""
+    tau = np.ones(data.groups) if inflation is None else shaped(inflation, (data.groups,), "inflation per group")
+    values, inverse, conditions = solve_triangle(combine(data, std), data.names)
+    covariance = inverse @ inverse.T
+    if inflation is not None:
+        spread = data.factors[:, :, :-1] @ inverse * np.sqrt(tau)[:, None, None] / std[:, None, None]
+        covariance = inverse @ np.einsum("gij,gik->jk", spread, spread) @ inverse.T
+    fit = _pack(data, values, covariance, std, tau, inverse, conditions)
+    if stated:
+        return fit
+    return _pack(data, values, covariance * fit.estimate.residual_std**2, std, tau, inverse, conditions)
+
+
+def _pack(
+    data: Triangles,
+    values: np.ndarray,
+    covariance: np.ndarray,
+    std: np.ndarray,
+    tau: np.ndarray,
+    inverse: np.ndarray,
+    conditions: tuple[float, float],
+) -> LinearFit:
+    """Return the fit with its residuals' sizes, degrees of freedom counted with the inflation τ."""
+    squares = residual_squares(data, values)
+    left = data.rows - tau * _leverage(data, std, inverse)
+    dof = int(np.round(np.sum(left / tau), 6))
+    if dof <= 0 or left.sum() <= 0:
+        raise Unidentifiable(
+            f"{int(data.rows.sum())} rows ({np.sum(data.rows / tau):.0f} independent ones) for {data.parameters} "
+            "parameters leave nothing to judge them by; record longer or estimate fewer",
+            data.names,
+        )
+    residual_std = float(np.sqrt(np.sum(squares / std**2) / left.sum()))
+    group_std = np.sqrt(squares / np.maximum(left, 1e-9))
+    estimate = Estimate(data.names, data.units, values, covariance, residual_std, dof)
+    return LinearFit(estimate, group_std, *conditions)
+
+
+def _leverage(data: Triangles, std: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+    """Return h_g = ‖W_g R⁻¹‖² / σ_g² (g,), which sum to p."""
+    return np.sum((data.factors[:, :, :-1] @ inverse) ** 2, axis=(1, 2)) / std**2
+
+
+def _floored(std: np.ndarray) -> np.ndarray:
+    """Return std with a floor of 1e-9 of the largest: exact data must not turn into infinite weights."""
+    largest = std.max(initial=0.0)
+    return np.maximum(std, 1e-9 * largest) if largest > 0.0 else np.ones_like(std)

@@ -1,0 +1,190 @@
+"""All that y = W x tells, in triangles: the R factor of [W y] of every group of rows, updated block by block.
+
+An hour at 1 kHz of seven joints with 100 parameters is a matrix of 20 GB and a triangle of 80 kB. One triangle is kept
+per group (a joint, a load case, a file), so that weights may change afterwards without another pass over the data: the
+weighted problem is the QR of the stacked R_g / σ_g. Nothing is squared on the way: what QR of the whole matrix can
+resolve, the triangles resolve too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.linalg
+
+from calib.arrays import frozen, shaped
+from calib.errors import CalibError, Unidentifiable
+
+CHUNK = 20_000  # rows per factorisation: bounds the working memory, 16 MB at 100 parameters
+RESOLUTION = 1e-10  # singular values of unit-norm columns below this part of the largest are rounding
+
+
+@dataclass(frozen=True, eq=False)
+class Triangles:
+    """R factors of [W y], one per group of rows.
+
+    Attributes:
+        names, units: p strings each, of the columns of W.
+        factors: (g, p + 1, p + 1) upper triangular; its last column belongs to y.
+        rows: (g,) rows absorbed so far.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    factors: np.ndarray
+    rows: np.ndarray
+
+    @property
+    def groups(self) -> int:
+        return len(self.rows)
+
+    @property
+    def parameters(self) -> int:
+        return len(self.names)
+
+
+def empty(names: Sequence[str], units: Sequence[str] | None = None, groups: int = 1) -> Triangles:
+    """Return triangles that have seen no rows."""
+    p = len(names)
+    given = tuple(units) if units is not None else ("",) * p
+    if len(given) != p:
+        raise CalibError(f"{p} parameter names but {len(given)} units")
+    return Triangles(tuple(names), given, frozen(np.zeros((groups, p + 1, p + 1))), frozen(np.zeros(groups), int))
+
+
+def absorb(data: Triangles, matrix: np.ndarray, target: np.ndarray, group: np.ndarray | int = 0) -> Triangles:
+    """Return the triangles after more rows: R_g becomes the R of [R_g; W_g y_g].
+
+    Columns that are zero in all rows of a group (a joint does not feel the links before it) cost nothing.
+
+    Args:
+        data: what was absorbed before.
+        matrix: (r, p) rows of W.
+        target: (r,) rows of y.
+        group: (r,) integers saying whose rows they are, or one integer for all.
+    """
+    matrix = shaped(matrix, (None, data.parameters), "observation matrix W")
+    target = shaped(target, (len(matrix),), "target y")
+    index = np.broadcast_to(np.asarray(group, dtype=int), len(matrix))
+    if len(index) and not 0 <= index.min() <= index.max() < data.groups:
+        raise CalibError(f"rows belong to groups {index.min()} to {index.max()}, but there are {data.groups} groups")
+    factors, rows = np.array(data.factors), np.array(data.rows)
+    for g in np.unique(index):
+        own = np.flatnonzero(index == g)
+        rows[g] += len(own)
+        for start in range(0, len(own), CHUNK):
+            part = own[start : start + CHUNK]
+            factors[g] = _update(factors[g], matrix[part], target[part])
+    return replace(data, factors=frozen(factors), rows=frozen(rows, int))
+
+
+def collect(
+    matrix: np.ndarray,
+    target: np.ndarray,
+    group: np.ndarray | None = None,
+    names: Sequence[str] | None = None,
+    units: Sequence[str] | None = None,
+) -> Triangles:
+    """Return the triangles of a whole problem; without names the columns are called x1, x2, …"""
+    matrix = shaped(matrix, (None, None), "observation matrix W")
+    count = 1 if group is None or len(group) == 0 else int(np.max(group)) + 1
+    names = names if names is not None else [f"x{k + 1}" for k in range(matrix.shape[1])]
+    return absorb(empty(names, units, count), matrix, target, 0 if group is None else group)
+
+
+def merge(first: Triangles, second: Triangles) -> Triangles:
+    """Return the triangles of both sets of rows, groups joined pairwise (parallel passes, several files)."""
+    if first.names != second.names or first.groups != second.groups:
+        raise CalibError("only triangles of the same parameters and groups merge")
+    factors = [retriangulate(np.vstack(pair)) for pair in zip(first.factors, second.factors)]
+    return replace(first, factors=frozen(np.stack(factors)), rows=frozen(first.rows + second.rows, int))
+
+
+def select(data: Triangles, columns: np.ndarray) -> Triangles:
+    """Return the triangles of the model with only these columns, in the order given."""
+    columns = np.asarray(columns, dtype=int)
+    wanted = np.append(columns, data.parameters)
+    factors = [retriangulate(factor[:, wanted]) for factor in data.factors]
+    names = tuple(data.names[k] for k in columns)
+    return Triangles(names, tuple(data.units[k] for k in columns), frozen(np.stack(factors)), data.rows)
+
+
+def combine(data: Triangles, std: np.ndarray | None = None) -> np.ndarray:
+    """Return the R factor (p + 1, p + 1) of all rows, those of group g divided by std[g] (None: by one)."""
+    scale = np.ones(data.groups) if std is None else shaped(std, (data.groups,), "standard deviation per group")
+    if (scale <= 0.0).any():
+        raise CalibError(f"standard deviations per group must be positive, found {scale.min()}")
+    size = data.parameters + 1
+    return retriangulate((data.factors / scale[:, None, None]).reshape(data.groups * size, size))
+
+
+def residual_squares(data: Triangles, values: np.ndarray) -> np.ndarray:
+    """Return ‖y_g - W_g x‖² of every group (g,), from the triangles alone."""
+    return np.sum((data.factors @ np.append(values, -1.0)) ** 2, axis=1)
+
+
+def retriangulate(stacked: np.ndarray) -> np.ndarray:
+    """Return the R factor of any matrix as a square upper triangle, padded with zero rows."""
+    size = stacked.shape[1]
+    factor = np.asarray(scipy.linalg.qr(stacked, mode="r", check_finite=False)[0])[:size]
+    return np.vstack([factor, np.zeros((size - len(factor), size))])
+
+
+def condition_numbers(factor: np.ndarray) -> tuple[float, float]:
+    """Return cond(W) and cond(W with unit-norm columns) from W or any R factor of it."""
+    norms = np.linalg.norm(factor, axis=0)
+    return _ratio(np.linalg.svd(factor, compute_uv=False)), _ratio(
+        np.linalg.svd(factor / np.where(norms > 0.0, norms, 1.0), compute_uv=False)
+    )
+
+
+def solve_triangle(factor: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
+    """Solve R x = z from the triangle [R z; 0 ρ] of [W y]; return x, R⁻¹ and the condition numbers of W.
+
+    Raises:
+        Unidentifiable: naming the columns that take part in a dependence.
+    """
+    p = len(names)
+    upper = factor[:p, :p]
+    norms = np.linalg.norm(upper, axis=0)
+    scaled = upper / np.where(norms > 0.0, norms, 1.0)
+    _, values, vt = np.linalg.svd(scaled)
+    weak = values <= RESOLUTION * values[0]
+    if weak.any():
+        raise _dependent(names, values, vt[weak])
+    inverse = np.asarray(scipy.linalg.solve_triangular(scaled, np.eye(p))) / norms[:, None]
+    solution = np.asarray(scipy.linalg.solve_triangular(scaled, factor[:p, p])) / norms
+    return solution, inverse, (_ratio(np.linalg.svd(upper, compute_uv=False)), _ratio(values))
+
+
+def _dependent(names: Sequence[str], values: np.ndarray, directions: np.ndarray) -> Unidentifiable:
+    """Return the error that names every column with a part in a null direction."""
+    part = np.linalg.norm(directions, axis=0)
+    concerned = [name for name, size in zip(names, part) if size > 0.01]
+    shown = ", ".join(concerned[:12]) + (f" and {len(concerned) - 12} more" if len(concerned) > 12 else "")
+    return Unidentifiable(
+        f"{len(directions)} combination(s) of {len(names)} parameters have no effect on the data: {shown}. Choose base "
+        "columns first (columns.split_columns), or add motion that tells them apart",
+        concerned,
+        values,
+    )
+
+
+def _update(factor: np.ndarray, matrix: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Return the R of [factor; matrix target], factorising live columns only."""
+    old = factor[factor.any(axis=1)]
+    live = np.flatnonzero(np.append(matrix.any(axis=0), True) | old.any(axis=0))
+    stacked = np.empty((len(old) + len(matrix), len(live)), order="F")
+    stacked[: len(old)] = old[:, live]
+    stacked[len(old) :, :-1] = matrix[:, live[:-1]]
+    stacked[len(old) :, -1] = target
+    upper = np.asarray(scipy.linalg.qr(stacked, mode="r", overwrite_a=True, check_finite=False)[0])[: len(live)]
+    result = np.zeros_like(factor)
+    result[: len(upper), live] = upper  # live[i] >= i: still upper triangular
+    return result
+
+
+def _ratio(values: np.ndarray) -> float:
+    return float(values[0] / values[-1]) if values[-1] > 0.0 else float("inf")

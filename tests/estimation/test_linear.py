@@ -1,0 +1,165 @@
+"""Linear estimators: what they agree with, whether their covariance is true, and what weighting gains."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.linalg
+from linear_problems import TRUTH, noisy, rows
+from scipy.signal import lfilter
+
+from calib.errors import CalibError, Unidentifiable
+from calib.estimation.linear import ols, ridge, settled_std, subsystem_std, wls
+from calib.estimation.triangles import collect
+
+STD = np.array([0.1, 1.0, 5.0])
+
+
+def test_ols_is_the_least_squares_solution_of_numpy_with_the_textbook_covariance():
+    matrix, target, _ = noisy(0, STD)
+    fit = ols(collect(matrix, target))
+    expected, rss, *_ = np.linalg.lstsq(matrix, target)
+    variance = rss[0] / (len(target) - 5)
+    assert fit.estimate.values == pytest.approx(expected, rel=1e-10)
+    assert fit.estimate.covariance == pytest.approx(variance * np.linalg.inv(matrix.T @ matrix), rel=1e-9)
+    assert fit.estimate.residual_std**2 == pytest.approx(variance, rel=1e-10)
+    assert fit.estimate.dof == 595
+    assert fit.condition == pytest.approx(np.linalg.cond(matrix), rel=1e-9)
+    assert fit.condition_normalised == pytest.approx(np.linalg.cond(matrix / np.linalg.norm(matrix, axis=0)), rel=1e-9)
+
+
+def test_wls_is_ols_of_the_rows_divided_by_their_standard_deviation():
+    matrix, target, group = noisy(1, STD)
+    fit = wls(collect(matrix, target, group), STD)
+    w = matrix / STD[group][:, None]
+    assert fit.estimate.values == pytest.approx(np.linalg.lstsq(w, target / STD[group])[0], rel=1e-10)
+    assert fit.estimate.covariance == pytest.approx(np.linalg.inv(w.T @ w), rel=1e-9)
+    assert fit.estimate.residual_std == pytest.approx(1.0, abs=0.1)
+
+
+def test_standard_deviations_of_the_groups_are_found_and_reproduce_themselves():
+    matrix, target, group = noisy(2, STD, 6000)
+    data = collect(matrix, target, group)
+    assert subsystem_std(data) == pytest.approx(STD, rel=0.06)
+    settled = settled_std(data)
+    fit = wls(data)
+    assert settled == pytest.approx(STD, rel=0.06)
+    assert fit.group_std == pytest.approx(settled, rel=1e-5)
+    assert fit.estimate.residual_std == pytest.approx(1.0, abs=1e-5)
+
+
+def test_settled_standard_deviations_are_unbiased_where_parameters_are_many():
+    found = []
+    for seed in range(200):
+        matrix, target, group = noisy(seed, np.array([1.0, 1.0, 1.0]), 30)
+        found.append(settled_std(collect(matrix, target, group)) ** 2)
+    mean = np.mean(found)
+    assert mean == pytest.approx(1.0, abs=4 * np.std(found) / np.sqrt(600))
+    assert 1.0 - 4 * np.std(found) / np.sqrt(600) > 25 / 30  # residuals without their degrees of freedom would fail
+
+
+@pytest.mark.parametrize("estimate, std", [(ols, np.array([1.0, 1.0, 1.0])), (wls, STD)])
+def test_the_covariance_is_true_over_many_data_sets(estimate, std):
+    sizes = []
+    for seed in range(300):
+        matrix, target, group = noisy(seed, std, 120)
+        found = estimate(collect(matrix, target, group)).estimate
+        error = found.values - TRUTH
+        sizes.append(error @ np.linalg.solve(found.covariance, error))
+    assert np.mean(sizes) == pytest.approx(5.0, abs=4 * np.sqrt(10 / 300) + 0.25)  # F(5, 115) has mean 5.09
+
+
+def test_wls_beats_ols_on_unlike_groups_by_what_theory_says():
+    def spread(estimate):
+        values = [estimate(collect(*noisy(seed, STD))).estimate.values for seed in range(100)]
+        return np.mean((np.array(values) - TRUTH) ** 2, axis=0)
+
+    matrix, _, group = noisy(0, STD)
+    w = matrix / STD[group][:, None]
+    hat = np.linalg.pinv(matrix)
+    promised = np.diag((hat * STD[group] ** 2) @ hat.T) / np.diag(np.linalg.inv(w.T @ w))
+    gain = spread(ols) / spread(wls)
+    assert promised.min() > 10
+    assert np.all((gain > promised / 2) & (gain < promised * 2))
+
+
+def test_autocorrelated_residuals_need_the_inflation_and_get_a_true_covariance_with_it():
+    naive, corrected, phi = [], [], 0.9
+    tau = np.array([(1 + phi) / (1 - phi)])
+    for seed in range(150):
+        rng = np.random.default_rng(seed)
+        t = np.arange(2000) / 2000
+        matrix = np.column_stack([np.ones(2000), np.sin(6 * t), t])  # slow columns
+        target = matrix @ [1.0, 2.0, 3.0] + lfilter([1.0], [1.0, -phi], rng.normal(size=2200))[200:]
+        data = collect(matrix, target)
+        for fit, sizes in ((ols(data), naive), (ols(data, tau), corrected)):
+            error = fit.estimate.values - [1.0, 2.0, 3.0]
+            sizes.append(error @ np.linalg.solve(fit.estimate.covariance, error) / 3)
+    assert np.mean(naive) > 10
+    assert np.mean(corrected) == pytest.approx(1.0, abs=0.3)
+    assert fit.estimate.dof == int(2000 / tau[0] - 3)
+
+
+def test_inflation_leaves_the_values_and_scales_a_single_groups_covariance():
+    data = collect(*noisy(3, STD)[:2])
+    plain, inflated = ols(data), ols(data, np.array([4.0]))
+    assert np.array_equal(plain.estimate.values, inflated.estimate.values)
+    ratio = inflated.estimate.covariance / plain.estimate.covariance
+    assert ratio == pytest.approx(4.0 * (600 - 5) / (600 - 20), rel=1e-9)
+
+
+def test_a_prior_acts_as_rows_of_its_own_and_the_unknown_stays_free():
+    matrix, target, group = noisy(4, STD)
+    mean, width = np.full(5, 0.7), np.array([0.1, np.inf, 0.5, 0.01, np.inf])
+    fit = ridge(collect(matrix, target, group), mean, np.diag(width**2), STD)
+    extra = np.diag(1 / width)
+    w, y = np.vstack([matrix / STD[group][:, None], extra]), np.concatenate([target / STD[group], extra @ mean])
+    assert fit.estimate.values == pytest.approx(np.linalg.lstsq(w, y)[0], rel=1e-9)
+    assert fit.estimate.covariance == pytest.approx(np.linalg.inv(w.T @ w), rel=1e-9)
+
+
+def test_a_prior_makes_an_unidentifiable_problem_solvable_and_leaves_the_sum_to_the_data():
+    rng = np.random.default_rng(5)
+    column = rng.normal(size=(50, 1))
+    data = collect(np.hstack([column, column]), column[:, 0] * 3.0 + rng.normal(0, 0.01, 50))
+    values = ridge(data, np.array([0.0, 1.0]), np.eye(2), np.array([0.01])).estimate.values
+    assert values == pytest.approx([1.0, 2.0], abs=0.01)
+
+
+def test_dependent_columns_are_named_and_only_they():
+    matrix, target, _ = noisy(6, STD)
+    matrix[:, 3] = 2 * matrix[:, 0] - matrix[:, 2]
+    with pytest.raises(Unidentifiable, match="base") as caught:
+        ols(collect(matrix, target, names=["XX1", "MX2", "Fv1", "Fc1", "Ia1"]))
+    assert caught.value.names == ("XX1", "Fv1", "Fc1")
+
+
+def test_a_column_without_effect_is_named():
+    matrix, target, _ = noisy(6, STD)
+    matrix[:, 1] = 0.0
+    with pytest.raises(Unidentifiable) as caught:
+        ols(collect(matrix, target))
+    assert caught.value.names == ("x2",)
+
+
+def test_too_few_rows_nan_and_wrong_shapes_are_refused():
+    matrix, group = rows(0)
+    with pytest.raises(Unidentifiable):
+        ols(collect(matrix[:4], np.ones(4)))
+    with pytest.raises(Unidentifiable, match="leave nothing"):
+        ols(collect(matrix[:5], np.ones(5)))
+    with pytest.raises(CalibError, match=r"shape \(600"):
+        collect(matrix, np.ones(599), group)
+    with pytest.raises(CalibError, match="not finite"):
+        collect(np.where(matrix == matrix[7, 1], np.nan, matrix), np.ones(600))
+    with pytest.raises(CalibError, match="group 1 has 4 rows"):
+        wls(collect(matrix[:100], np.ones(100), np.r_[np.zeros(96, int), np.ones(4, int)]))
+    with pytest.raises(CalibError, match="positive"):
+        wls(collect(matrix, np.ones(600), group), np.array([1.0, 0.0, 1.0]))
+
+
+def test_an_ill_conditioned_but_regular_problem_is_solved_to_qr_accuracy():
+    matrix = scipy.linalg.hilbert(8)[:, :6] @ np.diag(10.0 ** np.arange(6))
+    stacked = np.vstack([matrix] * 5)
+    fit = ols(collect(stacked, stacked @ np.ones(6)))  # the normal equations would keep no digit
+    assert fit.estimate.values == pytest.approx(np.ones(6), abs=1e-7)

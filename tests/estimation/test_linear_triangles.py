@@ -1,0 +1,89 @@
+"""Triangles carry all of the data: block by block, merged, selected and reweighted they equal the whole matrix."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from linear_problems import noisy
+
+from calib.errors import CalibError
+from calib.estimation.linear import wls
+from calib.estimation.triangles import absorb, collect, combine, empty, merge, residual_squares, select
+
+STD = np.array([0.1, 1.0, 5.0])
+
+
+def gram(data, std=None):
+    factor = combine(data, std)
+    return factor.T @ factor
+
+
+@pytest.mark.parametrize("size", [1, 7, 100, 600])
+def test_blocks_of_any_size_equal_the_whole(size):
+    matrix, target, group = noisy(0, STD)
+    data = empty(["a", "b", "c", "d", "e"], groups=3)
+    for start in range(0, 600, size):
+        stop = start + size
+        data = absorb(data, matrix[start:stop], target[start:stop], group[start:stop])
+    whole = np.column_stack([matrix, target]) / STD[group][:, None]
+    assert gram(data, STD) == pytest.approx(whole.T @ whole, rel=1e-11)
+    assert data.rows.tolist() == [200, 200, 200]
+    direct = wls(collect(matrix, target, group), STD).estimate
+    blocks = wls(data, STD).estimate
+    assert blocks.values == pytest.approx(direct.values, rel=1e-11)
+    assert blocks.covariance == pytest.approx(direct.covariance, rel=1e-10)
+
+
+def test_factors_are_upper_triangular_even_where_a_group_misses_columns():
+    matrix, target, group = noisy(1, STD)
+    matrix[group == 1, 2:4] = 0.0
+    for factor in collect(matrix, target, group).factors:
+        assert np.array_equal(factor, np.triu(factor))
+
+
+def test_more_rows_than_one_chunk_equal_the_whole():
+    rng = np.random.default_rng(2)
+    matrix, target = rng.normal(size=(45_000, 3)), rng.normal(size=45_000)
+    whole = np.column_stack([matrix, target])
+    assert gram(collect(matrix, target)) == pytest.approx(whole.T @ whole, rel=1e-11, abs=1e-8)
+
+
+def test_parts_merge_to_the_whole_and_only_like_parts_merge():
+    matrix, target, group = noisy(3, STD)
+    parts = [collect(matrix[k::2], target[k::2], np.r_[group[k::2]]) for k in (0, 1)]
+    whole = collect(matrix, target, group)
+    assert gram(merge(*parts), STD) == pytest.approx(gram(whole, STD), rel=1e-11)
+    with pytest.raises(CalibError, match="same parameters"):
+        merge(whole, collect(matrix, target, group, names=list("abcde")))
+
+
+def test_selected_columns_equal_a_model_without_the_others():
+    matrix, target, group = noisy(4, STD)
+    chosen = select(collect(matrix, target, group, names=list("abcde")), np.array([4, 0, 2]))
+    assert chosen.names == ("e", "a", "c")
+    assert gram(chosen, STD) == pytest.approx(gram(collect(matrix[:, [4, 0, 2]], target, group), STD), rel=1e-11)
+
+
+def test_residuals_of_every_group_are_read_from_the_triangles():
+    matrix, target, group = noisy(5, STD)
+    x = np.array([1.0, -2.0, 0.0, 0.5, 9.0])
+    squares = residual_squares(collect(matrix, target, group), x)
+    assert squares == pytest.approx([np.sum((target - matrix @ x)[group == g] ** 2) for g in range(3)], rel=1e-11)
+
+
+def test_an_absorbed_block_leaves_the_value_before_it_as_it_was():
+    matrix, target, _ = noisy(6, STD)
+    before = collect(matrix[:300], target[:300])
+    kept = before.factors.copy()
+    absorb(before, matrix[300:], target[300:])
+    assert np.array_equal(before.factors, kept)
+    with pytest.raises(ValueError):
+        before.factors[0, 0, 0] = 1.0
+
+
+def test_a_group_out_of_range_and_units_that_do_not_fit_are_refused():
+    matrix, target, _ = noisy(7, STD)
+    with pytest.raises(CalibError, match="1 groups"):
+        absorb(empty(list("abcde")), matrix, target, 3)
+    with pytest.raises(CalibError, match="5 parameter names but 1 units"):
+        empty(list("abcde"), ["kg"])
