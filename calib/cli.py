@@ -163,6 +163,91 @@ def export(
         console.print(note, soft_wrap=True, markup=False)
 
 
+# The guided session: new, next, status, redo, demo
+
+Folder = Annotated[Path, typer.Argument(help="the session's folder")]
+
+
+@app.command()
+def new(
+    folder: Folder,
+    robot: Annotated[str, typer.Option(help="a .urdf, an MDH .toml, a library name, or the folder of an earlier fit")],
+    instrument: Annotated[str, typer.Option(help="cmm, tracker, tracker6d, mocap, camera, other-pose, other-position")],
+    poses: Annotated[int, typer.Option(help="poses to choose for the fit")] = 40,
+    validation: Annotated[int, typer.Option(help="poses to measure and never fit; 0 for none")] = 20,
+    base: Base = "",
+    tip: Tip = "",
+    seed: Seed = 0,
+) -> None:
+    """Make a session FOLDER: calibrate a robot step by step, with a certificate at the end."""
+    from calib.procedure import guided
+
+    made = guided.begin(
+        folder, robot, instrument, poses=poses, validation=validation, base=base or "", tip=tip or "", seed=seed
+    )
+    _console().print(f"made {made.folder}; next: calib next {made.folder}", soft_wrap=True, markup=False)
+
+
+@app.command("next")
+def next_step(folder: Folder) -> None:
+    """Do what can be done in a session, then say what to do at the robot."""
+    _go_on(folder, f"calib next {folder}")
+
+
+@app.command()
+def redo(
+    folder: Folder,
+    step: Annotated[str, typer.Argument(help="describe, select, measure, fit, validate, export, certificate")],
+) -> None:
+    """Make a step of a session again, and all that rests on it."""
+    _go_on(folder, f"calib redo {folder} {step}", step)
+
+
+@app.command()
+def status(folder: Folder) -> None:
+    """Show how far a session is, and what is stale because something changed."""
+    from calib.procedure import guided
+
+    console = _console()
+    for renderable in guided.status_lines(folder):
+        console.print(renderable, soft_wrap=True)
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="the session's folder")] = Path("calib-demo"),
+    robot: Annotated[str, typer.Option(help="a robot of the library")] = "lwr4plus",
+    seed: Seed = 0,
+) -> None:
+    """Calibrate a simulated robot with a simulated instrument, and compare with the hidden truth."""
+    from calib.procedure import demo as demonstration
+
+    console = _console()
+    with _progress() as progress:
+        found = demonstration.run(out, robot, seed, _plainly(console), progress)
+    console.print(f"\n{found.seconds:.1f} s. Look at", soft_wrap=True, markup=False)
+    for words, name in demonstration.RESULTS:
+        console.print(f"  {words:15} {found.session.folder / name}", soft_wrap=True, markup=False)
+    if found.verdict == "fail":
+        raise typer.Exit(1)
+
+
+def _go_on(folder: Path, command: str, again: str = "") -> None:
+    from calib.procedure import guided
+
+    console = _console()
+    with _progress() as progress:
+        stop = guided.go_on(folder, _plainly(console), progress, command, again)
+    for line in stop.lines:
+        console.print(line, soft_wrap=True, markup=False)
+    if stop.verdict == "fail":
+        raise typer.Exit(1)
+
+
+def _plainly(console: Any) -> Any:
+    return lambda words: console.print(words, soft_wrap=True, markup=False)
+
+
 def _numbers(text: str, count: int, option: str) -> list[float]:
     from calib.errors import UsageError
 

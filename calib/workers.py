@@ -63,5 +63,6 @@ def _dask(address: str) -> Iterator[Map]:
         client = Client(address, timeout="10s")
     except (OSError, ValueError) as error:
         raise UsageError(f"no Dask scheduler answers at {address}: {error}") from error
+    scheduler: Any = client
     with client:
-        yield lambda function, *items: client.gather(client.map(function, *map(list, items), pure=False))
+        yield lambda function, *items: scheduler.gather(scheduler.map(function, *map(list, items), pure=False))

@@ -21,8 +21,9 @@ def tip_poses(source: str, chain: Chain, q: np.ndarray) -> np.ndarray:
     Raises:
         RobotError: where Pinocchio cannot read the text.
     """
-    import pinocchio as pin
+    import pinocchio
 
+    pin: Any = pinocchio  # its names come from C++, where no type checker sees them
     try:
         model: Any = pin.buildModelFromXML(source)
     except (ValueError, RuntimeError) as error:

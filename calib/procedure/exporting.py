@@ -21,6 +21,7 @@ from calib.robot.tree import read as read_tree
 from calib.transforms import to_xyz_rpy
 
 SAME = 1e-9  # poses read back by Pinocchio have to agree to this [m, and as a rotation matrix]
+UR_KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
 UR_LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 
 
@@ -96,8 +97,8 @@ def _sigmas(folder: Path) -> dict[str, float]:
 def export_ur_kinematics(found: Calibration, out: Path) -> Path:
     """Write the kinematics YAML of ur_description: x y z roll pitch yaw of the six joints' origins.
 
-    The frames are UR's own (base_link_inertia, then each joint about its z). They follow from the nominal arm's axes, so
-    that only the calibrated part of the numbers is new.
+    The frames are UR's own (base_link_inertia, then each joint about its z). They follow from the nominal arm's axes,
+    so that only the calibrated part of the numbers is new.
 
     Raises:
         UsageError: for an arm that has not UR's axes.
@@ -111,13 +112,11 @@ def export_ur_kinematics(found: Calibration, out: Path) -> Path:
     for link in UR_LINKS:
         xyz, rpy = to_xyz_rpy(edited.joints[link].origin)
         lines.append(f"  {link}:")
-        lines += [
-            f"    {k}: {v!r}" for k, v in zip(("x", "y", "z", "roll", "pitch", "yaw"), [*xyz.tolist(), *rpy.tolist()])
-        ]
+        lines += [f"    {key}: {value!r}" for key, value in zip(UR_KEYS, [*xyz.tolist(), *rpy.tolist()])]
     digest = int(hashlib.sha256("\n".join(lines).encode()).hexdigest()[:15], 16)
     head = [
-        "# Calibrated by armature-calib; for ur_description's kinematics_params_file. The driver compares the hash with",
-        "# the controller's own calibration and will say that they differ: this file is not the controller's.",
+        "# Calibrated by armature-calib; for ur_description's kinematics_params_file. The driver compares the hash",
+        "# with the controller's own calibration and will say that they differ: this file is not the controller's.",
         "kinematics:",
     ]
     return files.write(out, "\n".join([*head, *lines, f"  hash: calib_{digest}"]) + "\n")
@@ -126,8 +125,8 @@ def export_ur_kinematics(found: Calibration, out: Path) -> Path:
 def ur_template(nominal: Chain) -> str:
     """Return a URDF of a nominal arm in UR's frames, its six lengths taken from the arm's axes at q = 0.
 
-    d1 height of axis 2; a2, a3 distances of axes 2 to 3 and 3 to 4; d4 distance of axis 5 from axis 1; d5 height of axis
-    4 over axis 6; d6 distance of the tip from axis 5.
+    d1 height of axis 2; a2, a3 distances of axes 2 to 3 and 3 to 4; d4 distance of axis 5 from axis 1; d5 height of
+    axis 4 over axis 6; d6 distance of the tip from axis 5.
     """
     if nominal.n != 6 or any(joint.kind != "revolute" for joint in nominal.joints):
         raise RobotError(f"it has {nominal.n} joints, not six revolute ones")

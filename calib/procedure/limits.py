@@ -31,6 +31,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -160,7 +161,7 @@ def _collision(
     else:
         model = collision.from_chain(chain, radius, floor, obstacles)
         notes = (f"no collision shapes in the robot's file: capsules of radius {radius:g} m stand for its links",)
-    return lambda q: model.free(q, margin), notes
+    return partial(model.free, margin=margin), notes
 
 
 def _obstacle(entry: Mapping[str, Any], where: str) -> Any:

@@ -42,11 +42,8 @@ def outcome_lines(outcome: Outcome) -> Iterator[RenderableType]:
     """Say what came of a fit."""
     yield ladder_table(outcome)
     yield error_table(outcome)
-    unclear = outcome.unclear
-    for line in unclear[:MANY]:
+    for line in outcome.unclear:
         yield f"[yellow]identifiability[/]: {escape(line)}"
-    if len(unclear) > MANY:
-        yield f"... and {len(unclear) - MANY} more in metrics.json"
     for line in outcome.warnings:
         yield f"[yellow]note[/]: {escape(line)}"
     if outcome.outliers:

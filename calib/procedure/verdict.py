@@ -38,7 +38,7 @@ def judge(
     Rules, the first that holds:
 
     1. only frames were asked for: pass, with nothing claimed of the arm;
-    2. on any unseen file the calibrated arm is not better than the nominal one: fail;
+    2. on any unseen file the calibrated arm is worse than the nominal one: fail;
     3. no unseen rows and no cross-validation: marginal;
     4. no rigid geometry explains the measurements (`calib.procedure.diagnosis.plateau`): marginal at best;
     5. the gain on the unseen is below `GAIN`: marginal;
@@ -62,9 +62,9 @@ def judge(
         return Verdict("fail", "no model of the arm predicts unseen poses better than the nominal one")
     for name, comparison in proofs.items():
         before, after = (_rms(found.main) for found in comparison.errors)
-        if after >= before:
+        if after > WORSE * before:
             return Verdict(
-                "fail", f"on {name} the calibrated arm is no better than the nominal one: {_both(before, after)}"
+                "fail", f"on {name} the calibrated arm is worse than the nominal one: {_both(before, after)}"
             )
     if not proofs and cross_validated is None:
         return Verdict(
@@ -72,10 +72,8 @@ def judge(
         )
     if not proofs:
         before, after, where = _rms(fit.errors[0].main), float(cross_validated or 0.0), "by cross-validation only"
-        if after >= before:
-            return Verdict(
-                "fail", f"{where}, the calibrated arm is no better than the nominal one: {_both(before, after)}"
-            )
+        if after > WORSE * before:
+            return Verdict("fail", f"{where}, the calibrated arm is worse than the nominal one: {_both(before, after)}")
     else:
         name = max(proofs, key=lambda key: _rms(proofs[key].errors[1].main))
         before, after = (_rms(found.main) for found in proofs[name].errors)
