@@ -26,7 +26,7 @@ KINDS = {
     "distance_mm": ("distance", "mm"),
 }
 ARMS = ("nominal", "calibrated")
-MOST_ROWS = 90
+MOST_ROWS = 60
 CONVENTIONS = (
     "Units: m, rad, s, kg, N·m in all files unless a header names another; this page prints mm, deg and mrad.",
     "Modified Denavit-Hartenberg rows (Khalil and Kleinfinger): Rot_x(alpha) Trans_x(d) Trans_z(r) Rot_z(theta + q).",
@@ -45,13 +45,14 @@ LIMITATIONS = (
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of text under a header; `strong` names rows to set in bold; numeric columns stand to the right."""
+    """Rows of text under a header; `strong` are rows to set in bold, `numbers` columns to set to the right."""
 
     title: str
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
     note: str = ""
     strong: frozenset[int] = frozenset()
+    numbers: Sequence[int] = ()
     kind: str = "table"
 
 
@@ -191,7 +192,7 @@ def error_table(metrics: Mapping[str, Any]) -> Table:
             cells = [f"{numbers[key]:.3f}" for key in ("mean", "rms", "p95", "max")]
             rows.append((label if number == 0 else "", words if arm == "nominal" else "", arm, *cells))
     note = "Distances of pairs do not depend on where instrument and tool are placed."
-    return Table("Errors", header, rows, note, frozenset(strong))
+    return Table("Errors", header, rows, note, frozenset(strong), range(3, 7))
 
 
 def ladder_table(metrics: Mapping[str, Any]) -> Table:
@@ -205,7 +206,7 @@ def ladder_table(metrics: Mapping[str, Any]) -> Table:
             (rung["model"], str(rung["parameters"]), "" if error is None else f"{error:.4f}", rung.get("note", ""))
         )
     header = ("model", "parameters", "cross-validated rms [mm]", "remark")
-    return Table("Ladder of models", header, rows, f"Chosen: {metrics['model']}.", frozenset(strong))
+    return Table("Ladder of models", header, rows, f"Chosen: {metrics['model']}.", frozenset(strong), (1, 2))
 
 
 def parameter_table(report: Report) -> Table:
@@ -216,7 +217,7 @@ def parameter_table(report: Report) -> Table:
         factor, printed = {"m": (1e3, "mm"), "rad": (1e3, "mrad")}.get(unit, (1.0, unit))
         digits = ".3f" if factor > 1 else ".4g"
         numbers = [f"{factor * number:{digits}}" for number in (nominal, value)]
-        relative = "" if rsd is None or rsd > 999 else f"{rsd:.2g} %"
+        relative = "" if rsd is None or rsd > 999 else f"{rsd:.0f} %" if rsd >= 10 else f"{rsd:.2g} %"
         change = f"{factor * (value - nominal):+{digits}}"
         rows.append((name, printed, *numbers, change, f"{factor * sigma:.2g}", relative))
     left = len(report.parameters) - len(shown)
@@ -224,7 +225,7 @@ def parameter_table(report: Report) -> Table:
     if report.kept:
         note = f"Not fitted, kept at their nominal values: {', '.join(report.kept)}. {note}"
     header = ("parameter", "unit", "nominal", "calibrated", "change", "σ", "RSD")
-    return Table("Fitted parameters", header, rows, note.strip())
+    return Table("Fitted parameters", header, rows, note.strip(), numbers=range(2, 7))
 
 
 def outlier_table(metrics: Mapping[str, Any], most: int = 20) -> Table:
@@ -234,7 +235,7 @@ def outlier_table(metrics: Mapping[str, Any], most: int = 20) -> Table:
     note = "Rows beyond 4 robust sigmas. They were kept in the fit unless a robust loss was asked for."
     if len(found) > most:
         note += f" {len(found) - most} more in metrics.json."
-    return Table("Rows that do not fit", ("file", "row", "residual", "robust sigmas"), rows, note)
+    return Table("Rows that do not fit", ("file", "row", "residual", "robust sigmas"), rows, note, numbers=(1, 3))
 
 
 def identifiability(report: Report) -> list[str]:

@@ -28,9 +28,14 @@ def error_histogram(
     """
     factor, unit = UNITS[nature]
     one, two = factor * np.asarray(before), factor * np.asarray(after)
-    edges = np.linspace(0.0, max(one.max(), two.max(), 1e-9) * 1.02, 31)
+    top = max(one.max(), two.max(), 1e-9) * 1.02
+    apart = np.median(two) < np.median(one) / 6.0  # then equal bins would show one bar of the smaller errors
+    least = max(min(one.min(), two.min()), 1e-4 * top) * 0.9
+    edges = np.geomspace(least, top, 31) if apart else np.linspace(0.0, top, 31)
     with styled():
         figure, (axes,) = sheet(width=HALF, height=2.4)
+        axes.set_xscale("log" if apart else "linear")
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
         axes.hist(one, edges, color=BEFORE, label="nominal")
         axes.hist(two, edges, color=AFTER, alpha=0.9, label="calibrated")
         for sizes, colour, label in ((one, "#a8622a", "nominal"), (two, AFTER, "calibrated")):
@@ -46,7 +51,7 @@ def error_histogram(
                 "instrument", (factor * noise, 0.5), xycoords=("data", "axes fraction"), rotation=90, xytext=(2, 0),
                 textcoords="offset points", color=INK, va="center", fontsize=6.5,
             )  # fmt: skip
-        axes.set(xlabel=f"{nature} error [{unit}]", ylabel="poses", xlim=(0.0, edges[-1]))
+        axes.set(xlabel=f"{nature} error [{unit}]", ylabel="poses", xlim=(edges[0], edges[-1]))
         axes.margins(y=0.18)
     return figure
 

@@ -20,8 +20,9 @@ from calib.estimation.estimate import strong_correlations
 from calib.geometry.observation import has_instrument, predict, prepare
 from calib.geometry.parameters import layout
 from calib.procedure.comparing import Comparison
+from calib.procedure.diagnosis import plateau
 from calib.procedure.estimates import estimate_table
-from calib.procedure.fitting import Outcome
+from calib.procedure.fitting import Outcome, cross_validated, reach
 from calib.procedure.outputs import metrics
 from calib.transforms import invert
 
@@ -45,6 +46,7 @@ class Report:
         sets: per set of rows: name, unseen, poses, errors of both arms by nature [m, rad], and where there is one error
             per row q (rows, n) and points (rows, 3) in the arm's base.
         noise: what the stated sigmas alone give, rms by nature [m, rad]; None where none were stated.
+        judged: what `calib.procedure.verdict.judge` needs besides the errors.
     """
 
     schema: int
@@ -62,6 +64,7 @@ class Report:
     rank: int
     sets: list[dict[str, Any]]
     noise: dict[str, float | None]
+    judged: dict[str, Any]
 
 
 def collect(outcome: Outcome) -> Report:
@@ -70,8 +73,8 @@ def collect(outcome: Outcome) -> Report:
     table, names = estimate_table(fit, outcome.climb.nominal.cell), layout(fit.cell)
     groups = {name: names.group(k) for k, name in enumerate(names.names)}
     fitted = set(table.names)
-    sets = [_rows("fit", outcome.fit, False)]
-    sets += [_rows(name, found, found.proves) for name, found in outcome.validation.items()]
+    sets = [rows_of("fit", outcome.fit, False)]
+    sets += [rows_of(name, found, found.proves) for name, found in outcome.validation.items()]
     strong, matrix = _correlated(table.names, table.covariance)
     values = [] if fit.split is None else fit.split.singular_values.tolist()
     return Report(
@@ -90,10 +93,21 @@ def collect(outcome: Outcome) -> Report:
         rank=len(values) if fit.split is None else fit.split.rank,
         sets=sets,
         noise=_noise(outcome.fit.blocks),
+        judged=_judged(outcome),
     )
 
 
-def _rows(name: str, comparison: Comparison, unseen: bool) -> dict[str, Any]:
+def _judged(outcome: Outcome) -> dict[str, Any]:
+    rows = sum(len(block) for block in outcome.inputs.fit)
+    return {
+        "model": outcome.climb.chosen,
+        "cross_validated": cross_validated(outcome.climb),
+        "outlier_share": len({(each.file, each.row) for each in outcome.outliers}) / rows,
+        "unexplained": plateau(outcome.climb, reach(outcome.inputs.chain)),
+    }
+
+
+def rows_of(name: str, comparison: Comparison, unseen: bool) -> dict[str, Any]:
     """Return one set of rows: sizes of errors, and where they were measured if there is one error per row."""
     entry: dict[str, Any] = {"name": name, "unseen": unseen, "poses": comparison.poses}
     for arm, found in zip(("nominal", "calibrated"), comparison.errors):

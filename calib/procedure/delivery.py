@@ -1,0 +1,50 @@
+"""What leaves a session: the calibrated robot in the forms others read."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from calib import files
+from calib.errors import RobotError, UsageError
+from calib.procedure import exporting
+
+COPIED = ("robot.toml", "joint_corrections.csv", "joint_corrections.txt")
+
+
+def deliver(fit: Path, source: Path, out: Path) -> list[str]:
+    """Write the calibrated robot into `out`: TOML, URDF (the source's own XML where it is one), joint offsets.
+
+    Args:
+        fit: the folder of the fit.
+        source: the robot's description.
+        out: folder for the files.
+
+    Returns:
+        What was written, in words.
+    """
+    for name in COPIED:
+        if (fit / name).exists():
+            files.write(out / name, (fit / name).read_bytes())
+        elif (out / name).exists():
+            os.unlink(out / name)
+    found = exporting.read(fit)
+    if source.suffix == ".urdf":
+        exporting.export_urdf(found, source, out / "robot.urdf")
+        notes = ["robot.urdf: the given URDF with calibrated joint origins, all else kept"]
+    else:
+        written = (fit / "robot.urdf").read_text(encoding="utf-8")
+        exporting.check_readback(written, "robot.urdf", found.chain)
+        files.write(out / "robot.urdf", written)
+        notes = ["robot.urdf: written from the calibrated table"]
+    notes[0] += "; Pinocchio reads the same poses to 1e-9"
+    exporting.export_offsets(found, out / "joint_offsets.csv")
+    notes.append("robot.toml, joint_offsets.csv")
+    try:
+        exporting.export_ur_kinematics(found, out / "ur_kinematics.yaml")
+        notes.append("ur_kinematics.yaml: for kinematics_params_file of ur_description")
+    except (RobotError, UsageError):  # no UR arm
+        (out / "ur_kinematics.yaml").unlink(missing_ok=True)
+    if found.corrected:
+        notes.append("joint_corrections.csv: what a URDF cannot hold; formula in joint_corrections.txt")
+    return notes

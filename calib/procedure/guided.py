@@ -1,0 +1,98 @@
+"""The guided procedure as the commands `calib new`, `next`, `status` and `redo` run it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import RenderableType
+from rich.markup import escape
+from rich.table import Table
+
+from calib.errors import UsageError
+from calib.procedure import steps
+from calib.procedure.instruments import instrument as instrument_named
+from calib.procedure.session import Session, create, locked, open_session
+from calib.robot.load import load, resolve
+
+Say = Callable[[str], None]
+COLOURS = {"done": "green", "kept": "green", "ready": "cyan", "stale": "yellow", "waiting": "yellow", "after": "dim"}
+
+
+@dataclass(frozen=True)
+class Stop:
+    """Where `go_on` stopped: lines that say what to do now, and the verdict once there is one."""
+
+    lines: tuple[str, ...]
+    verdict: str = ""
+
+
+def begin(
+    folder: Path, robot: str, instrument: str, *, poses: int, validation: int, seed: int, **links: Any
+) -> Session:
+    """Make a session for a robot, which is read once to see that it can be.
+
+    Args:
+        folder: new.
+        robot: see `calib.robot.load`.
+        instrument: a key of `calib.procedure.instruments.INSTRUMENTS`.
+        poses, validation: how many to choose.
+        seed: of everything random.
+        links: ``base`` and ``tip`` of a URDF, empty for its own.
+    """
+    if poses < 1 or validation < 0:
+        raise UsageError(f"--poses {poses} --validation {validation}: at least one pose, and no fewer than 0")
+    device, source = instrument_named(instrument), resolve(robot)
+    chain = load(robot, links["base"] or None, links["tip"] or None)
+    return create(
+        folder, source, robot, name=chain.name, seed=seed, instrument=device.label, measures=device.measures,
+        sigma_position=device.sigma_position, sigma_orientation=device.sigma_orientation, fit=poses,
+        validation=validation, **links,
+    )  # fmt: skip
+
+
+def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "") -> Stop:
+    """Run what can be run, and say what to do then.
+
+    Args:
+        folder: of the session.
+        say, progress: lines that stay, and words that pass.
+        command: for the record.
+        again: name of a step to make again, with all that rests on it.
+    """
+    session = open_session(folder)
+    with locked(session, say):
+        if again:
+            steps.forget(session, steps.find(again))
+        state = steps.run_next(session, say, progress, command)
+    if state is not None:
+        return Stop(("", *steps.asks(session, state)))
+    metrics = json.loads(session.path("5-validation/metrics.json").read_text(encoding="utf-8"))
+    lines = (
+        "",
+        f"done; certificate: {session.path('certificate.html')}",
+        f"robot: {session.path('6-export/robot.urdf')}",
+    )
+    return Stop(lines, metrics["verdict"])
+
+
+def status_lines(folder: Path) -> Iterator[RenderableType]:
+    """Say how every step of a session stands, and what comes next."""
+    session = open_session(folder)
+    settings, found = session.settings, steps.states(session)
+    yield f"[bold]{escape(settings.name)}[/], {escape(settings.instrument['name'])}, made {settings.created[:10]}"
+    table = Table("", "step", "state", "", box=None, pad_edge=False)
+    for number, state in enumerate(found, 1):
+        colour = COLOURS[state.kind]
+        table.add_row(str(number), state.step.name, f"[{colour}]{state.kind}[/]", escape(state.words))
+    yield table
+    ahead = next((state for state in found if state.kind not in (steps.DONE, steps.KEPT)), None)
+    if ahead is None:
+        yield escape(f"certificate: {session.path('certificate.html')}")
+    elif ahead.kind == steps.WAITING:
+        yield from (escape(line) for line in steps.asks(session, ahead))
+    else:
+        yield escape(f"next: calib next {folder}")

@@ -1,0 +1,272 @@
+"""A session: a folder with numbered, human-readable files, that may be moved, copied, opened and edited.
+
+session.toml     what is to be calibrated, with what, how; written by `calib new`, edited by people
+1-robot/         the robot's description, copied, so that the folder can move
+2-poses/         poses.csv to measure and fit, validation.csv to measure and never fit
+3-measured/      what people bring: measured.csv (any name), and files whose name starts with validation
+4-fit/  5-validation/  6-export/  certificate.html
+state.json       which step was made from which files (SHA-256), when, by which version; written whole or not at all
+session.lock     there while a command works on the session
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import socket
+import tomllib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from calib import files
+from calib.errors import SessionError
+
+SCHEMA = 1
+FOLDERS = ("1-robot", "2-poses", "3-measured", "4-fit", "5-validation", "6-export")
+_HEAD = """# A calibration session; see `calib status` and `calib next`. Lengths in m, angles in rad.
+# Change what you like: steps made from something that changed are shown as stale and made again.
+schema = {schema}
+name = "{name}"
+created = "{created}"
+seed = {seed}                          # of pose selection, cross-validation and everything else random
+
+[robot]
+file = "{robot}"
+given = "{given}"
+base = "{base}"                        # URDF: the link the arm starts at, empty: the root
+tip = "{tip}"                          # URDF: the link the arm ends at, empty: the longest chain's end
+
+[instrument]
+name = "{instrument}"
+measures = "{measures}"                # pose (with orientation) or position
+sigma_position = {sigma_position}      # of one measurement, per axis; 0: to be estimated
+sigma_orientation = {sigma_orientation}
+tool = [0.05, 0.0, 0.05]               # where the target roughly sits in the tip's frame; only pose selection uses it
+
+[poses]
+fit = {fit}                            # how many poses to choose for the fit
+validation = {validation}              # how many more to measure and never fit; 0: no validation
+plan = true                            # false: measured files hold other poses than those chosen here
+index = "O1"
+method = "detmax"
+constraints = ""                       # a TOML file beside this one, see `calib select --help`
+
+[fit]
+model = "auto"                         # or frames, offsets, geometry, stiffness, ...
+loss = "none"                          # or huber, cauchy
+options = ""                           # a TOML file beside this one: column names, units (see calib.data.options)
+stations = "each"                      # each measured file has its own base placement, or one for all
+validation_frames = "fit"              # own: base and tool placement are fitted anew on validation files
+"""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What ``session.toml`` says, section by section; see its comments."""
+
+    name: str
+    created: str
+    seed: int
+    robot: Mapping[str, Any]
+    instrument: Mapping[str, Any]
+    poses: Mapping[str, Any]
+    fit: Mapping[str, Any]
+    schema: int = SCHEMA
+
+
+@dataclass(frozen=True)
+class Session:
+    """An open session: its folder, and its settings as they stand now."""
+
+    folder: Path
+    settings: Settings
+    notes: tuple[str, ...] = field(default=())
+
+    def path(self, name: str) -> Path:
+        """Return a file of the session by its name relative to the folder."""
+        return self.folder / name
+
+
+def create(folder: Path, robot_file: Path, given: str, **values: Any) -> Session:
+    """Make a session folder, whole or not at all.
+
+    Args:
+        folder: new, or empty.
+        robot_file: the description, copied into ``1-robot``.
+        given: what the user called it.
+        values: the other fields of ``session.toml``.
+
+    Raises:
+        SessionError: where something is there already, or the folder cannot be written.
+    """
+    if (folder / "session.toml").exists():
+        raise SessionError(f"{folder} is a session already; go on with: calib next {folder}")
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise SessionError(f"{folder} is not empty; give a new folder")
+    staging = folder.parent / f".{folder.name}.part"
+    try:
+        shutil.rmtree(staging, ignore_errors=True)
+        for name in FOLDERS:
+            (staging / name).mkdir(parents=True)
+        target = f"1-robot/robot{robot_file.suffix}"
+        shutil.copyfile(robot_file, staging / target)
+        created = datetime.now().astimezone().isoformat(timespec="seconds")
+        head = _HEAD.format(schema=SCHEMA, robot=target, given=_escaped(given), created=created, **values)
+        files.write(staging / "session.toml", head)
+        if folder.exists():
+            folder.rmdir()
+        os.replace(staging, folder)
+    except OSError as error:
+        shutil.rmtree(staging, ignore_errors=True)
+        raise SessionError(f"cannot make {folder}: {error.strerror or error}; nothing was left there") from error
+    return open_session(folder)
+
+
+def _escaped(text: str) -> str:
+    return text.replace("\\", "\\\\").replace('"', '\\"')
+
+
+def open_session(folder: Path) -> Session:
+    """Read the session in `folder`.
+
+    Raises:
+        SessionError: where there is none, it was made by a newer version, or its file is damaged.
+    """
+    path = folder / "session.toml"
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise SessionError(f"{folder} is no session (no session.toml); make one with: calib new {folder}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise SessionError(f"cannot read {path}: {error}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise SessionError(f"{path}: is no TOML: {error}; correct that line") from error
+    _check_schema(path, table.get("schema"))
+    known = {each.name for each in fields(Settings)}
+    for section, values in tomllib.loads(_example()).items():
+        if section not in table:
+            raise SessionError(f"{path}: '{section}' is missing")
+        _check_section(path, section, values, table[section])
+    unknown = sorted(set(table) - known)
+    if unknown:
+        raise SessionError(f"{path}: unknown key '{unknown[0]}'; known are {', '.join(sorted(known))}")
+    return Session(folder, Settings(**table))
+
+
+def _example() -> str:
+    return _HEAD.format(
+        schema=SCHEMA, name="", created="", seed=0, robot="", given="", base="", tip="", instrument="",
+        measures="pose", sigma_position=0.0, sigma_orientation=0.0, fit=30, validation=15,
+    )  # fmt: skip
+
+
+def _check_schema(path: Path, found: Any) -> None:
+    if found == SCHEMA:
+        return
+    if isinstance(found, int) and found > SCHEMA:
+        raise SessionError(f"{path}: schema {found} was made by a newer version; this one reads {SCHEMA}: upgrade")
+    raise SessionError(
+        f"{path}: schema {found!r} is not known to this version, which reads {SCHEMA}; make a new session"
+    )
+
+
+def _check_section(path: Path, section: str, expected: Any, found: Any) -> None:
+    """Refuse keys and values that a section cannot have, by the example's types."""
+    if not isinstance(expected, dict):
+        if not isinstance(found, type(expected)) or isinstance(found, bool) != isinstance(expected, bool):
+            raise SessionError(f"{path}: {section} = {found!r}: expected {type(expected).__name__}")
+        return
+    if not isinstance(found, dict):
+        raise SessionError(f"{path}: [{section}] has to be a table")
+    for key, value in expected.items():
+        if key not in found:
+            raise SessionError(f"{path}: [{section}] {key} is missing; its default is {value!r}")
+        numeric = isinstance(value, float) and isinstance(found[key], int) and not isinstance(found[key], bool)
+        if not numeric and type(found[key]) is not type(value):
+            raise SessionError(f"{path}: [{section}] {key} = {found[key]!r}: expected {type(value).__name__}")
+    unknown = sorted(set(found) - set(expected))
+    if unknown:
+        raise SessionError(f"{path}: [{section}] has no key '{unknown[0]}'; it has {', '.join(expected)}")
+
+
+def fingerprint(path: Path) -> str:
+    """Return the SHA-256 of a file, in hex."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def read_state(session: Session) -> dict[str, Any]:
+    """Return what ``state.json`` records; an empty record where there is none.
+
+    Raises:
+        SessionError: for a damaged file or one by a newer version, with what to do.
+    """
+    path = session.path("state.json")
+    if not path.exists():
+        return {"schema": SCHEMA, "steps": {}}
+    try:
+        state = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(state["steps"], dict):
+            raise TypeError("steps")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SessionError(f"{path} is damaged ({error}); delete it, and calib next makes the steps again") from error
+    _check_schema(path, state.get("schema"))
+    return state
+
+
+def write_state(session: Session, state: Mapping[str, Any]) -> None:
+    """Record `state`, whole or not at all."""
+    files.write_json(session.path("state.json"), state)
+
+
+@contextmanager
+def locked(session: Session, say: Any = print) -> Iterator[None]:
+    """Hold the session for one command; the lock of a command that was killed is taken over.
+
+    The lock is the kernel's (flock), so that it ends with the process; the file says whose it is.
+
+    Raises:
+        SessionError: while another command works on it.
+    """
+    import fcntl
+
+    path = session.path("session.lock")
+    try:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    except OSError as error:
+        raise SessionError(f"cannot write in {session.folder}: {error.strerror or error}") from error
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            holder = os.read(handle, 200).decode(errors="replace").strip() or "another command"
+            raise SessionError(f"{session.folder} is busy: {holder} works on it; wait for it to end") from None
+        if not path.exists() or os.stat(path).st_ino != os.fstat(handle).st_ino:
+            raise SessionError(f"{session.folder} was busy a moment ago; try again")
+        before = os.read(handle, 200).decode(errors="replace").strip()
+        if before:
+            say(f"the last command ({before}) was interrupted; going on from there")
+        os.ftruncate(handle, 0)
+        os.pwrite(handle, f"process {os.getpid()} on {socket.gethostname()}".encode(), 0)
+        yield
+        path.unlink(missing_ok=True)
+    except Exception:
+        with_own = path.exists() and os.stat(path).st_ino == os.fstat(handle).st_ino and _mine(handle)
+        if with_own:
+            path.unlink(missing_ok=True)
+        raise
+    finally:
+        os.close(handle)
+
+
+def _mine(handle: int) -> bool:
+    return os.pread(handle, 200, 0).decode(errors="replace").startswith(f"process {os.getpid()} ")

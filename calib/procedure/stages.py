@@ -1,0 +1,322 @@
+"""What each step of a session does. The same functions as the scriptable commands; only the files are the session's."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+
+from calib import files
+from calib.data.measurements import PoseMeasurements
+from calib.data.options import FileOptions, FitOptions, read_options
+from calib.data.plans import check_against, read_poses, write_poses
+from calib.errors import SessionError
+from calib.geometry.fit import Settings as FitSettings
+from calib.geometry.fit import combine, polish_frames
+from calib.procedure import calibrated, certificate, comparing, fitting, inputs, outputs, report
+from calib.procedure.session import Session, fingerprint
+from calib.procedure.verdict import judge
+from calib.robot.chain import Chain
+
+Say = Callable[[str], None]
+
+
+def robot_file(session: Session) -> Path:
+    """Return the session's robot description."""
+    return session.path(session.settings.robot["file"])
+
+
+def chain_of(session: Session) -> Chain:
+    """Return the nominal arm."""
+    robot = session.settings.robot
+    options = options_of(session)
+    return inputs.load_robot(robot_file(session), None, options, robot["base"] or None, robot["tip"] or None)[0]
+
+
+def options_of(session: Session) -> FitOptions:
+    """Return the fit options, with the instrument's sigmas where a file states none."""
+    name, instrument = session.settings.fit["options"], session.settings.instrument
+    options = read_options(session.path(name) if name else None)
+    position, turn = instrument["sigma_position"], instrument["sigma_orientation"]
+
+    def stated(each: FileOptions) -> FileOptions:
+        if position and each.sigma_position is None:
+            each = replace(each, sigma_position=(position,) * 3)
+        return replace(each, sigma_orientation=(turn,) * 3) if turn and each.sigma_orientation is None else each
+
+    return replace(
+        options, every=stated(options.every), files={name: stated(each) for name, each in options.files.items()}
+    )
+
+
+def measured_files(session: Session) -> tuple[list[Path], list[Path]]:
+    """Return the CSV files people have brought: for the fit, and for validation (names starting with it)."""
+    found = sorted(session.path("3-measured").glob("*.csv"))
+    unseen = [path for path in found if path.name.lower().startswith("validation")]
+    return [path for path in found if path not in unseen], unseen
+
+
+def describe(session: Session, say: Say) -> list[str]:
+    """Read the robot, and write down how it was understood."""
+    chain = chain_of(session)
+    lines = [f"{chain.name}: {chain.base} to {chain.tip}, {chain.n} joints, {len(chain.elements)} elements", ""]
+    for joint in chain.joints:
+        factor, unit = (180.0 / np.pi, "deg") if joint.kind == "revolute" else (1e3, "mm")
+        lines.append(f"{joint.name}: {joint.kind}, {factor * joint.lower:g} to {factor * joint.upper:g} {unit}")
+    lines += ["", "elements, base to tip [m, rad]"]
+    lines += [f"  {element.name:<24} {element.axis}  {element.value:.9g}" for element in chain.elements]
+    files.write(session.path("1-robot/summary.txt"), "\n".join(lines) + "\n")
+    return [lines[0]]
+
+
+def select(session: Session, say: Say) -> list[str]:
+    """Choose poses for the fit, and others at random for validation."""
+    from calib.procedure.planning import plan
+
+    chain, wanted = chain_of(session), session.settings.poses
+    say("choosing poses")
+    chosen = plan(session, robot_file(session), chain, say)
+    kinds = [joint.kind for joint in chain.joints]
+    names = chain.joint_names
+    write_poses(session.path("2-poses/poses.csv"), chosen.fit, names, unit="deg", kinds=kinds)
+    notes = [f"{len(chosen.fit)} poses for the fit: {chosen.words}"]
+    if wanted["validation"]:
+        write_poses(session.path("2-poses/validation.csv"), chosen.validation, names, unit="deg", kinds=kinds)
+        notes.append(f"{len(chosen.validation)} poses for validation, at random")
+    files.write_json(session.path("2-poses/selection.json"), chosen.record)
+    return notes
+
+
+def planned(session: Session, chain: Chain, name: str) -> np.ndarray | None:
+    """Return the planned poses in ``2-poses``; None where there is no plan."""
+    path = session.path(f"2-poses/{name}.csv")
+    if not session.settings.poses["plan"] or not path.exists():
+        return None
+    return read_poses(path, chain.joint_names, kinds=[joint.kind for joint in chain.joints])
+
+
+def arrive(session: Session, say: Say) -> list[str]:
+    """Check the files that were brought for the fit."""
+    chain, notes = chain_of(session), []
+    fit, _ = measured_files(session)
+    plan = planned(session, chain, "poses")
+    for path in fit:
+        notes += check_file(session, chain, path, plan)
+    files.write(session.path("3-measured/checked.txt"), "\n".join(notes) + "\n")
+    return notes
+
+
+def check_file(session: Session, chain: Chain, path: Path, plan: np.ndarray | None) -> list[str]:
+    """Return what is to be said of a measured file: rows, kind, what was ignored, missing poses.
+
+    Raises:
+        MeasurementError: for whatever cannot be right, with row and column.
+    """
+    notes = []
+    for block in inputs.read_file(path, chain, options_of(session)):
+        wanted = session.settings.instrument["measures"]
+        if wanted == "pose" and block.kind == "position":
+            notes.append(f"{path.name}: positions only, where the instrument gives poses")
+        ignored = f", ignored: {', '.join(block.ignored)}" if block.ignored else ""
+        notes.insert(0, f"{path.name}: {len(block)} rows of kind {block.kind}{ignored}")
+        notes += [f"{path.name}: {note}" for note in block.notes]
+        if plan is not None:
+            notes += [f"{path.name}: {note}" for note in check_against(plan, block)]
+    return notes
+
+
+def gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
+    """Return the robot with the fit's measurements, and with validation files if asked for."""
+    fit = session.settings.fit
+    chain = chain_of(session)
+    links = (chain.base, chain.tip) if robot_file(session).suffix == ".urdf" else (None, None)
+    return inputs.gather(
+        robot_file(session), measured_files(session)[0], validate, options=options_of(session),
+        stations=fit["stations"], refit_frames=fit["validation_frames"] == "own", base=links[0], tip=links[1],
+        seed=session.settings.seed,
+    )  # fmt: skip
+
+
+def fit(session: Session, say: Say) -> list[str]:
+    """Fit the geometry to the measured files; validation files are not looked at."""
+    settings = session.settings
+    outcome = fitting.run(
+        gathered(session), options_of(session), model=settings.fit["model"], loss=settings.fit["loss"],
+        seed=settings.seed, progress=say,
+    )  # fmt: skip
+    outputs.write_folder(outcome, session.path("4-fit"), report.write)
+    count = len(outcome.climb.fit.free)
+    return [f"model {outcome.climb.chosen}, {count} parameters on {outcome.fit.poses} poses", *outcome.warnings]
+
+
+def validate(session: Session, say: Say) -> list[str]:
+    """Hold the fitted robot against poses it has not seen, and judge."""
+    chain, unseen = chain_of(session), measured_files(session)[1]
+    folder, found, notes = session.path("5-validation"), report.read(session.path("4-fit")), []
+    if not session.settings.poses["validation"] and not unseen:
+        files.write_json(folder / "metrics.json", _verdict(found.metrics, {}))
+        return ["no validation asked for: judged by cross-validation only"]
+    plan = planned(session, chain, "validation")
+    for path in unseen:
+        notes += check_file(session, chain, path, plan)
+    say("comparing on unseen poses")
+    given = gathered(session, unseen)
+    fitted, validation = compared(session, given)
+    asked = session.settings.fit["model"]
+    verdict = judge(fitted, validation, asked=asked, **found.judged)
+    warnings = fitting.elsewhere(fitted, validation)
+    metrics: dict[str, object] = {"validation": {name: each.table() for name, each in validation.items()}}
+    metrics |= {"verdict": verdict.level, "reason": verdict.reason, "warnings": warnings}
+    sets = [report.rows_of(name, each, each.proves) for name, each in validation.items()]
+    write_errors(folder / "errors.csv", given.chain, validation)
+    files.write_json(folder / "rows.json", sets)
+    files.write_json(folder / "metrics.json", metrics)
+    return [*notes, f"verdict {verdict.level}: {verdict.reason}", *warnings]
+
+
+def compared(session: Session, given: inputs.Inputs) -> tuple[comparing.Comparison, dict[str, comparing.Comparison]]:
+    """Return nominal beside calibrated arm on fitted and on unseen rows."""
+    options, seed = options_of(session), session.settings.seed
+    loss = session.settings.fit["loss"]
+    settings = combine(FitSettings(), loss=loss, loss_scale=options.loss_scale)
+    torques = [fitting.gravity_of(given.chain, block) for block in given.fit]
+    nominal = polish_frames(fitting.install(given.chain, given.fit), given.fit, settings, torques).cell
+    cell = calibrated.read(session.path("4-fit"))
+    fitted = comparing.compare(nominal, cell, given.fit, torques, "fitted on these rows", False, seed)
+    unseen = {
+        name: comparing.compare_unseen(
+            nominal, cell, each, lambda block: fitting.gravity_of(given.chain, block), settings, seed
+        )
+        for name, each in given.unseen.items()
+    }
+    return fitted, unseen
+
+
+def write_errors(path: Path, chain: Chain, validation: dict[str, comparing.Comparison]) -> None:
+    """Write the errors of both arms at every unseen row."""
+    rows: list[list[object]] = []
+    for name, each in validation.items():
+        q = np.concatenate([block.q for block in each.blocks])
+        numbers = [row for block in each.blocks for row in _numbers(block)]
+        sizes = [found.main for found in each.errors]
+        if len(sizes[0]) == len(q):
+            rows += [
+                [name, number, *map(float, joints), 1e3 * float(a), 1e3 * float(b)]
+                for number, joints, a, b in zip(numbers, q, *sizes)
+            ]
+    joints = [f"{joint.name} [{joint.unit}]" for joint in chain.joints]
+    files.write_table(path, ["file", "row", *joints, "nominal [mm]", "calibrated [mm]"], rows)
+
+
+def _numbers(block: PoseMeasurements) -> list[int]:
+    assert block.rows is not None
+    return [int(row) for row in block.rows]
+
+
+def _verdict(metrics: dict, validation: dict) -> dict:
+    return {"validation": validation, "verdict": metrics["verdict"], "reason": metrics["reason"], "warnings": []}
+
+
+def export(session: Session, say: Say) -> list[str]:
+    """Put the calibrated robot into the forms others read."""
+    from calib.procedure.delivery import deliver
+
+    return deliver(session.path("4-fit"), robot_file(session), session.path("6-export"))
+
+
+def certify(session: Session, say: Say) -> list[str]:
+    """Print the certificate."""
+    from calib.procedure import figures
+
+    say("drawing")
+    found = report.read(session.path("4-fit"))
+    outside = json.loads(session.path("5-validation/metrics.json").read_text())
+    rows = session.path("5-validation/rows.json")
+    merged = {key: outside[key] for key in ("validation", "verdict", "reason")}
+    merged["warnings"] = [*found.metrics["warnings"], *outside["warnings"]]
+    sets = [*found.sets, *(json.loads(rows.read_text()) if rows.exists() and outside["validation"] else [])]
+    whole = replace(found, metrics=found.metrics | merged, sets=sets)
+    drawn = figures.draw(whole)
+    page = certificate.Page(
+        f"Calibration of {session.settings.name}",
+        f"{session.settings.instrument['name']}, {session.settings.created[:10]}",
+        setup(session, whole),
+        [certificate.geometry_stage(whole, drawn)],
+        listed(session),
+    )
+    files.write(session.path("certificate.html"), certificate.render(page))
+    files.write_json(session.path("5-validation/report.json"), asdict(whole))
+    return [f"verdict {outside['verdict']}: {outside['reason']}", "certificate.html"]
+
+
+def setup(session: Session, found: report.Report) -> list[tuple[str, str]]:
+    """Return what stands under Setup on the certificate."""
+    settings, fitted = session.settings, measured_files(session)
+    instrument = settings.instrument
+    stated = f", σ {1e6 * instrument['sigma_position']:g} µm" if instrument["sigma_position"] else ", σ estimated"
+    turning = f", {1e3 * instrument['sigma_orientation']:g} mrad" if instrument["sigma_orientation"] else ""
+    measured = ", ".join(path.name for path in (*fitted[0], *fitted[1]))
+    times = [path.stat().st_mtime for paths in fitted for path in paths]
+    from datetime import datetime
+
+    when = max(times, default=0.0)
+    day = datetime.fromtimestamp(when).strftime("%Y-%m-%d %H:%M") if when else "unknown"
+    return [
+        ("robot", f"{found.robot}, {found.base} to {found.tip}, {len(found.joints)} joints"),
+        ("description", settings.robot["given"]),
+        ("instrument", f"{instrument['name']}, measures {instrument['measures']}{stated}{turning}"),
+        ("session made", settings.created.replace("T", " ")),
+        ("measurements", f"{measured}; files of {day}"),
+        ("pose plan", session_plan(session)),
+        ("model", found.metrics["model"]),
+        ("seed", str(settings.seed)),
+        ("command", f"calib next {session.folder.name}"),
+        ("toolkit", certificate.versions()),
+    ]
+
+
+def session_plan(session: Session) -> str:
+    """Return in a few words how the poses were chosen."""
+    path = session.path("2-poses/selection.json")
+    if not session.settings.poses["plan"] or not path.exists():
+        return "poses not planned here"
+    return str(json.loads(path.read_text()).get("words", "chosen by hand"))
+
+
+def listed(session: Session) -> list[tuple[str, str, str, str]]:
+    """Return the files the certificate rests on: name, what it is, bytes, SHA-256."""
+    roles = {"1-robot": "nominal robot", "3-measured": "measured", "4-fit": "fit", "6-export": "calibrated robot"}
+    wanted = [robot_file(session), *measured_files(session)[0], *measured_files(session)[1]]
+    wanted += [session.path("4-fit/estimate.csv"), session.path("4-fit/covariance.csv")]
+    wanted += sorted(path for path in session.path("6-export").glob("*") if path.is_file())
+    rows = []
+    for path in wanted:
+        name = path.relative_to(session.folder)
+        role = "measured, unseen by the fit" if path.name.lower().startswith("validation") else roles[name.parts[0]]
+        rows.append((str(name), role, f"{path.stat().st_size}", fingerprint(path)))
+    return rows
+
+
+def clear_staging(session: Session) -> None:
+    """Remove what a killed command left beside its place."""
+    for path in session.folder.rglob(".*.part"):
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def require(path: Path, what: str) -> Path:
+    """Return a path that has to be there.
+
+    Raises:
+        SessionError: where it is not.
+    """
+    if not os.path.exists(path):
+        raise SessionError(f"{path} is missing: {what}")
+    return path

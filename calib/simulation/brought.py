@@ -1,0 +1,34 @@
+"""What an engineer brings from the cell: a measured block as the CSV file that `calib fit` reads."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from calib import files
+from calib.data.measurements import PoseMeasurements
+
+
+def write(measured: PoseMeasurements, path: str | Path, degrees: bool = True) -> Path:
+    """Write poses or positions as CSV: joints in deg, positions in mm, as controllers and instruments give them.
+
+    Args:
+        measured: of kind ``pose`` or ``position``; one target; every joint revolute where `degrees`.
+        path: of the file.
+        degrees: False for SI units throughout.
+    """
+    assert measured.position is not None
+    angle, length, unit = (180.0 / np.pi, 1e3, ("deg", "mm")) if degrees else (1.0, 1.0, ("rad", "m"))
+    columns = [angle * measured.q, length * measured.position]
+    header = [f"{name} [{unit[0]}]" for name in measured.joint_names] + [f"{axis} [{unit[1]}]" for axis in "xyz"]
+    if measured.quaternion is not None:
+        columns.append(measured.quaternion)
+        header += ["qx", "qy", "qz", "qw"]
+    if measured.sigma is not None:
+        columns.append(length * measured.sigma)
+        header += [f"sigma_{axis} [{unit[1]}]" for axis in "xyz"]
+    if measured.sigma_rotation is not None and measured.quaternion is not None:
+        columns.append(measured.sigma_rotation)
+        header += [f"sigma_r{axis}" for axis in "xyz"]
+    return files.write_table(path, header, np.hstack(columns).tolist())
