@@ -118,7 +118,7 @@ def _touched(
     sockets[1::2] = sockets[0 : 2 * (count // 2) : 2] + 0.1 * _unit(rng.normal(size=(count // 2, 3)))
     normals = _unit(rng.normal(size=(count, 3)))
     aim = sockets[group] + sigma * rng.normal(size=(len(q), 3))
-    for _ in range(300):
+    for _ in range(80):
         seen = see(inner, q, 0, tool)
         jacobian = joint_jacobian(truth.chain, element_jacobian(truth.chain, seen.walked, seen.point)[:, :3])
         miss, slope = (aim - seen.point.T)[:, :, None], jacobian.transpose(2, 1, 0)

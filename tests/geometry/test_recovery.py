@@ -15,7 +15,7 @@ from calib.geometry.installation import Installation
 from calib.geometry.parameters import layout
 
 SIGMA = 5e-5
-SEEDS = 12
+SEEDS = 24
 
 
 def one_kind(kind: str, count: int):
@@ -42,8 +42,8 @@ SCENES = {
     "pose": (one_kind("pose", 40), 1, 1),
     "position": (one_kind("position", 60), 1, 1),
     "distance": (one_kind("distance", 200), 1, 1),
-    "sockets": (one_kind("sockets", 120), 1, 1),
-    "plane": (one_kind("plane", 240), 1, 1),
+    "sockets": (one_kind("sockets", 96), 1, 1),
+    "plane": (one_kind("plane", 200), 1, 1),
     "bar": (one_kind("bar", 180), 1, 1),
     "two stations": (two_stations, 2, 2),
     "three reflectors": (three_reflectors, 1, 3),
@@ -66,22 +66,21 @@ def calibrate(nominal, measured, settings=None):
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_errors_are_chi_squared_in_the_stated_covariance(name):
-    total, freedom, spreads = 0.0, 0, []
+def test_errors_are_what_the_stated_covariance_says(name):
+    """dxᵀ C⁻¹ dx / p is Fisher's F(p, dof), C being scaled by the residuals; two-sided, each at four standard errors."""
+    scores, squares, freedom = [], 0.0, 0
     for seed in range(SEEDS):
         nominal, _, measured, exact = planted(name, seed)
         found = calibrate(nominal, measured)
         assert found.solution.status.good
         size, rest = deviation(found, exact)
         assert rest < 0.02, f"seed {seed}: {rest:.3f} of the error is in no fitted parameter"
-        total += size
-        freedom += len(found.free)
-        spreads.append(found.estimate.residual_std)
-    low, high = scipy.stats.chi2(freedom).ppf([5e-5, 1 - 5e-5])
-    assert low < total < high, f"{total:.0f} outside [{low:.0f}, {high:.0f}]"
-    dof = SEEDS * found.estimate.dof
-    low, high = scipy.stats.chi2(dof).ppf([5e-5, 1 - 5e-5])
-    assert low < np.sum(np.square(spreads)) * found.estimate.dof < high
+        p, dof = len(found.free), found.estimate.dof
+        scores.append(scipy.stats.norm.ppf(scipy.stats.f(p, dof).cdf(size / p)))
+        squares += dof * found.estimate.residual_std**2
+        freedom += dof
+    assert abs(np.sum(scores)) < 4 * np.sqrt(SEEDS), f"normal scores {np.round(scores, 1)}"
+    assert abs(squares - freedom) < 4 * np.sqrt(2 * freedom)  # the stated sigmas are those of the residuals
 
 
 @pytest.mark.parametrize("robot", ["lwr4plus", "ur5"])
@@ -124,9 +123,10 @@ def test_sigmas_that_are_not_stated_are_estimated(name):
         found, known = calibrate(nominal, [measured]), calibrate(nominal, [told])
         true = {"position": SIGMA, "orientation": 2e-4}
         ratios.append([sigma.mean() / true[part.label] for part, sigma in zip(found.found, found.sigmas)])
-        assert list(found.free) == list(known.free)
-        difference = (found.estimate.values - known.estimate.values) / known.estimate.sigma
-        assert np.abs(difference).max() < 0.5
+        q = random_joints(
+            nominal, 50, 9
+        )  # other weights may choose other columns for the same arm: compare predictions
+        assert position_error(found.cell, known.cell, q).max() < 0.5 * SIGMA
     assert np.mean(ratios, axis=0) == pytest.approx(1.0, abs=4 * 0.05 / np.sqrt(SEEDS))
 
 

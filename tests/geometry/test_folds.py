@@ -1,0 +1,118 @@
+"""Folds: a partition of the rows that keeps together what belongs together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from planted import cell, load, measure
+
+from calib.data.measurements import PoseMeasurements, take
+from calib.geometry.folds import Folds, region_folds, transfer_folds
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return cell(load("ur5"), 0, ("a", "b", "c"))
+
+
+def assert_partition(folds: Folds, measured) -> None:
+    """Every row is in exactly one fold, every fold has rows, and none has them all."""
+    assert len(folds.members) == len(measured)
+    assert [len(members) for members in folds.members] == [len(block) for block in measured]
+    counts = np.bincount(np.concatenate(folds.members), minlength=folds.count)
+    assert len(counts) == folds.count >= 2
+    assert counts.min() > 0 and counts.max() < counts.sum()
+
+
+@pytest.mark.parametrize("count", [30, 60, 300, 1000])
+def test_regions_are_a_partition_of_any_size_and_none_dominates(truth, count):
+    measured = [measure(truth, "position", count, 1)]
+    folds = transfer_folds(measured)
+    assert folds.kind == "regions"
+    assert_partition(folds, measured)
+    assert np.bincount(folds.members[0]).max() < (0.7 if count < 60 else 0.4) * count
+
+
+def test_regions_are_regions(truth):
+    """Rows of one region stand nearer to each other than to rows of other folds: a random split would not."""
+    measured = [measure(truth, "position", 400, 2)]
+    q = measured[0].q / measured[0].q.std(axis=0)
+    distance = np.linalg.norm(q[:, None] - q[None], axis=2) + 1e9 * np.eye(400)
+    nearest = distance.argmin(axis=1)
+    fold = region_folds(measured).members[0]
+    together = np.mean(fold == fold[nearest])
+    shuffled = np.random.default_rng(0).permutation(fold)
+    assert together > 2 * np.mean(shuffled == shuffled[nearest])
+
+
+def test_the_seed_repeats_the_regions(truth):
+    measured = [measure(truth, "position", 200, 3)]
+    one, same, other = (region_folds(measured, seed=s).members[0] for s in (1, 1, 2))
+    assert np.array_equal(one, same) and not np.array_equal(one, other)
+
+
+def test_stations_are_kept_whole_each_in_a_fold_of_its_own(truth):
+    measured = [measure(truth, "position", 20 + 5 * k, k, station=k) for k in range(3)]
+    measured.append(replace(measure(truth, "pose", 15, 9, station=1), file="again"))
+    folds = transfer_folds(measured)
+    assert folds.kind == "stations" and folds.count == 3
+    assert_partition(folds, measured)
+    first = [members[0] for members in folds.members]
+    assert all(len(set(members)) == 1 for members in folds.members)
+    assert first[1] == first[3] and len(set(first[:3])) == 3
+
+
+def test_one_station_only_is_split_by_regions(truth):
+    measured = [measure(truth, "position", 40, 1), measure(truth, "pose", 40, 2)]
+    folds = transfer_folds(measured)
+    assert folds.kind == "regions"
+    assert_partition(folds, measured)
+
+
+def test_the_two_rows_of_a_distance_stay_together(truth):
+    measured = [measure(truth, "distance", 120, 1), measure(truth, "position", 50, 2)]
+    order = np.random.default_rng(0).permutation(120)
+    measured[0] = take(measured[0], order)
+    folds = transfer_folds(measured)
+    assert_partition(folds, measured)
+    for pair in np.unique(measured[0].group):
+        assert len(set(folds.members[0][measured[0].group == pair])) == 1
+
+
+def sockets(fixtures: int, file: str = "one", linked: bool = True) -> PoseMeasurements:
+    """Return rows in shuffled order, two sockets per fixture."""
+    group = np.random.default_rng(1).permutation(np.repeat(np.arange(2 * fixtures), 8))
+    links = tuple((2 * k, 2 * k + 1, 0.05) for k in range(fixtures)) if linked else ()
+    q = np.random.default_rng(2).normal(size=(len(group), 3))
+    return PoseMeasurements("sockets", q, ("a", "b", "c"), group=group, links=links, file=file)
+
+
+@pytest.mark.parametrize("fixtures", [3, 5, 8])
+def test_fixtures_stay_whole_with_both_sockets_of_a_known_distance(fixtures):
+    measured = sockets(fixtures)
+    folds = transfer_folds([measured])
+    assert folds.kind == "fixtures" and folds.count == min(fixtures, 5)
+    assert_partition(folds, [measured])
+    for k in range(fixtures):
+        assert len(set(folds.members[0][np.isin(measured.group, [2 * k, 2 * k + 1])])) == 1
+
+
+def test_sockets_without_links_are_left_out_one_by_one():
+    measured = sockets(2, linked=False)
+    folds = transfer_folds([measured])
+    assert folds.kind == "fixtures" and folds.count == 4
+    assert_partition(folds, [measured])
+
+
+def test_one_fixture_cannot_be_left_out_so_regions_are():
+    assert transfer_folds([sockets(1)]).kind == "regions"
+
+
+def test_files_without_an_instrument_are_left_out_one_by_one():
+    measured = [sockets(2, "x"), sockets(2, "y"), sockets(2, "z")]
+    folds = transfer_folds(measured)
+    assert folds.kind == "files" and folds.count == 3
+    assert_partition(folds, measured)
+    assert all(len(set(members)) == 1 for members in folds.members)

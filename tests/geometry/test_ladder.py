@@ -1,0 +1,172 @@
+"""The ladder takes up what was planted, and nothing where the truth is rigid."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from planted import cell, load, measure, perturb, random_joints
+
+from calib.dynamics.gravity import gravity_torques
+from calib.errors import UsageError
+from calib.geometry.deflection import Deflection, Term, evaluate, names
+from calib.geometry.first_guess import install
+from calib.geometry.installation import Installation, see
+from calib.geometry.ladder import climb
+
+SIGMA = 4e-5
+
+
+def rigid(robot: str, seed: int) -> Installation:
+    return cell(perturb(load(robot), seed, 0.5e-3, 1e-3), seed)
+
+
+def sagging(seed: int) -> Installation:
+    """Return an LWR whose joints 2 and 4 give way: some millimetres at the tool."""
+    truth = rigid("lwr4plus", seed)
+    terms = (Term("theta2", "torque", 1), Term("theta4", "torque", 3))
+    return replace(truth, deflection=Deflection(terms, np.array([4e-5, 8e-5]), truth.chain))
+
+
+def wavy(seed: int) -> Installation:
+    """Return a UR5 with gear errors of 0.1 to 0.2 mrad on three joints, twice per turn and more often."""
+    truth = rigid("ur5", seed)
+    terms = (Term("theta2", "sin", 1, 2), Term("theta3", "cos", 2, 5), Term("theta1", "sin", 0, 11))
+    return replace(truth, deflection=Deflection(terms, np.array([2e-4, 1.5e-4, 2e-4]), truth.chain))
+
+
+def unseen(found, truth: Installation, known: bool) -> float:
+    """Return the rms position error at 400 other joints [m]."""
+    q = random_joints(truth.chain, 400, 99)
+    nominal = load(truth.chain.name)
+    predicted = evaluate(found.cell.deflection, q, gravity_torques(nominal, q) if known else None)
+    true = evaluate(truth.deflection, q, gravity_torques(nominal, q) if known else None)
+    gap = see(found.cell, q, bases=predicted).point - see(truth, q, bases=true).point
+    return float(np.sqrt(np.mean(np.sum(gap**2, axis=0))))
+
+
+@pytest.mark.parametrize(
+    "robot, kind, count", [("ur5", "position", 150), ("lwr4plus", "pose", 120), ("ur5", "pose", 600)]
+)
+@pytest.mark.parametrize("seed", range(3))
+def test_a_rigid_truth_gives_the_geometry_and_no_effect(robot, kind, count, seed):
+    truth = rigid(robot, seed)
+    measured = measure(truth, kind, count, seed, sigma=SIGMA, sigma_rotation=1e-4)
+    found = climb(install(load(robot), [measured]), [measured])
+    assert found.chosen == "geometry"
+    assert not found.fit.cell.deflection.terms
+    kept = [rung.model for rung in found.rungs if rung.kept]
+    assert kept[-1] == "geometry"
+    best = next(rung for rung in found.rungs if rung.model == "geometry")
+    assert best.cross_validated == pytest.approx(SIGMA * np.sqrt(3), rel=0.25)
+    assert best.parameters == len(found.fit.free)
+
+
+def test_an_arm_that_is_its_nominal_needs_only_frames():
+    truth = cell(load("ur5"), 1)
+    measured = measure(truth, "position", 150, 1, sigma=SIGMA)
+    found = climb(install(load("ur5"), [measured]), [measured])
+    assert found.chosen == "frames"
+
+
+def test_joint_offsets_are_found_to_be_joint_offsets():
+    nominal = load("ur5")
+    moving = [nominal.names[k] for k in nominal.moving]
+    offsets = dict(zip(moving, 2e-3 * np.random.default_rng(0).normal(size=6)))
+    truth = cell(nominal.with_values(offsets), 1)
+    measured = measure(truth, "position", 150, 1, sigma=SIGMA)
+    found = climb(install(nominal, [measured]), [measured])
+    assert found.chosen == "offsets"
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("known", [True, False])
+def test_planted_compliance_is_found(seed, known):
+    """With gravity torques as compliances, near the planted ones; without, as moments fitted with the geometry."""
+    truth, nominal = sagging(seed), load("lwr4plus")
+    torque = lambda q: gravity_torques(nominal, q)  # noqa: E731
+    measured = measure(truth, "position", 200, seed, sigma=SIGMA, torque=torque)
+    torques = [torque(measured.q)] if known else None
+    found = climb(install(nominal, [measured]), [measured], torques=torques)
+    plain = climb(install(nominal, [measured]), [measured], "geometry")
+    assert "stiffness" in found.chosen
+    errors = [unseen(f.fit, truth, True) if known or f is plain else _unseen_sag(f.fit, truth) for f in (found, plain)]
+    assert errors[0] < 2.5 * SIGMA < 5 * SIGMA < errors[1]
+    if known:
+        fitted = dict(
+            zip(names(found.fit.cell.deflection, nominal), np.asarray(found.fit.cell.deflection.coefficients))
+        )
+        assert fitted["theta2 compliance"] == pytest.approx(4e-5, rel=0.1)
+        assert fitted["theta4 compliance"] == pytest.approx(8e-5, rel=0.2)
+
+
+def _unseen_sag(found, truth: Installation) -> float:
+    q = random_joints(truth.chain, 400, 99)
+    true = evaluate(truth.deflection, q, gravity_torques(load("lwr4plus"), q))
+    gap = see(found.cell, q).point - see(truth, q, bases=true).point
+    return float(np.sqrt(np.mean(np.sum(gap**2, axis=0))))
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_planted_harmonics_are_found(seed):
+    truth, nominal = wavy(seed), load("ur5")
+    measured = measure(truth, "position", 400, seed, sigma=SIGMA)
+    start = install(nominal, [measured])
+    found, plain = climb(start, [measured]), climb(start, [measured], "geometry")
+    assert "harmonics" in found.chosen
+    assert unseen(found.fit, truth, False) < 0.5 * unseen(plain.fit, truth, False)
+    fitted = dict(zip(names(found.fit.cell.deflection, nominal), np.asarray(found.fit.cell.deflection.coefficients)))
+    joints = nominal.joint_names
+    assert fitted[f"theta2 sin 2 {joints[1]}"] == pytest.approx(2e-4, rel=0.25)
+    assert fitted[f"theta3 cos 5 {joints[2]}"] == pytest.approx(1.5e-4, rel=0.25)
+    assert fitted[f"theta1 sin 11 {joints[0]}"] == pytest.approx(2e-4, rel=0.25)
+
+
+def test_the_last_rung_kept_is_the_one_chosen_and_each_kept_rung_is_better():
+    truth = wavy(1)
+    measured = measure(truth, "position", 300, 1, sigma=SIGMA)
+    found = climb(install(load("ur5"), [measured]), [measured])
+    kept = [rung for rung in found.rungs if rung.kept]
+    assert np.all(np.diff([rung.cross_validated for rung in kept]) < 0)
+    assert found.chosen.split(" + ")[-1] == kept[-1].model.removeprefix("+ ")
+    assert kept[-1].parameters == len(found.fit.free)
+    assert found.nominal.cell.chain is not found.fit.cell.chain
+    assert np.array_equal(found.nominal.cell.chain.values, load("ur5").values)
+
+
+@pytest.mark.parametrize("model", ["frames", "offsets", "geometry", "stiffness", "coupling"])
+def test_any_rung_can_be_asked_for(model):
+    truth = rigid("ur5", 2)
+    measured = measure(truth, "position", 120, 1, sigma=SIGMA)
+    found = climb(install(load("ur5"), [measured]), [measured], model)
+    assert found.chosen.split(" + ")[-1] == model
+    assert found.rungs[-1].kept
+
+
+def test_what_is_fixed_stays_at_its_nominal():
+    from calib.geometry.parameters import layout
+
+    truth, nominal = rigid("ur5", 3), load("ur5")
+    measured = measure(truth, "position", 120, 1, sigma=SIGMA)
+    start = install(nominal, [measured])
+    fixed = layout(start).find(["theta3", "d3"])
+    found = climb(start, [measured], "geometry", fixed=fixed)
+    assert np.array_equal(found.fit.cell.chain.values[fixed], nominal.values[fixed])
+    assert not np.isin(fixed, found.fit.free).any()
+
+
+def test_an_unknown_model_is_refused_with_the_list():
+    truth = rigid("ur5", 3)
+    measured = measure(truth, "position", 40, 1, sigma=SIGMA)
+    with pytest.raises(UsageError, match="harmonics"):
+        climb(truth, [measured], "neural")
+
+
+def test_progress_is_told():
+    truth = rigid("ur5", 3)
+    measured = measure(truth, "position", 60, 1, sigma=SIGMA)
+    told = []
+    climb(truth, [measured], "geometry", progress=lambda done, total, what: told.append((done, total, what)))
+    assert list(dict.fromkeys(what for _, _, what in told)) == ["frames", "offsets", "geometry"]
+    assert all(a[0] <= b[0] for a, b in zip(told, told[1:])) and told[-1][0] <= told[-1][1]
