@@ -1,0 +1,120 @@
+"""Regressor, torques, inertia matrix and accelerations of a `Tree` in batch: shape checks around the kernels.
+
+    tau = Y(q, v, a) · chi,    chi the standard parameters XX XY XZ YY YZ ZZ MX MY MZ M, body after body.
+
+A static arm's drives show +g(q). numba is imported at the first call, not before.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib.arrays import shaped
+from calib.dynamics.tree import Tree
+from calib.errors import CalibError
+
+
+def regressor(tree: Tree, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+    """Return the regressor of the standard parameters, (N, n, 10 B).
+
+    Args:
+        q, v, a: (N, n) [rad or m, and per s, per s²].
+    """
+    from calib.dynamics import kernels
+
+    q, v, a = _states(tree, q=q, v=v, a=a)
+    out = np.zeros((len(q), tree.n, 10 * tree.bodies))
+    kernels.regressor(tree.arrays, *_placed(tree, q), v, a, out)
+    return out
+
+
+def regressor_gradient(
+    tree: Tree, q: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the slopes of s = Σ weights · Y(q, v, a) by q, v and a, three arrays (N, n), exactly.
+
+    Args:
+        weights: (N, n, 10 B); rank one, ``weights[k] = outer(lambda_k, chi)``, gives the derivatives of
+            Σ lambda · tau, so the gradient of any function of Y costs one call.
+    """
+    from calib.dynamics import kernels
+
+    q, v, a = _states(tree, q=q, v=v, a=a)
+    weights = np.ascontiguousarray(shaped(weights, (len(q), tree.n, 10 * tree.bodies), "weights of the regressor"))
+    slopes = np.zeros((3, *q.shape))
+    kernels.regressor_gradient(tree.arrays, *_placed(tree, q), v, a, weights, *slopes)
+    return slopes[0], slopes[1], slopes[2]
+
+
+def inverse_dynamics(tree: Tree, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+    """Return the rigid-body torques (N, n) [N m or N]: no motor inertia, no friction.
+
+    Args:
+        parameters: (10 B,) standard ones; any values, also those of no possible body.
+    """
+    from calib.dynamics import kernels
+
+    q, v, a = _states(tree, q=q, v=v, a=a)
+    out = np.zeros_like(q)
+    kernels.inverse_dynamics(tree.arrays, _parameters(tree, parameters), *_placed(tree, q), v, a, out)
+    return out
+
+
+def mass_matrix(tree: Tree, parameters: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Return the joint-space inertia M(q) of the bodies, (N, n, n)."""
+    from calib.dynamics import kernels
+
+    (q,) = _states(tree, q=q)
+    out = np.zeros((len(q), tree.n, tree.n))
+    kernels.mass_matrix(tree.arrays, _parameters(tree, parameters), *_placed(tree, q), out)
+    return out
+
+
+def forward_dynamics(
+    tree: Tree, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, tau: np.ndarray, added: np.ndarray | None = None
+) -> np.ndarray:
+    """Return the accelerations (N, n) that solve (M(q) + added) a = tau - c(q, v) - g(q).
+
+    Args:
+        tau: (N, n), friction already taken off.
+        added: (n, n) constant inertia beside the bodies': diag(Ia), coupling terms off the diagonal; None for none.
+
+    Raises:
+        CalibError: naming the sample where the inertia matrix is not positive definite.
+    """
+    from calib.dynamics import kernels
+
+    q, v, tau = _states(tree, q=q, v=v, tau=tau)
+    extra = np.zeros((tree.n, tree.n)) if added is None else shaped(added, (tree.n, tree.n), "added inertia")
+    out = np.empty_like(q)
+    extra = np.ascontiguousarray(extra)
+    failed = kernels.forward_dynamics(tree.arrays, _parameters(tree, parameters), extra, q, v, tau, out)
+    if failed >= 0:
+        raise CalibError(
+            f"sample {failed}: the inertia matrix is not positive definite, so these parameters belong to no possible "
+            f"robot there; use a physically consistent estimate to simulate"
+        )
+    return out
+
+
+_NAMES = {"q": "joint positions q", "v": "joint velocities v", "a": "joint accelerations a", "tau": "torques tau"}
+
+
+def _states(tree: Tree, **arrays: np.ndarray) -> list[np.ndarray]:
+    """Return q, v, a as finite C-contiguous (N, n) arrays of one length."""
+    rows: int | None = None
+    checked = []
+    for key, array in arrays.items():
+        checked.append(np.ascontiguousarray(shaped(array, (rows, tree.n), _NAMES[key])))
+        rows = len(checked[0])
+    return checked
+
+
+def _parameters(tree: Tree, parameters: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(shaped(parameters, (10 * tree.bodies,), "standard parameters"))
+
+
+def _placed(tree: Tree, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return each body's own motion and its cosine and sine, (N, B): numpy's are vectorised, the kernels' are not."""
+    amount = q[:, tree.coordinates] * tree.scales
+    return amount, np.cos(amount), np.sin(amount)

@@ -1,0 +1,191 @@
+"""The bodies of a robot as plain arrays: what the compiled kernels read.
+
+A body's frame stands right after the element that moves it (`Chain.inertias` are about the same frame):
+
+    T_i = T_parent(i) · placement_i · exp(axis_i · scale_i · q_{coordinate_i})
+
+with scale = sign · ratio, so a joint against its axis and a mimic joint's follower need no case of their own. A body
+without a coordinate is fixed to its parent (a payload).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.arrays import frozen, shaped
+from calib.errors import RobotError
+from calib.robot.chain import AXES, Chain, Element
+from calib.transforms import pose
+
+FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
+STANDARD = ("XX", "XY", "XZ", "YY", "YZ", "ZZ", "MX", "MY", "MZ", "M")
+UNITS = ("kg m²",) * 6 + ("kg m",) * 3 + ("kg",)
+
+
+@dataclass(frozen=True, eq=False)
+class Tree:
+    """B rigid bodies moved by n coordinates, parents before children.
+
+    Attributes:
+        labels: (B,) what a body's parameters are numbered with: ``ZZ3`` belongs to body ``3``.
+        parents: (B,) index of the parent body, -1 for the base.
+        kinds: (B,) `FIXED`, `REVOLUTE` or `PRISMATIC`.
+        axes: (B,) 0, 1, 2 for x, y, z of the body's own frame.
+        scales: (B,) sign times mimic ratio; 0 for a fixed body.
+        coordinates: (B,) which of the n coordinates moves it; -1 for a fixed body.
+        placements: (B, 4, 4) of the body's frame in its parent's at q = 0.
+        gravity: (3,) in the base frame [m/s²].
+        paths: (B, n) coordinates that move the body, in the order base to body, then -1.
+        depths: (B,) how many of them.
+    """
+
+    labels: tuple[str, ...]
+    parents: np.ndarray
+    kinds: np.ndarray
+    axes: np.ndarray
+    scales: np.ndarray
+    coordinates: np.ndarray
+    placements: np.ndarray
+    gravity: np.ndarray
+    paths: np.ndarray
+    depths: np.ndarray
+
+    @property
+    def bodies(self) -> int:
+        return len(self.parents)
+
+    @property
+    def n(self) -> int:
+        return self.paths.shape[1]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The 10·B standard parameters, body after body."""
+        return tuple(name + label for label in self.labels for name in STANDARD)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return UNITS * self.bodies
+
+    @property
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        """What every kernel takes as its first argument."""
+        return (
+            self.parents, self.kinds, self.axes, self.scales, self.coordinates, self.placements, self.gravity,
+            self.paths, self.depths,
+        )  # fmt: skip
+
+
+def tree(chain: Chain) -> Tree:
+    """Return the bodies of a chain: one behind each moving element (a mimic joint's followers are bodies, too).
+
+    Body j is numbered like its joint, from 1; a follower of joint 2 is ``2b``, the next one ``2c``.
+    """
+    first = set(chain.moving.tolist())
+    order = [k for k, element in enumerate(chain.elements) if element.joint is not None]
+    pending, placements = np.eye(4), []
+    labels: list[str] = []
+    for k, element in enumerate(chain.elements):
+        pending = pending if element.placement is None else pending @ element.placement
+        pending = pending @ _elementary(element)
+        if element.joint is not None:
+            placements.append(pending)
+            pending = np.eye(4)
+            number = str(element.joint + 1)
+            taken = sum(label.rstrip("bcdefgh") == number for label in labels)
+            labels.append(number if k in first else number + "abcdefgh"[taken])
+    moved = [chain.elements[k] for k in order]
+    return _assemble(
+        labels,
+        range(-1, len(order) - 1),
+        [REVOLUTE if element.axis[0] == "r" else PRISMATIC for element in moved],
+        [AXES.index(element.axis) % 3 for element in moved],
+        [element.sign * element.ratio for element in moved],
+        [element.joint or 0 for element in moved],
+        placements,
+        chain.gravity,
+        chain.n,
+    )
+
+
+def with_payload(tree: Tree, placement: np.ndarray, label: str | None = None, on: int = -1) -> Tree:
+    """Return the tree with one more body, fixed to body `on` (default the last).
+
+    Args:
+        placement: (4, 4), the frame of the payload's parameters in the frame of the body it is fixed to; `Chain.tail`
+            for the tip of a chain.
+        label: default the number after the last joint's, so 8 on an arm of seven joints.
+    """
+    parent = range(tree.bodies)[on]
+    label = str(tree.n + 1) if label is None else label
+    if label in tree.labels:
+        raise RobotError(f"a body '{label}' is there already; give the payload another label")
+    return _assemble(
+        [*tree.labels, label],
+        [*tree.parents, parent],
+        [*tree.kinds, FIXED],
+        [*tree.axes, 2],
+        [*tree.scales, 0.0],
+        [*tree.coordinates, -1],
+        [*tree.placements, shaped(placement, (4, 4), "payload placement")],
+        tree.gravity,
+        tree.n,
+    )
+
+
+def with_gravity(tree: Tree, gravity: np.ndarray) -> Tree:
+    """Return the tree under another gravity vector (3,) in the base frame [m/s²]."""
+    return replace(tree, gravity=frozen(shaped(gravity, (3,), "gravity")))
+
+
+def standard_parameters(chain: Chain) -> np.ndarray:
+    """Return the 10·B standard parameters of `tree(chain)` from the chain's inertias; followers have none.
+
+    Raises:
+        RobotError: where the chain has no inertias.
+    """
+    if chain.inertias is None:
+        raise RobotError(f"robot '{chain.name}': its masses are not known; add 'inertia' to its joints")
+    bodies = tree(chain)
+    result = np.zeros((bodies.bodies, 10))
+    for row, label in enumerate(bodies.labels):
+        if label.isdigit():
+            result[row] = chain.inertias[int(label) - 1]
+    return result.ravel()
+
+
+def _elementary(element: Element) -> np.ndarray:
+    """Return the constant part of an element, exp(sign · axis · value), (4, 4)."""
+    axis, amount = AXES.index(element.axis) % 3, element.sign * element.value
+    if element.axis[0] == "t":
+        return pose(position=amount * np.eye(3)[axis])
+    turn = np.eye(3)
+    one, two = (axis + 1) % 3, (axis + 2) % 3
+    turn[one, one] = turn[two, two] = np.cos(amount)
+    turn[two, one], turn[one, two] = np.sin(amount), -np.sin(amount)
+    return pose(turn)
+
+
+def _assemble(labels, parents, kinds, axes, scales, coordinates, placements, gravity, n) -> Tree:
+    """Freeze the arrays and list the coordinates that move each body."""
+    paths = np.full((len(labels), n), -1)
+    depths = np.zeros(len(labels), dtype=int)
+    for i, (parent, coordinate) in enumerate(zip(parents, coordinates)):
+        path = [] if parent < 0 else paths[parent, : depths[parent]].tolist()
+        if coordinate >= 0 and coordinate not in path:
+            path.append(coordinate)
+        paths[i, : len(path)], depths[i] = path, len(path)
+    return Tree(
+        labels=tuple(labels),
+        parents=frozen(list(parents), np.int64),
+        kinds=frozen(kinds, np.int64),
+        axes=frozen(axes, np.int64),
+        scales=frozen(scales),
+        coordinates=frozen(coordinates, np.int64),
+        placements=frozen(placements),
+        gravity=frozen(gravity),
+        paths=frozen(paths, np.int64),
+        depths=frozen(depths, np.int64),
+    )

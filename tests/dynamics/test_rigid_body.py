@@ -1,0 +1,198 @@
+"""Identities: regressor · parameters = inverse dynamics = Pinocchio; forward undoes inverse; gradients."""
+
+import numpy as np
+import pytest
+from arms import LIBRARY, motley, physical, states
+from differences import check
+
+from calib.dynamics import model, rigid_body
+from calib.dynamics.gravity import gravity_torques
+from calib.dynamics.tree import standard_parameters, tree, with_gravity, with_payload
+from calib.errors import CalibError, RobotError
+from calib.robot.chain import Chain, Element, Joint
+from calib.robot.load import load
+from calib.transforms import displace
+
+ARMS = {name: load(name) for name in LIBRARY} | {"motley": motley()}
+
+
+def relative(found, wanted):
+    return np.abs(found - wanted).max() / np.abs(wanted).max()
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_agrees_with_pinocchio(name):
+    chain = ARMS[name]
+    bodies, chi = tree(chain), physical(chain.n).ravel()
+    q, v, a = states(chain.n)
+    assert relative(rigid_body.regressor(bodies, q, v, a), model.regressor(chain, q, v, a)) < 1e-12
+    tau = rigid_body.inverse_dynamics(bodies, chi, q, v, a)
+    assert relative(tau, model.inverse_dynamics(chain, chi, q, v, a)) < 1e-12
+    assert relative(rigid_body.regressor(bodies, q, v, a) @ chi, tau) < 1e-12
+    accelerations = rigid_body.forward_dynamics(bodies, chi, q, v, tau)
+    assert relative(accelerations, a) < 1e-9
+    assert relative(accelerations, model.forward_dynamics(chain, chi, q, v, tau)) < 1e-9
+
+
+def test_pinocchio_carries_bodies_without_mass():
+    chain = ARMS["lwr4plus"]
+    rng = np.random.default_rng(1)
+    chi = rng.normal(size=70)
+    chi[9::10] = rng.uniform(1.0, 2.0, 7)
+    chi[[9, 39]] = 0.0
+    q, v, a = states(7)
+    tau = rigid_body.inverse_dynamics(tree(chain), chi, q, v, a)
+    assert relative(model.inverse_dynamics(chain, chi, q, v, a), tau) < 1e-12
+    with pytest.raises(RobotError, match="moments but no mass"):
+        model.model(chain, chi)
+
+
+def test_inertia_round_trip():
+    chi = physical(1)[0]
+    assert np.allclose(model.from_inertia(model.to_inertia(chi)), chi, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_mass_matrix_is_the_part_linear_in_acceleration(name):
+    chain = ARMS[name]
+    bodies, chi = tree(chain), physical(chain.n).ravel()
+    q, v, _ = states(chain.n, 5)
+    matrix = rigid_body.mass_matrix(bodies, chi, q)
+    rest = rigid_body.inverse_dynamics(bodies, chi, q, v, 0 * q)
+    for j in range(chain.n):
+        unit = np.tile(np.eye(chain.n)[j], (5, 1))
+        column = rigid_body.inverse_dynamics(bodies, chi, q, v, unit) - rest
+        assert np.allclose(matrix[:, :, j], column, rtol=0, atol=1e-12 * np.abs(matrix).max())
+
+
+def test_static_torques_are_those_of_gravity():
+    chain = ARMS["motley"]
+    q = states(5)[0]
+    found = rigid_body.inverse_dynamics(tree(chain), standard_parameters(chain), q, 0 * q, 0 * q)
+    assert np.allclose(found, gravity_torques(chain, q), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["lwr4plus", "motley", "mimic", "payload"])
+def test_gradient_of_the_regressor(name):
+    bodies = {"mimic": lambda: tree(mimic()), "payload": lambda: with_payload(tree(motley()), np.eye(4))}.get(
+        name, lambda: tree(ARMS[name])
+    )()
+    n, rng = bodies.n, np.random.default_rng(5)
+    x = rng.normal(size=3 * n)
+    weights = rng.normal(size=(1, n, 10 * bodies.bodies))
+
+    def weighted(x):
+        return np.sum(weights * rigid_body.regressor(bodies, *x.reshape(3, 1, n)))
+
+    slopes = np.concatenate([g[0] for g in rigid_body.regressor_gradient(bodies, *x.reshape(3, 1, n), weights)])
+    assert check(weighted, slopes, x) < 1e-8
+
+
+def test_gradient_of_torques_agrees_with_pinocchio_in_batch():
+    import pinocchio as pin
+
+    chain, chi = ARMS["lwr4plus"], physical(7).ravel()
+    q, v, a = states(7, 4)
+    push = np.random.default_rng(2).normal(size=(4, 7))
+    found = rigid_body.regressor_gradient(tree(chain), q, v, a, push[:, :, None] * chi)
+    made = model.model(chain, chi)
+    data = made.createData()
+    for k in range(4):
+        slopes = pin.computeRNEADerivatives(made, data, q[k], v[k], a[k])
+        for got, (index, matrix) in zip(found, enumerate(slopes)):
+            matrix = np.triu(matrix) + np.triu(matrix, 1).T if index == 2 else matrix
+            assert np.allclose(got[k], push[k] @ matrix, rtol=0, atol=1e-11)
+
+
+def mimic() -> Chain:
+    """Return two joints where the first one also drives a third body at -1.5 times its rate."""
+    step = displace(np.eye(4), [0.3, 0.1, 0.0, 0.4, 0.2, 0.1])
+    return Chain(
+        "mimic",
+        (Joint("a"), Joint("b")),
+        (
+            Element("one", "rz", 0.1, 0, 0),
+            Element("two", "ry", 0.2, 1, 1, placement=step),
+            Element("three", "rx", 0.3, 1, 0, ratio=-1.5, placement=step),
+        ),
+    )
+
+
+def test_mimic_is_a_chain_of_three_with_tied_coordinates():
+    tied = tree(mimic())
+    free = Chain(
+        "free",
+        (Joint("a"), Joint("b"), Joint("c")),
+        tuple(Element(e.name, e.axis, e.value, k, k, placement=e.placement) for k, e in enumerate(mimic().elements)),
+    )
+    q, v, a = states(2)
+    spread = np.array([[1.0, 0.0], [0.0, 1.0], [-1.5, 0.0]])
+    wanted = np.einsum(
+        "jc,kjp->kcp", spread, rigid_body.regressor(tree(free), q @ spread.T, v @ spread.T, a @ spread.T)
+    )
+    assert tied.labels == ("1", "2", "1b")
+    assert relative(rigid_body.regressor(tied, q, v, a), wanted) < 1e-13
+    chi = physical(3).ravel()
+    tau = rigid_body.inverse_dynamics(tied, chi, q, v, a)
+    assert relative(tau, wanted @ chi) < 1e-13
+    assert relative(rigid_body.forward_dynamics(tied, chi, q, v, tau), a) < 1e-10
+    with pytest.raises(RobotError, match="mimic"):
+        model.model(mimic())
+
+
+def test_payload_is_a_body_of_its_own():
+    """A payload's torques are those of the last link with the payload's parameters moved into its frame."""
+    from calib.robot.tree import transform_body
+
+    chain, load_ = ARMS["lwr4plus"], physical(1, 4)[0]
+    placement = displace(np.eye(4), [0.1, -0.2, 0.3, 0.4, 0.5, 0.6])
+    loaded = with_payload(tree(chain), placement)
+    assert loaded.names[-1] == "M8" and loaded.bodies == 8 and loaded.n == 7
+    chi = standard_parameters(chain)
+    merged = chi.copy()
+    merged[-10:] += transform_body(load_, placement)
+    q, v, a = states(7)
+    found = rigid_body.inverse_dynamics(loaded, np.concatenate([chi, load_]), q, v, a)
+    wanted = rigid_body.inverse_dynamics(tree(chain), merged, q, v, a)
+    assert relative(found, wanted) < 1e-13
+    assert relative(rigid_body.regressor(loaded, q, v, a) @ np.concatenate([chi, load_]), wanted) < 1e-13
+    with pytest.raises(RobotError, match="there already"):
+        with_payload(loaded, placement)
+
+
+def test_added_inertia_joins_the_bodies():
+    chain = ARMS["tx40"]
+    bodies, chi = tree(chain), standard_parameters(chain)
+    added = np.diag(np.arange(1.0, 7.0))
+    added[4, 5] = added[5, 4] = 0.3
+    q, v, a = states(6)
+    tau = rigid_body.inverse_dynamics(bodies, chi, q, v, a) + a @ added
+    assert relative(rigid_body.forward_dynamics(bodies, chi, q, v, tau, added), a) < 1e-12
+
+
+def test_gravity_is_a_parameter():
+    chain = ARMS["lwr4plus"]
+    q, v, a = states(7)
+    still = with_gravity(tree(chain), np.zeros(3))
+    chi = standard_parameters(chain)
+    assert np.abs(rigid_body.inverse_dynamics(still, chi, q, 0 * v, 0 * a)).max() == 0.0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda s: (s[0][:, :5], s[1], s[2]), "joint positions q: expected .*, 7"),
+        (lambda s: (s[0], s[1][:3], s[2]), "joint velocities v: expected .*20, 7"),
+        (lambda s: (s[0], s[1], np.where(s[2] == s[2][3, 2], np.nan, s[2])), r"index \(3, 2\) is not finite"),
+    ],
+)
+def test_bad_input_is_named(change, message):
+    with pytest.raises(CalibError, match=message):
+        rigid_body.regressor(tree(ARMS["lwr4plus"]), *change(states(7)))
+
+
+def test_impossible_inertia_is_no_answer():
+    bodies = tree(ARMS["lwr4plus"])
+    q, v, tau = states(7)
+    with pytest.raises(CalibError, match="sample 0: the inertia matrix is not positive definite"):
+        rigid_body.forward_dynamics(bodies, -standard_parameters(ARMS["lwr4plus"]), q, v, tau)
