@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -169,4 +170,4 @@ def test_progress_is_told():
     told = []
     climb(truth, [measured], "geometry", progress=lambda done, total, what: told.append((done, total, what)))
     assert list(dict.fromkeys(what for _, _, what in told)) == ["frames", "offsets", "geometry"]
-    assert all(a[0] <= b[0] for a, b in zip(told, told[1:])) and told[-1][0] <= told[-1][1]
+    assert all(a[0] <= b[0] for a, b in pairwise(told)) and told[-1][0] <= told[-1][1]

@@ -67,7 +67,7 @@ def calibrate(nominal, measured, settings=None):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_errors_are_what_the_stated_covariance_says(name):
-    """dxᵀ C⁻¹ dx / p is Fisher's F(p, dof), C being scaled by the residuals; two-sided, each at four standard errors."""
+    """dxᵀ C⁻¹ dx / p is Fisher's F(p, dof), C being scaled by the residuals; two-sided, at four standard errors."""
     scores, squares, freedom = [], 0.0, 0
     for seed in range(SEEDS):
         nominal, _, measured, exact = planted(name, seed)
@@ -102,7 +102,7 @@ def test_predictions_at_unseen_joints_are_better_than_one_measurement(robot, kin
 
 @pytest.mark.parametrize("name", ["pose", "position", "sockets", "distance"])
 def test_without_noise_the_truth_is_found_to_rounding(name):
-    scene, stations, tools = SCENES[name]
+    scene = SCENES[name][0]
     nominal = load("lwr4plus")
     truth = cell(perturb(nominal, 5, 1e-3, 2e-3), 1)
     measured = scene(truth, 1, 0.0, 1)
