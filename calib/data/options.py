@@ -12,7 +12,7 @@ TOML; every key is optional, and a key that is none of these is refused. Lengths
     socket_distance = 0.05           # between two sockets of the same fixture position
     socket_pairs = [["0", "1"]]      # which sockets that joins, where there are more than two
     model = "auto"                   # auto, frames, offsets, geometry, stiffness, coupling, harmonics
-    loss = "none"                    # none, huber, cauchy
+    loss = "auto"                    # auto (cauchy where rows are grossly wrong), none, huber, cauchy
     loss_scale = 1.345               # its constant, in sigmas
     beta = true                      # a sixth element for nearly parallel axes of an MDH table
     fix = ["theta1"]                 # parameters that stay at their nominal value
@@ -54,7 +54,7 @@ from calib.errors import UsageError
 FORMATS = ("csv", "robodk", "three_smr")
 EULER = ("wpr", "xyz", "vector")
 MODELS = ("auto", "frames", "offsets", "geometry", "stiffness", "coupling", "harmonics")
-LOSSES = ("none", "huber", "cauchy")
+LOSSES = ("auto", "none", "huber", "cauchy")
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class FitOptions:
     every: FileOptions = field(default_factory=FileOptions)
     files: Mapping[str, FileOptions] = field(default_factory=dict)
     model: str = "auto"
-    loss: str = "none"
+    loss: str = "auto"
     loss_scale: float | None = None
     beta: bool = True
     fix: tuple[str, ...] = ()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from scipy.spatial import KDTree
 
@@ -31,9 +33,14 @@ def lengths(found: GeometricFit) -> list[tuple[Block, Part]]:
     return result
 
 
+def _name(block: Block) -> str:
+    return Path(block.measured.file).name or "measurements"
+
+
 def _setup_change(block: Block, part: Part) -> list[str]:
     """Compare the rows before and after every cut: a run of rows twice as bad as the rest is another set-up."""
     size = np.linalg.norm(part.value, axis=0)
+    size = np.minimum(size, 4.0 * np.median(size))  # a few gross rows are not a set-up
     m = len(size)
     cuts = np.arange(max(10, m // 20), m - max(10, m // 20))
     energy = np.cumsum(size**2)
@@ -49,7 +56,7 @@ def _setup_change(block: Block, part: Part) -> list[str]:
     bad = (rows[0], rows[cut - 1]) if first_worse else (rows[cut], rows[-1])
     worse, rest = (before[best], after[best]) if first_worse else (after[best], before[best])
     return [
-        f"{block.measured.file or 'measurements'}: rows {bad[0]}–{bad[1]} fit worse than the rest ({1e3 * worse:.2f} "
+        f"{_name(block)}: rows {bad[0]}–{bad[1]} fit worse than the rest ({1e3 * worse:.2f} "
         f"against {1e3 * rest:.2f} mm rms) and behave like another set-up: was the instrument, the tool or the robot's "
         "mastering touched, or was it cold? Fit them apart (two files, --stations each) or leave them out."
     ]
@@ -62,14 +69,14 @@ def _systematic(block: Block, part: Part) -> list[str]:
     lines = []
     if floor is not None and floor < 0.6 * rms:
         lines.append(
-            f"{block.measured.file or 'measurements'}: the remaining {1e3 * rms:.3f} mm rms are mostly systematic "
+            f"{_name(block)}: the remaining {1e3 * rms:.3f} mm rms are mostly systematic "
             f"(neighbouring poses differ by only {1e3 * floor:.3f} mm): this model does not explain them all."
         )
     if stated is not None and rms > 5.0 * stated:
         lines.append(
-            f"{block.measured.file or 'measurements'}: the residual ({1e3 * rms:.3f} mm rms) is {rms / stated:.0f} times "
+            f"{_name(block)}: the residual ({1e3 * rms:.3f} mm rms) is {rms / stated:.0f} times "
             f"the stated uncertainty ({1e3 * stated:.3f} mm): no geometry of this form explains the measurements to the "
-            "instrument's accuracy. The σ of the parameters are scaled up accordingly, yet such errors are not random."
+            "instrument's accuracy. The parameters' σ are scaled up accordingly, yet such errors are not random."
         )
     return lines
 

@@ -54,7 +54,7 @@ def _merged(found: GeometricFit) -> list[str]:
         if kin == "without":
             lines.append(f"No effect on what was measured: {_list(names)}.")
         else:
-            lines.append(f"Cannot be told from {kin}, which takes it up: {_list(names)}.")
+            lines.append(f"Merged into {kin}, and left at nominal: {_list(names)}.")
     return lines
 
 
@@ -77,13 +77,19 @@ def _untold(found: GeometricFit) -> list[str]:
     if found.split is None:
         return []
     table = layout(found.start)
+    if found.prior is not None:
+        sigma = found.estimate.sigma
+        loose = np.isfinite(found.prior) & (sigma > 0.7 * found.prior) & (found.free < table.arm)
+        names = [table.names[k] for k in found.free[loose]]
+        return [f"Drawn to nominal, since the measurements hardly tell them: {_list(names)}."] if names else []
     kept = found.candidates[found.split.kept]
     left = [table.names[k] for k in np.setdiff1d(kept, found.free) if k < table.arm]
     if not left:
         return []
     return [
-        f"The poses tell these worse than a robot's maker does (±10 mm, ±50 mrad); they stay at nominal: {_list(left)}. "
-        "Poses that move the joints concerned further, or a target further off the last axis, would tell them."
+        "The poses tell these worse than a robot's maker does (±10 mm, ±50 mrad), so they stay at nominal: "
+        f"{_list(left)}. Poses that move the joints concerned further, or a target further off the last axis, would "
+        "tell them."
     ]
 
 

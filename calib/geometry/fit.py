@@ -13,6 +13,7 @@ from calib.estimation import robust
 from calib.estimation.columns import ColumnSplit
 from calib.estimation.estimate import Estimate
 from calib.estimation.nonlinear import Solution, covariance, solve
+from calib.estimation.relevance import gram, relevance
 from calib.geometry.identifiability import base_columns
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, observe, prepare, stack
@@ -21,6 +22,8 @@ from calib.geometry.residuals import Part
 
 PLAUSIBLE = {"m": 0.01, "rad": 0.05}  # how far a real arm may be from its nominal (our choice)
 RETRIES = 4
+WIDTHS = 3  # updates of a drawn fit's widths
+NARROWEST = 1e-6  # [m, rad]
 START_SIGMA = {"position": 1e-3, "orientation": 1e-3, "consistency": 1e-3, "distance": 1e-3, "plane": 1e-3}
 
 
@@ -29,7 +32,8 @@ class Settings:
     """How to fit.
 
     Attributes:
-        loss: ``none``, ``huber`` or ``cauchy``, on the size of each row's whitened residual.
+        loss: ``none``, ``huber`` or ``cauchy``, on the size of each row's whitened residual; ``auto`` is for the
+            ladder, which takes ``cauchy`` where rows are grossly wrong (`calib.geometry.ladder`), and else is ``none``.
         loss_scale: the loss's constant, in sigmas; None for its usual one.
         damping: first λ of Levenberg–Marquardt; 0 for the iterative linear least squares of eq. 11.
         tolerance: relative size of a column that counts as dependent.
@@ -61,6 +65,7 @@ class GeometricFit:
         blocks, found: the prepared measurements and their residual parts at the solution.
         sigmas: per part, the standard deviations used.
         weights: per part, (m,) robust weights.
+        prior: (f,) standard deviations about the nominal that the fit was drawn with; infinite for none.
     """
 
     cell: Installation
@@ -74,6 +79,7 @@ class GeometricFit:
     found: list[Part]
     sigmas: list[np.ndarray]
     weights: list[np.ndarray]
+    prior: np.ndarray | None = None
 
 
 def fit(
@@ -83,6 +89,7 @@ def fit(
     *,
     settings: Settings | None = None,
     torques: Sequence[np.ndarray | None] | None = None,
+    drawn: bool = False,
 ) -> GeometricFit:
     """Fit what can be told of the parameters `candidates`; the others keep their nominal values.
 
@@ -96,6 +103,8 @@ def fit(
         candidates: (c,) positions in the parameter vector; None for all.
         settings: see `Settings`.
         torques: gravity torques (m, n) per block [N m], for compliance terms.
+        drawn: keep all independent parameters, drawn to their nominal as strongly as the data themselves say
+            (`drawn_fit`), in place of sending the untold ones back.
 
     Raises:
         MeasurementError: fewer rows than unknowns.
@@ -106,6 +115,8 @@ def fit(
     blocks = prepare(cell, measured, torques)
     split = base_columns(cell, blocks, candidates, settings.tolerance)
     free = candidates[split.kept]
+    if drawn:
+        return replace(drawn_fit(cell, blocks, free, settings), split=split, candidates=candidates)
     plausible = plausible_deviation(cell, free)
     start, found = cell, None
     for prior in (plausible, *[None] * RETRIES):
@@ -118,6 +129,30 @@ def fit(
         start, free, plausible = _back_to_nominal(found.cell, cell, candidates, free[told]), free[told], plausible[told]
     assert found is not None
     return replace(found, start=cell, split=split, candidates=candidates)
+
+
+def drawn_fit(cell: Installation, blocks: list[Block], free: np.ndarray, settings: Settings) -> GeometricFit:
+    """Fit with a prior about the nominal whose widths are the most probable ones (evidence; MacKay 1992).
+
+    One width for joint offsets, one for other angles, one for lengths. Where measurements come from a few places only
+    (sockets, a plane), directions they hardly see would otherwise move the arm by centimetres to explain micrometres.
+    """
+    table, moving = layout(cell), {e.name for e in cell.chain.elements if e.joint is not None}
+    kind = [
+        -1 if k >= table.arm else 0 if table.names[k] in moving else 1 if table.units[k] == "rad" else 2 for k in free
+    ]
+    _, family = np.unique(kind, return_inverse=True)
+    family = family - int(min(kind) < 0)
+    prior = plausible_deviation(cell, free)
+    nominal = parameter_values(cell)[free]
+    found = fit_with_prior(cell, blocks, free, prior, settings=settings)
+    for _ in range(WIDTHS):
+        residual, matrix = stack(found.found, [s / np.sqrt(w) for s, w in zip(found.sigmas, found.weights)])
+        moved = np.where(family >= 0, parameter_values(found.cell)[free] - nominal, 0.0)
+        widths = relevance(gram(residual + matrix @ moved, matrix), family, prior).ridge
+        prior = np.where(family >= 0, np.clip(widths, NARROWEST, plausible_deviation(cell, free)), np.inf)
+        found = fit_with_prior(cell, blocks, free, prior, settings=settings)
+    return found
 
 
 def _back_to_nominal(
@@ -136,21 +171,23 @@ def fit_with_prior(
     prior: np.ndarray | None = None,
     *,
     settings: Settings | None = None,
+    nominal: Installation | None = None,
 ) -> GeometricFit:
-    """Fit exactly the parameters `free`, minimising Σ ‖(y - f(x)) / σ‖² + Σ ((x - x_start) / σ_prior)².
+    """Fit exactly the parameters `free`, minimising Σ ‖(y - f(x)) / σ‖² + Σ ((x - x_nominal) / σ_prior)².
 
     Sigmas that no file states are estimated, one per file and nature (position, orientation …), and the fit repeated
     until they settle; so are the weights of a robust loss.
 
     Args:
-        cell: where to start, and what the prior draws to.
+        cell: where to start.
         blocks: measurements prepared for this installation.
         free: (f,) positions in the parameter vector.
-        prior: (f,) standard deviations about the start; infinite for none.
+        prior: (f,) standard deviations; infinite for none.
         settings: see `Settings`.
+        nominal: what the prior draws to; None for `cell`.
     """
     settings = settings or Settings()
-    weigher = _Weigher(settings, cell, blocks, free, prior)
+    weigher = _Weigher(settings, nominal or cell, blocks, free, prior)
     state, solution = cell, None
     for number in range(settings.passes):
         weigher.update(state, first=number == 0)
@@ -195,9 +232,9 @@ class _Weigher:
     """Holds what changes between passes: sigmas and robust weights of every part."""
 
     def __init__(
-        self, settings: Settings, start: Installation, blocks: list[Block], free: np.ndarray, prior: np.ndarray | None
+        self, settings: Settings, nominal: Installation, blocks: list[Block], free: np.ndarray, prior: np.ndarray | None
     ):
-        self.settings, self.start, self.blocks, self.free = settings, start, blocks, free
+        self.settings, self.nominal, self.blocks, self.free = settings, nominal, blocks, free
         self.prior = prior if prior is not None and np.isfinite(prior).any() else None
         self.sigmas: list[np.ndarray] = []
         self.weights: list[np.ndarray] = []
@@ -218,10 +255,11 @@ class _Weigher:
                 self.blocks[0].measured.file,
             )
         share = max(1.0 - unknown / rows, 0.05)
-        robustly = self.settings.loss != "none"
+        loss = "none" if self.settings.loss == "auto" else self.settings.loss
+        robustly = loss != "none"
         self.sigmas = [_sigma(part, share, first and not robustly, robustly) for part in found]
         self.weights = [
-            robust.weights(_size(part, sigma), self.settings.loss, self.settings.loss_scale)
+            robust.weights(_size(part, sigma), loss, self.settings.loss_scale)
             for part, sigma in zip(found, self.sigmas)
         ]
 
@@ -239,7 +277,7 @@ class _Weigher:
         scales = [sigma / np.sqrt(weight) for sigma, weight in zip(self.sigmas, self.weights)]
         residual, matrix = stack(found, scales)
         if self.prior is not None:
-            pull = (parameter_values(self.start) - parameter_values(state))[self.free] / self.prior
+            pull = (parameter_values(self.nominal) - parameter_values(state))[self.free] / self.prior
             held = np.isfinite(self.prior)
             residual = np.concatenate([residual, pull[held]])
             matrix = np.vstack([matrix, np.diag(1.0 / self.prior)[held]])
@@ -263,8 +301,9 @@ class _Weigher:
             dof,
         )
         return GeometricFit(
-            state, cell, self.free, estimate, None, self.free, solution, self.blocks, found, self.sigmas, self.weights
-        )
+            state, cell, self.free, estimate, None, self.free, solution, self.blocks, found, self.sigmas,
+            self.weights, self.prior,
+        )  # fmt: skip
 
 
 def parameter_values(cell: Installation) -> np.ndarray:
@@ -295,6 +334,19 @@ def used_sigmas(found: GeometricFit) -> list[dict[str, float]]:
         count = _labels(block)
         parts = zip(found.found[start : start + count], found.sigmas[start : start + count])
         result.append({part.label: float(np.sqrt(np.mean(sigma**2))) for part, sigma in parts})
+        start += count
+    return result
+
+
+def row_weights(found: GeometricFit) -> list[np.ndarray]:
+    """Return per block the smallest robust weight of each row's parts (m,); 1 without a robust loss."""
+    result, start = [], 0
+    for block in found.blocks:
+        weight, count = np.ones(len(block.measured)), _labels(block)
+        for part, own in zip(found.found[start : start + count], found.weights[start : start + count]):
+            if len(part.index) == len(weight):
+                weight = np.minimum(weight, own)
+        result.append(weight)
         start += count
     return result
 
@@ -350,6 +402,6 @@ def combine(settings: Settings, **changes: object) -> Settings:
         UsageError: for a loss that does not exist.
     """
     result = replace(settings, **changes)  # type: ignore[arg-type]
-    if result.loss not in robust.LOSSES:
-        raise UsageError(f"loss '{result.loss}' is none of {', '.join(robust.LOSSES)}")
+    if result.loss not in ("auto", *robust.LOSSES):
+        raise UsageError(f"loss '{result.loss}' is none of auto, {', '.join(robust.LOSSES)}")
     return result

@@ -4,7 +4,8 @@
 
 Every rung is judged on rows it was not fitted to (`calib.geometry.folds`). An effect that does not lower that error is
 left out and the next one tried on top of those that did; effects left out get a second chance at the end, since sag may
-show only once gear errors are gone.
+show only once gear errors are gone. Without an instrument (sockets, planes, distances) the geometry is drawn to its
+nominal as strongly as the data say (`calib.geometry.fit.drawn_fit`).
 """
 
 from __future__ import annotations
@@ -19,15 +20,17 @@ from calib.errors import UsageError
 from calib.estimation.relevance import relevance
 from calib.geometry.deflection import Deflection, Term
 from calib.geometry.effects import EFFECTS, MODELS, Effect, term_groups, term_sizes
-from calib.geometry.fit import GeometricFit, Settings, fit, fit_with_prior, polish_frames
+from calib.geometry.fit import GeometricFit, Settings, fit, fit_with_prior, outliers, polish_frames
 from calib.geometry.folds import Folds, transfer_folds
 from calib.geometry.installation import Installation
-from calib.geometry.observation import prepare
+from calib.geometry.observation import has_instrument, prepare
 from calib.geometry.parameters import layout
 from calib.geometry.unseen import Judge, judge
 
 GAIN = 0.05  # an effect has to lower the error on unseen rows by this share (our choice)
 POSES_PER_ORDER = 8  # harmonics of order k are offered to sets of at least 8 k poses (our choice)
+
+GROSS = 8.0  # robust sigmas beyond which a row is not of this robot (our choice)
 
 Progress = Callable[[int, int, str], None]
 
@@ -61,6 +64,7 @@ class Climb:
         rungs: all models tried, in order.
         chosen: name of the chosen model, e.g. ``geometry + harmonics``.
         folds: how the unseen rows were set aside.
+        loss: the loss that was used.
     """
 
     fit: GeometricFit
@@ -68,6 +72,7 @@ class Climb:
     rungs: tuple[Rung, ...]
     chosen: str
     folds: Folds
+    loss: str = "none"
 
 
 def climb(
@@ -87,7 +92,8 @@ def climb(
         cell: nominal arm, frames placed (`calib.geometry.first_guess.install`).
         measured: blocks of measurements.
         model: ``auto``, or one of `MODELS`: that rung and all below it.
-        settings: of every fit.
+        settings: of every fit. With loss ``auto``, rows beyond `GROSS` robust sigmas of the rigid fit turn it into
+            ``cauchy``, for the fits and for the errors on unseen rows alike.
         torques: gravity torques (m, n) per block [N m]; None where the masses are not known.
         fixed: positions in the parameter vector that stay at their nominal.
         seed: of the regions.
@@ -99,9 +105,12 @@ def climb(
     if model not in ("auto", *MODELS):
         raise UsageError(f"model '{model}' is none of auto, {', '.join(MODELS)}")
     tell = progress or (lambda done, total, what: None)
-    folds = transfer_folds(measured, seed)
-    climber = _Climber(cell, measured, settings or Settings(), torques, fixed, folds, tell)
+    folds, settings = transfer_folds(measured, seed), settings or Settings()
+    climber = _Climber(cell, measured, settings, torques, fixed, folds, tell)
     climber.rigid(model)
+    if settings.loss == "auto" and outliers(climber.best, GROSS):
+        climber = _Climber(cell, measured, replace(settings, loss="cauchy"), torques, fixed, folds, tell)
+        climber.rigid(model)
     if model == "auto" or model in [effect.name for effect in EFFECTS]:
         climber.effects(model)
     return climber.result()
@@ -126,6 +135,7 @@ class _Climber:
         self.nominal = polish_frames(cell, measured, settings)
         self.best, self.rungs, self.chosen = self.nominal, [], "frames"
         self.steps = 0
+        self.drawn = not all(has_instrument(block) for block in measured)
 
     def rigid(self, model: str) -> None:
         """Try frames, joint offsets and the full geometry."""
@@ -143,7 +153,7 @@ class _Climber:
             self._tick(name)
             candidates = np.setdiff1d(candidates, self.fixed)
             found = self.nominal if name == "frames" else fit(
-                self.nominal.cell, self.measured, candidates, settings=self.settings
+                self.nominal.cell, self.measured, candidates, settings=self.settings, drawn=self.drawn
             )  # fmt: skip
             unseen = self._judge(found, ()).error_rigid()
             better = unseen < error * (1.0 - GAIN)
@@ -220,9 +230,11 @@ class _Climber:
             self.best.cell, deflection=Deflection(picked, np.zeros(len(picked)), self.nominal.cell.chain)
         )  # fmt: skip
         free = np.concatenate([self.best.free, layout(cell).term_index])
-        prior = np.concatenate([np.full(len(self.best.free), np.inf), ridge[alive]])
+        own = np.full(len(self.best.free), np.inf) if self.best.prior is None else self.best.prior
+        prior = np.concatenate([own, ridge[alive]])
         blocks = prepare(cell, self.measured, self.torques)
-        found = fit_with_prior(cell, blocks, free, prior, settings=self.settings)
+        nominal = replace(cell, chain=self.nominal.cell.chain)
+        found = fit_with_prior(cell, blocks, free, prior, settings=self.settings, nominal=nominal)
         return replace(found, start=self.best.start, split=self.best.split, candidates=self.best.candidates)
 
     def _terms(self, effect: Effect) -> list[Term]:
@@ -243,7 +255,8 @@ class _Climber:
         self.tell(self.steps, 2 * len(MODELS), what)
 
     def result(self) -> Climb:
-        return Climb(self.best, self.nominal, tuple(self.rungs), self.chosen, self.folds)
+        loss = "none" if self.settings.loss == "auto" else self.settings.loss
+        return Climb(self.best, self.nominal, tuple(self.rungs), self.chosen, self.folds, loss)
 
 
 def _places(offered: dict[str, list[Term]]) -> dict[str, np.ndarray]:

@@ -15,7 +15,7 @@ import numpy as np
 from calib.data.measurements import PoseMeasurements, take
 from calib.estimation.relevance import Gram, gram, relevance
 from calib.geometry.deflection import Deflection, Term
-from calib.geometry.fit import GeometricFit, plausible_deviation, used_sigmas
+from calib.geometry.fit import GeometricFit, plausible_deviation, row_weights, used_sigmas
 from calib.geometry.folds import Folds
 from calib.geometry.installation import Installation
 from calib.geometry.observation import has_instrument, observe, prepare
@@ -32,7 +32,7 @@ class Unseen:
 
     Attributes:
         squares: (folds,) sum of squared errors [m²].
-        rows: (folds,) rows.
+        rows: (folds,) rows, each counted by its robust weight.
     """
 
     squares: np.ndarray
@@ -125,29 +125,34 @@ def judge(
     """
     cell = replace(found.cell, deflection=Deflection(terms, np.zeros(len(terms)), reference))
     free = np.concatenate([found.free, layout(cell).term_index])
-    scales = used_sigmas(found)
+    scales, weights = used_sigmas(found), row_weights(found)
     rigid = len(found.free)
     each: list[Gram] = []
     held_out, rows = [], []
     pooled = all(has_instrument(block) for block in measured)
     for fold in range(folds.count):
         inside = [np.flatnonzero(members == fold) for members in folds.members]
-        metric, whitened, count = _statistics(cell, measured, inside, free, scales, torques, folds.kind == "stations")
+        metric, whitened, count = _statistics(
+            cell, measured, inside, free, scales, weights, torques, folds.kind == "stations"
+        )
         held_out.append(metric)
         rows.append(count)
         if not pooled:
             outside = [np.flatnonzero(members != fold) for members in folds.members]
-            whitened = _statistics(cell, measured, outside, free, scales, torques, False)[1]
+            whitened = _statistics(cell, measured, outside, free, scales, weights, torques, False)[1]
         each.append(whitened)
     if pooled:
         total = sum(each[1:], each[0])
         training = [_without(total, part) for part in each]
     else:
         total, training = (
-            _statistics(cell, measured, [np.arange(len(b)) for b in measured], free, scales, torques, False)[1],
+            _statistics(cell, measured, [np.arange(len(b)) for b in measured], free, scales, weights, torques, False)[
+                1
+            ],
             each,
         )
-    plausible = np.where(np.isfinite(p := plausible_deviation(found.cell, found.free)), p, 10.0)
+    wide = plausible_deviation(found.cell, found.free) if found.prior is None else found.prior
+    plausible = np.where(np.isfinite(wide), wide, 10.0)
     return Judge(rigid, groups, sizes, plausible, training, held_out, np.array(rows), total)
 
 
@@ -161,13 +166,14 @@ def _statistics(
     chosen: Sequence[np.ndarray],
     free: np.ndarray,
     scales: Sequence[dict[str, float]],
+    weights: Sequence[np.ndarray],
     torques: Sequence[np.ndarray | None] | None,
     replace_station: bool,
-) -> tuple[Gram, Gram, int]:
+) -> tuple[Gram, Gram, float]:
     """Return the statistics of chosen rows in metres (of what is in metres), whitened, and the count of metric rows."""
     p = len(free)
     metric = whitened = Gram(np.zeros((p, p)), np.zeros(p), 0.0, 0)
-    count = 0
+    count = 0.0
     for number, (block, rows) in enumerate(zip(measured, chosen)):
         frames: list[tuple[np.ndarray, np.ndarray]] = []
         pieces = np.array_split(rows, max(1, len(rows) // CHUNK)) if has_instrument(block) else [rows]
@@ -178,11 +184,13 @@ def _statistics(
             part_block = take(block, piece)
             ready = prepare(cell, [part_block], [None if torque is None else torque[piece]])
             for part in observe(cell, ready[0], free):
-                residual, matrix = part.value.ravel(), part.jacobian.reshape(p, -1).T
+                weight = weights[number][piece][part.index]
+                root = np.broadcast_to(np.sqrt(weight), part.value.shape).ravel()
+                residual, matrix = root * part.value.ravel(), (root * part.jacobian.reshape(p, -1)).T
                 sigma = scales[number][part.label]
                 whitened = whitened + gram(residual / sigma, matrix / sigma)
                 if part.label in METRES:
-                    count += part.value.shape[1]
+                    count += float(weight.sum())
                     if replace_station:
                         frames.append((residual, matrix))
                     else:
