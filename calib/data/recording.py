@@ -1,0 +1,168 @@
+"""What a controller logged while the robot moved: one frozen block per file, untouched; knows no robot."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.arrays import frozen
+from calib.errors import MeasurementError, UsageError
+
+KINDS = ("torque", "current")
+SERIES = ("q", "v", "effort", "tau_link", "tau_motor", "q_link")
+_CUT = re.compile(r"^(?P<file>.+)@(?P<start>[^@:/\\]*):(?P<stop>[^@:/\\]*)$")
+
+
+@dataclass(frozen=True, eq=False)
+class Joints:
+    """What a reader may hold a recording against; NaN or infinity where a limit is not known.
+
+    Attributes:
+        names: n joint names in the robot's order.
+        kinds: URDF's joint types (``revolute``, ``continuous``, ``prismatic``).
+        lower, upper: (n,) position limits [rad or m].
+        velocity: (n,) [rad/s or m/s].
+        effort: (n,) [N·m or N].
+    """
+
+    names: tuple[str, ...]
+    kinds: tuple[str, ...] = ()
+    lower: np.ndarray = None  # type: ignore[assignment]  # set below
+    upper: np.ndarray = None  # type: ignore[assignment]  # set below
+    velocity: np.ndarray = None  # type: ignore[assignment]  # set below
+    effort: np.ndarray = None  # type: ignore[assignment]  # set below
+
+    def __post_init__(self) -> None:
+        n = len(self.names)
+        object.__setattr__(self, "names", tuple(self.names))
+        object.__setattr__(self, "kinds", tuple(self.kinds) or ("revolute",) * n)
+        for name in ("lower", "upper", "velocity", "effort"):
+            value = getattr(self, name)
+            object.__setattr__(self, name, frozen(np.full(n, np.nan) if value is None else value))
+            if getattr(self, name).shape != (n,):
+                raise UsageError(f"{name}: expected {n} values, one per joint, found {getattr(self, name).shape}")
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """N samples of n joints from one file, as they were logged.
+
+    Attributes:
+        t: (N,) time since the file's first sample [s], strictly rising, not necessarily uniform; a part that was cut
+            out keeps the time of the whole file.
+        q: (N, n) joint positions on the motor side of any elasticity [rad or m].
+        effort: (N, n) what drives the joints: torques on the joint side [N·m or N], or motor currents [A].
+        kind: ``torque`` or ``current``: what `effort` is.
+        joint_names: n names.
+        v: (N, n) measured velocities [rad/s or m/s]; None where not recorded.
+        tau_link: (N, n) a second torque, of sensors behind the gear [N·m or N]; None where not recorded.
+        tau_motor: (N, n) torque on the motor's side of the gear, as recorded [N·m]; None where not recorded.
+        q_link: (N, n) second encoders, behind the gear [rad or m]; NaN in the columns of joints that have none.
+        drive_gain: (n,) torque per current that the file states [N·m/A or N/A]; None where it states none.
+        file: where it came from.
+        rows: (N,) number of each sample in the file, counted from 1.
+        notes: what is odd but was accepted, for the message.
+    """
+
+    t: np.ndarray
+    q: np.ndarray
+    effort: np.ndarray
+    kind: str
+    joint_names: tuple[str, ...]
+    v: np.ndarray | None = None
+    tau_link: np.ndarray | None = None
+    tau_motor: np.ndarray | None = None
+    q_link: np.ndarray | None = None
+    drive_gain: np.ndarray | None = None
+    file: str = ""
+    rows: np.ndarray = None  # type: ignore[assignment]  # set below
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise MeasurementError(f"kind '{self.kind}' is none of {', '.join(KINDS)}", self.file)
+        shape = (len(self.t), len(self.joint_names))
+        for name in SERIES:
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, frozen(value))
+                if getattr(self, name).shape != shape:
+                    found = getattr(self, name).shape
+                    raise MeasurementError(f"{name} has shape {found}, expected {shape} (samples, joints)", self.file)
+        object.__setattr__(self, "t", frozen(self.t))
+        object.__setattr__(self, "joint_names", tuple(self.joint_names))
+        rows = np.arange(1, shape[0] + 1) if self.rows is None else self.rows
+        object.__setattr__(self, "rows", frozen(rows, int))
+        if self.drive_gain is not None:
+            object.__setattr__(self, "drive_gain", frozen(self.drive_gain))
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    @property
+    def n(self) -> int:
+        """The number of joints."""
+        return self.q.shape[1]
+
+    @property
+    def duration(self) -> float:
+        """Time from the first to the last sample [s]."""
+        return float(self.t[-1] - self.t[0]) if len(self) else 0.0
+
+
+def take(recording: Recording, index: slice | np.ndarray) -> Recording:
+    """Return the samples at `index`, a slice or a mask (N,); they keep their times and row numbers."""
+    picked = {name: None if (value := getattr(recording, name)) is None else value[index] for name in SERIES}
+    return replace(recording, t=recording.t[index], rows=recording.rows[index], **picked)
+
+
+def cut(recording: Recording, start: float | None = None, stop: float | None = None) -> Recording:
+    """Return the samples with start ≤ t < stop [s]; None leaves that end open.
+
+    Raises:
+        MeasurementError: where nothing is left.
+    """
+    first, end = span(recording.t, start, stop)
+    if first >= end:
+        low, high = "" if start is None else f"{start:g}", "" if stop is None else f"{stop:g}"
+        last = f"{recording.t[-1]:.4g} s" if len(recording) else "nothing"
+        raise MeasurementError(f"the cut @{low}:{high} leaves no sample; the recording ends at {last}", recording.file)
+    return take(recording, slice(first, end))
+
+
+def span(t: np.ndarray, start: float | None, stop: float | None) -> tuple[int, int]:
+    """Return the first sample with t ≥ start and the first with t ≥ stop; a grain of 1 ns forgives rounding."""
+    first = 0 if start is None else int(np.searchsorted(t, start - 1e-9))
+    return first, len(t) if stop is None else int(np.searchsorted(t, stop - 1e-9))
+
+
+def parse_cut(text: str) -> tuple[str, float | None, float | None]:
+    """Return the file, start and stop [s] that ``log.npz@0:9.4`` says; either end may be left out (``log.npz@2:``).
+
+    Seconds count from the file's first sample. Without an ``@`` the whole text is the file.
+
+    Raises:
+        UsageError: for a cut that is not two times, or is empty.
+    """
+    match = _CUT.match(text)
+    if match is None:
+        return text, None, None
+    ends: list[float | None] = []
+    for part in (match["start"], match["stop"]):
+        try:
+            ends.append(float(part) if part.strip() else None)
+        except ValueError as error:
+            message = f"{text}: '{part}' is no time in seconds; a cut is written log.npz@0:9.4"
+            raise UsageError(message) from error
+    start, stop = ends
+    if start is not None and stop is not None and not start < stop:
+        raise UsageError(f"{text}: the cut ends at {stop:g} s, before it starts at {start:g} s")
+    return match["file"], start, stop
+
+
+def named(names: Sequence[str], n: int) -> tuple[str, ...]:
+    """Return `names`, or q1 … qn where there are none."""
+    return tuple(names) if len(names) else tuple(f"q{j + 1}" for j in range(n))
