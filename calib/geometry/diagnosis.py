@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import KDTree
 
-from calib.geometry.fit import GeometricFit
 from calib.geometry.observation import Block
 from calib.geometry.residuals import Part
+from calib.geometry.result import GeometricFit
 
 FEWEST = 30  # rows below which no pattern is looked for (our choice)
 
@@ -25,12 +25,8 @@ def diagnose(found: GeometricFit) -> list[str]:
 
 def lengths(found: GeometricFit) -> list[tuple[Block, Part]]:
     """Return per block its first part, which is in metres for every kind of measurement."""
-    result, start = [], 0
-    for block in found.blocks:
-        result.append((block, found.found[start]))
-        start += 2 if block.measured.kind == "pose" else 1
-        start += int(block.measured.kind == "sockets" and bool(block.measured.links))
-    return result
+    first = {piece.block: piece.part for piece in reversed(found.pieces)}
+    return [(block, first[number]) for number, block in enumerate(found.blocks)]
 
 
 def _name(block: Block) -> str:
@@ -75,8 +71,8 @@ def _systematic(block: Block, part: Part) -> list[str]:
     if stated is not None and rms > 5.0 * stated:
         lines.append(
             f"{_name(block)}: the residual ({1e3 * rms:.3f} mm rms) is {rms / stated:.0f} times "
-            f"the stated uncertainty ({1e3 * stated:.3f} mm): no geometry of this form explains the measurements to the "
-            "instrument's accuracy. The parameters' σ are scaled up accordingly, yet such errors are not random."
+            f"the stated uncertainty ({1e3 * stated:.3f} mm): no geometry of this form explains the measurements to "
+            "the instrument's accuracy. The parameters' σ are scaled up accordingly, yet such errors are not random."
         )
     return lines
 

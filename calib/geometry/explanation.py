@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.geometry.fit import GeometricFit
 from calib.geometry.observation import has_instrument
 from calib.geometry.parameters import Layout, layout
+from calib.geometry.result import GeometricFit
 from calib.robot.kinematics import forward
 
 STILL = 45.0  # [deg] orientation range below which "the wrist is held still" is the likely reason (our choice)

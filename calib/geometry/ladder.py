@@ -20,12 +20,14 @@ from calib.errors import UsageError
 from calib.estimation.relevance import relevance
 from calib.geometry.deflection import Deflection, Term
 from calib.geometry.effects import EFFECTS, MODELS, Effect, term_groups, term_sizes
-from calib.geometry.fit import GeometricFit, Settings, fit, fit_with_prior, outliers, polish_frames
+from calib.geometry.fit import fit, fit_with_prior, polish_frames
 from calib.geometry.folds import Folds, transfer_folds
 from calib.geometry.installation import Installation
 from calib.geometry.observation import has_instrument, prepare
 from calib.geometry.parameters import layout
+from calib.geometry.result import GeometricFit, outliers
 from calib.geometry.unseen import Judge, judge
+from calib.geometry.weighing import Settings
 
 GAIN = 0.05  # an effect has to lower the error on unseen rows by this share (our choice)
 POSES_PER_ORDER = 8  # harmonics of order k are offered to sets of at least 8 k poses (our choice)

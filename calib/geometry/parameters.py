@@ -111,3 +111,9 @@ def step(cell: Installation, free: np.ndarray, change: np.ndarray) -> Installati
 def layout_counts(cell: Installation) -> tuple[int, int, int, int]:
     """Return how many parameters the arm, stations, tools and deflection have."""
     return len(cell.chain.elements), 6 * len(cell.stations), 6 * len(cell.tools), len(cell.deflection.terms)
+
+
+def parameter_values(cell: Installation) -> np.ndarray:
+    """Return the full parameter vector; frames count from their present placement, hence zeros."""
+    _, stations, tools, _ = layout_counts(cell)
+    return np.concatenate([cell.chain.values, np.zeros(stations + tools), np.asarray(cell.deflection.coefficients)])

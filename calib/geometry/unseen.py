@@ -15,11 +15,12 @@ import numpy as np
 from calib.data.measurements import PoseMeasurements, take
 from calib.estimation.relevance import Gram, gram, relevance
 from calib.geometry.deflection import Deflection, Term
-from calib.geometry.fit import GeometricFit, plausible_deviation, row_weights, used_sigmas
+from calib.geometry.fit import plausible_deviation
 from calib.geometry.folds import Folds
 from calib.geometry.installation import Installation
 from calib.geometry.observation import has_instrument, observe, prepare
 from calib.geometry.parameters import layout
+from calib.geometry.result import GeometricFit, row_weights, used_sigmas
 from calib.robot.chain import Chain
 
 CHUNK = 1000  # poses observed at once

@@ -10,8 +10,9 @@ import numpy as np
 from calib.data.measurements import PoseMeasurements
 from calib.geometry.accuracy import Errors, errors, pair_errors, statistics, summary
 from calib.geometry.first_guess import install
-from calib.geometry.fit import Settings, polish_frames
+from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation
+from calib.geometry.weighing import Settings
 from calib.procedure.inputs import Unseen, pose_count
 
 Torques = list[np.ndarray | None]

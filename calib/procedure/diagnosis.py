@@ -9,9 +9,9 @@ import numpy as np
 
 from calib.data.measurements import PoseMeasurements
 from calib.geometry.accuracy import NATURE
-from calib.geometry.fit import GeometricFit, outliers
 from calib.geometry.ladder import Climb
 from calib.geometry.observation import observe
+from calib.geometry.result import GeometricFit, outliers
 
 FLOOR = 4e-4  # rms per metre of reach: more is not left by a rigid geometry of a sound arm (our choice)
 

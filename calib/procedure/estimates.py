@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.geometry.fit import GeometricFit, parameter_values
 from calib.geometry.installation import Installation
-from calib.geometry.parameters import layout
+from calib.geometry.parameters import layout, parameter_values
+from calib.geometry.result import GeometricFit
 
 HEADER = ("name", "unit", "nominal", "value", "sigma", "rsd")
 

@@ -13,10 +13,10 @@ from calib.errors import NotConverged
 from calib.geometry.diagnosis import diagnose
 from calib.geometry.explanation import explain
 from calib.geometry.first_guess import install
-from calib.geometry.fit import Settings, combine
 from calib.geometry.installation import Installation
 from calib.geometry.ladder import Climb, climb
 from calib.geometry.parameters import layout
+from calib.geometry.weighing import Settings, combine
 from calib.procedure.comparing import Comparison, compare, compare_unseen
 from calib.procedure.diagnosis import Outlier, named_outliers, plateau
 from calib.procedure.inputs import Inputs

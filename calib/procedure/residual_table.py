@@ -40,14 +40,11 @@ def write_residuals(outcome: Outcome, path: Path) -> Path:
 
 def _weights(outcome: Outcome) -> dict[tuple[str, int, str], float]:
     """Return the robust weight of each fitted residual by file, row and tool; the least of its natures."""
-    fit, result, start = outcome.climb.fit, {}, 0
-    for block in fit.blocks:
-        count = len(observe(fit.cell, block, _NONE))
-        for part, weight in zip(fit.found[start : start + count], fit.weights[start : start + count]):
-            for i, w in zip(part.index, weight):
-                key = _key(block.measured, int(i))
-                result[key] = min(float(w), result.get(key, np.inf))
-        start += count
+    fit, result = outcome.climb.fit, {}
+    for piece in fit.pieces:
+        for i, w in zip(piece.part.index, piece.weight):
+            key = _key(fit.blocks[piece.block].measured, int(i))
+            result[key] = min(float(w), result.get(key, np.inf))
     return result
 
 

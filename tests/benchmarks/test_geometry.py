@@ -131,7 +131,7 @@ def test_fit_of_800_poses(benchmark, description, way):
     start = polish_frames(install(nominal, [measured]), [measured]).cell
     best = fit(start, [measured])
     block, free = prepare(start, [measured])[0], best.free
-    cost = float(np.sum((best.found[0].value / best.sigmas[0]) ** 2))
+    cost = float(np.sum((best.pieces[0].part.value / best.pieces[0].sigma) ** 2))
     if way == "whole":
         benchmark(whole, nominal, measured)
     elif way == "fit alone":

@@ -9,9 +9,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.data.measurements import PoseMeasurements
-from calib.geometry.fit import GeometricFit
 from calib.geometry.installation import Installation, see
 from calib.geometry.observation import observe, prepare, stack
+from calib.geometry.result import GeometricFit
 from calib.robot.chain import Chain, Element, Joint, random_joints
 from calib.robot.kinematics import element_jacobian, joint_jacobian
 from calib.robot.load import load

@@ -11,7 +11,8 @@ from planted import cell, frames, load, measure, perturb, position_error, random
 from calib.data.measurements import take
 from calib.errors import MeasurementError
 from calib.geometry.first_guess import average_pose, install
-from calib.geometry.fit import Settings, polish_frames
+from calib.geometry.fit import polish_frames
+from calib.geometry.weighing import Settings
 from calib.transforms import invert, pose, rotation_vector
 
 
@@ -86,8 +87,8 @@ def test_with_arm_errors_of_millimetres_it_leads_to_the_best_of_many_random_star
             if kind != "pose":
                 start = replace(start, tools=pose(None, rng.uniform(-0.3, 0.3, (1, 3))))
             found = polish_frames(start, [measured])
-            costs.append(sum(float(np.sum(part.value**2)) for part in found.found))
-        mine = sum(float(np.sum(part.value**2)) for part in ours.found)
+            costs.append(sum(float(np.sum(piece.part.value**2)) for piece in found.pieces))
+        mine = sum(float(np.sum(piece.part.value**2)) for piece in ours.pieces)
         assert mine <= min(costs) * (1 + 1e-4)
         assert min(costs) <= mine * (1 + 1e-4)  # some random start gets there, too: the comparison means something
 

@@ -10,9 +10,11 @@ import scipy.stats
 from planted import cell, deviation, load, measure, perturb, position_error, random_joints
 
 from calib.geometry.first_guess import install
-from calib.geometry.fit import Settings, fit, outliers, polish_frames
+from calib.geometry.fit import fit, polish_frames
 from calib.geometry.installation import Installation
 from calib.geometry.parameters import layout
+from calib.geometry.result import outliers
+from calib.geometry.weighing import Settings
 
 SIGMA = 5e-5
 SEEDS = 24
@@ -69,7 +71,8 @@ def calibrate(nominal, measured, settings=None):
 def test_errors_are_what_the_stated_covariance_says(name):
     """dxᵀ C⁻¹ dx / p is Fisher's F(p, dof), C being scaled by the residuals; two-sided, at four standard errors."""
     scores, squares, freedom = [], 0.0, 0
-    for seed in range(SEEDS):
+    seeds = SEEDS // 2 if name in ("sockets", "plane") else SEEDS  # touching takes inverse kinematics, hence time
+    for seed in range(seeds):
         nominal, _, measured, exact = planted(name, seed)
         found = calibrate(nominal, measured)
         assert found.solution.status.good
@@ -79,7 +82,7 @@ def test_errors_are_what_the_stated_covariance_says(name):
         scores.append(scipy.stats.norm.ppf(scipy.stats.f(p, dof).cdf(size / p)))
         squares += dof * found.estimate.residual_std**2
         freedom += dof
-    assert abs(np.sum(scores)) < 4 * np.sqrt(SEEDS), f"normal scores {np.round(scores, 1)}"
+    assert abs(np.sum(scores)) < 4 * np.sqrt(seeds), f"normal scores {np.round(scores, 1)}"
     assert abs(squares - freedom) < 4 * np.sqrt(2 * freedom)  # the stated sigmas are those of the residuals
 
 
@@ -108,7 +111,7 @@ def test_without_noise_the_truth_is_found_to_rounding(name):
     measured = scene(truth, 1, 0.0, 1)
     found = calibrate(nominal, measured)
     assert found.solution.cost < 1e-6 * len(measured[0]) or found.estimate.residual_std < 1e-3
-    assert max(np.abs(part.value).max() for part in found.found) < 1e-8
+    assert max(np.abs(part.value).max() for part in (piece.part for piece in found.pieces)) < 1e-8
 
 
 @pytest.mark.parametrize("name", ["pose", "position"])
@@ -122,7 +125,7 @@ def test_sigmas_that_are_not_stated_are_estimated(name):
         told = measure(truth, name, 80, seed, sigma=SIGMA, sigma_rotation=2e-4)
         found, known = calibrate(nominal, [measured]), calibrate(nominal, [told])
         true = {"position": SIGMA, "orientation": 2e-4}
-        ratios.append([sigma.mean() / true[part.label] for part, sigma in zip(found.found, found.sigmas)])
+        ratios.append([piece.sigma.mean() / true[piece.part.label] for piece in found.pieces])
         q = random_joints(
             nominal, 50, 9
         )  # other weights may choose other columns for the same arm: compare predictions

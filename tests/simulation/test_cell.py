@@ -9,7 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calib.geometry.first_guess import install
-from calib.geometry.fit import GeometricFit, Settings, fit, polish_frames
+from calib.geometry.fit import fit, polish_frames
+from calib.geometry.result import GeometricFit
+from calib.geometry.weighing import Settings
 from calib.robot.chain import random_joints
 from calib.robot.kinematics import forward
 from calib.robot.load import load
@@ -44,7 +46,7 @@ def test_planted_truth_is_recovered_within_its_covariance(robot: str) -> None:
     cell = rigid(perturbed_cell(load(robot), 3, Instrument(encoder_sigma=0.0)))
     for seed in range(30):
         found = calibrate(cell, q, seed)
-        part = next(p for p in found.found if p.label == "position")
+        part = next(p.part for p in found.pieces if p.part.label == "position")
         predicted = np.einsum("fim,fg,gim->im", part.jacobian, found.estimate.covariance, part.jacobian)
         seen = found.cell.stations[0] @ forward(found.cell.chain, q) @ found.cell.tools[0]
         error = (seen[:, :3, 3] - true_poses(cell, q)[:, :3, 3]).T

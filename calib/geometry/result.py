@@ -1,0 +1,93 @@
+"""What a geometric fit returns, and how it looks row by row."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.estimation import robust
+from calib.estimation.columns import ColumnSplit
+from calib.estimation.estimate import Estimate
+from calib.estimation.nonlinear import Solution
+from calib.geometry.installation import Installation
+from calib.geometry.observation import Block
+from calib.geometry.residuals import Part
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """One residual part of a fit: the block it comes from, and how it was weighed.
+
+    Attributes:
+        block: index into `GeometricFit.blocks`.
+        part: residuals and Jacobian at the solution.
+        sigma: (rows, m) standard deviations used.
+        weight: (m,) robust weights.
+    """
+
+    block: int
+    part: Part
+    sigma: np.ndarray
+    weight: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class GeometricFit:
+    """The outcome of a fit.
+
+    Attributes:
+        cell: the calibrated installation.
+        start: the installation the fit began with.
+        free: (f,) positions of the fitted parameters in the full vector (`calib.geometry.parameters`).
+        estimate: values and covariance of the fitted parameters; stations and tools as displacements from the fitted
+            placement, hence with value 0.
+        split: which candidate columns were kept; None where the caller named the free ones.
+        candidates: what ``split`` indexes.
+        solution: the last Levenberg–Marquardt pass.
+        blocks: the prepared measurements.
+        pieces: their residual parts at the solution.
+        prior: (f,) standard deviations about the nominal that the fit was drawn with; infinite for none.
+    """
+
+    cell: Installation
+    start: Installation
+    free: np.ndarray
+    estimate: Estimate
+    split: ColumnSplit | None
+    candidates: np.ndarray
+    solution: Solution
+    blocks: list[Block]
+    pieces: list[Piece]
+    prior: np.ndarray | None = None
+
+
+def used_sigmas(found: GeometricFit) -> list[dict[str, float]]:
+    """Return per block the rms standard deviation used for each label [m or rad]."""
+    result: list[dict[str, float]] = [{} for _ in found.blocks]
+    for piece in found.pieces:
+        result[piece.block][piece.part.label] = float(np.sqrt(np.mean(piece.sigma**2)))
+    return result
+
+
+def row_weights(found: GeometricFit) -> list[np.ndarray]:
+    """Return per block the smallest robust weight of each row's parts (m,); 1 without a robust loss."""
+    result = [np.ones(len(block.measured)) for block in found.blocks]
+    for piece in found.pieces:
+        np.minimum.at(result[piece.block], piece.part.index, piece.weight)
+    return result
+
+
+def outliers(found: GeometricFit, threshold: float = 4.0) -> list[tuple[str, int, str, float]]:
+    """Return (file, row, label, size in robust sigmas) of rows that do not fit, worst first.
+
+    Sizes are measured against the robust spread of their own part (1.4826 · median), not against stated sigmas, so
+    that an optimistic instrument does not make every row an outlier.
+    """
+    result = []
+    for piece in found.pieces:
+        measured, part = found.blocks[piece.block].measured, piece.part
+        size = np.sqrt(np.mean(part.value**2, axis=0)) / max(robust.spread(part.value), 1e-15)
+        rows = measured.rows[part.index]
+        result += [(measured.file, int(rows[i]), part.label, float(size[i])) for i in np.flatnonzero(size > threshold)]
+    return sorted(result, key=lambda item: -item[3])

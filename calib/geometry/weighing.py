@@ -1,0 +1,158 @@
+"""How much each residual counts: sigmas stated or estimated, robust weights, priors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.errors import MeasurementError, UsageError
+from calib.estimation import robust
+from calib.estimation.estimate import Estimate
+from calib.estimation.nonlinear import Solution, covariance
+from calib.geometry.installation import Installation
+from calib.geometry.observation import Block, observe, stack
+from calib.geometry.parameters import layout, parameter_values
+from calib.geometry.residuals import Part
+from calib.geometry.result import GeometricFit, Piece
+
+START_SIGMA = {"position": 1e-3, "orientation": 1e-3, "consistency": 1e-3, "distance": 1e-3, "plane": 1e-3}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to fit.
+
+    Attributes:
+        loss: ``none``, ``huber`` or ``cauchy``, on the size of each row's whitened residual; ``auto`` is for the
+            ladder, which takes ``cauchy`` where rows are grossly wrong (`calib.geometry.ladder`), and else is ``none``.
+        loss_scale: the loss's constant, in sigmas; None for its usual one.
+        damping: first λ of Levenberg–Marquardt; 0 for the iterative linear least squares of eq. 11.
+        tolerance: relative size of a column that counts as dependent.
+        limit: linearisations at most, per pass.
+        passes: how often sigmas that are not stated (and robust weights) are estimated anew.
+    """
+
+    loss: str = "none"
+    loss_scale: float | None = None
+    damping: float = 1e-8
+    tolerance: float = 1e-6
+    limit: int = 300
+    passes: int = 3
+
+
+def combine(settings: Settings, **changes: object) -> Settings:
+    """Return settings with some fields changed.
+
+    Raises:
+        UsageError: for a loss that does not exist.
+    """
+    result = replace(settings, **changes)  # type: ignore[arg-type]
+    if result.loss not in ("auto", *robust.LOSSES):
+        raise UsageError(f"loss '{result.loss}' is none of auto, {', '.join(robust.LOSSES)}")
+    return result
+
+
+class Weigher:
+    """Holds what changes between passes: sigmas and robust weights of every part."""
+
+    def __init__(
+        self, settings: Settings, nominal: Installation, blocks: list[Block], free: np.ndarray, prior: np.ndarray | None
+    ):
+        self.settings, self.nominal, self.blocks, self.free = settings, nominal, blocks, free
+        self.prior = prior if prior is not None and np.isfinite(prior).any() else None
+        self.sigmas: list[np.ndarray] = []
+        self.weights: list[np.ndarray] = []
+        self.used = self.sigmas, self.weights
+
+    def parts(self, state: Installation, free: np.ndarray | None = None) -> list[Part]:
+        """Return the residual parts of all blocks, with their Jacobian for `free`."""
+        chosen = self.free if free is None else free
+        found = [observe(state, block, chosen) for block in self.blocks]
+        self.owners = [number for number, own in enumerate(found) for _ in own]
+        return [part for own in found for part in own]
+
+    def update(self, state: Installation, first: bool) -> None:
+        """Set sigmas and weights from the residuals at a state."""
+        found = self.parts(state, np.array([], dtype=int))
+        rows = sum(part.value.size for part in found)
+        unknown = len(self.free) + sum(part.nuisances for part in found)
+        if rows < unknown and self.prior is None:
+            raise MeasurementError(
+                f"{rows} measured numbers cannot determine {unknown} unknowns; measure more poses, or fit a smaller "
+                "model (--model frames or offsets)",
+                self.blocks[0].measured.file,
+            )
+        share = max(1.0 - unknown / rows, 0.05)
+        loss = "none" if self.settings.loss == "auto" else self.settings.loss
+        robustly = loss != "none"
+        self.sigmas = [_sigma(part, share, first and not robustly, robustly) for part in found]
+        self.weights = [
+            robust.weights(_size(part, sigma), loss, self.settings.loss_scale)
+            for part, sigma in zip(found, self.sigmas)
+        ]
+
+    def settle(self, solution: Solution) -> Solution | None:
+        """Return the solution in units of the sigmas its residuals give, or None where those would change the estimate.
+
+        A common factor on all sigmas changes nothing but the scale, unless a prior stands against them.
+        """
+        before, weights = self.used = self.sigmas, self.weights
+        self.update(solution.state, first=False)
+        ratios = [float(np.mean(new / old)) for new, old in zip(self.sigmas, before)]
+        steady = all(np.abs(new - old).max(initial=0.0) < 0.02 for new, old in zip(self.weights, weights))
+        common = ratios[0] if self.prior is None else 1.0
+        if not steady or any(abs(ratio / common - 1.0) > 0.02 for ratio in ratios):
+            return None
+        if self.prior is not None:
+            self.sigmas, self.weights = before, weights
+            return solution
+        return replace(solution, factor=solution.factor / common, cost=solution.cost / common**2)
+
+    def linearise(self, state: Installation) -> tuple[np.ndarray, np.ndarray]:
+        found = self.parts(state)
+        scales = [sigma / np.sqrt(weight) for sigma, weight in zip(self.sigmas, self.weights)]
+        residual, matrix = stack(found, scales)
+        if self.prior is not None:
+            pull = (parameter_values(self.nominal) - parameter_values(state))[self.free] / self.prior
+            held = np.isfinite(self.prior)
+            residual = np.concatenate([residual, pull[held]])
+            matrix = np.vstack([matrix, np.diag(1.0 / self.prior)[held]])
+        return residual, matrix
+
+    def result(self, solution: Solution) -> GeometricFit:
+        state = solution.state
+        found = self.parts(state)
+        table = layout(state)
+        rows = sum(part.value.size for part in found)
+        dof = rows - len(self.free) - sum(part.nuisances for part in found)
+        if self.prior is not None:
+            dof = max(dof + int(np.isfinite(self.prior).sum()), 1)
+        variance = solution.cost / max(dof, 1)
+        estimate = Estimate(
+            tuple(table.names[k] for k in self.free),
+            tuple(table.units[k] for k in self.free),
+            parameter_values(state)[self.free],
+            covariance(solution.factor, variance),
+            float(np.sqrt(variance)),
+            dof,
+        )
+        pieces = [Piece(*each) for each in zip(self.owners, found, self.sigmas, self.weights)]
+        return GeometricFit(
+            state, self.nominal, self.free, estimate, None, self.free, solution, self.blocks, pieces, self.prior
+        )
+
+
+def _sigma(part: Part, share: float, start: bool, robustly: bool) -> np.ndarray:
+    """Return the stated sigmas of a part, or one estimated from its residuals, as (rows, m)."""
+    if part.sigma is not None:
+        return part.sigma
+    if start:
+        return np.full(part.value.shape, START_SIGMA[part.label])
+    found = robust.spread(part.value) if robustly else float(np.sqrt(np.mean(part.value**2)))
+    return np.full(part.value.shape, max(found / np.sqrt(share), 1e-12))
+
+
+def _size(part: Part, sigma: np.ndarray) -> np.ndarray:
+    """Return each row's residual in sigmas, root mean square over its components (m,)."""
+    return np.sqrt(np.mean((part.value / sigma) ** 2, axis=0))
