@@ -115,7 +115,7 @@ def settled_std(data: Triangles, tolerance: float = 1e-6, limit: int = 200) -> n
     std = subsystem_std(data)
     for _ in range(limit):
         values, inverse, _ = solve_triangle(combine(data, std), data.names)
-        left = data.rows - _leverage(data, std, inverse)
+        left = data.rows - leverage(data, std, inverse)
         new = _floored(np.sqrt(residual_squares(data, values) / np.maximum(left, 1e-9)))
         change, std = float(np.max(np.abs(new / std - 1.0))), new
         if change < tolerance:
@@ -152,7 +152,7 @@ def _pack(
 ) -> LinearFit:
     """Return the fit with its residuals' sizes, degrees of freedom counted with the inflation τ."""
     squares = residual_squares(data, values)
-    left = data.rows - tau * _leverage(data, std, inverse)
+    left = data.rows - tau * leverage(data, std, inverse)
     dof = int(np.round(np.sum(left / tau), 6))
     if dof <= 0 or left.sum() <= 0:
         raise Unidentifiable(
@@ -166,7 +166,7 @@ def _pack(
     return LinearFit(estimate, group_std, *conditions)
 
 
-def _leverage(data: Triangles, std: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+def leverage(data: Triangles, std: np.ndarray, inverse: np.ndarray) -> np.ndarray:
     """Return h_g = ‖W_g R⁻¹‖² / σ_g² (g,), which sum to p."""
     return np.sum((data.factors[:, :, :-1] @ inverse) ** 2, axis=(1, 2)) / std**2
 

@@ -1,0 +1,267 @@
+"""Least squares where the rows of one sample belong together: full covariance across joints, samples that do not fit.
+
+The residual of sample k, e_k = y_k - W_k x (n joints), has covariance S across joints and none between samples; its
+size is Mahalanobis', d_k² = e_kᵀ S⁻¹ e_k. A robust fit weights each sample by w(d_k), and beyond the gate by nothing.
+That guards against bad y; a sample with a bad W of great leverage draws the fit unseen, as in every M-estimator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from calib.arrays import frozen, shaped
+from calib.errors import CalibError, NotConverged
+from calib.estimation import multivariate, robust
+from calib.estimation.estimate import Estimate
+from calib.estimation.linear import LinearFit, leverage, wls
+from calib.estimation.triangles import Triangles, absorb, combine, empty, solve_triangle
+
+CHUNK = 2000  # samples whitened at a time
+ROUNDS = 200
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """N samples of n joints.
+
+    Attributes:
+        names, units: p strings each.
+        matrix: (N, n, p), the regressors.
+        target: (N, n).
+        present: (N, n) bool, rows in use: slow joints may be cut sample by sample.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    matrix: np.ndarray
+    target: np.ndarray
+    present: np.ndarray
+
+    @property
+    def joints(self) -> np.ndarray:
+        """(N,) rows in use per sample."""
+        return self.present.sum(axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class SampleFit:
+    """A fit with the covariance of the noise across joints.
+
+    Attributes:
+        fit: the estimate; ``fit.group_std`` is the root of the diagonal of `noise`.
+        noise: (n, n) covariance S of one sample's residual.
+        weights: (N,) in 0..1.
+        outliers: (N,) bool, samples beyond the gate.
+    """
+
+    fit: LinearFit
+    noise: np.ndarray
+    weights: np.ndarray
+    outliers: np.ndarray
+
+    @property
+    def estimate(self) -> Estimate:
+        return self.fit.estimate
+
+
+def stack(
+    matrix: np.ndarray,
+    target: np.ndarray,
+    present: np.ndarray | None = None,
+    names: Sequence[str] | None = None,
+    units: Sequence[str] | None = None,
+) -> Samples:
+    """Return samples checked for shape and finiteness, without a copy; see `Samples`."""
+    matrix = shaped(matrix, (None, None, None), "observation matrices W")
+    target = shaped(target, matrix.shape[:2], "target y")
+    present = np.ones(target.shape, dtype=bool) if present is None else np.asarray(present, dtype=bool)
+    if present.shape != target.shape:
+        raise CalibError(f"rows present: expected an array of shape {target.shape}, found {present.shape}")
+    named = empty([f"x{k + 1}" for k in range(matrix.shape[2])] if names is None else names, units)
+    if named.parameters != matrix.shape[2]:
+        raise CalibError(f"{named.parameters} names for {matrix.shape[2]} columns")
+    return Samples(named.names, named.units, matrix, target, present)
+
+
+def gls(data: Samples, noise: np.ndarray | None = None, inflation: float = 1.0) -> SampleFit:
+    """Estimate x = argmin Σ_k e_kᵀ S⁻¹ e_k, rows whitened by the Cholesky factor of S (Aitken 1935).
+
+    Args:
+        data: the samples.
+        noise: (n, n) S in units of y; None: estimated from the residuals and iterated (Zellner 1962).
+        inflation: >= 1, see `linear`; one number for all joints.
+    """
+    return _iterate(data, by_joint(data), "none", None, noise, inflation)
+
+
+def irls(
+    data: Samples,
+    loss: str = "huber",
+    gate: float | None = 0.999,
+    noise: np.ndarray | None = None,
+    inflation: float = 1.0,
+) -> SampleFit:
+    """Estimate x and S by iteratively reweighted least squares over whole samples (Maronna 1976), with a gate.
+
+    Starts from a row-wise Cauchy fit with median spreads, because a covariance estimated from all samples would hide
+    the outliers that made it. The covariance of x is that of the M-estimator, `multivariate.variance_factor`.
+
+    Args:
+        data, noise, inflation: as in `gls`.
+        loss: one of `robust.LOSSES`.
+        gate: probability of a good sample to stay in; None: no gate.
+    """
+    return _iterate(data, row_irls(data), loss, gate, noise, inflation)
+
+
+def by_joint(data: Samples) -> LinearFit:
+    """Estimate x by WLS with one settled variance per joint: `linear.wls` of the samples' rows."""
+    return wls(_triangles(data, np.ones(data.target.shape)))
+
+
+def row_irls(data: Samples, loss: str = "cauchy") -> LinearFit:
+    """Estimate x with a weight of its own for every row, w(|ρ| / σ_j), σ_j = 1.4826 · median |ρ| of joint j.
+
+    For outliers that hit single joints. Its covariance is that of weighted rows, without the M-estimator's factor.
+
+    Args:
+        data: the samples.
+        loss: one of `robust.LOSSES`.
+    """
+    weights = np.ones(data.target.shape)
+    values = wls(_triangles(data, weights), _spreads(data, data.target)).estimate.values
+    for _ in range(ROUNDS):
+        residual = data.target - data.matrix @ values
+        std = _spreads(data, residual)
+        fit = wls(_triangles(data, robust.weights(np.abs(residual) / std, loss)), std)
+        step, values = fit.estimate.values - values, fit.estimate.values
+        if np.all(np.abs(step) <= 1e-3 * fit.estimate.sigma):
+            return LinearFit(fit.estimate, std, fit.condition, fit.condition_normalised)
+    raise NotConverged("the weights of the rows do not settle; try the Huber loss", values)
+
+
+@dataclass(frozen=True)
+class _Weighing:
+    """How samples are weighed: loss, gate, and whether S is stated."""
+
+    loss: str
+    gate: float | None
+    stated: bool
+
+    @property
+    def robust(self) -> bool:
+        return self.loss != "none" or self.gate is not None
+
+
+def _iterate(
+    data: Samples, start: LinearFit, loss: str, gate: float | None, noise: np.ndarray | None, inflation: float
+) -> SampleFit:
+    """Alternate S, weights and x until x moves by less than 1e-4 of its standard deviation."""
+    how, std = _Weighing(loss, gate, noise is not None), start.group_std
+    left = np.sqrt(_share_left(data, std))
+    covariance = np.diag(std**2) if noise is None else shaped(noise, (len(std),) * 2, "noise covariance")
+    values = start.estimate.values
+    for _ in range(ROUNDS):
+        residual = np.where(data.present, data.target - data.matrix @ values, 0.0) / left
+        size = sizes(residual, covariance, data.present)
+        weights = multivariate.weigh(size, data.joints, loss, gate)
+        if not how.stated:
+            covariance = _scatter(data, residual, weights * _consistent(data, how), weights)
+        factor, last = _factor(data, covariance, weights), values
+        values = solve_triangle(factor, data.names)[0]
+        if np.sum((factor[:-1, :-1] @ (values - last)) ** 2) <= 1e-8 * len(values):
+            return _pack(data, how, values, covariance, size, weights, factor, inflation)
+    raise NotConverged("the weights of the samples do not settle; try the other loss or a wider gate", values)
+
+
+def _pack(
+    data: Samples, how: _Weighing, values: np.ndarray, noise: np.ndarray, size: np.ndarray, weights: np.ndarray,
+    factor: np.ndarray, inflation: float,
+) -> SampleFit:  # fmt: skip
+    """Return the fit with the covariance of its kind of estimator."""
+    _, inverse, conditions = solve_triangle(factor, data.names)
+    variance = multivariate.variance_factor(size, data.joints, how.loss, how.gate) if how.robust else 1.0
+    squares = np.sum(weights * _consistent(data, how) * size**2)
+    dof = int(data.joints[weights > 0.0].sum() / inflation) - len(values)
+    residual_std = float(np.sqrt(squares / np.sum(weights * data.joints)))
+    covariance = variance * inflation * inverse @ inverse.T
+    estimate = Estimate(data.names, data.units, values, covariance, residual_std, dof)
+    outliers = (weights == 0.0) & (data.joints > 0)
+    fit = LinearFit(estimate, np.sqrt(np.diag(noise)), *conditions)
+    return SampleFit(fit, frozen(noise), frozen(weights), frozen(outliers, bool))
+
+
+def sizes(residual: np.ndarray, noise: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """Return Mahalanobis sizes (e_kᵀ S⁻¹ e_k)^½ (N,) of residuals (N, n), over the rows present."""
+    patterns, which = _roots(noise, present)
+    result = np.empty(len(residual))
+    for k, root in enumerate(patterns):
+        own = which == k
+        result[own] = np.linalg.norm(residual[own] @ root.T, axis=1)
+    return result
+
+
+def _roots(noise: np.ndarray, present: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return L⁻¹ (k, n, n) for every pattern of rows present, zero for the absent, and each sample's pattern (N,)."""
+    patterns, which = np.unique(present, axis=0, return_inverse=True)
+    roots = np.zeros((len(patterns), *noise.shape))
+    for k, pattern in enumerate(patterns):
+        block = np.ix_(pattern, pattern)
+        lower = np.linalg.cholesky(noise[block])
+        roots[k][block] = scipy.linalg.solve_triangular(lower, np.eye(len(lower)), lower=True)
+    return roots, which.reshape(-1)
+
+
+def _factor(data: Samples, noise: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the R factor of the whitened and weighted [W y], a chunk of samples at a time."""
+    roots, which = _roots(noise, data.present)
+    p = len(data.names)
+    total = empty(data.names)
+    for start in range(0, len(data.target), CHUNK):
+        part = slice(start, start + CHUNK)
+        root = roots[which[part]] * np.sqrt(weights[part])[:, None, None]
+        target = np.einsum("kij,kj->ki", root, data.target[part])
+        total = absorb(total, (root @ data.matrix[part]).reshape(-1, p), target.reshape(-1))
+    return total.factors[0]
+
+
+def _triangles(data: Samples, weights: np.ndarray) -> Triangles:
+    """Return the triangles of all rows present, one group per joint, rows weighted by (N, n)."""
+    rows = np.flatnonzero(data.present)
+    root, joints = np.sqrt(weights.ravel()[rows]), data.target.shape[1]
+    flat = data.matrix.reshape(-1, len(data.names))[rows] * root[:, None]
+    return absorb(empty(data.names, data.units, joints), flat, data.target.ravel()[rows] * root, rows % joints)
+
+
+def _spreads(data: Samples, residual: np.ndarray) -> np.ndarray:
+    """Return the robust standard deviation of each joint's residuals (n,), never zero."""
+    std = np.array([robust.spread(column[used]) for column, used in zip(residual.T, data.present.T)])
+    return np.maximum(std, 1e-9 * max(std.max(initial=0.0), 1e-300))
+
+
+def _share_left(data: Samples, std: np.ndarray) -> np.ndarray:
+    """Return 1 - h_j / r_j (n,): what the fit leaves of the variance of joint j's residuals."""
+    triangles = _triangles(data, np.ones(data.target.shape))
+    taken = leverage(triangles, std, solve_triangle(combine(triangles, std), data.names)[1])
+    return np.maximum(1.0 - taken / np.maximum(triangles.rows, 1), 1e-3)
+
+
+def _consistent(data: Samples, how: _Weighing) -> np.ndarray:
+    """Return the factor (N,) that makes the weighted scatter one for normal residuals."""
+    each = [multivariate.consistency(n, how.loss, how.gate) if n else 0.0 for n in range(data.target.shape[1] + 1)]
+    return np.array(each)[data.joints]
+
+
+def _scatter(data: Samples, residual: np.ndarray, scaled: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return S_ij = Σ c w e_i e_j / Σ w over samples with both rows present, eigenvalues floored where they must be."""
+    present = data.present.astype(float)
+    noise = (residual * scaled[:, None]).T @ residual / np.maximum((present * weights[:, None]).T @ present, 1e-300)
+    std = np.sqrt(np.diag(noise))
+    values, vectors = np.linalg.eigh(noise / np.outer(std, std))
+    if values[0] >= 1e-8:
+        return noise
+    return (vectors * np.maximum(values, 1e-8)) @ vectors.T * np.outer(std, std)  # pairs of unlike rows: not positive

@@ -1,0 +1,104 @@
+"""What the residuals still hold: correlation in time, departure from the normal law, and the share explained."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.stats
+
+from calib.arrays import frozen, shaped
+from calib.errors import CalibError
+
+
+@dataclass(frozen=True, eq=False)
+class Whiteness:
+    """Verdicts on one series of residuals.
+
+    Attributes:
+        acf, pacf: (lags,) at lags 1, 2, …
+        bound: half width 1.96 / sqrt(N) in which 95 % of a white series' values lie.
+        outside: share of the autocorrelations beyond the bound; 0.05 for a white series.
+        ljung_box, ljung_box_p: statistic and probability of a larger one in a white series.
+        skewness, kurtosis: of the residuals, 0 and 0 (excess) for normal ones.
+        normal_p: probability under the normal law, D'Agostino & Pearson (1973); it assumes independent residuals.
+    """
+
+    acf: np.ndarray
+    pacf: np.ndarray
+    bound: float
+    outside: float
+    ljung_box: float
+    ljung_box_p: float
+    skewness: float
+    kurtosis: float
+    normal_p: float
+
+
+def examine(residual: np.ndarray, lags: int = 30) -> Whiteness:
+    """Return what is left in a series of residuals (N,), evenly sampled, of one joint in one recording.
+
+    Args:
+        residual: (N,) with N > lags and N >= 20.
+        lags: autocorrelations looked at.
+    """
+    x = shaped(residual, (None,), "residuals")
+    if len(x) < max(lags + 1, 20):
+        raise CalibError(f"{len(x)} residuals are too few for {lags} lags; at least {max(lags + 1, 20)}")
+    rho = autocorrelation(x, lags)
+    bound = 1.96 / np.sqrt(len(x))
+    statistic, probability = ljung_box(rho, len(x))
+    return Whiteness(
+        frozen(rho), frozen(partial_autocorrelation(rho)), bound, float(np.mean(np.abs(rho) > bound)),
+        statistic, probability, float(scipy.stats.skew(x)), float(scipy.stats.kurtosis(x)),
+        float(scipy.stats.normaltest(x).pvalue),
+    )  # fmt: skip
+
+
+def autocorrelation(residual: np.ndarray, lags: int) -> np.ndarray:
+    """Return ρ_k = Σ_t x_t x_{t+k} / Σ_t x_t² for k = 1 … lags, the mean removed (by FFT)."""
+    x = np.asarray(residual, dtype=float) - np.mean(residual)
+    size = 1 << (2 * len(x) - 1).bit_length()
+    spectrum = np.abs(np.fft.rfft(x, size)) ** 2
+    covariance = np.fft.irfft(spectrum, size)[: lags + 1]
+    return covariance[1:] / covariance[0] if covariance[0] > 0.0 else np.zeros(lags)
+
+
+def partial_autocorrelation(acf: np.ndarray) -> np.ndarray:
+    """Return the partial autocorrelations of lags 1 … k from the autocorrelations (Durbin–Levinson)."""
+    result, phi = np.empty(len(acf)), np.zeros(0)
+    for k, rho in enumerate(acf):
+        before = acf[:k][::-1]
+        rest = 1.0 - phi @ acf[:k]
+        last = (rho - phi @ before) / rest if rest > 0.0 else 0.0
+        phi = np.append(phi - last * phi[::-1], last)
+        result[k] = last
+    return result
+
+
+def ljung_box(acf: np.ndarray, count: int) -> tuple[float, float]:
+    """Return Q = N (N + 2) Σ ρ_k² / (N - k) and P(χ²(lags) > Q) (Ljung & Box 1978).
+
+    Residuals of a regression on given columns lose no degree of freedom here; those of an ARMA model would.
+    """
+    statistic = count * (count + 2.0) * np.sum(acf**2 / (count - np.arange(1, len(acf) + 1)))
+    return float(statistic), float(scipy.stats.chi2.sf(statistic, len(acf)))
+
+
+def inflation(residual: np.ndarray) -> float:
+    """Return the integrated autocorrelation τ = 1 + 2 Σ_{k<=m} ρ_k >= 1: N residuals tell as much as N / τ white ones.
+
+    The window is the smallest m >= 5 τ(m) (Sokal 1997): longer sums add noise only. At most N / 4.
+    """
+    x = shaped(residual, (None,), "residuals")
+    if len(x) < 8:
+        return 1.0
+    tau = 1.0 + 2.0 * np.cumsum(autocorrelation(x, len(x) // 4))
+    enough = np.arange(1, len(tau) + 1) >= 5.0 * tau
+    return float(max(1.0, tau[np.argmax(enough)] if enough.any() else tau[-1]))
+
+
+def r_squared(target: np.ndarray, residual: np.ndarray) -> float:
+    """Return R² = 1 - Σ ρ² / Σ (y - mean y)²; negative where the mean would predict better."""
+    total = float(np.sum((target - np.mean(target)) ** 2))
+    return 1.0 - float(np.sum(np.asarray(residual) ** 2)) / total if total > 0.0 else float("nan")
