@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
-from calib.dynamics.model import tip_poses
 from calib.errors import RobotError, UsageError
 from calib.procedure import calibrated
 from calib.robot import description, urdf, urdf_write
 from calib.robot.chain import AXES, Chain, random_joints
 from calib.robot.kinematics import forward, joint_frames
 from calib.robot.markup import text
+from calib.robot.readback import tip_poses
 from calib.robot.tree import read as read_tree
 from calib.transforms import to_xyz_rpy
 

@@ -1,0 +1,104 @@
+"""What `calib export` promises: the source's file with other joint origins, and nothing else changed."""
+
+from __future__ import annotations
+
+import csv
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.robot import urdf
+from calib.robot.kinematics import forward
+from calib.robot.load import load
+from calib.robot.urdf_write import write_new
+from calib.transforms import from_xyz_rpy
+
+
+@pytest.fixture
+def fitted(cell, calib) -> Path:
+    """A source URDF with things that have to stay, and a fit of it."""
+    text = write_new(cell.nominal)
+    text = text.replace("</robot>", '  <!-- mine -->\n  <transmission name="t"><type>x</type></transmission>\n</robot>')
+    Path("source.urdf").write_text(text)
+    file = cell.write("a.csv", cell.measure(60))
+    code, _, err = calib("fit", "source.urdf", file, "--model", "geometry", "--out", "done")
+    assert code == 0, err
+    return Path("done")
+
+
+def test_the_source_keeps_everything_but_its_joint_origins(cell, calib, fitted):
+    code, out, err = calib("export", fitted, "--urdf", "source.urdf", "--out", "new.urdf")
+    assert code == 0, err
+    assert "base link and flange stay" in out
+    before, after = (Path(name).read_text() for name in ("source.urdf", "new.urdf"))
+    assert before != after
+    assert re.sub(r"<origin [^>]*>", "", before) == re.sub(r"<origin [^>]*>", "", after)
+    q = np.random.default_rng(1).uniform(-2, 2, (30, 6))
+    assert np.abs(forward(urdf.read("new.urdf"), q) - forward(load(fitted), q)).max() < 1e-9
+
+
+def test_pinocchio_reads_the_exported_urdf_as_the_calibrated_arm(cell, calib, fitted):
+    pin = pytest.importorskip("pinocchio")
+    assert calib("export", fitted, "--urdf", "source.urdf", "--out", "new.urdf")[0] == 0
+    chain, model = load(fitted), pin.buildModelFromUrdf("new.urdf")
+    data, tip = model.createData(), model.getFrameId(chain.tip)
+    for q in np.random.default_rng(2).uniform(-2, 2, (10, 6)):
+        pin.framesForwardKinematics(model, data, q)
+        assert np.abs(data.oMf[tip].homogeneous - forward(chain, q[None])[0]).max() < 1e-9
+
+
+def test_an_arm_fitted_from_a_table_goes_into_a_urdf_of_the_same_arm(cell, calib, fitted):
+    """Also after a second fit that started from the first one's folder: the first nominal is remembered."""
+    file = cell.write("b.csv", cell.measure(60, 3))
+    assert calib("fit", "ur5", "a.csv", "--model", "geometry", "--out", "table")[0] == 0
+    assert calib("fit", "table", file, "--model", "geometry", "--out", "again")[0] in (0, 1)
+    for folder in ("table", "again"):
+        code, _, err = calib("export", folder, "--urdf", "source.urdf", "--out", f"{folder}.urdf")
+        assert code == 0, err
+        q = np.random.default_rng(1).uniform(-2, 2, (30, 6))
+        difference = forward(urdf.read(f"{folder}.urdf"), q) - forward(load(folder), q)
+        assert np.abs(difference).max() < 1e-9
+
+
+def test_another_robots_urdf_is_refused(cell, calib, fitted):
+    Path("other.urdf").write_text(write_new(load("ur10")))
+    code, _, err = calib("export", fitted, "--urdf", "other.urdf", "--out", "new.urdf")
+    assert (code, "not describe the nominal robot" in err, Path("new.urdf").exists()) == (2, True, False)
+
+
+def test_offsets_are_what_a_controller_adds(cell, calib, fitted):
+    assert calib("export", fitted, "--offsets", "offsets.csv")[0] == 0
+    with Path("offsets.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    chain, nominal = load(fitted), load("source.urdf")
+    assert [row["joint"] for row in rows] == list(chain.joint_names)
+    for row, k in zip(rows, chain.moving):
+        assert float(row["offset"]) == pytest.approx(chain.values[k] - nominal.values[k], abs=1e-12)
+    assert float(rows[0]["offset"]) == 0.0  # the first joint's offset cannot be told from the station
+
+
+def test_ur_kinematics_give_the_calibrated_poses_in_the_frames_of_ur_description(cell, calib, fitted):
+    assert calib("export", fitted, "--ur-kinematics", "kinematics.yaml")[0] == 0
+    text = Path("kinematics.yaml").read_text()
+    assert re.search(r"^  hash: calib_\d+$", text, re.MULTILINE)
+    origins = {}
+    for link, block in re.findall(r"^  (\w+):\n((?:    \w+: \S+\n){6})", text, re.MULTILINE):
+        value = {key: float(number) for key, number in re.findall(r"(\w+): (\S+)", block)}
+        origins[link] = from_xyz_rpy([value[k] for k in "xyz"], [value[k] for k in ("roll", "pitch", "yaw")])
+    assert list(origins) == ["shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3"]
+    q = np.random.default_rng(4).uniform(-2, 2, (10, 6))
+    poses = np.broadcast_to(np.eye(4), (10, 4, 4))
+    for j, origin in enumerate(origins.values()):
+        poses = poses @ origin @ from_xyz_rpy(np.zeros((10, 3)), np.outer(q[:, j], [0, 0, 1]))
+    # base_link_inertia is the controller's base, wrist_3's link the controller's flange
+    assert np.abs(poses - forward(load(fitted), q)).max() < 1e-9
+
+
+def test_an_arm_without_ur_axes_has_no_ur_kinematics(cell, calib):
+    from calib.procedure.exporting import Calibration, export_ur_kinematics
+
+    panda = load("panda")
+    with pytest.raises(Exception, match="not the axes of a UR arm"):
+        export_ur_kinematics(Calibration(Path("x"), panda, panda, False), Path("y.yaml"))

@@ -1,0 +1,187 @@
+"""What `calib fit` promises: its files, its figures, its exit codes."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+
+from calib.procedure import calibrated
+from calib.robot import urdf
+from calib.robot.kinematics import forward
+from calib.robot.load import load
+from calib.transforms import from_xyz_rpy
+
+ERRORS = {"mean", "rms", "p95", "max"}
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_planted_arm_is_found_and_the_contract_is_kept(cell, calib):
+    file, other = cell.write("day1.csv", cell.measure(60)), cell.write("day2.csv", cell.measure(40, 1))
+    code, out, err = calib("fit", "ur5", file, "--validate", other, "--model", "geometry", "--out", "done")
+    assert code == 0, err
+    metrics = json.loads(Path("done/metrics.json").read_text())
+    assert metrics["fit"]["poses"] == 60
+    assert set(metrics["validation"]) == {"day2.csv"}
+    for part in (metrics["fit"], metrics["validation"]["day2.csv"]):
+        for arm in ("nominal", "calibrated"):
+            assert set(part[arm]["position_mm"]) == ERRORS
+            assert part[arm]["orientation_deg"] is None
+            assert "distance_mm" not in part[arm]
+    unseen = metrics["validation"]["day2.csv"]
+    assert unseen["nominal"]["position_mm"]["rms"] > 0.5
+    assert unseen["calibrated"]["position_mm"]["rms"] < 0.06  # noise of 0.02 mm per axis, 30 parameters from 60 poses
+    assert [rung["model"] for rung in metrics["ladder"]] == ["frames", "offsets", "geometry"]
+    assert metrics["ladder"][-1]["parameters"] == metrics["fit"]["parameters"]
+    assert metrics["verdict"] == "pass"
+    assert "verdict: pass" in out
+    assert "day2.csv" in out
+
+
+def test_the_files_of_a_fit_hold_the_same_robot(cell, calib):
+    file = cell.write("day1.csv", cell.measure(60))
+    assert calib("fit", "ur5", file, "--model", "geometry", "--out", "done")[0] == 0
+    q = np.random.default_rng(0).uniform(-2, 2, (20, 6))
+    installation = calibrated.read("done")
+    poses = installation.stations[0] @ forward(installation.chain, q) @ installation.tools[0]
+    rows = cell.measure(60)
+    seen = np.array([[row[axis] for axis in "xyz"] for row in rows])
+    fitted = np.array([[row[f"q{j + 1}"] for j in range(6)] for row in rows])
+    predicted = installation.stations[0] @ forward(installation.chain, fitted) @ installation.tools[0]
+    assert np.linalg.norm(predicted[:, :3, 3] - seen, axis=1).max() < 2e-4
+    again = urdf.read("done/robot.urdf")
+    assert np.abs(forward(again, q) - forward(load("done"), q)).max() < 1e-9
+    assert np.isfinite(poses).all()
+    estimate = read_rows(Path("done/estimate.csv"))
+    assert list(estimate[0]) == ["name", "unit", "nominal", "value", "sigma", "rsd"]
+    names = {row["name"] for row in estimate}
+    assert {"day1.x", "day1.rz", "tool.x"} <= names
+    chain, nominal = load("done"), load("ur5")
+    for row in estimate:
+        if row["name"] in chain.names:
+            k = chain.names.index(row["name"])
+            assert float(row["value"]) == np.float64(f"{chain.values[k]:.12g}")
+            assert float(row["nominal"]) == np.float64(f"{nominal.values[k]:.12g}")
+    covariance = read_rows(Path("done/covariance.csv"))
+    assert [row["name"] for row in covariance] == [row["name"] for row in estimate]
+    for row in estimate:
+        own = next(line for line in covariance if line["name"] == row["name"])
+        assert np.isclose(np.sqrt(float(own[row["name"]])), float(row["sigma"]), rtol=1e-6)
+
+
+def test_residuals_are_those_of_the_metrics(cell, calib):
+    rows = cell.measure(60)
+    rows[7]["x"] += 0.01
+    file = cell.write("day1.csv", rows)
+    assert calib("fit", "ur5", file, "--model", "geometry", "--loss", "cauchy", "--out", "done")[0] == 0
+    table = read_rows(Path("done/residuals.csv"))
+    metrics = json.loads(Path("done/metrics.json").read_text())
+    sizes = np.array([float(row["size [mm]"]) for row in table])
+    assert len(table) == 60
+    assert np.isclose(np.sqrt(np.mean(sizes**2)), metrics["fit"]["calibrated"]["position_mm"]["rms"], rtol=1e-6)
+    assert [row["row"] for row in table if row["outlier"] == "1"] == ["8"]
+    assert float(table[7]["weight"]) < 0.01 < 0.5 < float(table[0]["weight"])
+    worst = metrics["outliers"][0]
+    assert worst["row"] == 8
+    assert 9.0 < worst["size_mm"] < 11.0
+
+
+def test_holdout_keeps_the_last_share_of_the_permutation(cell, calib):
+    file = cell.write("day1.csv", cell.measure(60))
+    assert calib("fit", "ur5", file, "--holdout", "0.25", "--seed", "3", "--model", "offsets", "--out", "done")[0] in (
+        0,
+        1,
+    )
+    metrics = json.loads(Path("done/metrics.json").read_text())
+    assert metrics["fit"]["poses"] == 45
+    assert metrics["validation"]["day1.csv"]["poses"] == 15
+    assert metrics["seed"] == 3
+    rows = read_rows(Path("done/residuals.csv"))
+    held = sorted(int(row["row"]) - 1 for row in rows if row["set"] == "held out")
+    assert held == sorted(np.random.default_rng(3).permutation(60)[45:].tolist())
+
+
+def test_a_pose_file_from_another_station_needs_refitted_frames(cell, calib):
+    elsewhere = from_xyz_rpy([-2.0, 1.0, 0.0], [0.0, 0.4, 1.0])
+    columns = list(cell.measure(1)[0])
+    file = cell.write("a.csv", cell.measure(50), columns)
+    other = cell.write("b.csv", cell.measure(40, 1, elsewhere), columns)
+    code, out, _ = calib("fit", "ur5", file, "--validate", other, "--model", "geometry", "--out", "one")
+    assert "--refit-frames" in out
+    code, out, err = calib(
+        "fit", "ur5", file, "--validate", other, "--refit-frames", "--model", "geometry", "--out", "two"
+    )
+    assert code == 0, err
+    unseen = json.loads(Path("two/metrics.json").read_text())["validation"]["b.csv"]
+    assert set(unseen["calibrated"]["orientation_deg"]) == ERRORS
+    assert unseen["calibrated"]["position_mm"]["rms"] < 0.1 < unseen["nominal"]["position_mm"]["rms"]
+
+
+def test_two_files_have_two_stations_unless_one_is_asked_for(cell, calib):
+    file, other = cell.write("a.csv", cell.measure(40)), cell.write("b.csv", cell.measure(40, 1))
+    assert calib("fit", "ur5", file, other, "--model", "geometry", "--out", "each")[0] == 0
+    assert calibrated.read("each").station_names == ("a", "b")
+    assert calib("fit", "ur5", file, other, "--stations", "one", "--model", "geometry", "--out", "one")[0] == 0
+    assert calibrated.read("one").station_names == ("station",)
+    assert calib("fit", "ur5", file, other, "--tools", "each", "--model", "geometry", "--out", "tools")[0] == 0
+    assert calibrated.read("tools").tool_names == ("a tool", "b tool")
+
+
+def test_the_same_seed_gives_the_same_numbers(cell, calib):
+    file = cell.write("a.csv", cell.measure(40))
+    for name in ("one", "two"):
+        assert calib("fit", "ur5", file, "--holdout", "0.3", "--seed", "4", "--out", name)[0] in (0, 1)
+    assert Path("one/metrics.json").read_bytes() == Path("two/metrics.json").read_bytes()
+    assert Path("one/estimate.csv").read_bytes() == Path("two/estimate.csv").read_bytes()
+
+
+def test_a_calibrated_folder_is_a_robot_and_a_worse_arm_fails(cell, calib):
+    file = cell.write("a.csv", cell.measure(60))
+    assert calib("fit", "ur5", file, "--model", "geometry", "--out", "arm")[0] == 0
+    # five noisy poses more, full of gross errors: what is fitted to them is worse than the arm was
+    rows = cell.measure(60, 9)
+    for k, row in enumerate(rows):
+        row["x"] += 0.004 * (k % 3 - 1)
+    bad = cell.write("bad.csv", rows)
+    good = cell.write("good.csv", cell.measure(40, 2))
+    code, out, _ = calib(
+        "fit", "arm", bad, "--validate", good, "--refit-frames", "--model", "geometry", "--out", "worse"
+    )
+    assert code == 1
+    assert "verdict: fail" in out
+    assert json.loads(Path("worse/metrics.json").read_text())["verdict"] == "fail"
+
+
+def test_deflections_go_out_as_a_table_with_its_formula_and_come_back(cell, calib):
+    file = cell.write("a.csv", cell.measure(90))
+    assert calib("fit", "ur5", file, "--model", "coupling", "--out", "done")[0] in (0, 1)
+    installation = calibrated.read("done")
+    rows = read_rows(Path("done/joint_corrections.csv"))
+    assert len(rows) == len(installation.deflection.terms) > 0
+    assert "coefficient * b(q)" in Path("done/joint_corrections.txt").read_text()
+    metrics = json.loads(Path("done/metrics.json").read_text())
+    q = np.array([[row[f"q{j + 1}"] for j in range(6)] for row in cell.measure(90)])
+    from calib.geometry.installation import see
+
+    seen = np.array([[row[axis] for axis in "xyz"] for row in cell.measure(90)])
+    size = np.linalg.norm(see(installation, q).point.T - seen, axis=1)
+    assert np.isclose(1e3 * np.sqrt(np.mean(size**2)), metrics["fit"]["calibrated"]["position_mm"]["rms"], rtol=1e-6)
+    # a simpler model afterwards leaves no correction table behind
+    assert calib("fit", "ur5", file, "--model", "geometry", "--out", "done")[0] == 0
+    assert not Path("done/joint_corrections.csv").exists()
+
+
+def test_fixed_parameters_stay(cell, calib):
+    file = cell.write("a.csv", cell.measure(60))
+    Path("o.toml").write_text('fix = ["theta2", "theta3"]\n')
+    assert calib("fit", "ur5", file, "--options", "o.toml", "--model", "geometry", "--out", "done")[0] == 0
+    chain, nominal = load("done"), load("ur5")
+    values, before = dict(zip(chain.names, chain.values)), dict(zip(nominal.names, nominal.values))
+    assert values["theta2"] == before["theta2"]
+    assert values["theta4"] != before["theta4"]

@@ -1,0 +1,163 @@
+"""What `calib select` promises: better poses than chance gives, within the constraints, by seed."""
+
+from __future__ import annotations
+
+import csv
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib import workers
+from calib.errors import UsageError
+from calib.procedure import selecting
+from calib.procedure.limits import read_limits
+from calib.procedure.observing import observation, targets_of
+from calib.robot.load import load
+
+CONSTRAINTS = """
+[joints]
+q1 = ["-90 deg", "90 deg"]
+[target]
+height = [0.1, 1.0]
+axis_distance = 0.3
+reach = 0.9
+[instrument]
+xyz = [2.5, 0.0, 0.8]
+rpy = [0, "90 deg", 0]
+sight = "50 deg"
+[collision]
+radius = 0.04
+floor = -0.1
+"""
+
+
+def read_poses(path: str) -> np.ndarray:
+    with Path(path).open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == list(load("ur5").joint_names)
+    return np.array([[float(value) for value in row.values()] for row in rows])
+
+
+def test_better_than_chance_and_near_the_bound(cell, calib):
+    code, out, err = calib("select", "ur5", "-m", "12", "--candidates", "300", "--out", "p.csv", "--seed", "2")
+    assert code == 0, err
+    found = selecting.choose("ur5", 12, candidates=300, seed=2)
+    assert found.parameters == 30
+    assert found.selection.random_baseline < found.selection.value
+    assert 0.95 < found.selection.efficiency <= 1.0 + 1e-9
+    for words in ("best of 1000 random sets", "efficiency against the convex bound", "seconds"):
+        assert words in out
+    assert np.allclose(read_poses("p.csv"), found.selection.q, atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("robot", "kind", "tool", "count"),
+    [("ur5", "pose", (), 30), ("ur5", "position", (0, 0, 0.1), 25), ("ur5", "position", (0.05, 0, 0.1), 27),
+     ("lwr4plus", "pose", (), 34)],
+)  # fmt: skip
+def test_the_columns_are_those_that_can_be_told(robot, kind, tool, count):
+    cell = targets_of(load(robot), [tool] if tool else [])
+    assert len(observation(cell, kind).free) == count
+
+
+def test_chosen_poses_keep_the_constraints(cell, calib):
+    Path("c.toml").write_text(CONSTRAINTS)
+    code, out, err = calib(
+        "select",
+        "ur5",
+        "-m",
+        "12",
+        "--kind",
+        "position",
+        "--constraints",
+        "c.toml",
+        "--candidates",
+        "200",
+        "--out",
+        "p.csv",
+    )
+    assert code == 0, err
+    assert "capsules" in out
+    q = read_poses("p.csv")
+    arm = targets_of(load("ur5"))
+    limits = read_limits(Path("c.toml"), arm)
+    assert (np.abs(q[:, 0]) <= np.pi / 2).all()
+    for constraint in limits.constraints:
+        assert (constraint.function(q) <= 1e-8).all(), constraint.name
+    assert len(limits.constraints) == 4
+    assert limits.feasible is not None
+    assert limits.feasible(q).all()
+    # and they do exclude something
+    assert not all((constraint.function(np.zeros((1, 6))) <= 0).all() for constraint in limits.constraints)
+
+
+def test_the_gradients_of_the_constraints_are_those_of_central_differences(cell):
+    from poses.space import central_difference
+
+    Path("c.toml").write_text(CONSTRAINTS)
+    q = np.random.default_rng(0).uniform(-1.5, 1.5, (5, 6))
+    checked = 0
+    for constraint in read_limits(Path("c.toml"), targets_of(load("ur5"), [(0.1, 0, 0.2)])).constraints:
+        if constraint.gradient is not None:
+            slope = np.asarray(constraint.gradient(q))
+            assert np.abs(slope - central_difference(constraint.function, q).transpose(0, 2, 1)).max() < 1e-7
+            checked += 1
+    assert checked == 4
+
+
+def test_existing_poses_count(cell, calib):
+    assert calib("select", "ur5", "-m", "10", "--candidates", "200", "--out", "first.csv")[0] == 0
+    code, out, err = calib(
+        "select", "ur5", "-m", "5", "--candidates", "200", "--existing", "first.csv", "--out", "second.csv"
+    )
+    assert code == 0, err
+    assert "existing poses alone" in out
+    assert len(read_poses("second.csv")) == 5
+
+
+@pytest.mark.parametrize(
+    "text", ["[target]\nhight = 1\n", "[joints]\nq1 = [1, 0]\n", "[target]\nheight = 'tall'\n", "x ="]
+)
+def test_impossible_constraints(cell, calib, text):
+    Path("c.toml").write_text(text)
+    code, _, err = calib("select", "ur5", "--constraints", "c.toml", "--out", "p.csv")
+    assert (code, "c.toml" in err, Path("p.csv").exists()) == (2, True, False)
+
+
+def test_nothing_feasible_says_so(cell, calib):
+    Path("c.toml").write_text("[target]\nheight = 5.0\n")
+    code, _, err = calib("select", "ur5", "--constraints", "c.toml", "--candidates", "50", "--out", "p.csv")
+    assert (code, Path("p.csv").exists()) == (2, False)
+    assert "0 " in err
+
+
+def test_processes_map_in_order():
+    with workers.workers(2) as mapped:
+        assert list(mapped(pow, [2, 3, 5], [2, 2, 2])) == [4, 9, 25]
+
+
+def test_what_is_sent_to_other_processes_pickles(cell):
+    Path("c.toml").write_text(CONSTRAINTS)
+    arm = targets_of(load("ur5"))
+    limits, seen = read_limits(Path("c.toml"), arm), observation(arm, "position")
+    q = np.random.default_rng(0).uniform(-1, 1, (4, 6))
+    copy, again = pickle.loads(pickle.dumps((limits, seen)))
+    assert np.array_equal(again(q), seen(q))
+    assert np.array_equal(copy.feasible(q), limits.feasible(q))
+
+
+def test_workers_are_a_number_or_an_address():
+    with workers.workers() as mapped:
+        assert mapped is map
+    for wrong in ("many", "0", "-1"):
+        with pytest.raises(UsageError), workers.workers(wrong):
+            pass
+
+
+def test_dask_maps_in_order():
+    distributed = pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
+    local = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": None}
+    with distributed.LocalCluster(**local) as cluster, workers.workers(cluster.scheduler_address) as mapped:
+        assert list(mapped(pow, [2, 3], [2, 2])) == [4, 9]

@@ -1,0 +1,134 @@
+"""The arrows of DESIGN.md, section 2, held against every import in the sources, those inside functions included."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = [name for name in ("calib", "poses", "trajectories") if (ROOT / name).is_dir()]
+SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+
+# room -> what it must not import (a prefix of the module's name)
+FORBIDDEN = {
+    "poses": ["calib", "trajectories"],
+    "trajectories": ["calib", "poses"],
+    "calib.estimation": [
+        "calib.robot", "calib.geometry", "calib.data", "calib.dynamics", "calib.mechanism", "calib.simulation",
+        "calib.identification", "calib.procedure", "poses", "trajectories",
+    ],
+    "calib.robot": [
+        "calib.data", "calib.geometry", "calib.dynamics", "calib.estimation", "calib.mechanism", "calib.simulation",
+        "calib.identification", "calib.procedure", "poses", "trajectories",
+    ],
+    "calib.data": [
+        "calib.robot", "calib.geometry", "calib.dynamics", "calib.estimation", "calib.mechanism", "calib.simulation",
+        "calib.identification", "calib.procedure", "poses", "trajectories",
+    ],
+    "calib.geometry": [
+        "calib.dynamics", "calib.procedure", "calib.simulation", "calib.identification", "calib.mechanism",
+    ],
+    "calib.dynamics": ["calib.geometry", "calib.procedure", "calib.simulation", "calib.identification"],
+    "calib.simulation": ["calib.procedure"],
+    "calib.mechanism": ["calib.procedure"],
+    "calib.identification": ["calib.procedure"],
+    "calib": ["calib.cli"],
+}  # fmt: skip
+
+# heavy dependency -> the only modules that may import it (a trailing dot: all of that package)
+HOMES = {
+    "pinocchio": ["calib.dynamics.model", "calib.robot.collision", "calib.robot.readback"],
+    "coal": ["calib.robot.collision"],
+    "numba": ["calib.dynamics.kernels", "calib.simulation.kernels"],
+    "yourdfpy": ["calib.robot.urdf"],
+    "cv2": ["calib.data.camera"],
+    "mcap": ["calib.data."],
+    "rosbags": ["calib.data."],
+    "pandas": [],
+    "rerun": ["calib.procedure.viewer"],
+    "nlopt": ["poses.", "trajectories."],
+    "toppra": ["trajectories."],
+    "ruckig": ["trajectories."],
+    "cvxpy": ["calib.estimation.", "calib.dynamics.", "calib.identification.", "poses.", "trajectories."],
+    "matplotlib": ["calib.procedure."],
+    "jinja2": ["calib.procedure."],
+    "dask": ["calib.workers"],
+    "distributed": ["calib.workers"],
+    "typer": ["calib.cli"],
+    "click": ["calib.cli"],
+    "rich": ["calib.cli", "calib.procedure."],
+}
+
+
+def module_of(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+def imports(path: Path) -> Iterator[tuple[str, int]]:
+    """Yield every imported module's full name and its line."""
+    yield from imported(path.read_text(encoding="utf-8"), path.relative_to(ROOT).parent.parts)
+
+
+def imported(source: str, package: tuple[str, ...]) -> Iterator[tuple[str, int]]:
+    """Yield what a module of a package imports; ``from a import b`` counts as a and as a.b."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, node.lineno) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            stem = ".".join(
+                [*package[: len(package) - node.level + 1], node.module or ""] if node.level else [node.module]
+            )
+            yield stem.rstrip("."), node.lineno
+            yield from ((f"{stem.rstrip('.')}.{alias.name}", node.lineno) for alias in node.names)
+
+
+def within(name: str, prefix: str) -> bool:
+    return name == prefix or name.startswith(prefix + ".")
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_arrow_runs_the_wrong_way(path):
+    module = module_of(path)
+    for room, forbidden in FORBIDDEN.items():
+        if not within(module, room) or module == "calib.cli":
+            continue
+        wrong = [f"line {line}: {name}" for name, line in imports(path) for f in forbidden if within(name, f)]
+        assert not wrong, f"{module} is in {room}, which must not import {wrong}"
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_heavy_dependencies_stay_at_home(path):
+    module = module_of(path)
+    for name, line in imports(path):
+        homes = HOMES.get(name.split(".")[0])
+        if homes is not None:
+            allowed = any(module == home or (home.endswith(".") and module.startswith(home)) for home in homes)
+            assert allowed, f"{module} line {line} imports {name}, whose home is {', '.join(homes) or 'nowhere'}"
+
+
+def test_the_walker_sees_every_form_of_import():
+    inside = "def f():\n    from calib import cli\n    import poses.select as s\n"
+    source = inside + "from ..robot import chain\nfrom . import columns\n"
+    names = {name for name, _ in imported(source, ("calib", "estimation"))}
+    assert {"calib.cli", "poses.select", "calib.robot", "calib.robot.chain", "calib.estimation.columns"} <= names
+
+
+def test_every_package_is_listed_for_installation():
+    import tomllib
+
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    present = {module_of(path) for path in SOURCES if path.name == "__init__.py"}
+    assert present == set(listed)
+
+
+def test_the_command_line_starts_light():
+    """`calib --help` loads neither Pinocchio nor matplotlib nor the optimisers."""
+    heavy = ["pinocchio", "matplotlib", "scipy", "numpy", "nlopt", "cvxpy", "jinja2", "numba"]
+    code = f"import sys, calib.cli; print([name for name in {heavy} if name in sys.modules])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
