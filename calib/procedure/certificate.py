@@ -25,7 +25,7 @@ KINDS = {
     "orientation_deg": ("orientation", "deg"),
     "distance_mm": ("distance", "mm"),
 }
-ARMS = ("nominal", "calibrated")
+ARMS = {"nominal": "nominal", "calibrated": "calibrated", "urdf_alone": "its URDF alone"}
 MOST_ROWS = 60
 CONVENTIONS = (
     "Units: m, rad, s, kg, N·m in all files unless a header names another; this page prints mm, deg and mrad.",
@@ -160,7 +160,7 @@ def key_figures(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     result = []
     for key, (label, unit) in KINDS.items():
         if proof["calibrated"].get(key):
-            before, after = (proof[arm][key]["rms"] for arm in ARMS)
+            before, after = (proof[arm][key]["rms"] for arm in ("nominal", "calibrated"))
             result.append((f"{label}, rms on {where}", f"{after:.3g} {unit}", f"nominal {before:.3g} {unit}"))
     worst = proof["calibrated"].get("position_mm") or proof["calibrated"].get("distance_mm")
     if worst:
@@ -182,16 +182,21 @@ def error_table(metrics: Mapping[str, Any]) -> Table:
             (f"{words} [{unit}]", arm, found[arm][key])
             for key, (words, unit) in KINDS.items()
             for arm in ARMS
-            if found[arm].get(key)
+            if found.get(arm, {}).get(key)
         ]
         pairs = found.get("pair_distance_mm")
-        lines += [("distance of pairs [mm]", arm, pairs[arm]) for arm in ARMS] if pairs else []
+        lines += [("distance of pairs [mm]", arm, pairs[arm]) for arm in ARMS if arm in pairs] if pairs else []
         for number, (words, arm, numbers) in enumerate(lines):
             if arm == "calibrated":
                 strong.add(len(rows))
             cells = [f"{numbers[key]:.3f}" for key in ("mean", "rms", "p95", "max")]
-            rows.append((label if number == 0 else "", words if arm == "nominal" else "", arm, *cells))
+            rows.append((label if number == 0 else "", words if arm == "nominal" else "", ARMS[arm], *cells))
     note = "Distances of pairs do not depend on where instrument and tool are placed."
+    if any("urdf_alone" in found for _, found in sets):
+        note += (
+            " A URDF cannot hold the joint corrections of the chosen model: its errors alone stand beside; with "
+            "joint_corrections.csv they are those of the calibrated arm."
+        )
     return Table("Errors", header, rows, note, frozenset(strong), range(3, 7))
 
 

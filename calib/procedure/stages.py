@@ -16,8 +16,11 @@ from calib.data.measurements import PoseMeasurements
 from calib.data.options import FileOptions, FitOptions, read_options
 from calib.data.plans import check_against, read_poses, write_poses
 from calib.errors import SessionError
-from calib.geometry.fit import Settings as FitSettings
-from calib.geometry.fit import combine, polish_frames
+from calib.geometry.accuracy import errors, summary
+from calib.geometry.deflection import Deflection
+from calib.geometry.fit import polish_frames
+from calib.geometry.weighing import Settings as FitSettings
+from calib.geometry.weighing import combine
 from calib.procedure import calibrated, certificate, comparing, fitting, inputs, outputs, report
 from calib.procedure.session import Session, fingerprint
 from calib.procedure.verdict import judge
@@ -170,7 +173,8 @@ def validate(session: Session, say: Say) -> list[str]:
     asked = session.settings.fit["model"]
     verdict = judge(fitted, validation, asked=asked, **found.judged)
     warnings = fitting.elsewhere(fitted, validation)
-    metrics: dict[str, object] = {"validation": {name: each.table() for name, each in validation.items()}}
+    tables = {name: each.table() | without_corrections(each) for name, each in validation.items()}
+    metrics: dict[str, object] = {"validation": tables}
     metrics |= {"verdict": verdict.level, "reason": verdict.reason, "warnings": warnings}
     sets = [report.rows_of(name, each, each.proves) for name, each in validation.items()]
     write_errors(folder / "errors.csv", given.chain, validation)
@@ -195,6 +199,15 @@ def compared(session: Session, given: inputs.Inputs) -> tuple[comparing.Comparis
         for name, each in given.unseen.items()
     }
     return fitted, unseen
+
+
+def without_corrections(found: comparing.Comparison) -> dict[str, object]:
+    """Return the errors of the calibrated geometry alone, as a URDF holds it; nothing where that is all there is."""
+    cell = found.cells[1]
+    if not cell.deflection.terms:
+        return {}
+    bare = replace(cell, deflection=Deflection())
+    return {"urdf_alone": summary(errors(bare, found.blocks))}
 
 
 def write_errors(path: Path, chain: Chain, validation: dict[str, comparing.Comparison]) -> None:

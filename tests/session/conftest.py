@@ -1,0 +1,74 @@
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from calib.procedure import demo, steps
+from calib.procedure.guided import begin
+from calib.procedure.session import Session, locked, open_session
+from calib.simulation.cells import virtual_cell
+
+
+def quiet(words: str) -> None:
+    """Say nothing."""
+
+
+def go_on(session: Session) -> steps.State | None:
+    with locked(session, quiet):
+        return steps.run_next(open_session(session.folder), quiet, quiet)
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+@pytest.fixture(scope="session")
+def planned_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session that waits for measurements."""
+    folder = tmp_path_factory.mktemp("planned") / "cell"
+    session = begin(folder, "lwr4plus", "cmm", poses=20, validation=8, seed=1, base="", tip="")
+    edit(folder / "session.toml", 'model = "auto"', 'model = "geometry"')
+    waiting = go_on(session)
+    assert waiting is not None and waiting.step.name == "measure"
+    return folder
+
+
+@pytest.fixture(scope="session")
+def finished_folder(planned_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session that has come to its certificate."""
+    folder = tmp_path_factory.mktemp("finished") / "cell"
+    shutil.copytree(planned_folder, folder)
+    session = open_session(folder)
+    demo.bring(session, virtual_cell("lwr4plus"), 1)
+    assert go_on(session) is None
+    return folder
+
+
+@pytest.fixture
+def planned(planned_folder: Path, tmp_path: Path) -> Session:
+    shutil.copytree(planned_folder, tmp_path / "cell")
+    return open_session(tmp_path / "cell")
+
+
+@pytest.fixture
+def measured(planned: Session) -> Session:
+    demo.bring(planned, virtual_cell("lwr4plus"), 1)
+    return planned
+
+
+@pytest.fixture
+def finished(finished_folder: Path, tmp_path: Path) -> Session:
+    shutil.copytree(finished_folder, tmp_path / "cell")
+    return open_session(tmp_path / "cell")
+
+
+@pytest.fixture
+def plain(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw no figures: most claims about sessions are not about them, and drawing takes most of the time."""
+    from calib.procedure import figures
+
+    monkeypatch.setattr(figures, "draw", lambda report: {})

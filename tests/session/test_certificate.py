@@ -1,0 +1,141 @@
+"""The certificate is one file, says what it has to, and the figures are what the numbers are."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+
+from calib.errors import CalibError
+from calib.procedure import certificate, drawing, figures, plots, report
+
+
+class References(HTMLParser):
+    """Collects what a page would load, and its text."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.loaded: list[str] = []
+        self.tags: list[str] = []
+        self.text: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.loaded += [value or "" for name, value in attrs if name in ("src", "href", "xlink:href", "data", "srcset")]
+
+    def handle_data(self, data: str) -> None:
+        self.text.append(data)
+
+
+@pytest.fixture(scope="module")
+def page(finished_folder: Path) -> str:
+    return (finished_folder / "certificate.html").read_text()
+
+
+def test_it_loads_nothing_from_anywhere(page: str) -> None:
+    found = References()
+    found.feed(page)
+    assert all(reference.startswith(("#", "data:")) for reference in found.loaded)
+    assert not {"script", "link", "iframe", "object", "base"} & set(found.tags)
+    assert "@import" not in page and not re.search(r"url\((?!#)", page)
+    assert len(page) < 1_500_000
+
+
+def test_it_says_what_a_professional_signs(page: str, finished_folder: Path) -> None:
+    found = References()
+    found.feed(page)
+    text = " ".join(" ".join(found.text).split())
+    metrics = json.loads((finished_folder / "5-validation/metrics.json").read_text())
+    assert certificate.WORDS[metrics["verdict"]] in text and metrics["reason"][1:] in text
+    rms = metrics["validation"]["validation.csv"]["calibrated"]["position_mm"]["rms"]
+    assert f"{rms:.3f}" in text
+    for words in ("lwr4plus", "optical CMM", "60 µm", "seed", "numpy", "3-measured/measured.csv", "Limitations"):
+        assert words in text
+    digest = re.findall(r"\b[0-9a-f]{64}\b", text)
+    assert len(digest) == len(set(digest)) >= 6
+    for name in ("theta2", "d4", "alpha7", "kept at their nominal values: alpha1"):
+        assert name in text
+
+
+def test_ids_of_figures_do_not_meet(page: str) -> None:
+    ids = re.findall(r"<svg.*?</svg>", page, flags=re.DOTALL)
+    sets = [set(re.findall(r'\bid="([^"]+)"', svg)) for svg in ids]
+    assert len(sets) >= 7
+    assert sum(map(len, sets)) == len(set.union(*sets))
+
+
+def test_numbers_of_the_report_are_those_of_the_fit(finished_folder: Path) -> None:
+    found = report.read(finished_folder / "4-fit")
+    metrics = json.loads((finished_folder / "4-fit/metrics.json").read_text())
+    errors = 1e3 * np.array(found.sets[0]["calibrated"]["position"])
+    assert np.sqrt(np.mean(errors**2)) == pytest.approx(metrics["fit"]["calibrated"]["position_mm"]["rms"], rel=1e-5)
+    assert len(found.sets[0]["q"]) == len(found.sets[0]["points"]) == len(errors)
+    assert found.noise["position"] == pytest.approx(60e-6 * np.sqrt(3))
+
+
+def test_hostile_names_do_not_become_markup(finished_folder: Path) -> None:
+    found = replace(report.read(finished_folder / "4-fit"), robot="<script>alert(1)</script>")
+    written = certificate.render(certificate.of_fit(found, {}))
+    assert "<script>" not in written and "&lt;script&gt;" in written
+
+
+def test_another_versions_report_is_refused(finished_folder: Path, tmp_path: Path) -> None:
+    content = json.loads((finished_folder / "4-fit/report.json").read_text()) | {"schema": 99}
+    (tmp_path / "report.json").write_text(json.dumps(content))
+    with pytest.raises(CalibError, match="schema 99"):
+        report.read(tmp_path)
+
+
+def test_before_and_after_differ_in_greyscale() -> None:
+    def grey(colour: str) -> float:
+        return float(np.dot(to_rgb(colour), (0.299, 0.587, 0.114)))
+
+    assert grey(drawing.BEFORE) - grey(drawing.AFTER) > 0.35
+
+
+def test_every_figure_is_drawn_from_plain_arrays(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    before, after = rng.gamma(4.0, 1e-3, 60), rng.gamma(4.0, 1e-5, 60)
+    q, points = rng.uniform(-2.0, 2.0, (60, 7)), rng.normal(size=(60, 3))
+    names = [f"p{k}" for k in range(20)]
+    drawn = [
+        plots.error_histogram(before, after, noise=2e-5),
+        plots.error_histogram(before, before, "orientation"),
+        plots.residuals_by_joint(q, before, after, names[:7], [False] * 6 + [True]),
+        plots.error_map(points, after),
+        plots.parameter_changes(names, ["m", "rad"] * 10, rng.normal(size=20), np.ones(20), most=6),
+        plots.parameter_changes(names[:2], ["rad", "rad"], np.ones(2), np.ones(2)),
+        plots.singular_values(np.array([3.0, 1.0, 1e-9, 0.0]), 2),
+        plots.singular_values(np.array([3.0, 1.0]), 2),
+        plots.ladder(["frames", "geometry"], [12, 34], [5e-3, 1e-3], [True, True], 1e-4),
+        plots.selection_growth(range(5, 9), {"detmax": [1.0, 2.0, 3.0, 4.0], "random": [0.5, 1.0, np.nan, np.nan]}),
+        plots.correlation_map(names, np.eye(20)),
+    ]
+    for number, figure in enumerate(drawn):
+        assert isinstance(figure, Figure)
+        path = drawing.save(figure, tmp_path / f"{number}.png", dpi=40)
+        assert path.read_bytes()[:4] == b"\x89PNG"
+        for axes in figure.axes:
+            if axes.get_xlabel() and axes.axison:
+                assert axes.get_ylabel() or axes.get_yticklabels()
+    assert sorted(path.suffix for path in tmp_path.iterdir()) == [".png"] * len(drawn)
+
+
+def test_a_figure_as_svg_is_the_same_twice() -> None:
+    values = np.array([2.0, 1.0, 1e-12])
+    one, two = (drawing.svg(plots.singular_values(values, 2), "a") for _ in range(2))
+    assert one == two and one.startswith("<svg") and "<metadata>" not in one
+
+
+def test_what_the_data_do_not_give_is_left_out(finished_folder: Path) -> None:
+    found = report.read(finished_folder / "4-fit")
+    bare = [{key: value for key, value in found.sets[0].items() if key not in ("q", "points")}]
+    drawn = figures.draw(replace(found, sets=bare, singular_values=[]))
+    assert "joints" not in drawn and "singular_values" not in drawn and "position" in drawn

@@ -1,0 +1,38 @@
+"""The demonstration ends in a certificate, a robot other programs read, and errors near the instrument's."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib import cli
+from calib.procedure import steps
+from calib.procedure.session import open_session
+from calib.robot import urdf
+from calib.robot.kinematics import forward
+from calib.robot.load import load
+
+
+def test_demo_of_the_lwr4plus(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    out = tmp_path / "demo"
+    assert cli.run(["demo", "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    for name in ("certificate.html", "4-fit", "6-export/robot.urdf"):
+        assert str(out / name) in said.replace("\n", "") and (out / name).exists()
+    assert "hidden truth" in said
+    assert {state.kind for state in steps.states(open_session(out))} == {steps.DONE}
+    nominal, calibrated = map(float, re.findall(r"([\d.]+) mm", (out / "truth.txt").read_text())[:2])
+    assert calibrated < nominal / 15
+    chain, read = load(out / "6-export"), urdf.read(out / "6-export/robot.urdf")
+    q = np.random.default_rng(0).uniform(-1.5, 1.5, (5, 7))
+    np.testing.assert_allclose(forward(read, q), forward(chain, q), atol=1e-9)
+    assert cli.run(["demo", "--out", str(out)]) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", ["ur10e", "panda", "tx40", "rv2sq"])
+def test_demo_of_other_robots(robot: str, tmp_path: Path) -> None:
+    assert cli.run(["demo", "--out", str(tmp_path / "demo"), "--robot", robot, "--seed", "3"]) == 0

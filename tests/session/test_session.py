@@ -1,0 +1,246 @@
+"""A session survives being killed, moved, edited and run twice, and says what is stale."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from calib import cli
+from calib.errors import CalibError, MeasurementError, SessionError
+from calib.procedure import steps
+from calib.procedure.session import Session, locked, open_session, read_state
+
+from .conftest import edit, go_on, quiet
+
+pytestmark = pytest.mark.usefixtures("plain")
+
+
+def kinds(session: Session) -> dict[str, str]:
+    return {state.step.name: state.kind for state in steps.states(open_session(session.folder))}
+
+
+def words(session: Session, name: str) -> str:
+    return next(state.words for state in steps.states(open_session(session.folder)) if state.step.name == name)
+
+
+def test_a_finished_session_is_done_wherever_it_is(finished: Session, tmp_path: Path) -> None:
+    assert set(kinds(finished).values()) == {steps.DONE}
+    moved = finished.folder.rename(tmp_path / "elsewhere")
+    assert set(kinds(open_session(moved)).values()) == {steps.DONE}
+    assert go_on(open_session(moved)) is None
+    assert str(tmp_path) not in (moved / "state.json").read_text()
+
+
+def test_two_lines_say_what_to_do_and_what_to_bring(planned: Session) -> None:
+    waiting = next(state for state in steps.states(planned) if state.kind == steps.WAITING)
+    first, second = steps.asks(planned, waiting)
+    assert "20 poses" in first and "optical CMM" in first and "poses.csv" in first
+    assert "measured.csv" in second and "joint1 [deg]" in second and "qw" in second
+
+
+def test_the_fit_waits_for_validation_but_not_the_other_way_round(measured: Session) -> None:
+    validation = measured.path("3-measured/validation.csv").rename(measured.folder / "later.csv")
+    waiting = go_on(measured)
+    assert waiting is not None and waiting.step.name == "validate"
+    assert "8 poses" in steps.asks(measured, waiting)[0]
+    before = measured.path("4-fit/robot.toml").stat().st_mtime_ns
+    validation.rename(measured.path("3-measured/validation.csv"))
+    assert go_on(measured) is None
+    assert measured.path("4-fit/robot.toml").stat().st_mtime_ns == before
+
+
+def test_a_changed_measurement_makes_stale_what_rests_on_it(finished: Session) -> None:
+    path = finished.path("3-measured/measured.csv")
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(lines[:-1]) + "\n")
+    found = kinds(finished)
+    assert found["select"] == steps.DONE and found["measure"] == steps.STALE and found["fit"] == steps.AFTER
+    assert "measured.csv has changed" in words(finished, "measure")
+    assert go_on(finished) is None
+    assert json.loads(finished.path("4-fit/metrics.json").read_text())["fit"]["poses"] == 19
+    assert "1 of 20 planned poses were not measured: 20" in finished.path("3-measured/checked.txt").read_text()
+
+
+def test_a_changed_setting_makes_stale_only_what_reads_it(finished: Session) -> None:
+    edit(finished.path("session.toml"), 'model = "geometry"', 'model = "offsets"')
+    found = kinds(finished)
+    assert found["select"] == steps.DONE and found["measure"] == steps.STALE
+    assert go_on(open_session(finished.folder)) is None
+    assert json.loads(finished.path("4-fit/metrics.json").read_text())["model"] == "offsets"
+
+
+def test_a_plan_is_not_replaced_once_it_was_measured(finished: Session) -> None:
+    before = finished.path("2-poses/poses.csv").read_text()
+    edit(finished.path("session.toml"), "fit = 20", "fit = 25")
+    assert kinds(finished)["select"] == steps.KEPT and "redo select" in words(finished, "select")
+    assert go_on(open_session(finished.folder)) is None
+    assert finished.path("2-poses/poses.csv").read_text() == before
+
+
+def test_what_a_person_replaced_is_kept_and_said(finished: Session) -> None:
+    urdf = finished.path("6-export/robot.urdf")
+    urdf.write_text(urdf.read_text() + "<!-- checked -->\n")
+    assert kinds(finished)["export"] == steps.DONE
+    assert "replaced by hand: 6-export/robot.urdf" in words(finished, "export")
+    assert go_on(finished) is None
+    assert "checked" in urdf.read_text()
+
+
+def test_redo_makes_a_step_and_all_behind_it_again(finished: Session) -> None:
+    urdf = finished.path("6-export/robot.urdf")
+    original = urdf.read_text()
+    urdf.write_text("mine")
+    steps.forget(finished, steps.find("export"))
+    assert kinds(finished)["fit"] == steps.DONE and kinds(finished)["export"] == steps.READY
+    assert go_on(finished) is None
+    assert urdf.read_text() == original
+    with pytest.raises(SessionError, match="describe, select"):
+        steps.find("fitting")
+
+
+def test_killed_at_any_step_it_goes_on_from_there(measured: Session, finished_folder: Path) -> None:
+    expected = finished_folder.joinpath("4-fit/estimate.csv").read_text()
+    for name in ("measure", "fit", "validate", "certificate"):
+        assert _killed_at(measured, name) == -signal.SIGKILL
+        assert kinds(measured)[name] == steps.READY and "interrupted" in words(measured, name)
+    assert go_on(measured) is None
+    assert measured.path("4-fit/estimate.csv").read_text() == expected
+    assert not list(measured.folder.rglob(".*.part")) and not measured.path("session.lock").exists()
+
+
+def _killed_at(session: Session, name: str) -> int:
+    """Run `calib next` in a process of its own and kill it while it is in a step; return its exit code."""
+    code = (
+        "import sys, time\n"
+        "from calib.procedure import steps\n"
+        "from dataclasses import replace\n"
+        "def slow(session, say):\n"
+        "    (session.folder / '.4-fit.x.part').mkdir(exist_ok=True)\n"
+        "    print('there', flush=True); time.sleep(60)\n"
+        f"steps.STEPS = tuple(replace(s, make=slow) if s.name == {name!r} else s for s in steps.STEPS)\n"
+        "from calib import cli\n"
+        f"cli.run(['next', {str(session.folder)!r}])\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.strip() == "there":
+            break
+    process.kill()
+    return process.wait()
+
+
+def test_two_commands_do_not_work_on_one_session(planned: Session) -> None:
+    with (
+        locked(planned, quiet),
+        pytest.raises(SessionError, match=rf"busy: process {os.getpid()}"),
+        locked(planned, quiet),
+    ):
+        pass
+    with locked(planned, quiet):
+        pass
+
+
+def test_a_killed_commands_lock_is_taken_over(planned: Session) -> None:
+    planned.path("session.lock").write_text("process 999999 on some-host")
+    said: list[str] = []
+    with locked(planned, said.append):
+        pass
+    assert "process 999999" in said[0] and not planned.path("session.lock").exists()
+
+
+def test_a_failing_step_leaves_the_session_as_it_was(measured: Session) -> None:
+    go_on(measured)
+    before = read_state(measured)
+    path = measured.path("3-measured/measured.csv")
+    text = path.read_text()
+    path.write_text(text.replace("[deg]", "[rad]"))
+    with pytest.raises(MeasurementError, match=r"measured.csv, row 1, column 'joint\d'.*deg"):
+        go_on(measured)
+    assert "running" not in read_state(measured) and not measured.path("session.lock").exists()
+    path.write_text(text)
+    assert go_on(measured) is None
+    assert read_state(measured)["steps"].keys() == before["steps"].keys()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda head: head.replace("joint2", "?").replace("joint3", "joint2").replace("?", "joint3"), "swapped"),
+        (lambda head: head.replace("x [mm]", "x"), "in mm"),
+        (lambda head: head.replace("joint4 [deg],", "other,"), "joint"),
+    ],
+)
+def test_what_arrives_is_checked(measured: Session, change, message: str, capsys: pytest.CaptureFixture) -> None:
+    path = measured.path("3-measured/measured.csv")
+    head, _, rest = path.read_text().partition("\n")
+    path.write_text(f"{change(head)}\n{rest}")
+    assert cli.run(["next", str(measured.folder)]) == 2
+    said = capsys.readouterr().err
+    assert "measured.csv" in said and message in said and "Traceback" not in said
+    assert not measured.path("4-fit/robot.toml").exists()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("schema = 1", "schema = 2", "newer version"),
+        ("schema = 1", "schema = 0", "not known"),
+        ('model = "auto"', "model = 3", r"\[fit\] model = 3: expected str"),
+        ('loss = "none"', 'los = "none"', r"\[fit\] loss is missing"),
+        ("[poses]", "[poses", "is no TOML"),
+        ("seed = 1", 'seed = "one"', "seed"),
+    ],
+)
+def test_a_session_of_another_version_or_hand_is_recognised(planned: Session, old: str, new: str, message: str) -> None:
+    path = planned.path("session.toml")
+    path.write_text(path.read_text().replace('model = "geometry"', 'model = "auto"'))
+    edit(path, old, new)
+    with pytest.raises(SessionError, match=message):
+        open_session(planned.folder)
+
+
+def test_a_damaged_record_is_said_and_can_be_thrown_away(finished: Session) -> None:
+    finished.path("state.json").write_text('{"steps": ')
+    with pytest.raises(SessionError, match="delete it"):
+        steps.states(finished)
+    finished.path("state.json").unlink()
+    assert kinds(finished)["describe"] == steps.READY
+
+
+def test_commands_and_their_exit_codes(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    folder = str(tmp_path / "cell")
+    new = ["new", folder, "--robot", "ur5", "--instrument", "tracker", "--poses", "15", "--validation", "0"]
+    assert cli.run(new) == 0
+    assert cli.run(new) == 2 and "already" in capsys.readouterr().err
+    assert cli.run(["status", folder]) == 0 and "describe" in capsys.readouterr().out
+    assert cli.run(["next", folder]) == 0 and "measured.csv" in capsys.readouterr().out
+    assert cli.run(["next", str(tmp_path)]) == 2 and "no session" in capsys.readouterr().err
+    assert cli.run(["redo", folder, "nothing"]) == 2
+    assert cli.run(["new", str(tmp_path / "b"), "--robot", "ur55", "--instrument", "tracker"]) == 2
+    assert cli.run(["new", str(tmp_path / "b"), "--robot", "ur5", "--instrument", "ruler"]) == 2
+    assert not (tmp_path / "b").exists() and not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_read_only_folder_is_said(planned: Session) -> None:
+    planned.folder.chmod(0o500)
+    try:
+        with pytest.raises(CalibError, match="cannot write"):
+            go_on(planned)
+    finally:
+        planned.folder.chmod(0o700)
+
+
+def test_time_does_not_enter_the_results(measured: Session, finished_folder: Path) -> None:
+    time.sleep(0.01)
+    assert go_on(measured) is None
+    for name in ("4-fit/estimate.csv", "5-validation/errors.csv", "6-export/robot.urdf", "2-poses/poses.csv"):
+        assert measured.path(name).read_text() == (finished_folder / name).read_text()
