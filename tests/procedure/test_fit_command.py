@@ -133,6 +133,21 @@ def test_two_files_have_two_stations_unless_one_is_asked_for(cell, calib):
     assert calibrated.read("tools").tool_names == ("a tool", "b tool")
 
 
+def test_validation_files_may_follow_one_option_or_each_its_own(cell, calib):
+    file = cell.write("a.csv", cell.measure(40))
+    for name, seed in (("b.csv", 1), ("c.csv", 2)):
+        cell.write(name, cell.measure(30, seed))
+    start = ("fit", "ur5", file, "--model", "geometry")
+    assert calib(*start, "--validate", "b.csv", "c.csv", "--out", "one")[0] == 0
+    assert calib(*start, "--out", "two", "--validate", "b.csv", "--validate", "c.csv")[0] == 0
+    assert calib("fit", "--validate", "b.csv", "--out", "three", "ur5", file, "--model", "geometry")[0] == 0
+    found = {name: json.loads(Path(name, "metrics.json").read_text()) for name in ("one", "two", "three")}
+    assert found["one"] == found["two"]
+    assert set(found["one"]["validation"]) == {"b.csv", "c.csv"}
+    assert set(found["three"]["validation"]) == {"b.csv"}
+    assert found["three"]["fit"] == found["one"]["fit"]
+
+
 def test_the_same_seed_gives_the_same_numbers(cell, calib):
     file = cell.write("a.csv", cell.measure(40))
     for name in ("one", "two"):
