@@ -6,12 +6,15 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial import KDTree
+from scipy.stats import mannwhitneyu
 
 from calib.geometry.observation import Block
 from calib.geometry.residuals import Part
 from calib.geometry.result import GeometricFit
 
 FEWEST = 30  # rows below which no pattern is looked for (our choice)
+WORSE = 1.6  # a set-up's errors over the rest's from which on it is worth a word (our choice)
+CHANCE = 1e-3  # probability that the same rows in another order show such a change (our choice)
 
 
 def diagnose(found: GeometricFit) -> list[str]:
@@ -34,7 +37,7 @@ def _name(block: Block) -> str:
 
 
 def _setup_change(block: Block, part: Part) -> list[str]:
-    """Compare the rows before and after every cut: a run of rows twice as bad as the rest is another set-up."""
+    """Compare the rows before and after every cut, by size and by ranks (Mann–Whitney): a worse run is a set-up."""
     size = np.linalg.norm(part.value, axis=0)
     size = np.minimum(size, 4.0 * np.median(size))  # a few gross rows are not a set-up
     m = len(size)
@@ -45,9 +48,10 @@ def _setup_change(block: Block, part: Part) -> list[str]:
     ratio = np.maximum(before / np.maximum(after, 1e-15), after / np.maximum(before, 1e-15))
     weight = np.minimum(cuts, m - cuts)
     best = int(np.argmax((ratio - 1.0) * np.sqrt(weight)))
-    if ratio[best] < 1.6:
-        return []
     cut, first_worse = int(cuts[best]), before[best] > after[best]
+    chance = float(mannwhitneyu(size[:cut], size[cut:]).pvalue) * len(cuts)  # Bonferroni: the best of many cuts
+    if ratio[best] < WORSE or chance > CHANCE:
+        return []
     rows = block.measured.rows[part.index]
     bad = (rows[0], rows[cut - 1]) if first_worse else (rows[cut], rows[-1])
     worse, rest = (before[best], after[best]) if first_worse else (after[best], before[best])

@@ -1,0 +1,128 @@
+"""Two-sided: every warning on measurements and poses is given where it is due, and not where it is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from planted import cell, load, measure, perturb, random_joints
+
+from calib.data.measurements import PoseMeasurements, take
+from calib.geometry.deflection import Deflection, Term
+from calib.geometry.diagnosis import diagnose, neighbour_floor
+from calib.geometry.explanation import explain
+from calib.geometry.first_guess import install
+from calib.geometry.fit import fit, polish_frames
+from calib.geometry.installation import Installation, see
+
+SIGMA = 5e-5
+
+
+def truth_of(seed: int) -> Installation:
+    return cell(perturb(load("ur5"), seed, 0.5e-3, 1e-3), seed)
+
+
+def calibrate(measured: PoseMeasurements):
+    start = polish_frames(install(load("ur5"), [measured]), [measured])
+    return fit(start.cell, [measured])
+
+
+def nearby(truth: Installation, centres: int, each: int, seed: int, sigma: float = SIGMA, wide: float = 0.05):
+    """Measure clusters of neighbouring joints."""
+    rng = np.random.default_rng(seed)
+    q = np.repeat(random_joints(truth.chain, centres, rng), each, axis=0)
+    q = q + wide * rng.normal(size=q.shape)
+    point = see(truth, q).point.T
+    position = point + sigma * rng.normal(size=point.shape)
+    return PoseMeasurements("position", q, truth.chain.joint_names, position=position, file="cluster.csv")
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_noise_alone_gives_no_warning(seed):
+    for measured in (
+        measure(truth_of(seed), "position", 150, seed, sigma=SIGMA, stated=seed % 2 == 0),
+        measure(truth_of(seed), "pose", 100, seed, sigma=SIGMA),
+        nearby(truth_of(seed), 30, 6, seed),
+    ):
+        assert diagnose(calibrate(measured)) == []
+
+
+def with_bad_rows(seed: int) -> PoseMeasurements:
+    """Return 160 positions, the first 40 eight times as noisy."""
+    measured = measure(truth_of(seed), "position", 160, seed, sigma=SIGMA, stated=False, file="day.csv")
+    position = measured.position.copy()
+    position[:40] += 8 * SIGMA * np.random.default_rng(seed).normal(size=(40, 3))
+    return replace(measured, position=position)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_rows_of_another_set_up_are_named(seed):
+    lines = [line for line in diagnose(calibrate(with_bad_rows(seed))) if "set-up" in line]
+    assert len(lines) == 1 and lines[0].startswith("day.csv: rows 1–")
+    assert abs(int(lines[0].split("–")[1].split(" ")[0]) - 40) <= 16  # a tenth of the rows
+
+
+def test_bad_rows_scattered_over_the_day_are_no_set_up():
+    alarms = 0
+    for seed in range(12):
+        shuffled = replace(take(with_bad_rows(seed), np.random.default_rng(seed).permutation(160)), rows=None)
+        alarms += any("set-up" in line for line in diagnose(calibrate(shuffled)))
+    assert alarms == 0
+
+
+def test_noise_of_one_component_is_no_set_up():
+    alarms = 0
+    for seed in range(20):
+        found = calibrate(measure(truth_of(0), "distance", 160, seed, sigma=SIGMA))
+        alarms += any("set-up" in line for line in diagnose(found))
+    assert alarms == 0
+
+
+def test_errors_that_neighbours_share_are_called_systematic():
+    truth = truth_of(1)
+    terms = (Term("theta2", "sin", 1, 3), Term("theta3", "cos", 2, 4))
+    wavy = replace(truth, deflection=Deflection(terms, np.array([4e-4, 4e-4]), truth.chain))
+    lines = diagnose(calibrate(nearby(wavy, 40, 6, 1)))
+    assert any("mostly systematic" in line for line in lines)
+
+
+def test_an_instrument_worse_than_it_states_is_named():
+    measured = measure(truth_of(2), "position", 120, 2, sigma=10 * SIGMA)
+    optimistic = replace(measured, sigma=np.full((120, 3), SIGMA))
+    lines = diagnose(calibrate(optimistic))
+    assert len(lines) == 1 and "10 times the stated uncertainty" in lines[0]
+    assert diagnose(calibrate(measured)) == []
+
+
+def test_neighbours_differ_by_the_noise():
+    found = calibrate(nearby(truth_of(3), 100, 4, 3))
+    floor = neighbour_floor(found.blocks[0].measured.q, found.pieces[0].part)
+    assert floor == pytest.approx(SIGMA * np.sqrt(3), rel=0.15)
+
+
+def test_the_rank_is_told_with_its_gap():
+    lines = explain(calibrate(measure(truth_of(0), "pose", 60, 0, sigma=SIGMA)))
+    assert lines[0].startswith("30 of 38 parameters can be told apart")
+    assert "singular values fall from" in lines[0]
+    merged = " ".join(lines)
+    for name in ("alpha1", "d1", "r1", "theta1", "theta6"):
+        assert name in merged
+    assert "the placement of the instrument" in merged and "the mounting of the tool" in merged
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_tool_and_base_are_said_to_be_confused_only_where_they_are(seed):
+    """Positions in a small region with the wrist held still, against positions anywhere."""
+    truth = truth_of(seed)
+    centre = np.array([0.3, -1.2, 1.4, -0.5, 1.2, 0.4])
+    rng = np.random.default_rng(seed)
+    q = centre + np.array([0.3, 0.3, 0.3, 1e-4, 1e-4, 1e-4]) * rng.normal(size=(150, 6))
+    q[:, 3] -= (q[:, 1:3] - centre[1:3]).sum(axis=1)
+    point = see(truth, q).point.T
+    still = PoseMeasurements(
+        "position", q, truth.chain.joint_names, position=point + SIGMA * rng.normal(size=point.shape)
+    )
+    assert any("cannot be told from the base" in line for line in explain(calibrate(still)))
+    free = measure(truth, "position", 150, seed, sigma=SIGMA)
+    assert not any("cannot be told" in line for line in explain(calibrate(free)))
