@@ -17,15 +17,24 @@ from calib.errors import CalibError
 def regressor(tree: Tree, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
     """Return the regressor of the standard parameters, (N, n, 10 B).
 
+    Its memory is ordered (10 B, n, N), so that each column is contiguous in time and stacking it copies nothing.
+
     Args:
         q, v, a: (N, n) [rad or m, and per s, per s²].
     """
+    q, v, a = _states(tree, q=q, v=v, a=a)
+    out = np.zeros((10 * tree.bodies, tree.n, len(q)))
+    fill_regressor(tree, q, v, a, out)
+    return out.transpose(2, 1, 0)
+
+
+def fill_regressor(tree: Tree, q: np.ndarray, v: np.ndarray, a: np.ndarray, out: np.ndarray) -> None:
+    """Write the regressor into out (10 B, n or more, N), zero on entry; q, v, a (N, n) already checked."""
     from calib.dynamics import kernels
 
-    q, v, a = _states(tree, q=q, v=v, a=a)
-    out = np.zeros((len(q), tree.n, 10 * tree.bodies))
-    kernels.regressor(tree.arrays, *_placed(tree, q), v, a, out)
-    return out
+    amount = q.T[tree.coordinates] * tree.scales[:, None]
+    v, a = np.ascontiguousarray(v.T), np.ascontiguousarray(a.T)
+    kernels.regressor(tree.arrays, tree.upright, tree.order, amount, np.cos(amount), np.sin(amount), v, a, out)
 
 
 def regressor_gradient(

@@ -39,6 +39,8 @@ class Tree:
         gravity: (3,) in the base frame [m/s²].
         paths: (B, n) coordinates that move the body, in the order base to body, then -1.
         depths: (B,) how many of them.
+        upright: (B, 4, 4) the placements between frames turned so that each moving axis is z.
+        order: (B, 10) where the parameters of the turned frames stand in `STANDARD`.
     """
 
     labels: tuple[str, ...]
@@ -51,6 +53,8 @@ class Tree:
     gravity: np.ndarray
     paths: np.ndarray
     depths: np.ndarray
+    upright: np.ndarray
+    order: np.ndarray
 
     @property
     def bodies(self) -> int:
@@ -188,4 +192,21 @@ def _assemble(labels, parents, kinds, axes, scales, coordinates, placements, gra
         gravity=frozen(gravity),
         paths=frozen(paths, np.int64),
         depths=frozen(depths, np.int64),
+        upright=frozen(_upright(parents, axes, placements)),
+        order=frozen([_PERMUTED[axis] for axis in axes], np.int64),
     )
+
+
+_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+_TURNS = ((1, 2, 0), (2, 0, 1), (0, 1, 2))  # which old axes are the new x, y, z, by moving axis
+_PERMUTED = tuple(
+    [_PAIRS.index((min(turn[r], turn[s]), max(turn[r], turn[s]))) for r, s in _PAIRS] + [6 + r for r in turn] + [9]
+    for turn in _TURNS
+)
+
+
+def _upright(parents, axes, placements) -> list[np.ndarray]:
+    """Return the placements between frames whose axes are relabelled so that the moving one is z."""
+    turns = [pose(np.eye(3)[:, _TURNS[axis]]) for axis in axes]
+    before = [np.eye(4) if parent < 0 else turns[parent].T for parent in parents]
+    return [first @ placement @ turn for first, placement, turn in zip(before, placements, turns)]

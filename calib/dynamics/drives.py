@@ -1,0 +1,187 @@
+"""Drives as columns of the regressor: motor inertia, friction, offsets, and couplings between joints.
+
+    tau_r += parameter · Σ_joined shape(Σ_j weight_j · motion_j)
+
+A term acts on one torque row or on several, and in each sees the motion of one joint or of a weighted sum of joints, so
+a coupled wrist (TX40: tau5 += Iam6 a6 + Fvm6 v6 + Fcm6 sign(v5 + v6), tau6 += Iam6 a5 + Fvm6 v5 + Fcm6 sign(v5 + v6))
+is not a special case. Joint numbers here count from 0, in names from 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.dynamics.shapes import SHAPES, V0, Joined, Shape
+from calib.errors import CalibError
+
+Motion = tuple[tuple[int, float], ...]
+STANDARD = {"Ia": "acceleration", "Fv": "velocity", "Fc": "sign", "off": "one"}
+LINK_SIDE = {"Fvl": "velocity", "Fcl": "sign", "offl": "one"}
+MOTOR_SIDE = {"Ia": "acceleration", "Fvm": "velocity", "Fcm": "sign", "offm": "one"}
+
+
+@dataclass(frozen=True)
+class Term:
+    """One column.
+
+    Attributes:
+        name: of its parameter, e.g. ``Fc3``.
+        shape: a key of `SHAPES`.
+        acts: pairs (torque row, motion seen there), the motion as pairs (joint, weight); empty for a parameter without
+            any effect.
+        settings: as many numbers as the shape asks for.
+        side: "link" or "motor" of a joint torque sensor; without one all is seen from the motor.
+        linear: whether the joint is prismatic (units).
+    """
+
+    name: str
+    shape: str
+    acts: tuple[tuple[int, Motion], ...]
+    settings: tuple[float, ...] = ()
+    side: str = "motor"
+    linear: bool = False
+
+    def __post_init__(self) -> None:
+        if self.shape not in SHAPES:
+            raise CalibError(f"term '{self.name}': shape '{self.shape}' is none of {', '.join(SHAPES)}")
+        wanted = SHAPES[self.shape].settings
+        if len(self.settings) != len(wanted):
+            raise CalibError(
+                f"term '{self.name}': shape '{self.shape}' needs ({', '.join(wanted)}), not {self.settings}"
+            )
+        if self.side not in ("link", "motor"):
+            raise CalibError(f"term '{self.name}': side '{self.side}' is neither 'link' nor 'motor'")
+
+    @property
+    def form(self) -> Shape:
+        return SHAPES[self.shape]
+
+    @property
+    def unit(self) -> str:
+        return self.form.unit_linear if self.linear else self.form.unit
+
+
+def term(name: str, shape: str, joint: int, *settings: float, side: str = "motor", linear: bool = False) -> Term:
+    """Return the term of one joint that sees its own motion."""
+    return Term(name, shape, ((joint, ((joint, 1.0),)),), tuple(map(float, settings)), side, linear)
+
+
+def standard(
+    sets: Sequence[str], v0: float | Sequence[float] = V0, linear: Sequence[bool] | None = None
+) -> tuple[Term, ...]:
+    """Return the terms of n joints, joint after joint.
+
+    Args:
+        sets: n strings of names out of Ia Fv Fc off (and Fvl Fcl offl, Fvm Fcm offm), e.g. ``["Ia Fv Fc"] * 6``.
+        v0: smoothing of the Coulomb sign [rad/s or m/s], one or per joint.
+        linear: which joints are prismatic.
+    """
+    known = STANDARD | LINK_SIDE | MOTOR_SIDE
+    smoothing = np.broadcast_to(np.asarray(v0, dtype=float), (len(sets),))
+    result = []
+    for joint, names in enumerate(sets):
+        for name in names.split():
+            if name not in known:
+                raise CalibError(f"joint {joint + 1}: drive term '{name}' is none of {', '.join(known)}")
+            settings = (smoothing[joint],) if known[name] == "sign" else ()
+            side = "link" if name in LINK_SIDE else "motor"
+            is_linear = bool(linear[joint]) if linear is not None else False
+            result.append(term(f"{name}{joint + 1}", known[name], joint, *settings, side=side, linear=is_linear))
+    return tuple(result)
+
+
+def without_effect(label: str) -> tuple[Term, ...]:
+    """Return the seven drive parameters of a fixed body: the papers count them, they move nothing."""
+    named = {"Ia": "acceleration"} | LINK_SIDE | MOTOR_SIDE
+    return tuple(
+        Term(name + label, shape, (), (V0,) if shape == "sign" else (), "link" if name in LINK_SIDE else "motor")
+        for name, shape in named.items()
+    )
+
+
+def coupled(first: int, second: int, v0: float = V0, label: str | None = None) -> tuple[Term, ...]:
+    """Return Iam, Fvm, Fcm of a gear whose motor turns with the sum of two joints (the TX40 wrist: 4, 5).
+
+        tau_first += Iam a_second + Fvm v_second + Fcm sign(v_first + v_second), and the other way round
+
+    (Gautier & Janot's TX40 model; the joints' own Ia Fv Fc hold the rest.)
+    """
+    label = str(second + 1) if label is None else label
+    crossed = ((first, ((second, 1.0),)), (second, ((first, 1.0),)))
+    total: Motion = ((first, 1.0), (second, 1.0))
+    return (
+        Term(f"Iam{label}", "acceleration", crossed),
+        Term(f"Fvm{label}", "velocity", crossed),
+        Term(f"Fcm{label}", "sign", ((first, total), (second, total)), (v0,)),
+    )
+
+
+def added_inertia(terms: Iterable[Term], values: np.ndarray, n: int) -> np.ndarray:
+    """Return the constant inertia (n, n) that acceleration terms add to the bodies': diag(Ia) and couplings."""
+    result = np.zeros((n, n))
+    for one, value in zip(terms, values, strict=True):
+        if one.shape == "acceleration":
+            for row, motion in one.acts:
+                for joint, weight in motion:
+                    result[row, joint] += weight * value
+    return result
+
+
+def fill(terms: Sequence[Term], out: np.ndarray, motions: Sequence[np.ndarray | None], states: np.ndarray) -> None:
+    """Write the columns of terms into out (k, n, N), zero on entry.
+
+    Args:
+        motions: q, v, a, load, each (n, N), load None where unknown.
+        states: (s, N), see `friction_states`.
+    """
+    state = 0
+    for column, one in zip(out, terms, strict=True):
+        for row, motion in one.acts:
+            seen = _join(one, motion, motions, states[state] if one.form.remembers else None)
+            state += one.form.remembers
+            column[row] += one.form.values(seen, one.settings)
+
+
+def slopes(
+    terms: Sequence[Term], motions: Sequence[np.ndarray], weights: np.ndarray, out: Sequence[np.ndarray]
+) -> None:
+    """Add the slopes of Σ weights · columns by q, v, a to out, three arrays (n, N); weights (k, n, N)."""
+    for weight, one in zip(weights, terms, strict=True):
+        if one.form.slopes is None:
+            raise CalibError(f"term '{one.name}' ({one.shape}) depends on the past or on torques: it has no slopes")
+        for row, motion in one.acts:
+            parts = one.form.slopes(_join(one, motion, [*motions, None], None), one.settings)
+            for target, part in zip(out, parts):
+                for joint, share in motion:
+                    target[joint] += share * weight[row] * part
+
+
+def friction_states(terms: Sequence[Term], q: np.ndarray) -> np.ndarray:
+    """Return the stop operators' states (s, N) of one uninterrupted record q (n, N), at rest and unstressed at first.
+
+        z_k = clip(z_{k-1} + (x_k - x_{k-1}) / width, -1, 1):
+
+    stiff within ±width of the last turning point, Coulomb's sign beyond: friction that depends on the past (Iwan 1966;
+    several widths side by side are the Maxwell-slip model).
+    """
+    from calib.dynamics import kernels
+
+    found = []
+    for one in terms:
+        for _, motion in one.acts if one.form.remembers else ():
+            found.append(kernels.stop(sum((w * q[j] for j, w in motion), np.zeros(q.shape[1])), one.settings[0]))
+    return np.array(found).reshape(len(found), q.shape[1])
+
+
+def _join(one: Term, motion: Motion, motions: Sequence[np.ndarray | None], state: np.ndarray | None) -> Joined:
+    """Return what a term sees: weighted sums of q, v, a; of the load, that of the row's first joint."""
+    if one.form.loaded and motions[3] is None:
+        raise CalibError(f"term '{one.name}' needs the transmitted torque: give load (N, n), measured or predicted")
+    if len(motion) == 1 and motion[0][1] == 1.0:
+        x, v, a, load = (None if m is None else m[motion[0][0]] for m in motions)
+    else:
+        x, v, a, load = (None if m is None else sum(w * m[j] for j, w in motion) for m in motions)
+    return Joined(x, v, a, load, state)  # type: ignore[arg-type]

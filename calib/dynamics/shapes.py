@@ -1,0 +1,126 @@
+"""What a drive's torque can depend on: one function of the joint's motion per shape, with its exact slopes.
+
+A shape sees x, v, a [rad or m, per s, per s²] of one joint (or of a sum of joints, where a gear couples them), the
+torque the joint transmits, and its settings; it says by how much the torque changes per unit of its parameter.
+
+The Coulomb sign is smoothed as s(v) = tanh(v / v0) (v0 = 0: the exact sign; BIRDy's choice is v0 = 0.01 rad/s). It is
+a dead-zone sign where the shape is called ``dead``: 0 where abs(v) <= v0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+V0 = 0.01  # [rad/s or m/s], default smoothing of the Coulomb sign
+
+
+@dataclass(frozen=True)
+class Joined:
+    """The motion one term sees, each (N,); `load` [N m or N] and `state` None where no term asks for them."""
+
+    x: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    load: np.ndarray | None = None
+    state: np.ndarray | None = None
+
+
+Values = Callable[[Joined, tuple[float, ...]], np.ndarray]
+Slopes = Callable[[Joined, tuple[float, ...]], tuple[np.ndarray | float, np.ndarray | float, np.ndarray | float]]
+
+
+@dataclass(frozen=True)
+class Shape:
+    """One shape.
+
+    Attributes:
+        values: (N,) of a `Joined` and the settings.
+        slopes: by x, v and a, each (N,) or 0; None where the shape has none (it depends on the past or on torques).
+        unit: of the parameter for a revolute joint, and `unit_linear` for a prismatic one.
+        settings: names of the numbers it needs, with units.
+        loaded, remembers: whether it needs `Joined.load`, `Joined.state`.
+    """
+
+    values: Values
+    slopes: Slopes | None
+    unit: str
+    unit_linear: str
+    settings: tuple[str, ...] = ()
+    loaded: bool = False
+    remembers: bool = False
+
+
+def smooth_sign(v: np.ndarray, v0: float) -> np.ndarray:
+    """Return tanh(v / v0), the exact sign for v0 = 0."""
+    return np.tanh(v / v0) if v0 > 0 else np.sign(v)
+
+
+def _sign_slope(v: np.ndarray, v0: float) -> np.ndarray | float:
+    return (1.0 - np.tanh(v / v0) ** 2) / v0 if v0 > 0 else 0.0
+
+
+def _stribeck(m: Joined, s: tuple[float, ...]) -> np.ndarray:
+    return smooth_sign(m.v, s[2]) * np.exp(-((np.abs(m.v) / s[0]) ** s[1]))
+
+
+def _stribeck_slopes(m: Joined, s: tuple[float, ...]):
+    ratio = np.abs(m.v) / s[0]
+    inner = s[1] / s[0] * ratio ** (s[1] - 1.0) * np.sign(m.v)
+    return 0.0, np.exp(-(ratio ** s[1])) * (_sign_slope(m.v, s[2]) - smooth_sign(m.v, s[2]) * inner), 0.0
+
+
+def _fading(v: np.ndarray, speed: float) -> np.ndarray:
+    return 1.0 / (1.0 + (v / speed) ** 2)
+
+
+def _ripple_slopes(wave: np.ndarray, by_x: np.ndarray, m: Joined, s: tuple[float, ...]):
+    gain = _fading(m.v, s[1])
+    return s[0] * by_x * gain, -2.0 * m.v / s[1] ** 2 * gain**2 * wave, 0.0
+
+
+def _given(array: np.ndarray | None) -> np.ndarray:
+    assert array is not None  # the caller checks `Shape.loaded` and `Shape.remembers`
+    return array
+
+
+VISCOUS, VISCOUS_LINEAR = "N m s/rad", "N s/m"
+SHAPES: dict[str, Shape] = {
+    "acceleration": Shape(lambda m, s: m.a, lambda m, s: (0.0, 0.0, np.ones_like(m.a)), "kg m²", "kg"),
+    "velocity": Shape(lambda m, s: m.v, lambda m, s: (0.0, np.ones_like(m.v), 0.0), VISCOUS, VISCOUS_LINEAR),
+    "one": Shape(lambda m, s: np.ones_like(m.v), lambda m, s: (0.0, 0.0, 0.0), "N m", "N"),
+    "position": Shape(lambda m, s: m.x, lambda m, s: (np.ones_like(m.x), 0.0, 0.0), "N m/rad", "N/m"),
+    "sign": Shape(
+        lambda m, s: smooth_sign(m.v, s[0]), lambda m, s: (0.0, _sign_slope(m.v, s[0]), 0.0), "N m", "N", ("v0",)
+    ),
+    "dead": Shape(
+        lambda m, s: np.sign(m.v) * (np.abs(m.v) > s[0]), lambda m, s: (0.0, 0.0, 0.0), "N m", "N", ("v0",)
+    ),
+    "speed": Shape(
+        lambda m, s: np.abs(m.v), lambda m, s: (0.0, np.sign(m.v), 0.0), VISCOUS, VISCOUS_LINEAR
+    ),
+    "cubic": Shape(lambda m, s: m.v**3, lambda m, s: (0.0, 3.0 * m.v**2, 0.0), "N m s³/rad³", "N s³/m³"),
+    "root": Shape(
+        lambda m, s: m.v / np.sqrt(np.abs(m.v) + s[0]),
+        lambda m, s: (0.0, (0.5 * np.abs(m.v) + s[0]) / (np.abs(m.v) + s[0]) ** 1.5, 0.0),
+        "N m (s/rad)^½", "N (s/m)^½", ("v0",),
+    ),
+    "stribeck": Shape(_stribeck, _stribeck_slopes, "N m", "N", ("vs", "exponent", "v0")),
+    "load": Shape(
+        lambda m, s: np.abs(_given(m.load)) * smooth_sign(m.v, s[0]), None, "", "", ("v0",), loaded=True
+    ),
+    "load_velocity": Shape(lambda m, s: np.abs(_given(m.load)) * m.v, None, "s/rad", "s/m", loaded=True),
+    "stop": Shape(lambda m, s: _given(m.state), None, "N m", "N", ("width",), remembers=True),
+    "sine": Shape(
+        lambda m, s: np.sin(s[0] * m.x) * _fading(m.v, s[1]),
+        lambda m, s: _ripple_slopes(np.sin(s[0] * m.x), np.cos(s[0] * m.x), m, s),
+        "N m", "N", ("order", "speed"),
+    ),
+    "cosine": Shape(
+        lambda m, s: np.cos(s[0] * m.x) * _fading(m.v, s[1]),
+        lambda m, s: _ripple_slopes(np.cos(s[0] * m.x), -np.sin(s[0] * m.x), m, s),
+        "N m", "N", ("order", "speed"),
+    ),
+}  # fmt: skip

@@ -1,0 +1,149 @@
+"""Drive terms: what each column says, their slopes, couplings, friction with memory."""
+
+import numpy as np
+import pytest
+from arms import motley, states
+from differences import check
+
+from calib.dynamics import drives, friction
+from calib.dynamics.idim import IdentificationModel, friction_states, stacked, with_load, with_terms
+from calib.dynamics.tree import tree
+from calib.errors import CalibError
+from calib.robot.load import load
+
+TX40 = load("tx40")
+SMOOTH = (
+    drives.standard(["Ia Fv Fc off"] * 6, v0=0.5)
+    + drives.coupled(4, 5, v0=0.5)
+    + friction.asymmetric(0)
+    + friction.cubic(1)
+    + friction.root(2, 0.3)
+    + friction.stribeck(3, 0.4, 2.0, 0.5)
+    + friction.ripple(4, [3.0, 5.0], 0.7)
+)
+
+
+def column(model, name, *motion, **more):
+    return model.regressor(*motion, **more)[:, :, model.names.index(name)]
+
+
+def test_standard_columns():
+    q, v, a = states(6)
+    model = IdentificationModel(tree(TX40), drives.standard(["Ia Fv Fc off"] * 6, v0=0.0))
+    assert model.p == 84 and model.names[60:64] == ("Ia1", "Fv1", "Fc1", "off1")
+    assert model.units[60:64] == ("kg m²", "N m s/rad", "N m", "N m")
+    for name, wanted in (("Ia", a), ("Fv", v), ("Fc", np.sign(v)), ("off", np.ones_like(v))):
+        found = column(model, f"{name}4", q, v, a)
+        assert np.array_equal(found[:, 3], wanted[:, 3])
+        assert not np.any(np.delete(found, 3, axis=1))
+
+
+def test_smoothing_is_the_stated_one():
+    q, v, a = states(6)
+    model = IdentificationModel(tree(TX40), drives.standard(["Fc"] * 6, v0=0.2))
+    assert np.allclose(column(model, "Fc2", q, v, a)[:, 1], np.tanh(v[:, 1] / 0.2), rtol=0, atol=1e-15)
+
+
+def test_coupled_wrist():
+    """tau5 += Iam6 a6 + Fvm6 v6 + Fcm6 sign(v5 + v6), tau6 += Iam6 a5 + Fvm6 v5 + Fcm6 sign(v5 + v6)."""
+    q, v, a = states(6)
+    model = IdentificationModel(tree(TX40), drives.coupled(4, 5, v0=0.0))
+    assert model.names[-3:] == ("Iam6", "Fvm6", "Fcm6")
+    sign = np.sign(v[:, 4] + v[:, 5])
+    for name, fifth, sixth in (("Iam6", a[:, 5], a[:, 4]), ("Fvm6", v[:, 5], v[:, 4]), ("Fcm6", sign, sign)):
+        found = column(model, name, q, v, a)
+        assert np.array_equal(found[:, 4], fifth) and np.array_equal(found[:, 5], sixth)
+        assert not found[:, :4].any()
+    added = drives.added_inertia(drives.standard(["Ia"] * 6) + drives.coupled(4, 5)[:1], np.arange(1.0, 8.0), 6)
+    assert added[4, 5] == added[5, 4] == 7.0 and added[2, 2] == 3.0
+
+
+@pytest.mark.parametrize("kind", ["motor", "both", "drive", "link"])
+def test_gradient_of_the_model(kind):
+    chain = motley()
+    terms = drives.standard(["Ia Fvl Fcl offl Fvm Fcm offm"] * 5, v0=0.5)
+    model = IdentificationModel(tree(chain), terms, kind)
+    rng = np.random.default_rng(1)
+    x, weights = rng.normal(size=15), rng.normal(size=(1, model.rows, model.p))
+
+    def weighted(x):
+        return np.sum(weights * model.regressor(*x.reshape(3, 1, 5)))
+
+    slopes = model.regressor_gradient(*x.reshape(3, 1, 5), weights)
+    check(weighted, np.concatenate([g[0] for g in slopes]), x)
+
+
+def test_gradient_of_every_smooth_term():
+    model = IdentificationModel(tree(TX40), SMOOTH)
+    rng = np.random.default_rng(1)
+    x, weights = rng.normal(size=18), rng.normal(size=(1, 6, model.p))
+    slopes = model.regressor_gradient(*x.reshape(3, 1, 6), weights)
+    check(lambda x: np.sum(weights * model.regressor(*x.reshape(3, 1, 6))), np.concatenate([g[0] for g in slopes]), x)
+
+
+def test_terms_that_depend_on_more_say_so():
+    q, v, a = states(6)
+    model = with_terms(IdentificationModel(tree(TX40)), *friction.load_dependent(1, viscous=True))
+    assert with_load(model) == ("Ft2", "Fvt2")
+    with pytest.raises(CalibError, match="'Ft2' needs the transmitted torque"):
+        model.regressor(q, v, a)
+    with pytest.raises(CalibError, match="no slopes"):
+        model.regressor_gradient(q, v, a, np.zeros((len(q), 6, model.p)))
+    torque = np.random.default_rng(0).normal(size=q.shape)
+    found = column(model, "Fvt2", q, v, a, load=torque)
+    assert np.allclose(found[:, 1], np.abs(torque[:, 1]) * v[:, 1], rtol=0, atol=1e-15)
+
+
+def test_stop_operator_is_coulomb_in_motion_and_a_spring_at_rest():
+    """Stiff within a width of the turning point, ±1 beyond; the loop closes and remembers its side."""
+    model = IdentificationModel(tree(TX40), friction.presliding(2, [0.1]))
+    x = np.concatenate([np.linspace(0, 1, 101), np.linspace(1, 0.95, 6)[1:], np.linspace(0.95, 0, 96)[1:]])
+    q = np.zeros((len(x), 6))
+    q[:, 2] = x
+    state = friction_states(model, q)[0]
+    assert np.allclose(state[:11], np.arange(11) / 10) and np.all(state[11:101] == 1.0)
+    assert np.isclose(state[105], 0.5) and np.all(state[125:] == -1.0)
+    whole = column(model, "Fp3.1", q, 0 * q, 0 * q)[:, 2]
+    later = model.regressor(q[150:], 0 * q[150:], 0 * q[150:], states=state[None, 150:])[:, 2, -1]
+    assert np.array_equal(whole, state) and np.array_equal(later, state[150:])
+
+
+def test_ripple_fades_with_speed():
+    q, v, a = states(6)
+    model = IdentificationModel(tree(TX40), friction.ripple(0, [241.0], 0.5))
+    assert model.names[-2:] == ("Rs1.241", "Rc1.241")
+    wanted = np.sin(241 * q[:, 0]) / (1 + (v[:, 0] / 0.5) ** 2)
+    assert np.allclose(column(model, "Rs1.241", q, v, a)[:, 0], wanted, rtol=0, atol=1e-14)
+
+
+def test_units_of_a_prismatic_joint():
+    terms = drives.standard(["Ia Fv Fc"] * 2, linear=[False, True])
+    assert [one.unit for one in terms] == ["kg m²", "N m s/rad", "N m", "kg", "N s/m", "N"]
+
+
+def test_stacking_copies_nothing():
+    q, v, a = states(6)
+    model = IdentificationModel(tree(TX40), drives.standard(["Ia Fv"] * 6))
+    regressor = model.regressor(q, v, a)
+    matrix = stacked(regressor)
+    assert np.shares_memory(matrix, regressor) and matrix.flags.f_contiguous
+    assert np.array_equal(matrix[len(q) * 2 + 3], regressor[3, 2])
+    chi = np.random.default_rng(0).normal(size=model.p)
+    assert np.allclose(matrix @ chi, (regressor @ chi).T.ravel(), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: drives.standard(["Ia Fx"]), "joint 1: drive term 'Fx' is none of Ia"),
+        (lambda: drives.term("F", "sign", 0), r"needs \(v0\)"),
+        (lambda: drives.term("F", "curly", 0), "shape 'curly' is none of"),
+        (lambda: drives.Term("F", "one", (), side="left"), "neither 'link' nor 'motor'"),
+        (lambda: IdentificationModel(tree(TX40), drives.standard(["Ia"]) * 2), "'Ia1' occurs twice"),
+        (lambda: IdentificationModel(tree(TX40), drives.standard(["Ia"] * 7)), "'Ia7' names a joint beyond"),
+        (lambda: IdentificationModel(tree(TX40), (), "torque"), "kind 'torque' is none of"),
+    ],
+)
+def test_bad_terms_are_named(make, message):
+    with pytest.raises(CalibError, match=message):
+        make()
