@@ -6,12 +6,10 @@ reason, where the folder is absent.
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import pytest
-
-DATA = Path(os.environ.get("CALIB_DATA", Path(__file__).parents[2] / "shared" / "data"))
+from recordings import DATA
 
 
 @pytest.fixture

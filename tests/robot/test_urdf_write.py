@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 import pytest
-from conftest import DATA
+from recordings import DATA
 from robot_oracle import axis, inertial, joint, pinocchio_inertias, pinocchio_poses, robot
 
 from calib.errors import RobotError
