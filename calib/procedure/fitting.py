@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.data.measurements import PoseMeasurements
-from calib.data.options import FitOptions
-from calib.errors import NotConverged
+from calib.data.options import FitOptions, Harmonics
+from calib.errors import NotConverged, UsageError
 from calib.geometry.diagnosis import diagnose
 from calib.geometry.explanation import explain
 from calib.geometry.first_guess import install
@@ -76,6 +76,10 @@ def run(
         NotConverged: where the chosen model's fit did not come to an end.
     """
     options, say = options or FitOptions(), progress or (lambda words: None)
+    if options.prior or options.harmonics != Harmonics():
+        raise UsageError(
+            f"{options.source}: prior and harmonics are not used: the ladder chooses ridges and orders itself"
+        )
     settings = combine(Settings(), loss=loss or options.loss, loss_scale=options.loss_scale)
     asked = model or options.model
     say("placing the instrument and the tool")
