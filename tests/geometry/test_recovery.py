@@ -9,6 +9,7 @@ import pytest
 import scipy.stats
 from planted import cell, deviation, load, measure, perturb, position_error, random_joints
 
+from calib.estimation import robust
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit, polish_frames
 from calib.geometry.installation import Installation
@@ -223,3 +224,14 @@ def test_a_clean_measurement_has_no_outliers():
         nominal, _, measured, _ = planted("position", seed)
         named += len(outliers(calibrate(nominal, measured)))
     assert named == 0
+
+
+def test_a_row_is_an_outlier_beyond_four_robust_sigmas_per_component():
+    nominal, _, measured, _ = planted("position", 1)
+    found = calibrate(nominal, measured)
+    for size, expected in ((3.8, []), (4.2, [8])):
+        piece = found.pieces[0]
+        value = piece.part.value.copy()
+        value[:, 7] = size * robust.spread(value) * np.array([1.0, -1.0, 1.0])
+        changed = replace(found, pieces=[replace(piece, part=replace(piece.part, value=value))])
+        assert [item[1] for item in outliers(changed)] == expected

@@ -10,9 +10,12 @@ import pytest
 
 from calib.data.measurements import PoseMeasurements, take
 from calib.geometry.accuracy import errors, summary
+from calib.geometry.diagnosis import diagnose
+from calib.geometry.explanation import explain
 from calib.geometry.first_guess import install
-from calib.geometry.fit import Settings, outliers
 from calib.geometry.ladder import Climb, climb
+from calib.geometry.result import outliers
+from calib.geometry.weighing import Settings
 from calib.robot import urdf
 
 
@@ -171,3 +174,16 @@ def test_tiago_outliers_are_named(data, capsys):
     worst = int(measured.rows[np.argmax(sizes)])
     assert named[0][1] == worst
     assert len({item[1] for item in named}) <= 35 // 3
+
+
+def test_motoman_in_a_small_volume_cannot_tell_base_from_tool(data):
+    chain, measured = motoman(data, "right_6x6x6_150.csv")
+    found = climb(install(chain, [measured]), [measured], "geometry")
+    assert any("the tool cannot be told from the base" in line for line in explain(found.fit))
+
+
+def test_motoman_in_the_whole_workspace_is_said_not_to_be_rigid(data):
+    chain, measured = motoman(data, "right_wide_386.csv")
+    found = climb(install(chain, [measured]), [measured], "geometry")
+    lines = diagnose(found.fit)
+    assert any("another set-up" in line or "systematic" in line for line in lines), lines
