@@ -187,6 +187,15 @@ def test_frames_are_preferred_to_the_arm_and_offsets_to_lengths():
     assert {"beta3", "beta4"} <= kept and not {"r2", "r3"} <= kept
 
 
+def test_off_the_parallel_hayatis_beta_wins_over_the_offset_that_blows_up():
+    """On the arm as it really is alpha, d, beta, r, theta are one too many: r, ill defined there, stays at nominal."""
+    installation = cell(perturb(load("ur5"), 5, 1e-3, 2e-3), 2)
+    found = split(installation, tolerance=1e-9)
+    kept = {layout(installation).names[k] for k in found.kept}
+    assert found.rank == 30
+    assert {"beta3", "beta4"} <= kept and not {"r2", "r3", "r4"} <= kept
+
+
 def test_poses_that_hold_the_wrist_still_tell_fewer():
     installation = cell(load("ur5"), 2)
     q = random_joints(installation.chain, 60, 0)
