@@ -1,0 +1,140 @@
+"""Filters do not shift, derivatives are derivatives, and decimation commutes with the model."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib.data.decimation import (
+    KINDS,
+    decimate,
+    decimate_blocks,
+    decimate_regressor,
+    design_decimator,
+    factor_for,
+    kept,
+)
+from calib.data.filtering import border, curvature, low_pass, slope
+from calib.errors import CalibError, MeasurementError
+
+RATE = 1000.0
+
+
+def sine(f: float, n: int = 4000, phase: float = 0.3) -> np.ndarray:
+    return np.sin(2 * np.pi * f * np.arange(n) / RATE + phase)
+
+
+@pytest.mark.parametrize("f", [0.5, 3.0, 10.0])
+def test_a_sine_in_the_band_passes_without_shift(f):
+    x = sine(f)
+    gain = 1 / (1 + (f / 50.0) ** 8)
+    inner = slice(border(RATE, 50.0), -border(RATE, 50.0))
+    np.testing.assert_allclose(low_pass(x, RATE, 50.0)[inner], gain * x[inner], atol=1e-4)
+
+
+def test_the_gain_at_the_cutoff_is_one_half():
+    x = sine(50.0)
+    np.testing.assert_allclose(low_pass(x, RATE, 50.0)[1000:3000], x[1000:3000] / 2, atol=1e-4)
+
+
+def test_low_pass_is_the_same_forwards_and_backwards():
+    x = np.random.default_rng(2).normal(size=(3000, 2))
+    np.testing.assert_allclose(
+        low_pass(x[::-1], RATE, 40.0)[200:-200], low_pass(x, RATE, 40.0)[::-1][200:-200], atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("cutoff", [500.0, 800.0, 0.0, -1.0])
+def test_a_cutoff_beyond_nyquist_is_refused(cutoff):
+    with pytest.raises(MeasurementError, match="Nyquist frequency 500 Hz"):
+        low_pass(sine(1.0), RATE, cutoff)
+
+
+@pytest.mark.parametrize(
+    ("width", "first", "second"), [(1, 1 / 6, 1 / 12), (2, 1 / 30, 1 / 90), (4, 1 / 630, 1 / 3150)]
+)
+def test_central_differences_have_the_error_they_state(width, first, second):
+    f = 40.0
+    w = 2 * np.pi * f / RATE  # ω Δ
+    x, inner = sine(f), slice(width, -width)
+    exact = 2 * np.pi * f * np.cos(2 * np.pi * f * np.arange(4000) / RATE + 0.3)
+    error = np.abs(slope(x, RATE, width) - exact)[inner].max() / (2 * np.pi * f)
+    assert error == pytest.approx(first * w ** (2 * width), rel=0.1)
+    error = np.abs(curvature(x, RATE, width) + (2 * np.pi * f) ** 2 * x)[inner].max() / (2 * np.pi * f) ** 2
+    assert error == pytest.approx(second * w ** (2 * width), rel=0.1)
+
+
+def test_ends_without_neighbours_are_not_numbers():
+    x = slope(sine(3.0)[:, None], RATE, 3)
+    assert np.isnan(x[:3]).all() and np.isnan(x[-3:]).all() and np.isfinite(x[3:-3]).all()
+    assert np.isnan(curvature(np.ones(5), RATE, 3)).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("factor", [1, 2, 7])
+def test_decimation_commutes_with_the_model(kind, factor):
+    random = np.random.default_rng(factor)
+    w, x = random.normal(size=(2000, 3, 5)), random.normal(size=5)
+    decimator = design_decimator(RATE, factor, kind)
+    y = decimate(w @ x, decimator)
+    np.testing.assert_allclose(y, decimate(w, decimator) @ x, atol=1e-12)
+    assert len(y) == len(kept(np.zeros(2000, dtype=int), decimator)) > 0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_decimation_keeps_the_band_and_stops_what_would_fold_into_it(kind):
+    decimator = design_decimator(RATE, 10, kind)
+    index = kept(np.zeros(6000, dtype=int), decimator)
+    assert decimator.band == 40.0 and set(np.diff(index)) == {10}
+    low, folding = sine(20.0, 6000), sine(62.0, 6000)  # 62 Hz would come back as 38 Hz
+    np.testing.assert_allclose(decimate(low, decimator), low[index], atol=1e-2)
+    assert np.abs(decimate(folding, decimator)).max() < 2e-3
+    np.testing.assert_allclose(decimate(np.ones(6000), decimator), 1.0, atol=1e-12)
+
+
+def test_the_chebyshev_decimator_is_scipys():
+    from scipy.signal import cheby1, sosfiltfilt
+
+    x = np.random.default_rng(3).normal(size=8000)
+    decimator = design_decimator(RATE, 5, "chebyshev")
+    both = sosfiltfilt(cheby1(8, 0.05, 0.8 / 5, output="sos"), x) / 10 ** (-2 * 0.05 / 20)  # its ripple at 0 taken off
+    own = decimate(x, decimator)
+    assert np.abs(own - both[kept(np.zeros(8000, dtype=int), decimator)]).max() < 2e-3
+
+
+@pytest.mark.parametrize("block", [1, 3, 50, 997, 5000])
+def test_blocks_give_what_the_whole_gives(block):
+    x = np.random.default_rng(4).normal(size=(3001, 2, 3))
+    decimator = design_decimator(RATE, 8)
+    blocks = (x[i : i + block] for i in range(0, len(x), block))
+    np.testing.assert_allclose(
+        np.concatenate(list(decimate_blocks(blocks, decimator))), decimate(x, decimator), atol=1e-13
+    )
+
+
+def test_segments_do_not_mix_and_regressors_are_decimated_in_blocks():
+    random = np.random.default_rng(5)
+
+    class Moved:
+        q, v, a = random.normal(size=(3, 1500, 2))
+        segment = np.repeat([0, 1], [700, 800])
+
+    def regressor(q, v, a):
+        return np.stack([q, v * q, a], axis=-1)
+
+    decimator = design_decimator(RATE, 6)
+    w = np.concatenate(list(decimate_regressor(regressor, Moved(), decimator, block=128)))
+    whole = regressor(Moved.q, Moved.v, Moved.a)
+    np.testing.assert_allclose(w, decimate(whole, decimator, Moved.segment), atol=1e-12)
+    parts = [decimate(whole[:700], decimator), decimate(whole[700:], decimator)]
+    np.testing.assert_allclose(w, np.concatenate(parts), atol=1e-12)
+    index = kept(Moved.segment, decimator)
+    reach = decimator.reach
+    assert (Moved.segment[index - reach] == Moved.segment[index + reach]).all()
+
+
+def test_factors_follow_gautiers_formula():
+    assert factor_for(5000.0, 20.0) == 100  # the TX40's: 2π 0.8 f_m / (2 n_d)
+    assert factor_for(100.0, 45.0) == 1
+    with pytest.raises(CalibError, match="decimation by 0"):
+        design_decimator(RATE, 0)
