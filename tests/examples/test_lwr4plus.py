@@ -1,0 +1,56 @@
+"""The scripted LWR4+ study runs, and says what it says."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.simulation import lwr4plus
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def metrics(tmp_path_factory: pytest.TempPathFactory) -> dict:
+    out = tmp_path_factory.mktemp("study")
+    script = ROOT / "examples/lwr4plus/geometry.py"
+    done = subprocess.run([sys.executable, script, "--out", out, "--quick"], capture_output=True, text=True, check=True)
+    assert "paper, calibrated" in done.stdout
+    return json.loads((out / "metrics.json").read_text())
+
+
+def test_the_residual_has_the_papers_size(metrics: dict) -> None:
+    ours, paper = metrics["table_3"]["calibrated, unseen poses"], lwr4plus.TABLE_3["calibrated"]
+    for nature in ("position_mm", "orientation_deg"):
+        assert ours[nature]["mean"] == pytest.approx(paper[nature]["mean"], rel=0.25)
+    assert metrics["parameters"] == 32 and metrics["poses"] == 17
+
+
+def test_nominal_rows_tell_installations_from_arms(metrics: dict) -> None:
+    rows = {name: entry["position_mm"]["mean"] for name, entry in metrics["table_3"]["nominal"].items()}
+    paper = lwr4plus.TABLE_3["nominal"]["position_mm"]["mean"]
+    assert rows["full nominal column"] > 10 * paper
+    assert rows["nominal arm, station and tool fitted"] == pytest.approx(paper, rel=0.25)
+
+
+def test_with_a_rigid_truth_the_covariance_holds(metrics: dict) -> None:
+    assert metrics["table_2"]["within_2_sigma_rigid_truth_mean_of_10"] > 0.9 * 32
+    assert metrics["eq_11_against_eq_12"]["largest_difference_in_sigmas"] < 1e-2
+
+
+def test_ranks_are_those_of_the_paper_and_of_the_algebra(metrics: dict) -> None:
+    assert metrics["rank"]["alpha8 = d8 = 0"] == {"above 0.001": 32, "above 1e-09": 32}
+    assert metrics["rank"]["calibrated"]["above 1e-09"] == 34
+
+
+def test_selection_is_better_than_chance(metrics: dict) -> None:
+    for row in metrics["selection"]:
+        assert row["gain_over_random"] > 1.0 and 0.9 < row["efficiency"] <= 1.0 + 1e-9
+    sets = metrics["random_sets"]
+    assert sets["best"] <= sets["median"] <= sets["worst"] < lwr4plus.CONDITION
+    assert np.isfinite(metrics["condition_number"]["ours_m_rad"])
