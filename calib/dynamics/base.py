@@ -1,0 +1,313 @@
+"""Base parameters: which columns of the regressor carry information, and what each of them stands for.
+
+    W chi = W_kept (chi_kept + K chi_dropped) = W_kept chi_base,    W_dropped = W_kept K
+
+(Gautier 1991, numerically by QR). Which columns are kept is our choice where the algebra leaves one: Khalil's, who
+regroups YY, MZ, M of a link behind a revolute joint, and the six moments of inertia of one behind a prismatic joint, on
+the links before (Khalil & Kleinfinger 1987). The columns are tried one after another in a fixed order, not by the size
+of pivots, so that no rounding of a BLAS library decides between equals.
+
+Columns are chosen on the nominal chain; `regroup` recomputes K on the calibrated one, where it holds only nearly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.arrays import frozen, shaped
+from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.tree import FIXED, PRISMATIC
+from calib.errors import CalibError
+from calib.estimation.columns import ColumnSplit, split_columns
+from calib.estimation.triangles import retriangulate
+
+SAMPLES = 500
+BLOCK = 2048  # samples per factorisation: bounds the memory, and keeps it in the processor's cache
+NEGLIGIBLE = 1e-11  # coefficients below this part of the largest of their column are rounding
+KEPT_LAST = {"revolute": (3, 8, 9), "prismatic": (0, 1, 2, 3, 4, 5)}  # YY MZ M; XX to ZZ, in frames with axis z
+
+Loads = Sequence[Collection[str] | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Base:
+    """Base parameters of a model.
+
+    Attributes:
+        kind: of the model's rows, see `calib.dynamics.idim.KINDS`.
+        standard: names of the p parameters of the model.
+        standard_units: their units.
+        split: the kept and dropped columns, K = ``split.coefficients``, singular values and their gap.
+        remainder: (p - b,) what K leaves of each dropped column, relative to its norm: rounding on the chain the
+            columns were chosen on, more after `regroup`.
+        lost: (p - b,) the same as a torque: rms over the samples' rows per unit of the parameter [N m or N per unit].
+    """
+
+    kind: str
+    standard: tuple[str, ...]
+    standard_units: tuple[str, ...]
+    split: ColumnSplit
+    remainder: np.ndarray
+    lost: np.ndarray
+
+    @property
+    def b(self) -> int:
+        return self.split.rank
+
+    @property
+    def kept(self) -> np.ndarray:
+        return self.split.kept
+
+    @property
+    def without_effect(self) -> tuple[str, ...]:
+        return tuple(self.standard[k] for k in self.split.without_effect)
+
+    @property
+    def regrouped(self) -> tuple[str, ...]:
+        """Names of the parameters that go into others."""
+        silent = set(self.split.without_effect.tolist())
+        return tuple(self.standard[k] for k in self.split.dropped if k not in silent)
+
+    @property
+    def transform(self) -> np.ndarray:
+        """(b, p), base = transform @ standard."""
+        result = np.zeros((self.b, len(self.standard)))
+        result[np.arange(self.b), self.kept] = 1.0
+        result[:, self.split.dropped] = self.split.coefficients
+        return result
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The b names, with R where others are regrouped in."""
+        return tuple(
+            self.standard[k] + ("R" if row.any() else "") for k, row in zip(self.kept, self.split.coefficients)
+        )
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return tuple(self.standard_units[k] for k in self.kept)
+
+
+@dataclass(frozen=True, eq=False)
+class BaseModel:
+    """A model seen through its base columns: what excitation and identification work with."""
+
+    model: IdentificationModel
+    base: Base
+
+    def __post_init__(self) -> None:
+        _require_same(self.base, self.model)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.base.names
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return self.base.units
+
+    def regressor(
+        self,
+        q: np.ndarray,
+        v: np.ndarray,
+        a: np.ndarray,
+        load: np.ndarray | None = None,
+        carried: Collection[str] | None = None,
+        states: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Return the regressor (N, rows, b); arguments as of `IdentificationModel.regressor`."""
+        full = self.model.regressor(q, v, a, load, carried, states)
+        return full.transpose(2, 1, 0)[self.base.kept].transpose(2, 1, 0)
+
+    def regressor_gradient(
+        self, q: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the slopes of Σ weights · regressor by q, v, a, each (N, n); weights (N, rows, b)."""
+        weights = shaped(weights, (len(q), self.model.rows, self.base.b), "weights of the regressor")
+        full = np.zeros((len(q), self.model.rows, self.model.p))
+        full[:, :, self.base.kept] = weights
+        return self.model.regressor_gradient(q, v, a, full)
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Random states over which columns are compared: q, v, a, load (N, n) and friction states (s, N)."""
+
+    q: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    load: np.ndarray
+    states: np.ndarray
+
+
+def random_samples(
+    model: IdentificationModel,
+    count: int = SAMPLES,
+    seed: int | np.random.Generator = 0,
+    lower: np.ndarray | None = None,
+    upper: np.ndarray | None = None,
+) -> Samples:
+    """Draw states: q uniform within its limits (default ±π), v and a uniform within ±3 per s and ±3 per s²."""
+    rng, n = np.random.default_rng(seed), model.tree.n
+    low = np.full(n, -np.pi) if lower is None else lower
+    q = rng.uniform(low, np.full(n, np.pi) if upper is None else upper, (count, n))
+    v, a, load = rng.uniform(-3.0, 3.0, (3, count, n))
+    remembering = sum(len(one.acts) for one in model.columns if one.form.remembers)
+    return Samples(q, v, a, load, rng.uniform(-1.0, 1.0, (remembering, count)))
+
+
+def find(
+    model: IdentificationModel, samples: Samples | None = None, loads: Loads | None = None, tolerance: float = 1e-6
+) -> Base:
+    """Choose the base columns of a model.
+
+    Args:
+        samples: states to compare columns over; default `random_samples`. Recorded motion tells what that motion
+            identifies instead of what any motion could.
+        loads: the load cases stacked, each as `carried` of the regressor; default with all payloads and without, if
+            the model has any.
+        tolerance: a column counts where, at unit norm, more than this of it is independent of the columns before.
+    """
+    samples = random_samples(model) if samples is None else samples
+    cases = _load_cases(model, loads)
+    factor = r_factor(model, samples, cases)
+    split = _clean(split_columns(factor, [np.array([k]) for k in preference(model)], tolerance))
+    return _describe(model, split, factor, len(cases) * len(samples.q))
+
+
+def regroup(base: Base, model: IdentificationModel, samples: Samples | None = None, loads: Loads | None = None) -> Base:
+    """Recompute K on another geometry (the calibrated chain), the columns kept: W_dropped ≈ W_kept K, least squares.
+
+    The remainder says how well that holds over the samples. Columns without effect on the nominal chain (on the
+    calibrated one a small one) take part; the singular values are those of the new geometry.
+    """
+    _require_same(base, model)
+    samples = random_samples(model) if samples is None else samples
+    cases = _load_cases(model, loads)
+    factor = r_factor(model, samples, cases)
+    kept, dropped = base.split.kept, base.split.dropped
+    silent, scale = _norms(factor)
+    scaled = np.where(silent, 0.0, factor / scale)
+    found = np.linalg.lstsq(scaled[:, kept], scaled[:, dropped], rcond=None)[0]
+    split = replace(
+        base.split,
+        coefficients=frozen(found * scale[dropped] / scale[kept][:, None]),
+        without_effect=frozen(np.flatnonzero(silent), int),
+        singular_values=frozen(np.linalg.svd(scaled, compute_uv=False)),
+    )
+    return _describe(model, _clean(split), factor, len(cases) * len(samples.q))
+
+
+def preference(model: IdentificationModel) -> np.ndarray:
+    """Return all columns in the order they are tried: of moving links what Khalil keeps, drives, the rest, payloads."""
+    bodies = model.tree
+    first: list[int] = []
+    late: list[int] = []
+    fixed: list[int] = []
+    for i in range(0 if model.kind == "drive" else bodies.bodies):
+        if bodies.kinds[i] == FIXED:
+            fixed += range(10 * i, 10 * i + 10)
+            continue
+        last = KEPT_LAST["prismatic" if bodies.kinds[i] == PRISMATIC else "revolute"]
+        for c in range(10):
+            (late if c in last else first).append(10 * i + int(bodies.order[i, c]))
+    inertial = len(first) + len(late) + len(fixed)
+    return np.array([*first, *range(inertial, model.p), *late, *fixed], dtype=int)
+
+
+def r_factor(model: IdentificationModel, samples: Samples, loads: Loads = (None,)) -> np.ndarray:
+    """Return the R factor (p, p) of the observation matrix over samples and load cases, block by block.
+
+    One triangle per torque row is updated with the columns that row can see at all (a joint does not feel the links
+    before it), then all are stacked: memory is bounded by a block, whatever the number of samples.
+    """
+    p = model.p
+    triangles = np.zeros((model.rows, p, p))
+    for start in range(0, len(samples.q), BLOCK):
+        part = slice(start, start + BLOCK)
+        for carried in loads:
+            block = model.regressor(
+                samples.q[part], samples.v[part], samples.a[part], samples.load[part], carried, samples.states[:, part]
+            )
+            for row in range(model.rows):
+                triangles[row] = _updated(triangles[row], block.transpose(2, 1, 0)[:, row])
+    return retriangulate(triangles.reshape(-1, p))
+
+
+def expressions(base: Base, digits: int = 4, smallest: float = 1e-4) -> tuple[str, ...]:
+    """Return what each base parameter stands for, e.g. ``ZZ1R = ZZ1 + YY2``.
+
+    Args:
+        digits: significant digits of the coefficients.
+        smallest: coefficients below are left out (on a calibrated geometry nearly all are there, and small).
+    """
+    lines = []
+    for name, k, row in zip(base.names, base.kept, base.split.coefficients):
+        text = base.standard[k]
+        for coefficient, index in zip(row, base.split.dropped):
+            if abs(coefficient) < smallest:
+                continue
+            size = f"{abs(coefficient):.{digits}g}"
+            factor = "" if size == "1" else f"{size} "
+            text += f" {'-' if coefficient < 0 else '+'} {factor}{base.standard[index]}"
+        lines.append(f"{name} = {text}")
+    return tuple(lines)
+
+
+def to_standard(base: Base, values: np.ndarray) -> np.ndarray:
+    """Return standard parameters (p,) with the same torques: base values at the kept ones, zero at the others."""
+    result = np.zeros(len(base.standard))
+    result[base.kept] = shaped(values, (base.b,), "base parameters")
+    return result
+
+
+def _load_cases(model: IdentificationModel, loads: Loads | None) -> Loads:
+    """Return the load cases: all payloads and none, where the model has payloads."""
+    if loads is not None:
+        return loads
+    return (None, ()) if model.kind != "drive" and np.any(model.tree.kinds == FIXED) else (None,)
+
+
+def _updated(triangle: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Return the R factor of [triangle; columnsᵀ] (p, p); columns (p, N)."""
+    live = np.flatnonzero(columns.any(axis=1) | triangle.any(axis=0))
+    stacked = np.empty((len(columns) + columns.shape[1], len(live)), order="F")
+    stacked[: len(columns)] = triangle[:, live]
+    stacked[len(columns) :] = columns[live].T
+    result = np.zeros_like(triangle)
+    result[: len(live), live] = retriangulate(stacked)
+    return result
+
+
+def _clean(split: ColumnSplit) -> ColumnSplit:
+    """Return the split with coefficients that are rounding set to zero."""
+    coefficients = np.array(split.coefficients)
+    size = np.abs(coefficients).max(axis=0, initial=0.0)
+    coefficients[np.abs(coefficients) <= NEGLIGIBLE * size] = 0.0
+    coefficients[:, np.isin(split.dropped, split.without_effect)] = 0.0
+    near = np.abs(coefficients - np.round(coefficients)) <= NEGLIGIBLE
+    return replace(split, coefficients=frozen(np.where(near, np.round(coefficients), coefficients)))
+
+
+def _norms(factor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return which columns are without effect, and the norms of the others (1 for these)."""
+    norms = np.linalg.norm(factor, axis=0)
+    silent = norms <= 1e-12 * norms.max(initial=0.0)
+    return silent, np.where(silent, 1.0, norms)
+
+
+def _describe(model: IdentificationModel, split: ColumnSplit, factor: np.ndarray, samples: int) -> Base:
+    """Return the base with ‖W_d - W_k K‖ per dropped column, relative and as rms torque."""
+    silent, scale = _norms(factor)
+    rest = np.linalg.norm(factor[:, split.dropped] - factor[:, split.kept] @ split.coefficients, axis=0)
+    rest[silent[split.dropped]] = 0.0
+    lost = rest / np.sqrt(samples * model.rows)
+    return Base(model.kind, model.names, model.units, split, frozen(rest / scale[split.dropped]), frozen(lost))
+
+
+def _require_same(base: Base, model: IdentificationModel) -> None:
+    if (base.kind, base.standard) != (model.kind, model.names):
+        raise CalibError("the base parameters belong to another model: its kind or its parameters' names differ")

@@ -1,0 +1,253 @@
+"""Base parameters: the counts of the literature, the regrouping formulas of the LWR4+, prediction unchanged."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from arms import motley, physical, states
+from differences import check
+
+from calib.dynamics import base, drives, friction, model, rigid_body
+from calib.dynamics.idim import MODELS, IdentificationModel
+from calib.dynamics.tree import standard_parameters, tree, with_gravity, with_payload
+from calib.errors import CalibError
+from calib.robot.load import load
+from calib.simulation import lwr4plus
+
+SENSED = "Ia Fvl Fcl offl Fvm Fcm offm"
+
+
+@cache
+def arm(kind, tilted=False):
+    """The study's model: seven joints with torque sensors, payload as body 8, its drive parameters counted too."""
+    chain = load("lwr4plus")
+    bodies = with_payload(tree(chain), chain.tail)
+    bodies = with_gravity(bodies, np.array([1.0, 2.0, -9.5])) if tilted else bodies
+    return IdentificationModel(bodies, drives.standard([SENSED] * 7) + drives.without_effect("8"), kind)
+
+
+@cache
+def found(kind):
+    return base.find(arm(kind))
+
+
+def test_counts_of_model_2():
+    """136 standard, 18 without effect, 16 regrouped, 102 base (Kolyubin, Shiriaev, Jubien 2019, section 6.2)."""
+    result = found("both")
+    assert (len(result.standard), len(result.without_effect), len(result.regrouped), result.b) == (136, 18, 16, 102)
+    assert result.split.gap > 1e9
+    silent = "XX1 XY1 XZ1 YY1 YZ1 MX1 MY1 MZ1 M1 M2 MZ2 Ia8 Fvl8 Fcl8 offl8 Fvm8 Fcm8 offm8"
+    assert set(result.without_effect) == set(silent.split())
+    late = [f"{name}{j}" for j in range(3, 8) for name in ("YY", "MZ", "M")]
+    assert set(result.regrouped) == {"YY2", *late}
+
+
+@pytest.mark.parametrize(("kind", "count"), [("link", 74), ("both", 102), ("drive", 28), ("motor", 79)])
+def test_counts_of_models_1_2_3_and_of_motor_torques_alone(kind, count):
+    assert found(kind).b == count
+    assert MODELS == {1: "link", 2: "both", 3: "drive"}
+
+
+@pytest.mark.parametrize("case", [None, ()])
+def test_one_load_case_leaves_the_payload_in_the_links(case):
+    assert base.find(arm("both"), loads=(case,)).b == 92
+
+
+def test_tilted_gravity_adds_two():
+    result = base.find(arm("both", tilted=True))
+    assert result.b == 104
+    assert {"MX1", "MY1"} <= {name.rstrip("R") for name in result.names}
+
+
+@pytest.mark.parametrize(
+    ("robot", "sets", "count"),
+    [
+        ("lwr4plus", "", 43),
+        ("ur5", "", 36),
+        ("ur5", "Ia", 40),
+        ("tx40", "Ia Fv Fc", 52),
+        ("rv2sq", "Ia Fv Fc", 52),
+    ],
+)
+def test_counts_of_other_arms(robot, sets, count):
+    chain = load(robot)
+    assert base.find(IdentificationModel(tree(chain), drives.standard([sets] * chain.n))).b == count
+
+
+@pytest.mark.parametrize(("sets", "count"), [("Ia Fv Fc", 54), ("Ia Fv Fc off", 60)])
+def test_counts_of_the_coupled_wrist(sets, count):
+    terms = drives.standard([sets] * 6) + drives.coupled(4, 5)[1:]
+    assert base.find(IdentificationModel(tree(load("tx40")), terms)).b == count
+
+
+R3, R5 = 0.40, 0.39
+OUTER3, OUTER5 = ("M3", "M4", "M5", "M6", "M7"), ("M5", "M6", "M7")
+FORMULAS = {
+    "ZZ1": {"YY2": 1},
+    "XX2": {"YY2": -1, "YY3": 1, "MZ3": 2 * R3} | dict.fromkeys(OUTER3, R3**2),
+    "ZZ2": {"YY3": 1, "MZ3": 2 * R3} | dict.fromkeys(OUTER3, R3**2),
+    "MY2": {"MZ3": 1} | dict.fromkeys(OUTER3, R3),
+    "XX3": {"YY3": -1, "YY4": 1},
+    "ZZ3": {"YY4": 1},
+    "MY3": {"MZ4": 1},
+    "XX4": {"YY4": -1, "YY5": 1, "MZ5": 2 * R5} | dict.fromkeys(OUTER5, R5**2),
+    "ZZ4": {"YY5": 1, "MZ5": 2 * R5} | dict.fromkeys(OUTER5, R5**2),
+    "MY4": {"MZ5": -1} | dict.fromkeys(OUTER5, -R5),
+    "XX5": {"YY5": -1, "YY6": 1},
+    "ZZ5": {"YY6": 1},
+    "MY5": {"MZ6": -1},
+    "XX6": {"YY6": -1, "YY7": 1},
+    "ZZ6": {"YY7": 1},
+    "MY6": {"MZ7": 1},
+    "XX7": {"YY7": -1},
+}
+
+
+def test_regrouping_of_the_lwr():
+    """The formulas that symbolic elimination gives (Khalil & Kleinfinger 1987), every coefficient of all 102 rows."""
+    result = found("both")
+    wanted = np.zeros((result.b, 136))
+    for row, k in enumerate(result.kept):
+        wanted[row, k] = 1.0
+        for name, coefficient in FORMULAS.get(result.standard[k], {}).items():
+            wanted[row, result.standard.index(name)] = coefficient
+    assert np.allclose(result.transform, wanted, rtol=0, atol=1e-12)
+    lines = base.expressions(result)
+    assert "ZZ1R = ZZ1 + YY2" in lines and "MY2R = MY2 + MZ3 + 0.4 M3 + 0.4 M4 + 0.4 M5 + 0.4 M6 + 0.4 M7" in lines
+    assert {name[:-1] for name in result.names if name.endswith("R")} == set(FORMULAS)
+
+
+@pytest.mark.parametrize("kind", ["motor", "both"])
+def test_base_parameters_predict_what_the_standard_ones_do(kind):
+    full, result = arm(kind), found(kind)
+    chi = np.random.default_rng(0).normal(size=full.p)
+    q, v, a = states(7)
+    wanted = full.regressor(q, v, a) @ chi
+    reduced = base.BaseModel(full, result)
+    beta = result.transform @ chi
+    assert np.allclose(reduced.regressor(q, v, a) @ beta, wanted, rtol=0, atol=1e-11)
+    assert np.allclose(full.regressor(q, v, a) @ base.to_standard(result, beta), wanted, rtol=0, atol=1e-11)
+    assert reduced.names == result.names and len(reduced.units) == result.b
+
+
+def test_inertia_matrix_survives_the_regrouping():
+    """Dropped parameters at zero leave M(q) as it is: a base estimate can be simulated."""
+    chain = load("tx40")
+    full = IdentificationModel(tree(chain))
+    result, chi = base.find(full), standard_parameters(chain)
+    q = states(6)[0]
+    wanted = rigid_body.mass_matrix(full.tree, chi, q)
+    values = base.to_standard(result, result.transform @ chi)
+    assert np.allclose(rigid_body.mass_matrix(full.tree, values, q), wanted, rtol=0, atol=1e-12)
+
+
+def test_gradient_through_the_base_columns():
+    reduced = base.BaseModel(arm("both"), found("both"))
+    rng = np.random.default_rng(1)
+    x, weights = rng.normal(size=21), rng.normal(size=(1, 14, 102))
+    smooth = np.array(["Fc" not in name for name in reduced.names])  # tanh(100 v) is too steep for differences
+    weights = weights * smooth
+    slopes = reduced.regressor_gradient(*x.reshape(3, 1, 7), weights)
+    check(
+        lambda x: np.sum(weights * reduced.regressor(*x.reshape(3, 1, 7))),
+        np.concatenate([g[0] for g in slopes]),
+        x,
+    )
+
+
+def test_regrouping_on_the_calibrated_geometry():
+    """The nominal columns stay, K moves (LWR4+ of the 2019 study, Table 2, rows 2 to 7), and it holds exactly."""
+    nominal = IdentificationModel(tree(load("lwr4plus")))
+    calibrated = IdentificationModel(tree(lwr4plus.arm(lwr4plus.table_2()[1])))
+    first = base.find(nominal)
+    second = base.regroup(first, calibrated)
+    assert np.array_equal(first.kept, second.kept) and first.names != second.names
+    assert first.remainder.max() < 1e-9 and second.remainder.max() < 1e-9
+    assert 1e-3 < np.abs(second.transform - first.transform).max() < 0.1
+    q, v, a = states(7, 200)
+    chi = standard_parameters(load("lwr4plus"))
+    wanted = calibrated.regressor(q, v, a) @ chi
+    old, new = (base.BaseModel(calibrated, one).regressor(q, v, a) @ (one.transform @ chi) for one in (first, second))
+    assert np.allclose(new, wanted, rtol=0, atol=1e-8)
+    assert np.abs(old - wanted).max() > 1e-2
+
+
+def test_a_leaning_axis_adds_weak_directions_and_the_remainder_says_what_they_carry():
+    """Axis 1 at 1 mrad from the vertical: rank 43 -> 45 by columns of about 0.01 N m per kg m, left out and reported."""
+    chain = load("lwr4plus")
+    leaning = IdentificationModel(with_gravity(tree(chain), 9.81 * np.array([np.sin(1e-3), 0.0, -np.cos(1e-3)])))
+    first = base.find(IdentificationModel(tree(chain)))
+    second = base.regroup(first, leaning)
+    assert base.find(leaning).b == 45
+    assert second.split.singular_values[45] < 1e-12 * second.split.singular_values[0]
+    names = [second.standard[k] for k in second.split.dropped]
+    assert second.without_effect and {"MX1", "MY1"}.isdisjoint(second.without_effect)
+    sideways = second.lost[names.index("MX1")]  # one of seven rows feels 9.81 sin(1e-3) sin(q1) per kg m
+    assert np.isclose(sideways, 9.81e-3 / np.sqrt(2 * 7), rtol=0.2)
+
+
+def test_memory_stays_bounded_and_blocks_do_not_matter(monkeypatch):
+    full = IdentificationModel(tree(load("ur5")))
+    samples = base.random_samples(full, 300)
+    whole = base.r_factor(full, samples)
+    monkeypatch.setattr(base, "BLOCK", 64)
+    parts = base.r_factor(full, samples)
+    assert np.allclose(parts.T @ parts, whole.T @ whole, rtol=0, atol=1e-9 * np.abs(whole).max() ** 2)
+    sizes = []
+    original = IdentificationModel.regressor
+
+    def watched(self, *states):
+        result = original(self, *states)
+        sizes.append(len(result))
+        return result
+
+    monkeypatch.setattr(IdentificationModel, "regressor", watched)
+    base.r_factor(full, samples)
+    assert max(sizes) == 64 and sum(sizes) == 300
+
+
+@pytest.mark.parametrize("name", ["motley", "motley with payload"])
+def test_prismatic_joints_and_tilted_gravity(name):
+    """The rank of the whole matrix is what the search in order finds, and the prediction stays exact."""
+    chain = motley()
+    bodies = with_payload(tree(chain), np.eye(4)) if "payload" in name else tree(chain)
+    full = IdentificationModel(bodies)
+    result = base.find(full)
+    q, v, a = states(5, 300)
+    cases = (
+        [full.regressor(q, v, a), full.regressor(q, v, a, carried=())]
+        if "payload" in name
+        else [full.regressor(q, v, a)]
+    )
+    matrix = np.concatenate([case.reshape(-1, full.p) for case in cases])
+    assert result.b == np.linalg.matrix_rank(matrix, tol=1e-9 * np.linalg.norm(matrix))
+    chi = physical(bodies.bodies).ravel()
+    for case in cases:
+        assert np.allclose(case[:, :, result.kept] @ (result.transform @ chi), case @ chi, rtol=0, atol=1e-10)
+    moved = [k for k in range(50, 60) if k in result.kept] if "payload" in name else range(10)
+    assert "payload" not in name or len(moved) == 10
+
+
+def test_counts_do_not_depend_on_the_frames():
+    """The TIAGo-like arm of axes x, y, z keeps as many columns as Pinocchio's regressor has rank."""
+    chain = motley(7)
+    q, v, a = states(5, 200)
+    matrix = model.regressor(chain, q, v, a).reshape(-1, 50)
+    assert base.find(IdentificationModel(tree(chain))).b == np.linalg.matrix_rank(
+        matrix, tol=1e-9 * np.linalg.norm(matrix)
+    )
+
+
+def test_richer_friction_has_columns_of_its_own():
+    chain = load("ur5")
+    rich = friction.asymmetric(1) + friction.load_dependent(1) + friction.presliding(1, [0.01, 0.05])
+    plain = IdentificationModel(tree(chain), drives.standard(["Ia Fv Fc off"] * 6))
+    full = IdentificationModel(tree(chain), plain.terms + rich)
+    assert base.find(full).b == base.find(plain).b + 4
+
+
+def test_base_of_another_model_is_refused():
+    with pytest.raises(CalibError, match="another model"):
+        base.BaseModel(arm("motor"), found("both"))
+    with pytest.raises(CalibError, match="another model"):
+        base.regroup(found("both"), arm("motor"))
