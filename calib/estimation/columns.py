@@ -10,6 +10,8 @@ import scipy.linalg
 
 from calib.arrays import frozen
 
+TIE = 1e-3  # columns of nearly equal norm enter in their own order
+
 
 @dataclass(frozen=True, eq=False)
 class ColumnSplit:
@@ -49,7 +51,8 @@ def split_columns(
 ) -> ColumnSplit:
     """Choose independent columns of W by pivoted QR, groups of columns in order of preference.
 
-    Within a group the columns enter by pivoted QR (Gautier 1991); a later group only adds what the earlier ones leave.
+    Within a group the columns enter by pivoted QR (Gautier 1991), of two alike the earlier one first (so that rounding
+    does not choose); a later group only adds what the earlier ones leave.
     Columns are scaled to unit norm first, except those of negligible norm, which have no effect (scaling a column of
     1e-17 would turn rounding into information).
 
@@ -95,6 +98,7 @@ def _pick(scaled: np.ndarray, groups: list[np.ndarray], silent: np.ndarray, tole
         rest = scaled[:, candidates]
         for _ in range(2):  # twice is enough (Kahan): orthogonal to rounding
             rest = rest - basis @ (basis.T @ rest)
+        rest = rest * (1.0 - TIE * np.arange(len(candidates)) / len(candidates))
         q, r, order = (np.asarray(x) for x in scipy.linalg.qr(rest, mode="economic", pivoting=True))
         count = int(np.sum(np.abs(np.diag(r)) > tolerance))
         kept.extend(candidates[order[:count]])

@@ -115,12 +115,15 @@ def _loose(found: GeometricFit) -> list[str]:
 
 
 def _confused(found: GeometricFit, own: list[int], index: dict[str, int]) -> str:
-    """Return the station whose estimate correlates by more than 0.95 with the tool's; empty for none."""
-    sigma = np.where(found.estimate.sigma > 0, found.estimate.sigma, 1.0)
-    correlation = np.abs(found.estimate.covariance) / np.outer(sigma, sigma)
+    """Return the station whose estimate trades with the tool's (canonical correlation above 0.95); empty for none."""
+    covariance = found.estimate.covariance
     for station in found.cell.station_names:
         theirs = [k for name, k in index.items() if name.rsplit(".", 1)[0] == station]
-        if theirs and correlation[np.ix_(own, theirs)].max() > 0.95:
+        if not theirs:
+            continue
+        roots = [np.linalg.cholesky(covariance[np.ix_(part, part)]) for part in (own, theirs)]
+        cross = np.linalg.solve(roots[0], covariance[np.ix_(own, theirs)])
+        if np.linalg.norm(np.linalg.solve(roots[1], cross.T), 2) > 0.95:
             return station
     return ""
 

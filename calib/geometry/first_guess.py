@@ -17,17 +17,20 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.data.measurements import PoseMeasurements
+from calib.data.measurements import PoseMeasurements, take
 from calib.errors import MeasurementError
+from calib.geometry.deflection import Deflection
 from calib.geometry.installation import Installation
 from calib.geometry.observation import has_instrument
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from calib.transforms import invert, orthonormal, pose
 
+ENOUGH = 300  # rows of a block that a guess is made from (our choice)
 
-def install(chain: Chain, measured: Sequence[PoseMeasurements]) -> Installation:
-    """Return the nominal arm with stations and tools placed by the measurements.
+
+def install(chain: Chain, measured: Sequence[PoseMeasurements], known: Deflection | None = None) -> Installation:
+    """Return the nominal arm, with deflections known from an earlier fit, stations and tools placed by measurements.
 
     A tool seen in several blocks takes its guess from the block that tells most (poses before positions before the
     rest, then the most rows); a station likewise. Tools that no block can place start at the tip.
@@ -39,6 +42,7 @@ def install(chain: Chain, measured: Sequence[PoseMeasurements]) -> Installation:
     tools: dict[str, np.ndarray] = {}
     rank = {"pose": 0, "position": 1, "sockets": 2}
     for block in sorted(measured, key=lambda b: (rank.get(b.kind, 3), -len(b))):
+        block = take(block, np.unique(np.linspace(0, len(block) - 1, ENOUGH).astype(int)))
         arm = forward(chain, block.q)
         for number in np.unique(block.tool):
             name, rows = block.tool_names[number], block.tool == number
@@ -54,6 +58,7 @@ def install(chain: Chain, measured: Sequence[PoseMeasurements]) -> Installation:
         np.array([tools.get(name, np.eye(4)) for name in tool_names]),
         station_names,
         tool_names,
+        known=known or Deflection(),
     )
 
 

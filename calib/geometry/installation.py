@@ -23,7 +23,8 @@ class Installation:
         stations: (S, 4, 4) poses of the arm's base in each instrument's frame.
         tools: (T, 4, 4) poses of each target in the tip's frame.
         station_names, tool_names: S and T strings.
-        deflection: what q does not say (stiffness, coupling, harmonics).
+        deflection: what q does not say (stiffness, coupling, harmonics), to be fitted.
+        known: deflections found earlier, which stay as they are.
     """
 
     chain: Chain
@@ -32,10 +33,21 @@ class Installation:
     station_names: tuple[str, ...] = ("station",)
     tool_names: tuple[str, ...] = ("tool",)
     deflection: Deflection = field(default_factory=Deflection)
+    known: Deflection = field(default_factory=Deflection)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "stations", frozen(self.stations))
         object.__setattr__(self, "tools", frozen(self.tools))
+
+
+def merged(cell: Installation) -> Installation:
+    """Return the same installation with known and fitted deflections as one."""
+    if not cell.known.terms:
+        return cell
+    terms = (*cell.known.terms, *cell.deflection.terms)
+    values = np.concatenate([np.asarray(cell.known.coefficients), np.asarray(cell.deflection.coefficients)])
+    reference = cell.known.reference if cell.deflection.reference is None else cell.deflection.reference
+    return replace(cell, deflection=Deflection(terms, values, reference), known=Deflection())
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,19 +70,27 @@ class Seen:
 
 
 def see(
-    cell: Installation, q: np.ndarray, station: int = 0, tool: np.ndarray | int = 0, bases: np.ndarray | None = None
+    cell: Installation,
+    q: np.ndarray,
+    station: int = 0,
+    tool: np.ndarray | int = 0,
+    bases: np.ndarray | None = None,
+    given: np.ndarray | None = None,
 ) -> Seen:
     """Predict what an instrument sees at joint values q (m, n).
 
     Args:
         cell: the installation.
         q: (m, n) [rad or m].
-        station: index of the instrument placement.
+        station: index of the instrument placement; -1 for the arm's base frame.
         tool: index of the target, one or (m,).
         bases: (E, m) of the deflection's terms at q; evaluated here where None.
+        given: (K, m) displacements by the known deflections; evaluated here where None.
     """
     extra = extra_displacements(cell.chain, cell.deflection, q, bases)
-    walked = sweep(cell.chain, q, cell.stations[station], extra)
+    given = extra_displacements(cell.chain, cell.known, q) if given is None else given
+    extra = given if extra is None else extra if given is None else extra + given
+    walked = sweep(cell.chain, q, None if station < 0 else cell.stations[station], extra)
     if len(cell.tools) == 1 or np.ndim(tool) == 0:
         placement = cell.tools[0 if len(cell.tools) == 1 else int(np.asarray(tool))]
         flat = walked.rotation.reshape(3, -1)

@@ -22,10 +22,11 @@ class Block:
 
     Attributes:
         measured: m rows.
-        station: index of their station; unused by kinds without an instrument.
+        station: index of their station; -1 for kinds without an instrument, which are seen from the arm's base.
         tool: (m,) index of each row's target among the installation's tools.
         torque: (m, n) gravity torques [N m], or None.
         bases: (E, m) the deflection's bases, evaluated once.
+        given: (K, m) displacements by the known deflections, or None.
     """
 
     measured: PoseMeasurements
@@ -33,6 +34,7 @@ class Block:
     tool: np.ndarray
     torque: np.ndarray | None = None
     bases: np.ndarray | None = None
+    given: np.ndarray | None = None
 
 
 def prepare(
@@ -46,10 +48,12 @@ def prepare(
     blocks = []
     for number, block in enumerate(measured):
         torque = torques[number] if torques is not None else None
-        station = _index(cell.station_names, block.station, "station") if has_instrument(block) else 0
+        station = _index(cell.station_names, block.station, "station") if has_instrument(block) else -1
         tools = np.array([_index(cell.tool_names, name, "tool") for name in block.tool_names])
         bases = deflection.evaluate(cell.deflection, block.q, torque) if cell.deflection.terms else None
-        blocks.append(Block(block, station, tools[block.tool], torque, bases))
+        known = deflection.evaluate(cell.known, block.q, torque) if cell.known.terms else None
+        given = deflection.extra_displacements(cell.chain, cell.known, block.q, known)
+        blocks.append(Block(block, station, tools[block.tool], torque, bases, given))
     return blocks
 
 
@@ -66,7 +70,7 @@ def _index(names: tuple[str, ...], name: str, what: str) -> int:
 
 def predict(cell: Installation, block: Block) -> Seen:
     """Return what the instrument should see in a block."""
-    return see(cell, block.measured.q, block.station, block.tool, block.bases)
+    return see(cell, block.measured.q, block.station, block.tool, block.bases, block.given)
 
 
 def observe(cell: Installation, block: Block, free: np.ndarray) -> list[Part]:
@@ -88,7 +92,7 @@ def target_jacobian(cell: Installation, block: Block, seen: Seen, free: np.ndarr
         jacobian[in_arm] = element_jacobian(cell.chain, seen.walked, seen.point, free[in_arm])
     for place in np.flatnonzero(section == 1):
         number, axis = divmod(int(free[place]) - arm, 6)
-        if number == block.station and has_instrument(block.measured):
+        if number == block.station:
             _station_column(jacobian[place], cell.stations[number], seen, axis)
     for place in np.flatnonzero(section == 2):
         number, axis = divmod(int(free[place]) - arm - stations, 6)

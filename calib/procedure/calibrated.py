@@ -27,7 +27,7 @@ import numpy as np
 
 from calib.errors import RobotError
 from calib.geometry.deflection import Deflection, Term
-from calib.geometry.installation import Installation
+from calib.geometry.installation import Installation, merged
 from calib.robot import description
 from calib.robot.chain import Chain
 from calib.robot.tables import check_keys, number, placement, placement_table, vector
@@ -35,6 +35,7 @@ from calib.robot.tables import check_keys, number, placement, placement_table, v
 
 def tables(cell: Installation) -> dict[str, Any]:
     """Return the tables ``station``, ``tool`` and, where there are terms, ``deflection`` of an installation."""
+    cell = merged(cell)
     result: dict[str, Any] = {
         "station": [{"name": n, **placement_table(t)} for n, t in zip(cell.station_names, cell.stations)],
         "tool": [{"name": n, **placement_table(t)} for n, t in zip(cell.tool_names, cell.tools)],

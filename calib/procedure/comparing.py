@@ -93,5 +93,5 @@ def compare_unseen(
 
 def place(cell: Installation, block: PoseMeasurements, torques: Torques, settings: Settings) -> Installation:
     """Return an arm, deflections included, with base and tool placement fitted on a block and nothing else."""
-    start = replace(install(cell.chain, [block]), deflection=cell.deflection)
+    start = replace(install(cell.chain, [block], cell.known), deflection=cell.deflection)
     return polish_frames(start, [block], settings, torques).cell

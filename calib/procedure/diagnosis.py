@@ -69,6 +69,15 @@ def plateau(found: Climb, reach: float) -> str:
     )
 
 
+def remains(found: Climb, reach: float) -> bool:
+    """Say whether the chosen model, joint corrections included, leaves more than `FLOOR` of the reach on rows left out.
+
+    Where it does not, that no rigid geometry explains the measurements is a remark, and no ground to doubt the model.
+    """
+    kept = [rung.cross_validated for rung in found.rungs if rung.kept]
+    return not kept or kept[-1] > FLOOR * reach
+
+
 def _file_rows(block: PoseMeasurements) -> np.ndarray:
     assert block.rows is not None
     return block.rows

@@ -18,7 +18,7 @@ from calib.geometry.ladder import Climb, climb
 from calib.geometry.parameters import layout
 from calib.geometry.weighing import Settings, combine
 from calib.procedure.comparing import Comparison, compare, compare_unseen
-from calib.procedure.diagnosis import Outlier, named_outliers, plateau
+from calib.procedure.diagnosis import Outlier, named_outliers, plateau, remains
 from calib.procedure.inputs import Inputs
 from calib.procedure.verdict import Verdict, judge
 from calib.robot.chain import Chain
@@ -83,7 +83,7 @@ def run(
     settings = combine(Settings(), loss=loss or options.loss, loss_scale=options.loss_scale)
     asked = model or options.model
     say("placing the instrument and the tool")
-    start = install(inputs.chain, inputs.fit)
+    start = install(inputs.chain, inputs.fit, inputs.known)
     torques = [gravity_of(inputs.chain, block) for block in inputs.fit]
     found = climb(
         start,
@@ -114,7 +114,7 @@ def run(
         asked=asked,
         cross_validated=cross_validated(found),
         outlier_share=len({(each.file, each.row) for each in named}) / sum(len(block) for block in inputs.fit),
-        unexplained=unexplained,
+        unexplained=unexplained if remains(found, reach(inputs.chain)) else "",
     )
     notes = (*inputs.notes, *(note for block in inputs.fit for note in block.notes), *elsewhere(fitted, validation))
     warnings = (*notes, *((unexplained,) if unexplained else ()), *diagnose(found.fit))

@@ -12,6 +12,8 @@ from calib.data.measurements import PoseMeasurements, take
 from calib.data.options import FitOptions, check_files
 from calib.data.pose_files import joint_columns, read_measurements
 from calib.errors import MeasurementError, UsageError
+from calib.geometry.deflection import Deflection
+from calib.procedure import calibrated
 from calib.robot import description
 from calib.robot.chain import Chain, Joint
 from calib.robot.load import load, resolve
@@ -46,6 +48,7 @@ class Inputs:
         fit: blocks to fit on.
         unseen: by the name of the file they come from.
         notes: what a user should know about how the files were understood.
+        known: deflections that came with the robot, from an earlier fit.
     """
 
     chain: Chain
@@ -53,6 +56,7 @@ class Inputs:
     fit: tuple[PoseMeasurements, ...]
     unseen: Mapping[str, Unseen] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    known: Deflection = field(default_factory=Deflection)
 
 
 def gather(
@@ -111,7 +115,10 @@ def gather(
             own = refit_frames
             shared = block if own else _shared(block, fit, notes)
             unseen[_free_name(unseen, block.file)] = Unseen(shared, own_frames=own, seen=again)
-    return Inputs(chain, source, tuple(fit), unseen, tuple(notes))
+    known = calibrated.read(source).deflection if source.suffix == ".toml" else Deflection()
+    if known.terms:
+        notes.append(f"{robot} brings {len(known.terms)} deflection terms of an earlier fit; they stay as they are")
+    return Inputs(chain, source, tuple(fit), unseen, tuple(notes), known)
 
 
 def load_robot(

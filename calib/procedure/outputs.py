@@ -13,6 +13,7 @@ import numpy as np
 from calib import files
 from calib.errors import UsageError
 from calib.geometry.deflection import Deflection
+from calib.geometry.installation import merged
 from calib.procedure import calibrated
 from calib.procedure.estimates import HEADER, estimate_table
 from calib.procedure.fitting import Outcome
@@ -101,8 +102,9 @@ def _write_all(outcome: Outcome, folder: Path) -> None:
     rows = ([name, *map(float, row)] for name, row in zip(table.names, table.covariance))
     files.write_table(folder / "covariance.csv", ("name", *table.names), rows)
     write_residuals(outcome, folder / "residuals.csv")
-    if fit.cell.deflection.terms:
-        write_corrections(fit.cell.chain, fit.cell.deflection, folder)
+    whole = merged(fit.cell)
+    if whole.deflection.terms:
+        write_corrections(whole.chain, whole.deflection, folder)
     files.write_json(folder / "metrics.json", metrics(outcome))
 
 

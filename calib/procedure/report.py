@@ -20,7 +20,7 @@ from calib.estimation.estimate import strong_correlations
 from calib.geometry.observation import has_instrument, predict, prepare
 from calib.geometry.parameters import layout
 from calib.procedure.comparing import Comparison
-from calib.procedure.diagnosis import plateau
+from calib.procedure.diagnosis import plateau, remains
 from calib.procedure.estimates import estimate_table
 from calib.procedure.fitting import Outcome, cross_validated, reach
 from calib.procedure.outputs import metrics
@@ -98,12 +98,12 @@ def collect(outcome: Outcome) -> Report:
 
 
 def _judged(outcome: Outcome) -> dict[str, Any]:
-    rows = sum(len(block) for block in outcome.inputs.fit)
+    rows, long = sum(len(block) for block in outcome.inputs.fit), reach(outcome.inputs.chain)
     return {
         "model": outcome.climb.chosen,
         "cross_validated": cross_validated(outcome.climb),
         "outlier_share": len({(each.file, each.row) for each in outcome.outliers}) / rows,
-        "unexplained": plateau(outcome.climb, reach(outcome.inputs.chain)),
+        "unexplained": plateau(outcome.climb, long) if remains(outcome.climb, long) else "",
     }
 
 

@@ -40,7 +40,8 @@ def judge(
     1. only frames were asked for: pass, with nothing claimed of the arm;
     2. on any unseen file the calibrated arm is worse than the nominal one: fail;
     3. no unseen rows and no cross-validation: marginal;
-    4. no rigid geometry explains the measurements (`calib.procedure.diagnosis.plateau`): marginal at best;
+    4. no rigid geometry explains the measurements (`calib.procedure.diagnosis.plateau`), and what else the chosen model
+       holds does not explain them either (`remains`): marginal at best;
     5. the gain on the unseen is below `GAIN`: marginal;
     6. unseen errors above `TRANSFER` times the fit's own: marginal;
     7. more than `OUTLIERS` of the rows do not fit: marginal;
