@@ -19,6 +19,7 @@ from calib.errors import CalibError, Unidentifiable
 
 CHUNK = 20_000  # rows per factorisation: bounds the working memory, 16 MB at 100 parameters
 RESOLUTION = 1e-10  # singular values of unit-norm columns below this part of the largest are rounding
+ADVICE = "choose base columns first (columns.split_columns), or add motion that tells them apart"
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,26 +151,29 @@ def solve_triangle(factor: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray
     upper = factor[:p, :p]
     norms = np.linalg.norm(upper, axis=0)
     scaled = upper / np.where(norms > 0.0, norms, 1.0)
-    _, values, vt = np.linalg.svd(scaled)
-    weak = values <= RESOLUTION * values[0]
-    if weak.any():
-        raise _dependent(names, values, vt[weak])
+    values = require_rank(scaled, names)
     inverse = np.asarray(scipy.linalg.solve_triangular(scaled, np.eye(p))) / norms[:, None]
     solution = np.asarray(scipy.linalg.solve_triangular(scaled, factor[:p, p])) / norms
     return solution, inverse, (_ratio(np.linalg.svd(upper, compute_uv=False)), _ratio(values))
 
 
-def _dependent(names: Sequence[str], values: np.ndarray, directions: np.ndarray) -> Unidentifiable:
-    """Return the error that names every column with a part in a null direction."""
-    part = np.linalg.norm(directions, axis=0)
+def require_rank(scaled: np.ndarray, names: Sequence[str], advice: str = ADVICE) -> np.ndarray:
+    """Return the singular values of a matrix with columns of comparable size, or say which columns are dependent.
+
+    Raises:
+        Unidentifiable: naming every column with a part in a null direction.
+    """
+    _, values, vt = np.linalg.svd(scaled)
+    weak = values <= RESOLUTION * values[0] if values[0] > 0.0 else np.ones(len(values), dtype=bool)
+    if not weak.any():
+        return values
+    part = np.linalg.norm(vt[weak], axis=0)
     concerned = [name for name, size in zip(names, part) if size > 0.01]
     shown = ", ".join(concerned[:12]) + (f" and {len(concerned) - 12} more" if len(concerned) > 12 else "")
-    return Unidentifiable(
-        f"{len(directions)} combination(s) of {len(names)} parameters have no effect on the data: {shown}. Choose base "
-        "columns first (columns.split_columns), or add motion that tells them apart",
-        concerned,
-        values,
+    message = (
+        f"{int(weak.sum())} combination(s) of {len(names)} parameters have no effect on the data: {shown}; {advice}"
     )
+    raise Unidentifiable(message, concerned, values)
 
 
 def _update(factor: np.ndarray, matrix: np.ndarray, target: np.ndarray) -> np.ndarray:

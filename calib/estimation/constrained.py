@@ -1,0 +1,243 @@
+"""Least squares under inequalities h(b) >= 0 by a primal-dual interior point, from a triangle of [W y].
+
+min ½ ‖R b - z‖² over h(b) = s, s > 0 with the barrier -ν Σ log s. With R from `triangles.combine` it is constrained
+least squares, with `instruments.projected` the inner problem of PC-IDIM-IV (Janot's slides on the TX40, where the sign
+of the multipliers' term must be read as minus). Constraints add knowledge, not consistency: where they bind at wrong
+values the estimate is biased, and they do not cure the bias of least squares in a loop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from calib.arrays import frozen, shaped
+from calib.errors import CalibError, NotConverged
+from calib.estimation.triangles import require_rank
+
+Vector = Callable[[np.ndarray], np.ndarray]
+Curvature = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+TOLERANCE = 1e-10  # on stationarity, feasibility and gap of the scaled problem
+
+
+@dataclass(frozen=True, eq=False)
+class Constrained:
+    """The optimum, with what is needed to check it.
+
+    Attributes:
+        values: (p,) b.
+        multipliers: (c,) μ >= 0 of the constraints.
+        slack: (c,) h(b).
+        binding: (c,) bool; where the data want to go on, symptom of a constraint too tight or of a biased estimate.
+        stationarity: largest |Rᵀ(R b - z) - Aᵀ μ| with columns of R of unit norm and ‖z‖ = 1.
+        gap: largest μ_i s_i, scaled likewise.
+        covariance: (p, p) unscaled (multiply by σ²), binding constraints taken as equalities.
+        iterations: Newton steps.
+    """
+
+    values: np.ndarray
+    multipliers: np.ndarray
+    slack: np.ndarray
+    binding: np.ndarray
+    stationarity: float
+    gap: float
+    covariance: np.ndarray
+    iterations: int
+
+
+def within(factor: np.ndarray, matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> Constrained:
+    """Minimise ½ ‖R b - z‖² under lower <= A b <= upper; infinite bounds are left out.
+
+    Multipliers, slack and binding come in the order of the finite lower bounds, then the finite upper ones.
+
+    Args:
+        factor: (p + 1, p + 1) triangle [R z; 0 ρ], R of full rank.
+        matrix: A (c, p); the identity for bounds on single parameters.
+        lower, upper: (c,), -inf and inf allowed.
+    """
+    p = len(factor) - 1
+    matrix = shaped(matrix, (None, p), "constraint matrix A")
+    lower, upper = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
+    if lower.shape != (len(matrix),) or upper.shape != lower.shape or np.isnan(lower).any() or np.isnan(upper).any():
+        raise CalibError(f"bounds: expected {len(matrix)} lower and upper ones, none of them NaN")
+    if (lower >= upper).any():
+        worst = int(np.argmax(lower - upper))
+        raise CalibError(f"bounds: lower {lower[worst]:g} is not below upper {upper[worst]:g} in row {worst}")
+    low, high = np.isfinite(lower), np.isfinite(upper)
+    rows = np.vstack([matrix[low], -matrix[high]])
+    offset = np.concatenate([-lower[low], upper[high]])
+    return minimise(factor, lambda b: rows @ b + offset, lambda b: rows)
+
+
+def minimise(
+    factor: np.ndarray, h: Vector, jacobian: Vector, start: np.ndarray | None = None, curvature: Curvature | None = None
+) -> Constrained:
+    """Minimise ½ ‖R b - z‖² under h(b) >= 0.
+
+    Newton steps on the perturbed optimality conditions, solved by QR of [R; √(μ/s) A; √K], K the positive part of
+    -Σ μ_i ∇²h_i; a step goes 0.995 of the way to the boundary and is halved until the merit
+    ½ ‖R b - z‖² - ν Σ log s + κ Σ |h - s| falls. The start need not be feasible.
+
+    Args:
+        factor: (p + 1, p + 1) triangle [R z; 0 ρ], R of full rank.
+        h: b (p,) -> (c,).
+        jacobian: b (p,) -> ∂h/∂b (c, p).
+        start: (p,); None: the unconstrained optimum.
+        curvature: b (p,), μ (c,) -> Σ μ_i ∇²h_i (p, p). None: taken as zero, right for linear h; for a curved one that
+            binds the steps may then converge slowly or not at all.
+
+    Raises:
+        NotConverged: where the constraints contradict each other, or a curved h is not concave.
+    """
+    problem = _scale(factor, h, jacobian, start, curvature)
+    b = problem.start
+    distance = problem.h(b)
+    s = np.full(len(distance), np.abs(distance).max(initial=1e-2))
+    mu = np.full(len(distance), 0.1)
+    for count in range(200):
+        residuals = _residuals(problem, b, s, mu)
+        if max(residuals) <= TOLERANCE:
+            return _result(problem, b, s, mu, residuals, count)
+        if mu.max(initial=0.0) > 1e8:
+            break  # multipliers without bound: no point satisfies all constraints
+        nu = _barrier(s, mu)
+        db, ds, dmu = _newton(problem, b, s, mu, nu)
+        size = _step_size(problem, b, s, mu, db, ds, dmu, nu)
+        b, s, mu = b + size * db, s + size * ds, mu + size * dmu
+    raise NotConverged(
+        f"constrained least squares: the residuals do not fall below {max(residuals):.2g}; the constraints may "
+        "contradict each other, or be curved the wrong way (state the curvature)",
+        b * problem.unit,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Scaled:
+    """The problem in b / unit, with columns of R of unit norm and ‖z‖ = 1."""
+
+    upper: np.ndarray
+    target: np.ndarray
+    unit: np.ndarray
+    length: float
+    rows: np.ndarray
+    start: np.ndarray
+    functions: tuple[Vector, Vector, Curvature | None]
+
+    def h(self, b: np.ndarray) -> np.ndarray:
+        return self.functions[0](b * self.unit) / self.rows
+
+    def jacobian(self, b: np.ndarray) -> np.ndarray:
+        return self.functions[1](b * self.unit) * self.unit / self.rows[:, None]
+
+    def root_curvature(self, b: np.ndarray, mu: np.ndarray) -> np.ndarray:
+        """Return √K (k, p) with K the positive part of -Σ μ_i ∇²h_i."""
+        if self.functions[2] is None:
+            return np.zeros((0, len(b)))
+        bend = self.functions[2](b * self.unit, mu / self.rows) * np.outer(self.unit, self.unit)
+        values, vectors = np.linalg.eigh(-bend)
+        return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+
+
+def _scale(
+    factor: np.ndarray, h: Vector, jacobian: Vector, start: np.ndarray | None, curvature: Curvature | None
+) -> _Scaled:
+    factor = shaped(factor, (len(factor), len(factor)), "triangle [R z]")
+    p = len(factor) - 1
+    norms = np.linalg.norm(factor[:p, :p], axis=0)
+    upper = factor[:p, :p] / np.where(norms > 0.0, norms, 1.0)
+    require_rank(upper, [f"x{k + 1}" for k in range(p)])
+    length = float(np.linalg.norm(factor[:p, p])) or 1.0
+    unit, target = length / norms, factor[:p, p] / length
+    b = np.linalg.solve(upper, target) if start is None else np.asarray(start, dtype=float) / unit
+    rows = np.linalg.norm(jacobian(b * unit) * unit, axis=1)
+    return _Scaled(upper, target, unit, length, np.where(rows > 0.0, rows, 1.0), b, (h, jacobian, curvature))
+
+
+def _residuals(problem: _Scaled, b: np.ndarray, s: np.ndarray, mu: np.ndarray) -> tuple[float, float, float]:
+    """Return stationarity, infeasibility and gap."""
+    slope = problem.upper.T @ (problem.upper @ b - problem.target) - problem.jacobian(b).T @ mu
+    apart = np.abs(problem.h(b) - s).max(initial=0.0)
+    return float(np.abs(slope).max()), float(apart), float(np.max(s * mu, initial=0.0))
+
+
+def _newton(
+    problem: _Scaled, b: np.ndarray, s: np.ndarray, mu: np.ndarray, nu: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the step of b, s and μ."""
+    a, apart, weight = problem.jacobian(b), problem.h(b) - s, np.sqrt(mu / s)
+    bend = problem.root_curvature(b, mu)
+    stacked = np.vstack([problem.upper, weight[:, None] * a, bend])
+    right = np.concatenate(
+        [problem.target - problem.upper @ b, nu / np.sqrt(mu * s) - weight * apart, np.zeros(len(bend))]
+    )
+    db = _least(stacked, right)
+    ds = a @ db + apart
+    return db, ds, (nu - mu * ds) / s - mu
+
+
+def _least(stacked: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solve least squares with rows of very unlike size: heavy rows first and columns pivoted (Powell & Reid 1969).
+
+    Plain QR loses the light rows' digits, and the iteration jams on most problems.
+    """
+    order = np.argsort(-np.abs(stacked).max(axis=1))
+    q, r, pivots = (np.asarray(x) for x in scipy.linalg.qr(stacked[order], mode="economic", pivoting=True))
+    solution = np.empty(stacked.shape[1])
+    solution[pivots] = scipy.linalg.solve_triangular(r, q.T @ right[order])
+    return solution
+
+
+def _barrier(s: np.ndarray, mu: np.ndarray) -> float:
+    """Return ν = 0.1 min(0.05 (1 - ξ) / ξ, 2)³ sᵀμ / c, ξ the least s_i μ_i over their mean (Vanderbei & Shanno 1999).
+
+    Larger where the products are uneven; with a fixed share the iterates crawl along the boundary.
+    """
+    if not len(s):
+        return 0.0
+    mean = float(s @ mu) / len(s)
+    even = float(np.min(s * mu)) / mean
+    return max(mean * max(0.1 * min(0.05 * (1.0 - even) / even, 2.0) ** 3, 1e-3), 0.01 * TOLERANCE)
+
+
+def _step_size(
+    problem: _Scaled, b: np.ndarray, s: np.ndarray, mu: np.ndarray,
+    db: np.ndarray, ds: np.ndarray, dmu: np.ndarray, nu: float,
+) -> float:  # fmt: skip
+    """Return the part of the step that keeps s and μ positive and lowers the merit."""
+    both, change = np.concatenate([s, mu]), np.concatenate([ds, dmu])
+    falling = change < 0.0
+    size = min(1.0, 0.995 * float(np.min(-both[falling] / change[falling], initial=np.inf)))
+    price = 2.0 * float(np.max(np.abs(mu + dmu), initial=0.0)) + 1.0
+
+    def merit(t: float) -> float:
+        ahead, slack = b + t * db, s + t * ds
+        misfit = problem.upper @ ahead - problem.target
+        return float(0.5 * misfit @ misfit - nu * np.log(slack).sum() + price * np.abs(problem.h(ahead) - slack).sum())
+
+    now = merit(0.0)
+    for _ in range(20):
+        if merit(size) <= now + 1e-12 * (1.0 + abs(now)):
+            break
+        size *= 0.5
+    return size
+
+
+def _result(
+    problem: _Scaled, b: np.ndarray, s: np.ndarray, mu: np.ndarray, residuals: tuple[float, float, float], count: int
+) -> Constrained:
+    """Return the optimum in the caller's units."""
+    binding = mu > s
+    normal = problem.jacobian(b)[binding]
+    free = np.linalg.svd(normal)[2][np.linalg.matrix_rank(normal) :] if binding.any() else np.eye(len(b))
+    root = np.linalg.pinv(problem.upper @ free.T)
+    spread = free.T @ root * (problem.unit / problem.length)[:, None] if len(free) else np.zeros((len(b), 1))
+    values, slack = b * problem.unit, s * problem.rows
+    multipliers = mu * problem.length**2 / problem.rows
+    return Constrained(
+        frozen(values), frozen(multipliers), frozen(slack), frozen(binding, bool),
+        residuals[0], residuals[2], frozen(spread @ spread.T), count,
+    )  # fmt: skip

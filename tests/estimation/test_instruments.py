@@ -1,0 +1,216 @@
+"""Instruments: right where least squares is not, and the tests say when; all from triangles."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib.errors import Unidentifiable
+from calib.estimation.constrained import minimise, within
+from calib.estimation.instruments import (
+    exogeneity,
+    hausman,
+    instrument,
+    iv,
+    least_squares,
+    projected,
+    strength,
+)
+from calib.estimation.linear import ols
+
+TRUTH = np.array([2.0, -1.0, 0.5])
+
+
+def planted(seed: int, feedback: float = 0.0, noise: float = 0.3, count: int = 400, miss: float = 0.05):
+    """Return Z, W, y: y's noise reaches the first two columns of W by `feedback`; Z misses the clean W by `miss`."""
+    rng = np.random.default_rng(seed)
+    clean = rng.normal(size=(count, 3))
+    error = noise * rng.normal(size=count)
+    matrix = clean + 0.1 * rng.normal(size=(count, 3)) * (feedback != 0.0)
+    matrix[:, :2] -= feedback * error[:, None]
+    instruments = clean + miss * rng.normal(size=(count, 3))
+    return instruments, matrix, clean @ TRUTH + error + (matrix - clean) @ TRUTH
+
+
+def test_it_is_the_textbook_formula_with_its_covariance_and_two_stage_least_squares():
+    z, w, y = planted(0, 1.0)
+    found = iv(instrument(z, w, y)).estimate
+    assert found.values == pytest.approx(np.linalg.solve(z.T @ w, z.T @ y), rel=1e-9)
+    fitted = z @ np.linalg.lstsq(z, w)[0]
+    assert found.values == pytest.approx(np.linalg.lstsq(fitted, y)[0], rel=1e-9)
+    rho = y - w @ found.values
+    bread = np.linalg.inv(z.T @ w)
+    assert found.covariance == pytest.approx(rho @ rho / 397 * bread @ z.T @ z @ bread.T, rel=1e-8)
+    assert found.dof == 397
+
+
+def test_rows_are_weighted_on_both_sides():
+    z, w, y = planted(1, 1.0)
+    group, std = np.tile([0, 1], 200), np.array([1.0, 4.0])
+    omega = 1 / std[group] ** 2
+    found = iv(instrument(z, w, y, group), std).estimate.values
+    assert found == pytest.approx(np.linalg.solve((z.T * omega) @ w, (z.T * omega) @ y), rel=1e-9)
+
+
+def test_blocks_equal_the_whole_and_least_squares_is_in_the_same_triangles():
+    z, w, y = planted(2, 1.0)
+    whole = instrument(z, w, y, names=["a", "b", "c"])
+    half = instrument(z[:150], w[:150], y[:150], names=["a", "b", "c"])
+    both = instrument(z[150:], w[150:], y[150:], before=half)
+    assert iv(both).estimate.values == pytest.approx(iv(whole).estimate.values, rel=1e-11)
+    assert iv(both).estimate.names == ("a", "b", "c")
+    assert ols(least_squares(both)).estimate.values == pytest.approx(np.linalg.lstsq(w, y)[0], rel=1e-10)
+
+
+def test_instruments_equal_to_the_columns_give_least_squares():
+    _, w, y = planted(3)
+    found, ordinary = iv(instrument(w, w, y)).estimate, ols(least_squares(instrument(w, w, y))).estimate
+    assert found.values == pytest.approx(ordinary.values, rel=1e-10)
+    assert found.covariance == pytest.approx(ordinary.covariance, rel=1e-9)
+
+
+def test_it_is_unbiased_where_least_squares_is_not_and_its_covariance_is_true():
+    errors, sizes, naive = [], [], []
+    for seed in range(300):
+        problem = instrument(*planted(seed, 1.0))
+        found = iv(problem).estimate
+        errors.append(found.values - TRUTH)
+        sizes.append(errors[-1] @ np.linalg.solve(found.covariance, errors[-1]))
+        naive.append(ols(least_squares(problem)).estimate.values - TRUTH)
+    standard = np.std(errors, axis=0) / np.sqrt(300)
+    assert np.all(np.abs(np.mean(errors, axis=0)) < 4 * standard)
+    assert np.abs(np.mean(naive, axis=0)[:2]).min() > 20 * standard.max()
+    assert np.mean(sizes) == pytest.approx(3.0, abs=4 * np.sqrt(6 / 300) + 0.1)
+
+
+def test_noise_in_the_columns_themselves_is_cured_too():
+    naive, cured = [], []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        clean = rng.normal(size=(500, 3))
+        y = clean @ TRUTH + 0.1 * rng.normal(size=500)
+        problem = instrument(clean, clean + 0.5 * rng.normal(size=(500, 3)), y)
+        cured.append(iv(problem).estimate.values - TRUTH)
+        naive.append(ols(least_squares(problem)).estimate.values - TRUTH)
+    assert np.abs(np.mean(naive, axis=0)[0]) > 0.3  # 2.0 shrinks by 1 / (1 + 0.25)
+    assert np.abs(np.mean(cured, axis=0)).max() < 4 * np.std(cured) / np.sqrt(60)
+
+
+@pytest.mark.parametrize("test", [exogeneity, hausman])
+def test_durbin_wu_hausman_keeps_its_level_where_least_squares_is_right(test):
+    verdicts = [test(instrument(*planted(seed, miss=0.3))) for seed in range(400)]
+    assert np.mean([v.p < 0.05 for v in verdicts]) == pytest.approx(0.05, abs=0.035)
+    assert verdicts[0].degrees[0] == 3
+
+
+@pytest.mark.parametrize("test", [exogeneity, hausman])
+def test_durbin_wu_hausman_sees_the_feedback(test):
+    assert np.mean([test(instrument(*planted(seed, 1.0))).biased() for seed in range(100)]) > 0.95
+
+
+def test_the_augmented_regression_is_the_f_test_written_out():
+    z, w, y = planted(4, 0.3)
+    v = w - z @ np.linalg.lstsq(z, w)[0]
+    sums = [np.sum((y - m @ np.linalg.lstsq(m, y)[0]) ** 2) for m in (w, np.hstack([w, v]))]
+    verdict = exogeneity(instrument(z, w, y))
+    assert verdict.statistic == pytest.approx((sums[0] - sums[1]) / 3 / (sums[1] / 394), rel=1e-8)
+    assert verdict.degrees == (3, 394)
+
+
+def test_hausmans_form_is_the_quadratic_form_written_out():
+    z, w, y = planted(5, 0.3)
+    problem = instrument(z, w, y)
+    ordinary = ols(least_squares(problem)).estimate
+    fitted = z @ np.linalg.lstsq(z, w)[0]
+    gap = np.linalg.inv(fitted.T @ fitted) - np.linalg.inv(w.T @ w)
+    d = iv(problem).estimate.values - ordinary.values
+    assert hausman(problem).statistic == pytest.approx(d @ np.linalg.solve(gap, d) / ordinary.residual_std**2, rel=1e-6)
+
+
+def test_columns_that_the_instruments_explain_wholly_are_not_tested():
+    z, w, y = planted(6, 1.0)
+    w[:, 2] = z[:, 2]
+    y = y + 0.0
+    assert exogeneity(instrument(z, w, y)).degrees[0] == 2
+    assert hausman(instrument(z, w, y)).degrees[0] == 2
+
+
+def test_autocorrelated_noise_needs_the_inflation_to_keep_the_level():
+    def rejected(tau):
+        result = []
+        for seed in range(150):
+            rng = np.random.default_rng(seed)
+            draw = rng.normal(size=(7, 900))
+            for k in range(1, 900):
+                draw[:, k] += 0.9 * draw[:, k - 1]
+            slow = draw[:, 100:]
+            w = slow[:3].T
+            y = w @ TRUTH + slow[3]
+            result.append(exogeneity(instrument(w + 0.5 * slow[4:].T, w, y), inflation=tau).p < 0.05)
+        return np.mean(result)
+
+    assert rejected(1.0) > 0.4
+    assert rejected((1 + 0.81) / (1 - 0.81)) < 0.12  # columns and noise with the same correlation: Σ ρ_k²
+
+
+def test_strength_of_perfect_good_and_useless_instruments():
+    z, w, y = planted(7, 1.0)
+    same, good = strength(instrument(w, w, y)), strength(instrument(z, w, y))
+    useless = strength(instrument(np.column_stack([z[:, :2], np.random.default_rng(7).normal(size=400)]), w, y))
+    assert same.correlations == pytest.approx(np.ones(3))
+    assert same.partial_r2 == pytest.approx(np.ones(3))
+    assert not good.weak and good.correlations.min() > 0.85 and good.partial_r2.min() > 0.8
+    assert useless.weak and useless.correlations[-1] < 0.15
+    assert useless.partial_r2[2] < 0.05 < 0.25 < useless.partial_r2[:2].min()
+
+
+def test_first_stage_values_are_those_of_the_regressions_written_out():
+    z, w, y = planted(8, 1.0, miss=0.5)
+    found = strength(instrument(z, w, y))
+    fitted = z @ np.linalg.lstsq(z, w)[0]
+    rest = w - fitted
+    expected = np.sum(fitted**2, axis=0) / 3 / (np.sum(rest**2, axis=0) / 397)
+    assert found.first_stage_f == pytest.approx(expected, rel=1e-8)
+    concentration = np.linalg.solve(rest.T @ rest, fitted.T @ fitted) * 397 / 3
+    assert found.cragg_donald == pytest.approx(np.linalg.eigvals(concentration).real.min(), rel=1e-6)
+    unit = (m / np.linalg.norm(m, axis=0) for m in (z, w))
+    zu, wu = unit
+    assert found.condition == pytest.approx(np.linalg.cond(zu.T @ wu), rel=1e-8)
+
+
+def test_an_instrument_without_motion_and_dependent_columns_are_named():
+    z, w, y = planted(9)
+    still = z.copy()
+    still[:, 1] = 0.0
+    with pytest.raises(Unidentifiable, match="instrument of Fv2") as caught:
+        iv(instrument(still, w, y, names=["Ia1", "Fv2", "Fc3"]))
+    assert caught.value.names == ("instrument of Fv2",)
+    twice = w.copy()
+    twice[:, 2] = 2 * twice[:, 0]
+    with pytest.raises(Unidentifiable) as caught:
+        iv(instrument(z, twice, y, names=["Ia1", "Fv2", "Fc3"]))
+    assert caught.value.names == ("Ia1", "Fc3")
+
+
+def test_constraints_that_hold_change_nothing_and_bind_with_a_multiplier_where_they_do_not():
+    problem = instrument(*planted(10, 1.0), names=["a", "b", "c"])
+    triangle, free = projected(problem), iv(problem).estimate
+    easy = within(triangle, np.eye(3), np.full(3, -10.0), np.full(3, 10.0))
+    assert easy.values == pytest.approx(free.values, abs=1e-8)
+    tight = within(triangle, np.eye(3), np.array([0.0, 0.0, 0.0]), np.full(3, np.inf))
+    assert tight.binding.tolist() == [False, True, False]
+    assert tight.values[1] == pytest.approx(0.0, abs=1e-9)
+    q, u, c = triangle[:3, :3].T @ triangle[:3, :3], [0, 2], [1]
+    moved = free.values[u] + np.linalg.solve(q[np.ix_(u, u)], q[np.ix_(u, c)] @ free.values[c])
+    assert tight.values[u] == pytest.approx(moved, abs=1e-8)  # the slides' relation, in its two-stage form
+
+
+def test_a_curved_constraint_enters_iv_as_well():
+    triangle = projected(instrument(*planted(11, 1.0)))
+    found = minimise(
+        triangle, lambda b: np.array([1.0 - b @ b]), lambda b: -2 * b[None], None, lambda b, mu: -2 * mu[0] * np.eye(3)
+    )
+    assert found.values @ found.values == pytest.approx(1.0, abs=1e-9)
+    r, z = triangle[:3, :3], triangle[:3, 3]
+    slope = r.T @ (r @ found.values - z)
+    assert slope == pytest.approx(-2 * found.multipliers[0] * found.values, abs=1e-7 * np.abs(r.T @ z).max())
