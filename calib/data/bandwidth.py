@@ -28,6 +28,7 @@ ACTIVE = 0.05  # a joint of less than this share of the fastest one's speed says
 HIGHEST = 20.0  # [Hz]; rigid industrial robots reach 10 to 20 (Gautier); above that, joints bend
 SPREAD = 3.0  # a joint this many times above the median of all is taken to vibrate
 USABLE = 0.8  # of the Nyquist frequency
+NOISE = 0.05  # of the acceleration's rms: noise in it that is too much
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,13 +80,10 @@ def propose_cutoffs(sampled: Resampled, dynamics: float | None = None) -> Cutoff
         for j, peak in enumerate(resonance)
         if np.isfinite(peak)
     ]
-    most = USABLE * sampled.rate / 2
-    position, factor = min(5 * dynamics, most), factor_for(sampled.rate, min(2 * dynamics, most))
+    position, why = _position_cutoff(f, power, floor, active, dynamics, sampled.rate)
+    factor = factor_for(sampled.rate, min(2 * dynamics, USABLE * sampled.rate / 2))
     band = USABLE * sampled.rate / (2 * factor)
-    reasons.append(f"f_q = {position:.3g} Hz (5 f_dyn)")
-    if 5 * dynamics > most:
-        reasons[-1] = f"f_q = {most:.3g} Hz, 0.8 of the Nyquist frequency: 5 f_dyn = {5 * dynamics:.3g} Hz is beyond it"
-    reasons.append(f"f_p = {band:.3g} Hz (2 f_dyn, to the next whole n_d = {factor})")
+    reasons += [why, f"f_p = {band:.3g} Hz (2 f_dyn, to the next whole n_d = {factor})"]
     noise = np.sqrt(floor * sampled.rate / 2)
     return Cutoffs(
         dynamics, per_joint, position, band, factor, resonance, frozen(noise), frozen(f), frozen(power), frozen(effort),
@@ -101,6 +99,29 @@ def check_cutoff(cutoff: float, rate: float, file: str = "") -> None:
             f"choose at most {USABLE * rate / 2:.4g} Hz"
         )
         raise MeasurementError(message, file)
+
+
+def _position_cutoff(
+    f: np.ndarray, power: np.ndarray, floor: np.ndarray, active: np.ndarray, dynamics: float, rate: float
+) -> tuple[float, str]:
+    """Return f_q [Hz] and why: 5 f_dyn, less where noise would reach 5 % of the acceleration, but at least 2 f_dyn.
+
+    White noise of density S_0 becomes an acceleration of variance (2π)⁴ S_0 f_q⁵/5.
+    """
+    band = f <= 2 * dynamics
+    signal = (f[:, None] ** 4 * np.maximum(power - floor, 0))[band].sum(axis=0) * (f[1] - f[0])
+    quiet = (5 * NOISE**2 * signal / np.maximum(floor, 1e-300)) ** 0.2
+    quiet = float(np.median(quiet[active])) if active.any() else np.inf
+    most = USABLE * rate / 2
+    if most <= min(5 * dynamics, quiet):
+        return most, f"f_q = {most:.3g} Hz, {USABLE:g} of the Nyquist frequency; 5 f_dyn would be {5 * dynamics:.3g} Hz"
+    if quiet >= 5 * dynamics:
+        return 5 * dynamics, f"f_q = {5 * dynamics:.3g} Hz (5 f_dyn)"
+    lower = min(max(quiet, 2 * dynamics), most)
+    return (
+        lower,
+        f"f_q = {lower:.3g} Hz: at 5 f_dyn = {5 * dynamics:.3g} Hz noise exceeds 5 % of the acceleration",
+    )
 
 
 def _active(q: np.ndarray) -> np.ndarray:

@@ -21,6 +21,7 @@ from calib.data.resampling import GAP, Resampled, SamplingReport, resample
 from calib.errors import MeasurementError, UsageError
 
 SLOW = 0.01  # of a joint's peak speed: below it stands, for friction (the TX40's own thresholds are this share)
+CREEP = 1e-3  # no joint moves below this [rad/s or m/s]
 
 
 @dataclass(frozen=True)
@@ -174,7 +175,7 @@ def moving(motion: Motion, slow: float | Sequence[float] = SLOW) -> np.ndarray:
     peak = np.abs(motion.v).max(axis=0)
     threshold = slow * peak if isinstance(slow, (int, float)) else np.asarray(slow, dtype=float)
     noise = 3 * velocity_noise(motion)
-    return np.abs(motion.v) >= np.maximum(np.maximum(threshold, noise), 1e-12)
+    return np.abs(motion.v) >= np.maximum(np.maximum(threshold, noise), CREEP)
 
 
 def standstill(motion: Motion, slow: float | Sequence[float] = SLOW) -> np.ndarray:

@@ -1,0 +1,126 @@
+"""What a motion can tell, before any model: is it one sine, do joints move together, is it the motion seen before?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import detrend, find_peaks, periodogram
+from scipy.spatial import cKDTree
+
+from calib.arrays import frozen
+from calib.data.motion import Motion, standstill
+
+LINE = 1e-3  # of the strongest line's power: a line that counts
+TOGETHER = 0.98  # correlation of two joints that move as one
+FUNCTION = 0.02  # of the largest singular value: a function of time that counts
+STILL = 1e-3  # a joint that goes less far has not moved [rad or m]
+NEAR = 0.05  # a state is met again if it differs by less than this share of the motion's spread, in the rms over all
+MOST = 20_000  # states of a motion that are compared
+
+
+@dataclass(frozen=True, eq=False)
+class ExcitationReport:
+    """How rich the motion of the joints is.
+
+    Attributes:
+        lines: (n,) number of spectral lines of each joint's position that have 1e-3 or more of the strongest's power.
+        strongest: (n,) frequency of the strongest one [Hz]; NaN for a joint that does not move.
+        share: (n,) part of the joint's power in it.
+        correlation: (n, n) of the positions.
+        functions: number of independent functions of time that all positions are made of (2 for one sine).
+        still: (n,) joints that never move.
+        notes: what a user should be told.
+    """
+
+    lines: np.ndarray
+    strongest: np.ndarray
+    share: np.ndarray
+    correlation: np.ndarray
+    functions: int
+    still: np.ndarray
+    notes: tuple[str, ...]
+
+    @property
+    def poor(self) -> bool:
+        """Whether the motion is one frequency, or fewer functions of time than half the joints that move."""
+        moving = ~self.still
+        return bool((self.lines[moving] <= 1).all()) or self.functions < 0.5 * moving.sum()
+
+
+def report_excitation(motion: Motion) -> ExcitationReport:
+    """Return what the positions of `motion` say of its richness; its longest segment is looked at.
+
+    One frequency cannot tell inertia from gravity and stiffness: with q = A sin ωt, q̈ = -ω² (q - q̄).
+    """
+    q = detrend(motion.q[motion.segment == np.bincount(motion.segment).argmax()], axis=0, type="constant")
+    still = np.ptp(q, axis=0) < STILL
+    found = [(0, np.nan, 0.0) if still[j] else _lines(q[:, j], motion.rate) for j in range(motion.n)]
+    unit = q / np.where(still, np.inf, np.sqrt((q**2).sum(axis=0)))
+    correlation = unit.T @ unit
+    singular = np.linalg.svd(unit[:: max(1, len(unit) // MOST)], compute_uv=False)
+    functions = int((singular > FUNCTION * singular[0]).sum())
+    lines, strongest, share = (np.array(part) for part in zip(*found))
+    notes = _notes(motion.joint_names, lines, strongest, correlation, functions, still)
+    return ExcitationReport(
+        frozen(lines, int), frozen(strongest), frozen(share), frozen(correlation), functions, frozen(still, bool), notes
+    )
+
+
+def repeats(training: Motion, other: Motion) -> float:
+    """Return the share of `other`'s moving samples whose state the training motion has been in, 0 to 1.
+
+    A state is (q, v); it was met before where the nearest one of the training motion differs by less than 5 % of that
+    motion's spread, in the rms over the coordinates. Neither a shift in time, nor another number of laps, nor another
+    order of parts hides a repeat; the same path at another speed is none. Evidence from a repeat is no evidence:
+    whatever the model gets wrong along that path, the fit has already absorbed (our choice: refuse from a half on).
+    """
+    moves = np.ptp(training.q, axis=0) > STILL
+    if not moves.any() or training.n != other.n:
+        return 0.0
+    states = []
+    for motion in (training, other):
+        own = ~standstill(motion)
+        states.append(np.hstack([motion.q[own], motion.v[own]]))
+    spread = np.hstack([training.q.std(axis=0), training.v.std(axis=0)])
+    fixed = ~np.hstack([moves, moves])
+    spread[fixed] = np.maximum(np.abs(np.hstack([other.q.std(axis=0), other.v.std(axis=0)]))[fixed], STILL)
+    seen, new = (state[:: max(1, len(state) // most)] / spread for state, most in zip(states, (MOST, MOST // 10)))
+    if not len(seen) or not len(new):
+        return 0.0
+    limit = NEAR * np.sqrt(seen.shape[1])
+    distance, _ = cKDTree(seen).query(new, distance_upper_bound=limit)
+    return float(np.isfinite(distance).mean())
+
+
+def _lines(q: np.ndarray, rate: float) -> tuple[int, float, float]:
+    """Return the number of lines, the strongest one's frequency [Hz], and its part of the power of a series (N,)."""
+    f, power = periodogram(q, rate, "hann", nfft=4 * len(q))
+    peaks, _ = find_peaks(power, height=LINE * power.max(), distance=8, prominence=0.5 * LINE * power.max())
+    top = int(np.argmax(power))
+    width = 8  # half the main lobe of Hann's window, in steps of the padded transform
+    share = power[max(0, top - width) : top + width + 1].sum() / power.sum()
+    return max(1, len(peaks)), float(f[top]), float(share)
+
+
+def _notes(
+    names: tuple[str, ...],
+    lines: np.ndarray,
+    strongest: np.ndarray,
+    correlation: np.ndarray,
+    functions: int,
+    still: np.ndarray,
+) -> tuple[str, ...]:
+    moving = np.flatnonzero(~still)
+    notes = [f"{names[j]} never moves" for j in np.flatnonzero(still)]
+    if len(moving) and (lines[moving] <= 1).all():
+        low, high = strongest[moving].min(), strongest[moving].max()
+        hertz = f"{low:.3g} Hz" if high - low < 0.1 * high else f"{low:.3g} to {high:.3g} Hz"
+        notes.append(f"each joint moves at one frequency ({hertz}): inertia and gravity or stiffness look alike")
+    pairs = [(i, j) for i in moving for j in moving if i < j and abs(correlation[i, j]) > TOGETHER]
+    if pairs:
+        told = ", ".join(f"{names[i]}–{names[j]}" for i, j in pairs[:6]) + (" …" if len(pairs) > 6 else "")
+        notes.append(f"joints that move as one (correlation above {TOGETHER:g}): {told}")
+    if len(moving) > 1 and functions < len(moving):
+        notes.append(f"all {len(moving)} moving joints follow {functions} functions of time")
+    return tuple(notes)
