@@ -13,7 +13,7 @@ from calib.errors import UsageError
 
 def test_defaults_without_a_file():
     options = read_options()
-    assert options == FitOptions() and options.model == "auto" and options.loss == "none"
+    assert options == FitOptions() and options.model == "auto" and options.loss == "auto"
     assert options.for_file("any.csv") is options.every and options.every.check_limits
 
 
@@ -67,7 +67,7 @@ def test_harmonics_up_to_an_order():
         ({"sigma": {"positon": 1e-5}}, "sigma: there is no key 'positon' .did you mean 'position'"),
         ({"kind": "poses"}, "kind: expected one of pose.*did you mean 'pose'.*found 'poses'"),
         ({"model": "stifness"}, "did you mean 'stiffness'"),
-        ({"loss": "l1"}, "loss: expected one of none, huber, cauchy"),
+        ({"loss": "l1"}, "loss: expected one of auto, none, huber, cauchy"),
         ({"units": {"x": "furlong"}}, "units.x: expected one of rad"),
         ({"sigma": {"position": [1e-5, 1e-5]}}, "a number or three"),
         ({"sigma": {"position": 20}}, "at most 0.1 .are these mm"),
