@@ -158,6 +158,19 @@ def iv(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1
     return LinearFit(estimate, np.sqrt(squares / left), *condition_numbers(factor[:, p : 2 * p]))
 
 
+def settled(before: LinearFit, now: LinearFit, change: float = 0.025, residual: float = 0.025) -> bool:
+    """Say whether the outer loop (simulate, estimate) may stop: parameters and residual have come to rest.
+
+    |Δx_j| < change · |x_j| for every parameter and |Δ‖ρ‖| < residual · ‖ρ‖ (Janot, Vandanjon & Gautier 2014; both
+    usually 1 … 5 %). A parameter that moves by less than a fifth of its standard deviation rests as well (our choice:
+    one near zero never meets a relative rule).
+    """
+    moved = np.abs(now.estimate.values - before.estimate.values)
+    allowed = np.maximum(change * np.abs(before.estimate.values), 0.2 * now.estimate.sigma)
+    sizes = before.estimate.residual_std, now.estimate.residual_std
+    return bool(np.all(moved <= allowed) and abs(sizes[1] - sizes[0]) <= residual * sizes[0])
+
+
 def strength(problem: Instruments, std: np.ndarray | None = None) -> Strength:
     """Return what the instruments tell about the columns; all measures from one R factor.
 
@@ -202,8 +215,10 @@ def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: f
     p, rows = len(problem.names), problem.data.rows.sum() / inflation
     factor = combine(problem.data, std)
     whole = factor[:, p : 2 * p]
+    norms = np.linalg.norm(whole, axis=0)
+    require_rank(whole / np.where(norms > 0.0, norms, 1.0), problem.names)
     part = np.vstack([np.zeros((p, p)), factor[p:, p : 2 * p]])
-    size = np.linalg.norm(part, axis=0) > 1e-8 * np.linalg.norm(whole, axis=0)
+    size = np.linalg.norm(part, axis=0) > 1e-8 * norms
     columns = np.hstack([whole, part[:, size]])
     split = split_columns(columns, [np.arange(p)], 1e-8)
     k = split.rank - p

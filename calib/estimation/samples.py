@@ -3,6 +3,7 @@
 The residual of sample k, e_k = y_k - W_k x (n joints), has covariance S across joints and none between samples; its
 size is Mahalanobis', d_k² = e_kᵀ S⁻¹ e_k. A robust fit weights each sample by w(d_k), and beyond the gate by nothing.
 That guards against bad y; a sample with a bad W of great leverage draws the fit unseen, as in every M-estimator.
+The samples stay in memory, since each round weights them anew: meant for decimated data.
 """
 
 from __future__ import annotations
@@ -231,10 +232,15 @@ def _factor(data: Samples, noise: np.ndarray, weights: np.ndarray) -> np.ndarray
 
 def _triangles(data: Samples, weights: np.ndarray) -> Triangles:
     """Return the triangles of all rows present, one group per joint, rows weighted by (N, n)."""
-    rows = np.flatnonzero(data.present)
-    root, joints = np.sqrt(weights.ravel()[rows]), data.target.shape[1]
-    flat = data.matrix.reshape(-1, len(data.names))[rows] * root[:, None]
-    return absorb(empty(data.names, data.units, joints), flat, data.target.ravel()[rows] * root, rows % joints)
+    root = np.sqrt(weights)
+    total = empty(data.names, data.units, data.target.shape[1])
+    for start in range(0, len(data.target), CHUNK):
+        part = slice(start, start + CHUNK)
+        sample, joint = np.nonzero(data.present[part])
+        scale = root[part][sample, joint]
+        matrix = data.matrix[part][sample, joint] * scale[:, None]
+        total = absorb(total, matrix, data.target[part][sample, joint] * scale, joint)
+    return total
 
 
 def _spreads(data: Samples, residual: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ from calib.estimation.instruments import (
     iv,
     least_squares,
     projected,
+    settled,
     strength,
 )
 from calib.estimation.linear import ols
@@ -151,6 +152,16 @@ def test_autocorrelated_noise_needs_the_inflation_to_keep_the_level():
 
     assert rejected(1.0) > 0.4
     assert rejected((1 + 0.81) / (1 - 0.81)) < 0.12  # columns and noise with the same correlation: Σ ρ_k²
+
+
+def test_the_outer_loop_rests_when_parameters_and_residual_do_and_only_then():
+    z, w, y = planted(12)
+    fit = iv(instrument(z, w, y))
+    assert settled(fit, iv(instrument(z, w, y * 1.001)))
+    assert not settled(fit, iv(instrument(z, w, y + 0.2 * w[:, 0])))  # a parameter moves by 10 %
+    noisy = y + np.linalg.qr(np.column_stack([z, w, y]), mode="complete")[0][:, -1] * 5.0
+    assert iv(instrument(z, w, noisy)).estimate.values == pytest.approx(fit.estimate.values)
+    assert not settled(fit, iv(instrument(z, w, noisy)))  # the same parameters, another residual
 
 
 def test_strength_of_perfect_good_and_useless_instruments():
