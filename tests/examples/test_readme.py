@@ -1,0 +1,60 @@
+"""What the README says can be done, can be done."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from calib import cli
+from calib.robot import library, urdf_write
+from calib.robot.chain import random_joints
+from calib.robot.load import load
+from calib.simulation import brought
+from calib.simulation.cell import measure
+from calib.simulation.cells import virtual_cell
+
+ROOT = Path(__file__).parents[2]
+README = (ROOT / "README.md").read_text()
+BLOCKS = re.findall(r"```sh\n(.*?)```", README, flags=re.DOTALL)
+
+
+def commands(block: str) -> list[list[str]]:
+    """Return the arguments of every `calib` command in a block, comments left out."""
+    lines = [shlex.split(line, comments=True) for line in block.splitlines()]
+    return [line[1:] for line in lines if line and line[0] == "calib"]
+
+
+@pytest.fixture
+def at_a_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with the files the README speaks of."""
+    cell = virtual_cell("ur5", 1)
+    q = random_joints(load("ur5"), 60, 1)
+    (tmp_path / "robot.urdf").write_text(urdf_write.write_new(load("ur5")))
+    brought.write(measure(cell, q, 2), tmp_path / "measured.csv")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_blocks_are_found_and_short() -> None:
+    assert len(README.split()) < 600 and len(BLOCKS) == 4
+    assert [len(commands(block)) for block in BLOCKS] == [0, 0, 3, 3]
+    assert "calib demo" in BLOCKS[0] and "pytest" in BLOCKS[1]
+
+
+@pytest.mark.parametrize("number", [2, 3])
+def test_its_commands_run(number: int, at_a_cell: Path, capsys: pytest.CaptureFixture) -> None:
+    for arguments in commands(BLOCKS[number]):
+        assert cli.run(arguments) == 0, (arguments, capsys.readouterr())
+    if number == 3:
+        assert (at_a_cell / "calibrated.urdf").exists() and (at_a_cell / "fit/certificate.html").exists()
+
+
+def test_what_it_points_to_is_there() -> None:
+    for target in re.findall(r"\]\(([^)]+)\)", README):
+        assert (ROOT / target).exists(), target
+    named = re.search(r"library name \(`([^`]+)`\)", README)
+    assert named and tuple(sorted(named[1].split())) == library.names()
+    assert (ROOT / "LICENSE").exists() and (ROOT / "CHANGELOG.md").exists()
