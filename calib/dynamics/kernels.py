@@ -7,8 +7,11 @@ gravity, (u_j, s_j) angular and linear velocity of the frame per unit rate of co
 
 J the inertia about the origin, h = [MX, MY, MZ] (Gautier & Khalil 1990), is linear in the parameters, and
 tau_j = Σ_i (u_j · n_i + s_j · f_i): the regressor needs no backward pass. Products and sums may be fused ("contract");
-nothing else of IEEE arithmetic is given up. ``tree`` is `Tree.arrays`, B bodies, n coordinates; ``amount``, ``cosine``,
-``sine`` (N, B) are each body's own motion. Row 0 of ``motion`` and ``twists`` is the base, row i + 1 body i.
+nothing else of IEEE arithmetic is given up.
+
+``links`` and ``constants`` are those of a `Tree` with B bodies and n coordinates: every frame is turned so that its
+joint's axis is z, and ``parameters`` (10 B) follow (`Tree.order`). Row 0 of ``motion`` and ``twists`` is the base, row
+i + 1 body i; row i of ``frames`` is its rotation (0 to 8) and origin (9 to 11) in its parent's frame.
 """
 
 from __future__ import annotations
@@ -17,74 +20,66 @@ import numpy as np
 from numba import njit
 
 FIXED, REVOLUTE = 0, 1
+PARENT, KIND, COORDINATE, DEPTH, PATH = 0, 1, 2, 3, 4  # columns of links
+SCALE = 12  # of constants, behind the placement's three rows; its last row is gravity
 L = 32  # samples side by side in the regressor: 8 to 128 measured, flat from 32 on
 OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
 
 
 @njit(**OPTIONS)
-def _place(tree, i, amount, cosine, sine, turn, shift):
-    """Write rotation turn[i] and origin shift[i] of body i in its parent's frame, the joint moved by `amount`."""
-    kind, axis, placement = tree[1][i], tree[2][i], tree[5]
+def _place(links, constants, i, amount, cosine, sine, frames):
+    """Write row i of `frames`, the joint moved by `amount`."""
     for r in range(3):
-        turn[i, r, 0] = placement[i, r, 0]
-        turn[i, r, 1] = placement[i, r, 1]
-        turn[i, r, 2] = placement[i, r, 2]
-        shift[i, r] = placement[i, r, 3]
-    if kind == REVOLUTE:
-        one, two = (axis + 1) % 3, (axis + 2) % 3
-        for r in range(3):
-            x, y = turn[i, r, one], turn[i, r, two]
-            turn[i, r, one] = cosine * x + sine * y
-            turn[i, r, two] = cosine * y - sine * x
-    elif kind != FIXED:
-        for r in range(3):
-            shift[i, r] += amount * turn[i, r, axis]
+        x, y, z, t = constants[i, 4 * r], constants[i, 4 * r + 1], constants[i, 4 * r + 2], constants[i, 4 * r + 3]
+        frames[i, 3 * r], frames[i, 3 * r + 1] = x, y
+        if links[i, KIND] == REVOLUTE:
+            frames[i, 3 * r], frames[i, 3 * r + 1] = cosine * x + sine * y, cosine * y - sine * x
+        elif links[i, KIND] != FIXED:
+            t += amount * z
+        frames[i, 3 * r + 2] = z
+        frames[i, 9 + r] = t
 
 
 @njit(**OPTIONS)
-def _advance(tree, i, rate, change, turn, shift, motion):
+def _advance(links, i, rate, change, frames, motion):
     """Write w, dw, a of body i (row i + 1 of `motion`, (B + 1, 9)) from its parent's."""
-    p, h = tree[0][i] + 1, i + 1
+    p, h = links[i, PARENT] + 1, i + 1
     wx, wy, wz = motion[p, 0], motion[p, 1], motion[p, 2]
     ex, ey, ez = motion[p, 3], motion[p, 4], motion[p, 5]
-    x, y, z = shift[i, 0], shift[i, 1], shift[i, 2]
+    x, y, z = frames[i, 9], frames[i, 10], frames[i, 11]
     dot, square = wx * x + wy * y + wz * z, wx * wx + wy * wy + wz * wz
     ax = motion[p, 6] + ey * z - ez * y + wx * dot - x * square
     ay = motion[p, 7] + ez * x - ex * z + wy * dot - y * square
     az = motion[p, 8] + ex * y - ey * x + wz * dot - z * square
     for r in range(3):
-        tx, ty, tz = turn[i, 0, r], turn[i, 1, r], turn[i, 2, r]
+        tx, ty, tz = frames[i, r], frames[i, 3 + r], frames[i, 6 + r]
         motion[h, r] = tx * wx + ty * wy + tz * wz
         motion[h, 3 + r] = tx * ex + ty * ey + tz * ez
         motion[h, 6 + r] = tx * ax + ty * ay + tz * az
-    kind, axis = tree[1][i], tree[2][i]
-    if kind == FIXED:
-        return
-    one, two = (axis + 1) % 3, (axis + 2) % 3
-    if kind == REVOLUTE:
-        motion[h, 3 + one] += motion[h, two] * rate
-        motion[h, 3 + two] -= motion[h, one] * rate
-        motion[h, 3 + axis] += change
-        motion[h, axis] += rate
-    else:
-        motion[h, 6 + one] += 2.0 * motion[h, two] * rate
-        motion[h, 6 + two] -= 2.0 * motion[h, one] * rate
-        motion[h, 6 + axis] += change
+    if links[i, KIND] == REVOLUTE:
+        motion[h, 3] += motion[h, 1] * rate
+        motion[h, 4] -= motion[h, 0] * rate
+        motion[h, 5] += change
+        motion[h, 2] += rate
+    elif links[i, KIND] != FIXED:
+        motion[h, 6] += 2.0 * motion[h, 1] * rate
+        motion[h, 7] -= 2.0 * motion[h, 0] * rate
+        motion[h, 8] += change
 
 
 @njit(**OPTIONS)
-def _carry(tree, i, turn, shift, twists):
+def _carry(links, constants, i, frames, twists):
     """Write the twists (u_j, s_j) of body i (row i + 1 of `twists`, (B + 1, n, 6)) from its parent's."""
-    t00, t01, t02 = turn[i, 0, 0], turn[i, 0, 1], turn[i, 0, 2]
-    t10, t11, t12 = turn[i, 1, 0], turn[i, 1, 1], turn[i, 1, 2]
-    t20, t21, t22 = turn[i, 2, 0], turn[i, 2, 1], turn[i, 2, 2]
-    x, y, z = shift[i, 0], shift[i, 1], shift[i, 2]
-    p, h, own = tree[0][i], i + 1, tree[4][i]
+    t00, t01, t02 = frames[i, 0], frames[i, 1], frames[i, 2]
+    t10, t11, t12 = frames[i, 3], frames[i, 4], frames[i, 5]
+    t20, t21, t22 = frames[i, 6], frames[i, 7], frames[i, 8]
+    x, y, z = frames[i, 9], frames[i, 10], frames[i, 11]
+    p, h, own = links[i, PARENT], i + 1, links[i, COORDINATE]
     if own >= 0:
         for r in range(6):
             twists[h, own, r] = 0.0
-    for k in range(tree[8][p] if p >= 0 else 0):
-        j = tree[7][p, k]
+    for k in range(links[p, DEPTH] if p >= 0 else 0):
+        j = links[p, PATH + k]
         ux, uy, uz = twists[p + 1, j, 0], twists[p + 1, j, 1], twists[p + 1, j, 2]
         sx = twists[p + 1, j, 3] + uy * z - uz * y
         sy = twists[p + 1, j, 4] + uz * x - ux * z
@@ -96,15 +91,15 @@ def _carry(tree, i, turn, shift, twists):
         twists[h, j, 4] = t01 * sx + t11 * sy + t21 * sz
         twists[h, j, 5] = t02 * sx + t12 * sy + t22 * sz
     if own >= 0:
-        twists[h, own, tree[2][i] + (0 if tree[1][i] == REVOLUTE else 3)] += tree[3][i]
+        twists[h, own, 2 if links[i, KIND] == REVOLUTE else 5] += constants[i, SCALE]
 
 
 @njit(**OPTIONS)
-def _place_lanes(placement, i, joint, turn):
+def _place_lanes(constants, i, joint, turn):
     """Write rotation (rows 0 to 8) and origin (9 to 11) of body i from cosine, sine and shift in `joint`."""
-    a0, a1, a2, x = placement[i, 0, 0], placement[i, 0, 1], placement[i, 0, 2], placement[i, 0, 3]
-    b0, b1, b2, y = placement[i, 1, 0], placement[i, 1, 1], placement[i, 1, 2], placement[i, 1, 3]
-    c0, c1, c2, z = placement[i, 2, 0], placement[i, 2, 1], placement[i, 2, 2], placement[i, 2, 3]
+    a0, a1, a2, x = constants[i, 0], constants[i, 1], constants[i, 2], constants[i, 3]
+    b0, b1, b2, y = constants[i, 4], constants[i, 5], constants[i, 6], constants[i, 7]
+    c0, c1, c2, z = constants[i, 8], constants[i, 9], constants[i, 10], constants[i, 11]
     for k in range(L):
         cosine, sine, shift = joint[k], joint[L + k], joint[2 * L + k]
         turn[k], turn[L + k], turn[2 * L + k] = cosine * a0 + sine * a1, cosine * a1 - sine * a0, a2
@@ -184,9 +179,10 @@ def _project_lanes(motion, twist, columns):
 
 
 @njit(**OPTIONS)
-def _load_lanes(tree, i, amount, cosine, sine, v, a, start, count, joint):
+def _load_lanes(links, constants, i, amount, cosine, sine, v, a, start, count, joint):
     """Write cosine, sine, shift, rate and change of body i's joint for `count` samples from `start`."""
-    c, scale, revolute, sliding = tree[4][i], tree[3][i], tree[1][i] == REVOLUTE, tree[1][i] > REVOLUTE
+    c, scale = links[i, COORDINATE], constants[i, SCALE]
+    revolute, sliding = links[i, KIND] == REVOLUTE, links[i, KIND] > REVOLUTE
     for k in range(count):
         joint[k] = cosine[i, start + k] if revolute else 1.0
         joint[L + k] = sine[i, start + k] if revolute else 0.0
@@ -196,33 +192,37 @@ def _load_lanes(tree, i, amount, cosine, sine, v, a, start, count, joint):
 
 
 @njit(**OPTIONS)
-def regressor(tree, upright, order, amount, cosine, sine, v, a, out):
-    """Fill out (10 B, n, N), zero on entry, with the standard regressor; amount, cosine, sine (B, N), v, a (n, N).
+def regressor(links, constants, order, amount, cosine, sine, v, a, out):
+    """Fill out (10 B, n, N), zero on entry, with the standard regressor.
 
     L samples at a time, the sample index innermost, so that the compiler turns every line into vector instructions.
-    Frames are turned so that each joint's axis is z (`Tree.upright`); `order` (B, 10) puts the columns back.
+
+    Args:
+        order: (B, 10), `Tree.order`: where the columns go.
+        amount, cosine, sine: (B, N), each body's own motion.
+        v, a: (n, N).
     """
     bodies, count, n = amount.shape[0], amount.shape[1], v.shape[0]
     joint, turn, columns = np.zeros(5 * L), np.empty(12 * L), np.empty(10 * L)
     motion, twists = np.zeros((bodies + 1, 9 * L)), np.zeros((bodies + 1, n, 6 * L))
     for r in range(3):
-        motion[0, (6 + r) * L : (7 + r) * L] = -tree[6][r]
+        motion[0, (6 + r) * L : (7 + r) * L] = -constants[bodies, r]
     for start in range(0, count, L):
         width = min(L, count - start)
         for i in range(bodies):
-            c, p, turning = tree[4][i], tree[0][i], 1.0 if tree[1][i] == REVOLUTE else 0.0
-            _load_lanes(tree, i, amount, cosine, sine, v, a, start, width, joint)
-            _place_lanes(upright, i, joint, turn)
+            p, c, turning = links[i, PARENT], links[i, COORDINATE], 1.0 if links[i, KIND] == REVOLUTE else 0.0
+            _load_lanes(links, constants, i, amount, cosine, sine, v, a, start, width, joint)
+            _place_lanes(constants, i, joint, turn)
             _advance_lanes(turning, joint, turn, motion[p + 1], motion[i + 1])
             if c >= 0:
                 twists[i + 1, c, :] = 0.0
-            for k in range(tree[8][p] if p >= 0 else 0):
-                _carry_lanes(turn, twists[p + 1, tree[7][p, k]], twists[i + 1, tree[7][p, k]])
+            for k in range(links[p, DEPTH] if p >= 0 else 0):
+                _carry_lanes(turn, twists[p + 1, links[p, PATH + k]], twists[i + 1, links[p, PATH + k]])
             if c >= 0:
-                first = (2 if tree[1][i] == REVOLUTE else 5) * L
-                twists[i + 1, c, first : first + L] += tree[3][i]
-            for k in range(tree[8][i]):
-                j = tree[7][i, k]
+                first = (2 if links[i, KIND] == REVOLUTE else 5) * L
+                twists[i + 1, c, first : first + L] += constants[i, SCALE]
+            for k in range(links[i, DEPTH]):
+                j = links[i, PATH + k]
                 _project_lanes(motion[i + 1], twists[i + 1, j], columns)
                 for r in range(10):
                     row = 10 * i + order[i, r]
@@ -251,76 +251,77 @@ def _wrench(i, parameters, motion, wrench):
 
 
 @njit(**OPTIONS)
-def _return(tree, i, turn, shift, wrench, sign, tau):
+def _return(links, constants, i, frames, wrench, sign, tau):
     """Add sign times body i's share to tau (n,), then its wrench to the parent's."""
-    c, p = tree[4][i], tree[0][i]
+    c, p = links[i, COORDINATE], links[i, PARENT]
+    fx, fy, fz = wrench[i, 0], wrench[i, 1], wrench[i, 2]
+    nx, ny, nz = wrench[i, 3], wrench[i, 4], wrench[i, 5]
     if c >= 0:
-        tau[c] += sign * tree[3][i] * wrench[i, tree[2][i] + (3 if tree[1][i] == REVOLUTE else 0)]
+        tau[c] += sign * constants[i, SCALE] * (nz if links[i, KIND] == REVOLUTE else fz)
     if p >= 0:
-        fx, fy, fz = wrench[i, 0], wrench[i, 1], wrench[i, 2]
-        nx, ny, nz = wrench[i, 3], wrench[i, 4], wrench[i, 5]
-        gx = turn[i, 0, 0] * fx + turn[i, 0, 1] * fy + turn[i, 0, 2] * fz
-        gy = turn[i, 1, 0] * fx + turn[i, 1, 1] * fy + turn[i, 1, 2] * fz
-        gz = turn[i, 2, 0] * fx + turn[i, 2, 1] * fy + turn[i, 2, 2] * fz
-        x, y, z = shift[i, 0], shift[i, 1], shift[i, 2]
+        gx = frames[i, 0] * fx + frames[i, 1] * fy + frames[i, 2] * fz
+        gy = frames[i, 3] * fx + frames[i, 4] * fy + frames[i, 5] * fz
+        gz = frames[i, 6] * fx + frames[i, 7] * fy + frames[i, 8] * fz
+        x, y, z = frames[i, 9], frames[i, 10], frames[i, 11]
         wrench[p, 0] += gx
         wrench[p, 1] += gy
         wrench[p, 2] += gz
-        wrench[p, 3] += turn[i, 0, 0] * nx + turn[i, 0, 1] * ny + turn[i, 0, 2] * nz + y * gz - z * gy
-        wrench[p, 4] += turn[i, 1, 0] * nx + turn[i, 1, 1] * ny + turn[i, 1, 2] * nz + z * gx - x * gz
-        wrench[p, 5] += turn[i, 2, 0] * nx + turn[i, 2, 1] * ny + turn[i, 2, 2] * nz + x * gy - y * gx
+        wrench[p, 3] += frames[i, 0] * nx + frames[i, 1] * ny + frames[i, 2] * nz + y * gz - z * gy
+        wrench[p, 4] += frames[i, 3] * nx + frames[i, 4] * ny + frames[i, 5] * nz + z * gx - x * gz
+        wrench[p, 5] += frames[i, 6] * nx + frames[i, 7] * ny + frames[i, 8] * nz + x * gy - y * gx
 
 
 @njit(**OPTIONS)
-def inverse_dynamics(tree, parameters, amount, cosine, sine, v, a, out):
-    """Fill out (N, n), zero on entry, with the torques (recursive Newton-Euler; Luh, Walker, Paul 1980)."""
+def inverse_dynamics(links, constants, parameters, amount, cosine, sine, v, a, out):
+    """Fill out (N, n), zero on entry, with the torques (recursive Newton-Euler; Luh, Walker, Paul 1980).
+
+    Args:
+        amount, cosine, sine: (N, B), each body's own motion.
+    """
     bodies = amount.shape[1]
-    turn, shift = np.empty((bodies, 3, 3)), np.empty((bodies, 3))
-    motion, wrench, tau = np.zeros((bodies + 1, 9)), np.empty((bodies, 6)), np.empty(v.shape[1])
-    motion[0, 6:] = -tree[6]
+    frames, motion = np.empty((bodies, 12)), np.zeros((bodies + 1, 9))
+    wrench, tau = np.empty((bodies, 6)), np.empty(v.shape[1])
+    motion[0, 6:] = -constants[bodies, :3]
     for sample in range(v.shape[0]):
         tau[:] = 0.0
         for i in range(bodies):
-            c = tree[4][i]
-            rate = tree[3][i] * v[sample, c] if c >= 0 else 0.0
-            change = tree[3][i] * a[sample, c] if c >= 0 else 0.0
-            _place(tree, i, amount[sample, i], cosine[sample, i], sine[sample, i], turn, shift)
-            _advance(tree, i, rate, change, turn, shift, motion)
+            c, scale = links[i, COORDINATE], constants[i, SCALE]
+            _place(links, constants, i, amount[sample, i], cosine[sample, i], sine[sample, i], frames)
+            _advance(links, i, scale * v[sample, c], scale * a[sample, c], frames, motion)
             _wrench(i, parameters, motion, wrench)
         for i in range(bodies - 1, -1, -1):
-            _return(tree, i, turn, shift, wrench, 1.0, tau)
-        for j in range(v.shape[1]):
-            out[sample, j] = tau[j]
+            _return(links, constants, i, frames, wrench, 1.0, tau)
+        out[sample] = tau
 
 
 @njit(**OPTIONS)
-def _compose(tree, i, turn, shift, composite):
-    """Add the parameters of body i, taken to its parent's frame, to the parent's (rows of `composite`, (B, 10))."""
-    p = tree[0][i]
+def _compose(links, i, frames, composite):
+    """Add the parameters of body i, taken to its parent's frame, to the parent's (rows of `composite`, (B, 10)).
+
+    J about the parent's origin = R J Rᵀ + (2 t·h + M t·t) 1 - (h tᵀ + t hᵀ) - M t tᵀ, h in the parent's axes.
+    """
+    p = links[i, PARENT]
     if p < 0:
         return
     xx, xy, xz = composite[i, 0], composite[i, 1], composite[i, 2]
     yy, yz, zz = composite[i, 3], composite[i, 4], composite[i, 5]
     bx, by, bz, mass = composite[i, 6], composite[i, 7], composite[i, 8], composite[i, 9]
-    x, y, z = shift[i, 0], shift[i, 1], shift[i, 2]
-    hx = turn[i, 0, 0] * bx + turn[i, 0, 1] * by + turn[i, 0, 2] * bz
-    hy = turn[i, 1, 0] * bx + turn[i, 1, 1] * by + turn[i, 1, 2] * bz
-    hz = turn[i, 2, 0] * bx + turn[i, 2, 1] * by + turn[i, 2, 2] * bz
-    # J about the parent's origin = R J Rᵀ + (2 t·h + M t·t) 1 - (h tᵀ + t hᵀ) - M t tᵀ
-    trace = 2.0 * (x * hx + y * hy + z * hz) + mass * (x * x + y * y + z * z)
-    k = 0
-    for r in range(3):
-        tx, ty, tz = turn[i, r, 0], turn[i, r, 1], turn[i, r, 2]
-        cx, cy, cz = xx * tx + xy * ty + xz * tz, xy * tx + yy * ty + yz * tz, xz * tx + yz * ty + zz * tz
-        for s in range(r, 3):
-            composite[p, k] += cx * turn[i, s, 0] + cy * turn[i, s, 1] + cz * turn[i, s, 2]
-            k += 1
-    composite[p, 0] += trace - 2.0 * hx * x - mass * x * x
-    composite[p, 3] += trace - 2.0 * hy * y - mass * y * y
-    composite[p, 5] += trace - 2.0 * hz * z - mass * z * z
-    composite[p, 1] -= hx * y + hy * x + mass * x * y
-    composite[p, 2] -= hx * z + hz * x + mass * x * z
-    composite[p, 4] -= hy * z + hz * y + mass * y * z
+    t00, t01, t02 = frames[i, 0], frames[i, 1], frames[i, 2]
+    t10, t11, t12 = frames[i, 3], frames[i, 4], frames[i, 5]
+    t20, t21, t22 = frames[i, 6], frames[i, 7], frames[i, 8]
+    x, y, z = frames[i, 9], frames[i, 10], frames[i, 11]
+    hx, hy, hz = t00 * bx + t01 * by + t02 * bz, t10 * bx + t11 * by + t12 * bz, t20 * bx + t21 * by + t22 * bz
+    ax, ay, az = xx * t00 + xy * t01 + xz * t02, xy * t00 + yy * t01 + yz * t02, xz * t00 + yz * t01 + zz * t02
+    cx, cy, cz = xx * t10 + xy * t11 + xz * t12, xy * t10 + yy * t11 + yz * t12, xz * t10 + yz * t11 + zz * t12
+    first = t00 * ax + t01 * ay + t02 * az
+    second = t10 * cx + t11 * cy + t12 * cz
+    hxx, hyy, hzz = (2.0 * hx + mass * x) * x, (2.0 * hy + mass * y) * y, (2.0 * hz + mass * z) * z
+    composite[p, 0] += first + hyy + hzz
+    composite[p, 1] += t10 * ax + t11 * ay + t12 * az - hx * y - hy * x - mass * x * y
+    composite[p, 2] += t20 * ax + t21 * ay + t22 * az - hx * z - hz * x - mass * x * z
+    composite[p, 3] += second + hxx + hzz
+    composite[p, 4] += t20 * cx + t21 * cy + t22 * cz - hy * z - hz * y - mass * y * z
+    composite[p, 5] += xx + yy + zz - first - second + hxx + hyy  # the trace does not turn
     composite[p, 6] += hx + mass * x
     composite[p, 7] += hy + mass * y
     composite[p, 8] += hz + mass * z
@@ -328,54 +329,39 @@ def _compose(tree, i, turn, shift, composite):
 
 
 @njit(**OPTIONS)
-def _momentum(tree, i, composite, wrench):
-    """Write what a unit rate of body i's own joint gives the composite body: force and moment (row i of `wrench`)."""
-    axis = tree[2][i]
-    one, two = (axis + 1) % 3, (axis + 2) % 3
-    for k in range(6):
-        wrench[i, k] = 0.0
-    if tree[1][i] == REVOLUTE:
-        wrench[i, one], wrench[i, two] = -composite[i, 6 + two], composite[i, 6 + one]
-        wrench[i, 3] = composite[i, axis]
-        wrench[i, 4] = composite[i, 1 if axis == 0 else 3 if axis == 1 else 4]
-        wrench[i, 5] = composite[i, 2 if axis == 0 else 4 if axis == 1 else 5]
-    else:
-        wrench[i, axis] = composite[i, 9]
-        wrench[i, 3 + one], wrench[i, 3 + two] = composite[i, 6 + two], -composite[i, 6 + one]
+def _inertia(links, constants, frames, composite, matrix):
+    """Add the joint-space inertia to matrix (n, n) (composite rigid bodies; Walker & Orin 1982).
 
-
-@njit(**OPTIONS)
-def _inertia(tree, turn, shift, composite, wrench, matrix):
-    """Add the joint-space inertia to matrix (n, n) (composite rigid bodies; Walker & Orin 1982)."""
-    for i in range(turn.shape[0] - 1, -1, -1):
-        _compose(tree, i, turn, shift, composite)
-        c, k = tree[4][i], i
+    A unit rate of joint i gives the composite body behind it a momentum; its share in every joint before is M_ci.
+    """
+    for i in range(frames.shape[0] - 1, -1, -1):
+        _compose(links, i, frames, composite)
+        c, k, weight = links[i, COORDINATE], i, constants[i, SCALE]
         if c < 0:
             continue
-        _momentum(tree, i, composite, wrench)
-        fx, fy, fz = wrench[i, 0], wrench[i, 1], wrench[i, 2]
-        nx, ny, nz = wrench[i, 3], wrench[i, 4], wrench[i, 5]
-        weight = tree[3][i]
-        matrix[c, c] += weight * weight * wrench[i, tree[2][i] + (3 if tree[1][i] == REVOLUTE else 0)]
-        while tree[0][k] >= 0:
-            gx = turn[k, 0, 0] * fx + turn[k, 0, 1] * fy + turn[k, 0, 2] * fz
-            gy = turn[k, 1, 0] * fx + turn[k, 1, 1] * fy + turn[k, 1, 2] * fz
-            gz = turn[k, 2, 0] * fx + turn[k, 2, 1] * fy + turn[k, 2, 2] * fz
-            mx = turn[k, 0, 0] * nx + turn[k, 0, 1] * ny + turn[k, 0, 2] * nz
-            my = turn[k, 1, 0] * nx + turn[k, 1, 1] * ny + turn[k, 1, 2] * nz
-            mz = turn[k, 2, 0] * nx + turn[k, 2, 1] * ny + turn[k, 2, 2] * nz
-            x, y, z = shift[k, 0], shift[k, 1], shift[k, 2]
-            fx, fy, fz = gx, gy, gz
-            nx, ny, nz = mx + y * gz - z * gy, my + z * gx - x * gz, mz + x * gy - y * gx
-            k = tree[0][k]
-            d, axis = tree[4][k], tree[2][k]
+        if links[i, KIND] == REVOLUTE:
+            fx, fy, fz = -composite[i, 7], composite[i, 6], 0.0
+            nx, ny, nz = composite[i, 2], composite[i, 4], composite[i, 5]
+            matrix[c, c] += weight * weight * nz
+        else:
+            fx, fy, fz = 0.0, 0.0, composite[i, 9]
+            nx, ny, nz = composite[i, 7], -composite[i, 6], 0.0
+            matrix[c, c] += weight * weight * fz
+        while links[k, PARENT] >= 0:
+            gx = frames[k, 0] * fx + frames[k, 1] * fy + frames[k, 2] * fz
+            gy = frames[k, 3] * fx + frames[k, 4] * fy + frames[k, 5] * fz
+            gz = frames[k, 6] * fx + frames[k, 7] * fy + frames[k, 8] * fz
+            x, y, z = frames[k, 9], frames[k, 10], frames[k, 11]
+            mx = frames[k, 0] * nx + frames[k, 1] * ny + frames[k, 2] * nz + y * gz - z * gy
+            my = frames[k, 3] * nx + frames[k, 4] * ny + frames[k, 5] * nz + z * gx - x * gz
+            mz = frames[k, 6] * nx + frames[k, 7] * ny + frames[k, 8] * nz + x * gy - y * gx
+            fx, fy, fz, nx, ny, nz = gx, gy, gz, mx, my, mz
+            k = links[k, PARENT]
+            d = links[k, COORDINATE]
             if d >= 0:
-                if tree[1][k] == REVOLUTE:
-                    share = nx if axis == 0 else ny if axis == 1 else nz
-                else:
-                    share = fx if axis == 0 else fy if axis == 1 else fz
-                matrix[c, d] += weight * tree[3][k] * share
-                matrix[d, c] += weight * tree[3][k] * share
+                share = weight * constants[k, SCALE] * (nz if links[k, KIND] == REVOLUTE else fz)
+                matrix[c, d] += share
+                matrix[d, c] += share
 
 
 @njit(**OPTIONS)
@@ -410,82 +396,86 @@ def solve(matrix, vector):
 @njit(**OPTIONS)
 def workspace(bodies, n):
     """Return the scratch arrays of `accelerate` for B bodies and n coordinates."""
-    turn, shift, motion = np.empty((bodies, 3, 3)), np.empty((bodies, 3)), np.zeros((bodies + 1, 9))
-    return turn, shift, motion, np.empty((bodies, 6)), np.empty((bodies, 10)), np.empty((n, n))
+    frames, motion, wrench = np.empty((bodies, 12)), np.zeros((bodies + 1, 9)), np.empty((bodies, 6))
+    return frames, motion, wrench, np.empty((bodies, 10)), np.empty((n, n))
 
 
 @njit(**OPTIONS)
-def accelerate(tree, parameters, added, q, v, tau, work, out):
+def accelerate(links, constants, parameters, added, q, v, tau, work, out):
     """Write the accelerations (n,) of one state: (M(q) + added) a = tau - c(q, v) - g(q).
 
-    Made to be called from other compiled loops: allocates nothing, `work` from `workspace`.
+    Made to be called from other compiled loops: allocates nothing, `work` from `workspace`, `parameters` from
+    `calib.dynamics.rigid_body.kernel_parameters`.
 
     Returns:
         False where the inertia matrix is not positive definite; `out` is then not an answer.
     """
-    turn, shift, motion, wrench, composite, matrix = work
-    bodies, n = turn.shape[0], q.shape[0]
-    motion[0, 6], motion[0, 7], motion[0, 8] = -tree[6][0], -tree[6][1], -tree[6][2]
+    frames, motion, wrench, composite, matrix = work
+    bodies, n = frames.shape[0], q.shape[0]
+    motion[0, 6], motion[0, 7], motion[0, 8] = -constants[bodies, 0], -constants[bodies, 1], -constants[bodies, 2]
     for j in range(n):
         out[j] = tau[j]
         for k in range(n):
             matrix[j, k] = added[j, k]
     for i in range(bodies):
-        c = tree[4][i]
-        amount, rate = (tree[3][i] * q[c], tree[3][i] * v[c]) if c >= 0 else (0.0, 0.0)
-        _place(tree, i, amount, np.cos(amount), np.sin(amount), turn, shift)
-        _advance(tree, i, rate, 0.0, turn, shift, motion)
+        c, scale = links[i, COORDINATE], constants[i, SCALE]
+        amount, cosine, sine = scale * q[c], 1.0, 0.0
+        if links[i, KIND] == REVOLUTE:
+            cosine, sine = np.cos(amount), np.sin(amount)
+        _place(links, constants, i, amount, cosine, sine, frames)
+        _advance(links, i, scale * v[c], 0.0, frames, motion)
         _wrench(i, parameters, motion, wrench)
         for k in range(10):
             composite[i, k] = parameters[10 * i + k]
     for i in range(bodies - 1, -1, -1):
-        _return(tree, i, turn, shift, wrench, -1.0, out)
-    _inertia(tree, turn, shift, composite, wrench, matrix)
+        _return(links, constants, i, frames, wrench, -1.0, out)
+    _inertia(links, constants, frames, composite, matrix)
     return solve(matrix, out)
 
 
 @njit(**OPTIONS)
-def forward_dynamics(tree, parameters, added, q, v, tau, out):
+def forward_dynamics(links, constants, parameters, added, q, v, tau, out):
     """Fill out (N, n) by `accelerate`; return the first sample whose inertia is not positive definite, or -1."""
-    work = workspace(tree[0].shape[0], q.shape[1])
+    work = workspace(links.shape[0], q.shape[1])
     for sample in range(q.shape[0]):
-        if not accelerate(tree, parameters, added, q[sample], v[sample], tau[sample], work, out[sample]):
+        if not accelerate(links, constants, parameters, added, q[sample], v[sample], tau[sample], work, out[sample]):
             return sample
     return -1
 
 
 @njit(**OPTIONS)
-def mass_matrix(tree, parameters, amount, cosine, sine, out):
+def mass_matrix(links, constants, parameters, amount, cosine, sine, out):
     """Fill out (N, n, n), zero on entry, with the joint-space inertia."""
     bodies = amount.shape[1]
-    turn, shift, wrench = np.empty((bodies, 3, 3)), np.empty((bodies, 3)), np.empty((bodies, 6))
-    composite = np.empty((bodies, 10))
+    frames, composite = np.empty((bodies, 12)), np.empty((bodies, 10))
     for sample in range(amount.shape[0]):
         for i in range(bodies):
-            _place(tree, i, amount[sample, i], cosine[sample, i], sine[sample, i], turn, shift)
+            _place(links, constants, i, amount[sample, i], cosine[sample, i], sine[sample, i], frames)
             for k in range(10):
                 composite[i, k] = parameters[10 * i + k]
-        _inertia(tree, turn, shift, composite, wrench, out[sample])
+        _inertia(links, constants, frames, composite, out[sample])
 
 
 @njit(**OPTIONS)
-def _share(tree, i, sample, weights, motion, twists, slopes, bars):
+def _share(links, order, i, sample, weights, motion, twists, slopes, bars):
     """Add body i's own part of the reverse pass: slopes of Σ_j S_j · wrench_i(g_j), g_j = weights[sample, j, body i].
 
     ``slopes`` (B + 1, 9) belongs to w, dw, a; ``bars`` (B + 1, n, 6) to the twists.
     """
     h, first = i + 1, 10 * i
+    k0, k1, k2, k3, k4 = order[i, 0], order[i, 1], order[i, 2], order[i, 3], order[i, 4]
+    k5, k6, k7, k8 = order[i, 5], order[i, 6], order[i, 7], order[i, 8]
     wx, wy, wz = motion[h, 0], motion[h, 1], motion[h, 2]
     ex, ey, ez = motion[h, 3], motion[h, 4], motion[h, 5]
     ax, ay, az = motion[h, 6], motion[h, 7], motion[h, 8]
     square = wx * wx + wy * wy + wz * wz
-    for k in range(tree[8][i]):
-        j = tree[7][i, k]
+    for k in range(links[i, DEPTH]):
+        j = links[i, PATH + k]
         ux, uy, uz = twists[h, j, 0], twists[h, j, 1], twists[h, j, 2]
         sx, sy, sz = twists[h, j, 3], twists[h, j, 4], twists[h, j, 5]
-        xx, xy, xz = weights[sample, j, first], weights[sample, j, first + 1], weights[sample, j, first + 2]
-        yy, yz, zz = weights[sample, j, first + 3], weights[sample, j, first + 4], weights[sample, j, first + 5]
-        hx, hy, hz = weights[sample, j, first + 6], weights[sample, j, first + 7], weights[sample, j, first + 8]
+        xx, xy, xz = weights[sample, j, first + k0], weights[sample, j, first + k1], weights[sample, j, first + k2]
+        yy, yz, zz = weights[sample, j, first + k3], weights[sample, j, first + k4], weights[sample, j, first + k5]
+        hx, hy, hz = weights[sample, j, first + k6], weights[sample, j, first + k7], weights[sample, j, first + k8]
         mass = weights[sample, j, first + 9]
         px, py, pz = xx * wx + xy * wy + xz * wz, xy * wx + yy * wy + yz * wz, xz * wx + yz * wy + zz * wz
         dot = wx * hx + wy * hy + wz * hz
@@ -509,45 +499,42 @@ def _share(tree, i, sample, weights, motion, twists, slopes, bars):
 
 
 @njit(**OPTIONS)
-def _unjoint(tree, i, rate, motion, slopes):
+def _unjoint(links, i, rate, motion, slopes):
     """Undo the joint's own terms of `_advance` in reverse; return the slopes by rate and by change."""
-    kind, axis, h = tree[1][i], tree[2][i], i + 1
-    one, two = (axis + 1) % 3, (axis + 2) % 3
-    if kind == FIXED:
+    h = i + 1
+    if links[i, KIND] == FIXED:
         return 0.0, 0.0
-    if kind == REVOLUTE:
-        by_rate = slopes[h, axis] + slopes[h, 3 + one] * motion[h, two] - slopes[h, 3 + two] * motion[h, one]
-        slopes[h, two] += slopes[h, 3 + one] * rate
-        slopes[h, one] -= slopes[h, 3 + two] * rate
-        return by_rate, slopes[h, 3 + axis]
-    by_rate = 2.0 * (slopes[h, 6 + one] * motion[h, two] - slopes[h, 6 + two] * motion[h, one])
-    slopes[h, two] += 2.0 * slopes[h, 6 + one] * rate
-    slopes[h, one] -= 2.0 * slopes[h, 6 + two] * rate
-    return by_rate, slopes[h, 6 + axis]
+    if links[i, KIND] == REVOLUTE:
+        by_rate = slopes[h, 2] + slopes[h, 3] * motion[h, 1] - slopes[h, 4] * motion[h, 0]
+        slopes[h, 1] += slopes[h, 3] * rate
+        slopes[h, 0] -= slopes[h, 4] * rate
+        return by_rate, slopes[h, 5]
+    by_rate = 2.0 * (slopes[h, 6] * motion[h, 1] - slopes[h, 7] * motion[h, 0])
+    slopes[h, 1] += 2.0 * slopes[h, 6] * rate
+    slopes[h, 0] -= 2.0 * slopes[h, 7] * rate
+    return by_rate, slopes[h, 8]
 
 
 @njit(**OPTIONS)
-def _unadvance(tree, i, rate, turn, shift, motion, slopes):
+def _unadvance(links, i, rate, frames, motion, slopes):
     """Take the slopes of body i's motion to its parent's; return the slope by the joint's own motion."""
-    p, h, axis = tree[0][i] + 1, i + 1, tree[2][i]
-    one, two = (axis + 1) % 3, (axis + 2) % 3
+    p, h = links[i, PARENT] + 1, i + 1
     by_amount = 0.0
-    if tree[1][i] == REVOLUTE:  # d(Rᵀ x)/dθ = -z × Rᵀ x, of the rotated parts of w, dw, a alone
-        vx, vy = motion[h, one], motion[h, two]
-        by_amount += slopes[h, one] * vy - slopes[h, two] * vx
-        by_amount += slopes[h, 3 + one] * (motion[h, 3 + two] + vx * rate)
-        by_amount -= slopes[h, 3 + two] * (motion[h, 3 + one] - vy * rate)
-        by_amount += slopes[h, 6 + one] * motion[h, 6 + two] - slopes[h, 6 + two] * motion[h, 6 + one]
+    if links[i, KIND] == REVOLUTE:  # d(Rᵀ x)/dθ = -z × Rᵀ x, of the rotated parts of w, dw, a alone
+        vx, vy = motion[h, 0], motion[h, 1]
+        by_amount += slopes[h, 0] * vy - slopes[h, 1] * vx
+        by_amount += slopes[h, 3] * (motion[h, 4] + vx * rate) - slopes[h, 4] * (motion[h, 3] - vy * rate)
+        by_amount += slopes[h, 6] * motion[h, 7] - slopes[h, 7] * motion[h, 6]
+    sx, sy, sz = slopes[h, 6], slopes[h, 7], slopes[h, 8]
+    gx = frames[i, 0] * sx + frames[i, 1] * sy + frames[i, 2] * sz
+    gy = frames[i, 3] * sx + frames[i, 4] * sy + frames[i, 5] * sz
+    gz = frames[i, 6] * sx + frames[i, 7] * sy + frames[i, 8] * sz
     for r in range(3):
-        tx, ty, tz = turn[i, r, 0], turn[i, r, 1], turn[i, r, 2]
-        for part in (0, 3, 6):
-            up = tx * slopes[h, part] + ty * slopes[h, part + 1] + tz * slopes[h, part + 2]
-            slopes[p, part + r] += up
-            if part == 6:
-                slopes[0, r] = up
-    gx, gy, gz = slopes[0, 0], slopes[0, 1], slopes[0, 2]
+        tx, ty, tz = frames[i, 3 * r], frames[i, 3 * r + 1], frames[i, 3 * r + 2]
+        slopes[p, r] += tx * slopes[h, 0] + ty * slopes[h, 1] + tz * slopes[h, 2]
+        slopes[p, 3 + r] += tx * slopes[h, 3] + ty * slopes[h, 4] + tz * slopes[h, 5]
     wx, wy, wz = motion[p, 0], motion[p, 1], motion[p, 2]
-    x, y, z = shift[i, 0], shift[i, 1], shift[i, 2]
+    x, y, z = frames[i, 9], frames[i, 10], frames[i, 11]
     dot, gw, gt = wx * x + wy * y + wz * z, gx * wx + gy * wy + gz * wz, 2.0 * (gx * x + gy * y + gz * z)
     slopes[p, 0] += gx * dot + x * gw - wx * gt
     slopes[p, 1] += gy * dot + y * gw - wy * gt
@@ -555,75 +542,72 @@ def _unadvance(tree, i, rate, turn, shift, motion, slopes):
     slopes[p, 3] += y * gz - z * gy
     slopes[p, 4] += z * gx - x * gz
     slopes[p, 5] += x * gy - y * gx
-    if tree[1][i] > REVOLUTE:  # the slope by the shift, along the axis
+    slopes[p, 6] += gx
+    slopes[p, 7] += gy
+    slopes[p, 8] += gz
+    if links[i, KIND] > REVOLUTE:  # the slope by the shift, along z
         ex, ey, ez = motion[p, 3], motion[p, 4], motion[p, 5]
         square = wx * wx + wy * wy + wz * wz
-        by_amount += turn[i, 0, axis] * (gy * ez - gz * ey + wx * gw - gx * square)
-        by_amount += turn[i, 1, axis] * (gz * ex - gx * ez + wy * gw - gy * square)
-        by_amount += turn[i, 2, axis] * (gx * ey - gy * ex + wz * gw - gz * square)
+        by_amount += frames[i, 2] * (gy * ez - gz * ey + wx * gw - gx * square)
+        by_amount += frames[i, 5] * (gz * ex - gx * ez + wy * gw - gy * square)
+        by_amount += frames[i, 8] * (gx * ey - gy * ex + wz * gw - gz * square)
     return by_amount
 
 
 @njit(**OPTIONS)
-def _uncarry(tree, i, turn, shift, twists, bars):
+def _uncarry(links, i, frames, twists, bars):
     """Take the slopes of body i's twists to its parent's; return the slope by the joint's own motion."""
-    p, h, axis, own = tree[0][i], i + 1, tree[2][i], tree[4][i]
-    one, two = (axis + 1) % 3, (axis + 2) % 3
-    x, y, z = shift[i, 0], shift[i, 1], shift[i, 2]
+    p, h = links[i, PARENT], i + 1
+    x, y, z = frames[i, 9], frames[i, 10], frames[i, 11]
     by_amount = 0.0
-    for k in range(tree[8][p] if p >= 0 else 0):
-        j = tree[7][p, k]
-        if tree[1][i] == REVOLUTE:
-            ua, ub = twists[h, j, one], twists[h, j, two]
-            by_amount += bars[h, j, one] * ub - bars[h, j, two] * ua
-            by_amount += bars[h, j, 3 + one] * twists[h, j, 3 + two] - bars[h, j, 3 + two] * twists[h, j, 3 + one]
+    for k in range(links[p, DEPTH] if p >= 0 else 0):
+        j = links[p, PATH + k]
         bx, by, bz = bars[h, j, 0], bars[h, j, 1], bars[h, j, 2]
         cx, cy, cz = bars[h, j, 3], bars[h, j, 4], bars[h, j, 5]
-        sx = turn[i, 0, 0] * cx + turn[i, 0, 1] * cy + turn[i, 0, 2] * cz
-        sy = turn[i, 1, 0] * cx + turn[i, 1, 1] * cy + turn[i, 1, 2] * cz
-        sz = turn[i, 2, 0] * cx + turn[i, 2, 1] * cy + turn[i, 2, 2] * cz
-        bars[p + 1, j, 0] += turn[i, 0, 0] * bx + turn[i, 0, 1] * by + turn[i, 0, 2] * bz + y * sz - z * sy
-        bars[p + 1, j, 1] += turn[i, 1, 0] * bx + turn[i, 1, 1] * by + turn[i, 1, 2] * bz + z * sx - x * sz
-        bars[p + 1, j, 2] += turn[i, 2, 0] * bx + turn[i, 2, 1] * by + turn[i, 2, 2] * bz + x * sy - y * sx
+        sx = frames[i, 0] * cx + frames[i, 1] * cy + frames[i, 2] * cz
+        sy = frames[i, 3] * cx + frames[i, 4] * cy + frames[i, 5] * cz
+        sz = frames[i, 6] * cx + frames[i, 7] * cy + frames[i, 8] * cz
+        bars[p + 1, j, 0] += frames[i, 0] * bx + frames[i, 1] * by + frames[i, 2] * bz + y * sz - z * sy
+        bars[p + 1, j, 1] += frames[i, 3] * bx + frames[i, 4] * by + frames[i, 5] * bz + z * sx - x * sz
+        bars[p + 1, j, 2] += frames[i, 6] * bx + frames[i, 7] * by + frames[i, 8] * bz + x * sy - y * sx
         bars[p + 1, j, 3] += sx
         bars[p + 1, j, 4] += sy
         bars[p + 1, j, 5] += sz
-        if tree[1][i] > REVOLUTE:
+        if links[i, KIND] == REVOLUTE:
+            by_amount += bx * twists[h, j, 1] - by * twists[h, j, 0] + cx * twists[h, j, 4] - cy * twists[h, j, 3]
+        elif links[i, KIND] != FIXED:
             ux, uy, uz = twists[p + 1, j, 0], twists[p + 1, j, 1], twists[p + 1, j, 2]
-            by_amount += turn[i, 0, axis] * (sy * uz - sz * uy)
-            by_amount += turn[i, 1, axis] * (sz * ux - sx * uz)
-            by_amount += turn[i, 2, axis] * (sx * uy - sy * ux)
-    return by_amount if own >= 0 else 0.0
+            by_amount += frames[i, 2] * (sy * uz - sz * uy)
+            by_amount += frames[i, 5] * (sz * ux - sx * uz)
+            by_amount += frames[i, 8] * (sx * uy - sy * ux)
+    return by_amount
 
 
 @njit(**OPTIONS)
-def regressor_gradient(tree, amount, cosine, sine, v, a, weights, gq, gv, ga):
+def regressor_gradient(links, constants, order, amount, cosine, sine, v, a, weights, gq, gv, ga):
     """Add the slopes of Σ weights · Y(q, v, a) by q, v and a to gq, gv, ga (N, n), zero on entry; weights (N, n, 10 B).
 
-    Reverse differentiation of `regressor`, by hand: one forward pass, one pass back, O(n B) per sample.
+    Reverse differentiation of the regressor, by hand: one forward pass, one pass back, O(n B) per sample.
     """
     bodies, n = amount.shape[1], v.shape[1]
-    turn, shift = np.empty((bodies, 3, 3)), np.empty((bodies, 3))
-    motion, twists = np.zeros((bodies + 1, 9)), np.zeros((bodies + 1, n, 6))
+    frames, motion, twists = np.empty((bodies, 12)), np.zeros((bodies + 1, 9)), np.zeros((bodies + 1, n, 6))
     slopes, bars = np.zeros((bodies + 1, 9)), np.zeros((bodies + 1, n, 6))
-    motion[0, 6:] = -tree[6]
+    motion[0, 6:] = -constants[bodies, :3]
     for sample in range(v.shape[0]):
         slopes[:] = 0.0
         bars[:] = 0.0
         for i in range(bodies):
-            c = tree[4][i]
-            rate = tree[3][i] * v[sample, c] if c >= 0 else 0.0
-            change = tree[3][i] * a[sample, c] if c >= 0 else 0.0
-            _place(tree, i, amount[sample, i], cosine[sample, i], sine[sample, i], turn, shift)
-            _advance(tree, i, rate, change, turn, shift, motion)
-            _carry(tree, i, turn, shift, twists)
-            _share(tree, i, sample, weights, motion, twists, slopes, bars)
+            c, scale = links[i, COORDINATE], constants[i, SCALE]
+            _place(links, constants, i, amount[sample, i], cosine[sample, i], sine[sample, i], frames)
+            _advance(links, i, scale * v[sample, c], scale * a[sample, c], frames, motion)
+            _carry(links, constants, i, frames, twists)
+            _share(links, order, i, sample, weights, motion, twists, slopes, bars)
         for i in range(bodies - 1, -1, -1):
-            c, scale = tree[4][i], tree[3][i]
-            rate = scale * v[sample, c] if c >= 0 else 0.0
-            by_rate, by_change = _unjoint(tree, i, rate, motion, slopes)
-            by_amount = _unadvance(tree, i, rate, turn, shift, motion, slopes)
-            by_amount += _uncarry(tree, i, turn, shift, twists, bars)
+            c, scale = links[i, COORDINATE], constants[i, SCALE]
+            rate = scale * v[sample, c]
+            by_rate, by_change = _unjoint(links, i, rate, motion, slopes)
+            by_amount = _unadvance(links, i, rate, frames, motion, slopes)
+            by_amount += _uncarry(links, i, frames, twists, bars)
             if c >= 0:
                 gq[sample, c] += scale * by_amount
                 gv[sample, c] += scale * by_rate

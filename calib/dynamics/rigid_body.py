@@ -34,7 +34,7 @@ def fill_regressor(tree: Tree, q: np.ndarray, v: np.ndarray, a: np.ndarray, out:
 
     amount = q.T[tree.coordinates] * tree.scales[:, None]
     v, a = np.ascontiguousarray(v.T), np.ascontiguousarray(a.T)
-    kernels.regressor(tree.arrays, tree.upright, tree.order, amount, np.cos(amount), np.sin(amount), v, a, out)
+    kernels.regressor(tree.links, tree.constants, tree.order, amount, np.cos(amount), np.sin(amount), v, a, out)
 
 
 def regressor_gradient(
@@ -51,7 +51,7 @@ def regressor_gradient(
     q, v, a = _states(tree, q=q, v=v, a=a)
     weights = np.ascontiguousarray(shaped(weights, (len(q), tree.n, 10 * tree.bodies), "weights of the regressor"))
     slopes = np.zeros((3, *q.shape))
-    kernels.regressor_gradient(tree.arrays, *_placed(tree, q), v, a, weights, *slopes)
+    kernels.regressor_gradient(tree.links, tree.constants, tree.order, *_placed(tree, q), v, a, weights, *slopes)
     return slopes[0], slopes[1], slopes[2]
 
 
@@ -65,7 +65,9 @@ def inverse_dynamics(tree: Tree, parameters: np.ndarray, q: np.ndarray, v: np.nd
 
     q, v, a = _states(tree, q=q, v=v, a=a)
     out = np.zeros_like(q)
-    kernels.inverse_dynamics(tree.arrays, _parameters(tree, parameters), *_placed(tree, q), v, a, out)
+    kernels.inverse_dynamics(
+        tree.links, tree.constants, kernel_parameters(tree, parameters), *_placed(tree, q), v, a, out
+    )
     return out
 
 
@@ -75,7 +77,7 @@ def mass_matrix(tree: Tree, parameters: np.ndarray, q: np.ndarray) -> np.ndarray
 
     (q,) = _states(tree, q=q)
     out = np.zeros((len(q), tree.n, tree.n))
-    kernels.mass_matrix(tree.arrays, _parameters(tree, parameters), *_placed(tree, q), out)
+    kernels.mass_matrix(tree.links, tree.constants, kernel_parameters(tree, parameters), *_placed(tree, q), out)
     return out
 
 
@@ -97,13 +99,21 @@ def forward_dynamics(
     extra = np.zeros((tree.n, tree.n)) if added is None else shaped(added, (tree.n, tree.n), "added inertia")
     out = np.empty_like(q)
     extra = np.ascontiguousarray(extra)
-    failed = kernels.forward_dynamics(tree.arrays, _parameters(tree, parameters), extra, q, v, tau, out)
+    failed = kernels.forward_dynamics(
+        tree.links, tree.constants, kernel_parameters(tree, parameters), extra, q, v, tau, out
+    )
     if failed >= 0:
         raise CalibError(
             f"sample {failed}: the inertia matrix is not positive definite, so these parameters belong to no possible "
             f"robot there; use a physically consistent estimate to simulate"
         )
     return out
+
+
+def kernel_parameters(tree: Tree, parameters: np.ndarray) -> np.ndarray:
+    """Return standard parameters (10 B,) as `kernels.accelerate` wants them: about frames whose moving axis is z."""
+    rows = shaped(parameters, (10 * tree.bodies,), "standard parameters").reshape(tree.bodies, 10)
+    return np.take_along_axis(rows, tree.order, axis=1).ravel()
 
 
 _NAMES = {"q": "joint positions q", "v": "joint velocities v", "a": "joint accelerations a", "tau": "torques tau"}
@@ -117,10 +127,6 @@ def _states(tree: Tree, **arrays: np.ndarray) -> list[np.ndarray]:
         checked.append(np.ascontiguousarray(shaped(array, (rows, tree.n), _NAMES[key])))
         rows = len(checked[0])
     return checked
-
-
-def _parameters(tree: Tree, parameters: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(shaped(parameters, (10 * tree.bodies,), "standard parameters"))
 
 
 def _placed(tree: Tree, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -39,7 +39,9 @@ class Tree:
         gravity: (3,) in the base frame [m/s²].
         paths: (B, n) coordinates that move the body, in the order base to body, then -1.
         depths: (B,) how many of them.
-        upright: (B, 4, 4) the placements between frames turned so that each moving axis is z.
+        links: (B, 4 + n) parent, kind, coordinate, depth and path of every body, for the kernels.
+        constants: (B + 1, 13) the first three rows of every placement, between frames turned so that each moving axis
+            is z, and the scale; gravity in the last row; for the kernels.
         order: (B, 10) where the parameters of the turned frames stand in `STANDARD`.
     """
 
@@ -53,7 +55,8 @@ class Tree:
     gravity: np.ndarray
     paths: np.ndarray
     depths: np.ndarray
-    upright: np.ndarray
+    links: np.ndarray
+    constants: np.ndarray
     order: np.ndarray
 
     @property
@@ -72,14 +75,6 @@ class Tree:
     @property
     def units(self) -> tuple[str, ...]:
         return UNITS * self.bodies
-
-    @property
-    def arrays(self) -> tuple[np.ndarray, ...]:
-        """What every kernel takes as its first argument."""
-        return (
-            self.parents, self.kinds, self.axes, self.scales, self.coordinates, self.placements, self.gravity,
-            self.paths, self.depths,
-        )  # fmt: skip
 
 
 def tree(chain: Chain) -> Tree:
@@ -141,7 +136,10 @@ def with_payload(tree: Tree, placement: np.ndarray, label: str | None = None, on
 
 def with_gravity(tree: Tree, gravity: np.ndarray) -> Tree:
     """Return the tree under another gravity vector (3,) in the base frame [m/s²]."""
-    return replace(tree, gravity=frozen(shaped(gravity, (3,), "gravity")))
+    gravity = shaped(gravity, (3,), "gravity")
+    constants = np.array(tree.constants)
+    constants[-1, :3] = gravity
+    return replace(tree, gravity=frozen(gravity), constants=frozen(constants))
 
 
 def standard_parameters(chain: Chain) -> np.ndarray:
@@ -181,9 +179,13 @@ def _assemble(labels, parents, kinds, axes, scales, coordinates, placements, gra
         if coordinate >= 0 and coordinate not in path:
             path.append(coordinate)
         paths[i, : len(path)], depths[i] = path, len(path)
+    parents, upright = list(parents), np.array(_upright(parents, axes, placements))
+    constants = np.zeros((len(labels) + 1, 13))
+    constants[:-1, :12], constants[:-1, 12] = upright[:, :3].reshape(-1, 12), scales
+    constants[-1, :3] = gravity
     return Tree(
         labels=tuple(labels),
-        parents=frozen(list(parents), np.int64),
+        parents=frozen(parents, np.int64),
         kinds=frozen(kinds, np.int64),
         axes=frozen(axes, np.int64),
         scales=frozen(scales),
@@ -192,7 +194,8 @@ def _assemble(labels, parents, kinds, axes, scales, coordinates, placements, gra
         gravity=frozen(gravity),
         paths=frozen(paths, np.int64),
         depths=frozen(depths, np.int64),
-        upright=frozen(_upright(parents, axes, placements)),
+        links=frozen(np.column_stack([parents, kinds, coordinates, depths, paths]), np.int64),
+        constants=frozen(constants),
         order=frozen([_PERMUTED[axis] for axis in axes], np.int64),
     )
 

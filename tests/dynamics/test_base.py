@@ -173,7 +173,7 @@ def test_regrouping_on_the_calibrated_geometry():
 
 
 def test_a_leaning_axis_adds_weak_directions_and_the_remainder_says_what_they_carry():
-    """Axis 1 at 1 mrad from the vertical: rank 43 -> 45 by columns of about 0.01 N m per kg m, left out and reported."""
+    """Axis 1 at 1 mrad from the vertical: rank 43 -> 45 by columns of 0.01 N m per kg m, left out and reported."""
     chain = load("lwr4plus")
     leaning = IdentificationModel(with_gravity(tree(chain), 9.81 * np.array([np.sin(1e-3), 0.0, -np.cos(1e-3)])))
     first = base.find(IdentificationModel(tree(chain)))
