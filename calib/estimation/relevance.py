@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg
 from scipy.linalg.lapack import dpotri  # type: ignore[attr-defined]
 
-OUTWEIGHED = 1.0  # a group is out once its prior is this many times as precise as the data on its columns (our choice)
+OUTWEIGHED = 2.0  # a group is out once its prior is this many times as precise as the data on its columns (our choice)
 
 
 @dataclass(frozen=True, eq=False)
