@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.arrays import frozen, shaped
-from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.idim import IdentificationModel, friction_states
 from calib.dynamics.tree import FIXED, PRISMATIC
 from calib.errors import CalibError
 from calib.estimation.columns import ColumnSplit, split_columns
@@ -134,13 +134,19 @@ class BaseModel:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Random states over which columns are compared: q, v, a, load (N, n) and friction states (s, N)."""
+    """States over which columns are compared, random or recorded.
+
+    Attributes:
+        q, v, a: (N, n) [rad or m, and per s, per s²].
+        load: (N, n) transmitted torques, where a friction term depends on them.
+        states: (s, N) of `idim.friction_states`, where a friction term remembers.
+    """
 
     q: np.ndarray
     v: np.ndarray
     a: np.ndarray
-    load: np.ndarray
-    states: np.ndarray
+    load: np.ndarray | None = None
+    states: np.ndarray | None = None
 
 
 def random_samples(
@@ -225,13 +231,13 @@ def r_factor(model: IdentificationModel, samples: Samples, loads: Loads = (None,
     before it), then all are stacked: memory is bounded by a block, whatever the number of samples.
     """
     p = model.p
+    states = friction_states(model, samples.q) if samples.states is None else samples.states
     triangles = np.zeros((model.rows, p, p))
     for start in range(0, len(samples.q), BLOCK):
         part = slice(start, start + BLOCK)
         for carried in loads:
-            block = model.regressor(
-                samples.q[part], samples.v[part], samples.a[part], samples.load[part], carried, samples.states[:, part]
-            )
+            load = None if samples.load is None else samples.load[part]
+            block = model.regressor(samples.q[part], samples.v[part], samples.a[part], load, carried, states[:, part])
             for row in range(model.rows):
                 triangles[row] = _updated(triangles[row], block.transpose(2, 1, 0)[:, row])
     return retriangulate(triangles.reshape(-1, p))

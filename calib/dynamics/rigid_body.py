@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib.arrays import shaped
-from calib.dynamics.tree import Tree
+from calib.dynamics.tree import REVOLUTE, Tree
 from calib.errors import CalibError
 
 
@@ -33,8 +33,10 @@ def fill_regressor(tree: Tree, q: np.ndarray, v: np.ndarray, a: np.ndarray, out:
     from calib.dynamics import kernels
 
     amount = q.T[tree.coordinates] * tree.scales[:, None]
+    if np.abs(amount).max(initial=0.0) >= 1e6:  # beyond what the kernel's sine is made for
+        amount = np.where(tree.kinds[:, None] == REVOLUTE, np.remainder(amount, 2 * np.pi), amount)
     v, a = np.ascontiguousarray(v.T), np.ascontiguousarray(a.T)
-    kernels.regressor(tree.links, tree.constants, tree.order, amount, np.cos(amount), np.sin(amount), v, a, out)
+    kernels.regressor(tree.links, tree.constants, tree.order, amount, v, a, out)
 
 
 def regressor_gradient(
