@@ -17,7 +17,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.lib import format as npy
 
-from calib.data.recording import Joints, Recording, cut, span
+from calib.data.recording import Joints, Recording, cut, read_only, span
 from calib.data.recording_options import OWN, RATES, SYNONYMS, RecordingOptions, find_names, joint_order, scale
 from calib.errors import MeasurementError
 
@@ -67,12 +67,12 @@ def _from_archive(
         if values.shape != q.shape:
             message = f"has shape {values.shape} where {found['q']} has {q.shape} (samples, joints)"
             raise MeasurementError(message, path, column=theirs)
-        series["effort" if ours == kind else ours] = values[:, order] * scale(ours, options.units.get(ours, ""))
+        series["effort" if ours == kind else ours] = _arrange(values, order, scale(ours, options.units.get(ours, "")))
     gain = _optional(archive, members, "drive_gain", path, None)
     unused = [name for name in members if name not in (*found.values(), *OWN, *RATES)]
     return Recording(
         t[rows],
-        q[:, order] * scale("q", options.units.get("q", "")),
+        _arrange(q, order, scale("q", options.units.get("q", ""))),
         kind=kind,
         joint_names=names,
         drive_gain=None if gain is None else np.asarray(gain, dtype=float)[order],
@@ -175,6 +175,12 @@ def _member(
         message = f"holds {values.dtype}, expected numbers"
         raise MeasurementError(message, path, column=member.removesuffix(".npy"))
     return values if exact else values.astype(float)
+
+
+def _arrange(values: np.ndarray, order: list[int], factor: float) -> np.ndarray:
+    """Return the columns in `order`, in SI, without a copy where nothing is to do."""
+    values = values if order == list(range(values.shape[1])) else values[:, order]
+    return read_only(values if factor == 1.0 else values * factor)
 
 
 def _skip(stream: IO[bytes], size: int) -> None:

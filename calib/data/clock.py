@@ -30,6 +30,7 @@ GAIN = 0.8  # another clock than the stamps' must bring the roughness below this
 WHOLE = 0.1  # rms distance of the counted steps from whole numbers
 JUDGED = 0.3  # share of the steps at a speed at which they can be counted
 DRIFT = 101  # samples over which a drift of the stamps is followed
+STAY = 15  # samples over which it is judged whether the stamps stay late
 LOOK = 20_000  # samples that are compared
 
 
@@ -78,7 +79,7 @@ def find_clock(recording: Recording, kind: str = "auto") -> Clock:
 def even_times(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
     """Return even times (N,), all kept, and their step [s]: k T + drift, k counting lost samples; None if not even."""
     step = _step(t)
-    k = np.concatenate([[0], np.cumsum(np.maximum(1, np.round(np.diff(t) / step)))])
+    k = np.arange(len(t)) + np.concatenate([[0], np.cumsum(_lost(t, step))])
     period, start = np.polyfit(k, t, 1)
     late = t - (start + period * k)
     even = start + period * k + uniform_filter1d(late, DRIFT, mode="nearest")
@@ -113,6 +114,15 @@ def counted_times(recording: Recording) -> tuple[np.ndarray, np.ndarray, float] 
     count = np.where(stamped > 20, np.maximum(stamped, 1), count)
     t = np.concatenate([[0], np.cumsum(count)]) * period
     return t + np.median(recording.t - t), np.concatenate([[True], count > 0]), period
+
+
+def _lost(t: np.ndarray, step: float) -> np.ndarray:
+    """Return (N - 1,) how many samples are missing in each step: whole steps by which the stamps stay late after it."""
+    lost, late = np.zeros(len(t) - 1), t - step * np.arange(len(t))
+    for i in np.flatnonzero(np.diff(t) > 1.5 * step) + 1:
+        after, before = late[i : i + STAY], late[max(0, i - STAY) : i]
+        lost[i - 1] = max(0.0, np.round((np.median(after) - np.median(before)) / step))
+    return lost
 
 
 def _step(t: np.ndarray) -> float:

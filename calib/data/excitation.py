@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import detrend, find_peaks, periodogram
+from scipy.signal import detrend, find_peaks, get_window, periodogram
 from scipy.spatial import cKDTree
 
 from calib.arrays import frozen
@@ -95,7 +95,8 @@ def repeats(training: Motion, other: Motion) -> float:
 
 def _lines(q: np.ndarray, rate: float) -> tuple[int, float, float]:
     """Return the number of lines, the strongest one's frequency [Hz], and its part of the power of a series (N,)."""
-    f, power = periodogram(q, rate, "hann", nfft=4 * len(q))
+    window = get_window("hann", len(q))
+    f, power = periodogram(q - window @ q / window.sum(), rate, window, nfft=4 * len(q), detrend=False)
     peaks, _ = find_peaks(power, height=LINE * power.max(), distance=8, prominence=0.5 * LINE * power.max())
     top = int(np.argmax(power))
     width = 8  # half the main lobe of Hann's window, in steps of the padded transform

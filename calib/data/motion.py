@@ -16,7 +16,7 @@ from calib.arrays import frozen
 from calib.data.bandwidth import USABLE, Cutoffs, check_cutoff, propose_cutoffs
 from calib.data.decimation import Decimator, decimate, design_decimator, factor_for, kept, too_short
 from calib.data.filtering import ORDER, border, curvature, low_pass, slope
-from calib.data.recording import Recording
+from calib.data.recording import Recording, read_only
 from calib.data.resampling import GAP, Resampled, SamplingReport, resample
 from calib.errors import MeasurementError, UsageError
 
@@ -122,11 +122,11 @@ def make_motion(recording: Recording, options: FilterOptions | None = None) -> M
     q, v, a, inside = _derive(sampled, cutoff, options)
     if not len(kept(sampled.segment[inside], decimator)):
         raise too_short(int(inside.sum()), decimator)
-    others = {name: value[inside] for name, value in sampled.series.items() if name not in ("q", "v")}
-    v_measured = sampled.series["v"][inside] if "v" in sampled.series else None
+    others = {name: read_only(value[inside]) for name, value in sampled.series.items() if name not in ("q", "v")}
+    v_measured = read_only(sampled.series["v"][inside]) if "v" in sampled.series else None
     return Motion(
-        *(frozen(values[inside]) for values in (sampled.t, q, v, a)),
-        weight=frozen(sampled.weight[inside]),
+        *(read_only(values[inside]) for values in (sampled.t, q, v, a)),
+        weight=read_only(sampled.weight[inside]),
         segment=frozen(sampled.segment[inside], int),
         rate=sampled.rate,
         band=decimator.band,

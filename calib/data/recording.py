@@ -88,11 +88,11 @@ class Recording:
         for name in SERIES:
             value = getattr(self, name)
             if value is not None:
-                object.__setattr__(self, name, frozen(value))
+                object.__setattr__(self, name, settled(value))
                 if getattr(self, name).shape != shape:
                     found = getattr(self, name).shape
                     raise MeasurementError(f"{name} has shape {found}, expected {shape} (samples, joints)", self.file)
-        object.__setattr__(self, "t", frozen(self.t))
+        object.__setattr__(self, "t", settled(self.t))
         object.__setattr__(self, "joint_names", tuple(self.joint_names))
         rows = np.arange(1, shape[0] + 1) if self.rows is None else self.rows
         object.__setattr__(self, "rows", frozen(rows, int))
@@ -111,6 +111,19 @@ class Recording:
     def duration(self) -> float:
         """Time from the first to the last sample [s]."""
         return float(self.t[-1] - self.t[0]) if len(self) else 0.0
+
+
+def settled(values: np.ndarray) -> np.ndarray:
+    """Return `values` themselves where they are read-only floats already, else a frozen copy: logs are large."""
+    owner = values.base if isinstance(values, np.ndarray) and values.base is not None else values
+    fixed = isinstance(owner, np.ndarray) and not owner.flags.writeable and values.dtype == float
+    return values if fixed else frozen(values)
+
+
+def read_only(values: np.ndarray) -> np.ndarray:
+    """Return `values`, which nobody else holds, locked."""
+    values.flags.writeable = False
+    return values
 
 
 def take(recording: Recording, index: slice | np.ndarray) -> Recording:

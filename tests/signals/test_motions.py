@@ -1,0 +1,240 @@
+"""From a log with a bad clock, gaps and noise to the motion that was."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.data.bandwidth import propose_cutoffs
+from calib.data.clock import find_clock
+from calib.data.decimation import decimate, decimate_regressor
+from calib.data.excitation import repeats, report_excitation
+from calib.data.motion import FilterOptions, in_band, make_motion, moving, standstill, thin
+from calib.data.recording import Recording, take
+from calib.data.resampling import resample
+from calib.errors import MeasurementError, UsageError
+
+
+def waves(t: np.ndarray, lines=((0.4, 0.9, 1.3), (0.3, 0.7, 1.1)), phase: float = 7.0) -> tuple[np.ndarray, ...]:
+    """Return q, v, a (N, n) of sums of sines."""
+    sums = []
+    for order, f in ((0, np.sin), (1, np.cos), (2, lambda x: -np.sin(x))):
+        sums.append(
+            np.stack(
+                [
+                    sum(0.4 / w * (2 * np.pi * w) ** order * f(2 * np.pi * w * t + phase * w) for w in line)
+                    for line in lines
+                ],
+                1,
+            )
+        )
+    return tuple(sums)
+
+
+def recorded(t: np.ndarray, true: np.ndarray, noise: float = 0.0, seed: int = 0, measured: bool = True) -> Recording:
+    """Return a log stamped `t` of samples taken at `true`."""
+    q, v, a = waves(true)
+    random = np.random.default_rng(seed)
+    tau = 20 * np.cos(q) + 2 * v + 0.5 * a
+    q = q + random.normal(0, noise, q.shape) if noise else q
+    return Recording(t, q, tau, "torque", ("a", "b"), v=v if measured else None, file="log.npz")
+
+
+def even(rate: float = 500.0, duration: float = 10.0) -> np.ndarray:
+    return np.arange(int(duration * rate)) / rate
+
+
+def test_a_clean_log_gives_the_derivatives():
+    t = even()
+    motion = make_motion(recorded(t, t), FilterOptions(cutoff=30.0))
+    for found, true in zip((motion.q, motion.v, motion.a), waves(motion.t)):
+        np.testing.assert_allclose(found[100:-100], true[100:-100], atol=1e-4 * np.abs(true).max())
+        np.testing.assert_allclose(found, true, atol=5e-3 * np.abs(true).max())  # what the ends still feel
+    assert motion.segment.max() == 0 and motion.weight.min() == 1 and motion.sampling.clock == "stamps"
+
+
+def test_true_jitter_is_resampled_by_the_stamps():
+    t = even()
+    jittered = t + np.random.default_rng(1).uniform(-6e-4, 6e-4, len(t))
+    sampled = resample(recorded(jittered, jittered))
+    assert sampled.report.clock == "stamps" and 2e-4 < sampled.report.jitter[0] < 8e-4
+    np.testing.assert_allclose(sampled.series["q"], waves(sampled.t)[0], atol=1e-7)
+    assert np.ptp(np.diff(sampled.t)) < 1e-12
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_jitter_of_the_logger_alone_is_seen_through(measured):
+    t = even()
+    jittered = t + np.random.default_rng(2).uniform(-6e-4, 6e-4, len(t))
+    clock = find_clock(recorded(jittered, t, measured=measured))
+    assert clock.kind in ("even", "counted") and clock.roughness[clock.kind] < 0.1
+    assert np.std(clock.t - t) < 1e-4
+
+
+def test_samples_read_twice_and_missed_are_counted():
+    random = np.random.default_rng(3)
+    k = np.cumsum(random.choice([0, 1, 2], 5000, p=[0.06, 0.88, 0.06]))
+    true = k / 500
+    stamps = np.arange(5000) / 500 + random.uniform(-5e-4, 5e-4, 5000)
+    recording = recorded(stamps, true)
+    clock = find_clock(recording)
+    assert clock.kind == "counted" and (~clock.keep).sum() == (np.diff(k) == 0).sum()
+    steps = np.diff(clock.t) * 500
+    assert np.mean(np.abs(steps - np.diff(k)) < 0.01) > 0.99  # all but where the robot is too slow to count
+    report = resample(recording).report
+    assert report.repeated == (np.diff(k) == 0).sum() and report.lost > 200
+    assert any("read twice" in line for line in report.lines())
+    motion, blind = make_motion(recording), make_motion(recording, FilterOptions(clock="stamps"))
+    assert np.abs(motion.a).max() < 1.1 * np.abs(waves(true)[2]).max() and motion.weight.min() == 0
+    assert np.abs(blind.a - waves(blind.t)[2]).std() > 3 * np.abs(motion.a - waves(motion.t)[2]).std() * 0.5
+
+
+def test_a_clock_that_is_not_there_is_refused():
+    t = even()
+    with pytest.raises(UsageError, match="cannot be dated so"):
+        find_clock(recorded(t, t, measured=False), "counted")
+    with pytest.raises(UsageError, match="expected one of auto, stamps"):
+        find_clock(recorded(t, t), "sundial")
+
+
+def test_short_gaps_are_bridged_and_long_ones_split():
+    t = even()
+    keep = np.ones(len(t), dtype=bool)
+    keep[1000:1004] = False  # 10 ms
+    keep[2500:3500] = False  # 2 s
+    sampled = resample(take(recorded(t, t), keep))
+    report = sampled.report
+    assert report.lost == 4 and len(report.gaps) == 1 and not report.dropped
+    start, length = report.gaps[0]
+    assert start == pytest.approx(t[2499]) and length == pytest.approx(2.002)
+    assert any(line == "gap of 2 s at 4.998 s: split there" for line in report.lines())
+    assert sampled.weight[1000:1004].max() == 0 and sampled.weight.sum() == keep.sum()
+    np.testing.assert_allclose(sampled.series["q"][1000:1004], waves(t)[0][1000:1004], atol=1e-6)
+    motion = make_motion(take(recorded(t, t), keep))
+    assert sorted(set(motion.segment)) == [0, 1]
+    assert not ((motion.t > t[2499] - 0.05) & (motion.t < t[3500] + 0.05)).any()
+    index = thin(motion)
+    assert len(decimate(motion.effort, motion.decimator, motion.segment)) == len(index)
+
+
+def test_crumbs_between_gaps_are_left_out():
+    t = even()
+    keep = np.ones(len(t), dtype=bool)
+    keep[2000:2500] = keep[2530:3000] = False
+    report = resample(take(recorded(t, t), keep)).report
+    assert len(report.gaps) == 2 and len(report.dropped) == 1
+    with pytest.raises(MeasurementError, match="none longer than 50 samples"):
+        resample(take(recorded(t, t), np.arange(len(t)) % 400 < 40))
+
+
+@pytest.mark.parametrize(
+    ("options", "pattern"),
+    [
+        (FilterOptions(cutoff=250.0), "cut-off of 250 Hz is not between 0 and the Nyquist frequency, 250 Hz at 500 Hz"),
+        (FilterOptions(cutoff=(10.0, 400.0)), "cut-off of 400 Hz"),
+        (FilterOptions(band=300.0), "identification band of 300 Hz"),
+        (FilterOptions(band=0.2), r"needs .* s without a gap"),
+    ],
+)
+def test_filters_that_cannot_be(options, pattern):
+    t = even()
+    with pytest.raises(MeasurementError, match=pattern):
+        make_motion(recorded(t, t), options)
+
+
+def test_cutoffs_are_one_or_one_per_joint():
+    t = even()
+    with pytest.raises(UsageError, match="3 values for 2 joints"):
+        make_motion(recorded(t, t), FilterOptions(cutoff=(1.0, 2.0, 3.0)))
+    assert list(make_motion(recorded(t, t), FilterOptions(cutoff=(20.0, 30.0))).cutoff) == [20.0, 30.0]
+
+
+def test_proposed_cutoffs_follow_the_motion_and_the_noise():
+    t = even(500.0, 20.0)
+    proposed = propose_cutoffs(resample(recorded(t, t, noise=1e-6)))
+    assert proposed.joint_dynamics.max() <= 1.75 and proposed.dynamics == 2.0  # lines up to 1.3 Hz, windows of 4 s
+    assert proposed.position == 10.0 and 3.99 < proposed.band < 4.2
+    assert proposed.band == pytest.approx(0.8 * 500 / (2 * proposed.factor))
+    np.testing.assert_allclose(proposed.noise, 1e-6, rtol=0.1)
+    noisy = propose_cutoffs(resample(recorded(t, t, noise=3e-3)))
+    assert noisy.position < 10.0 and any("noise exceeds 5 %" in reason for reason in noisy.reasons)
+    stated = propose_cutoffs(resample(recorded(t, t)), dynamics=10.0)
+    assert stated.position == 50.0 and stated.band > 19.99
+
+
+def test_a_resonance_does_not_raise_the_cutoff():
+    t = even(500.0, 20.0)
+    clean = recorded(t, t, noise=1e-7)
+    ringing = replace(clean, q=clean.q + 2e-4 * np.sin(2 * np.pi * 60 * t)[:, None])
+    proposed = propose_cutoffs(resample(ringing))
+    assert proposed.dynamics <= 2.0 and proposed.position <= 10.0
+
+
+def test_the_model_holds_after_the_parallel_decimation():
+    """W x = y for the true parameters, filtered and thinned alike, in blocks."""
+    t = even()
+    motion = make_motion(recorded(t, t), FilterOptions(cutoff=40.0, band=20.0))
+
+    def regressor(q, v, a):
+        return np.stack([np.cos(q), v, a], axis=-1)
+
+    w = np.concatenate(list(decimate_regressor(regressor, motion, motion.decimator, block=700)))
+    y = decimate(motion.effort, motion.decimator, motion.segment)
+    x = np.linalg.lstsq(w.reshape(-1, 3), y.ravel(), rcond=None)[0]
+    np.testing.assert_allclose(x, [20.0, 2.0, 0.5], rtol=2e-4)
+    assert len(thin(motion)) == len(w) and thin(motion).rate == pytest.approx(50.0)
+
+
+def test_standing_and_moving_samples():
+    t = even(500.0, 12.0)
+    q = np.zeros((len(t), 2))
+    s = np.clip((t - 3) / 6, 0, 1)
+    q[:, 0] = s**3 * (10 - 15 * s + 6 * s**2)
+    recording = Recording(t, q, np.ones_like(q) + q, "torque", ("a", "b"))
+    motion = make_motion(recording, FilterOptions(cutoff=20.0))
+    stands = standstill(motion)
+    assert stands[motion.t < 2.9].all() and stands[motion.t > 9.1].all() and not stands[abs(motion.t - 6) < 2].any()
+    assert not moving(motion)[:, 1].any()
+    fast = moving(motion, [0.2, 0.2])[:, 0]
+    assert 0 < fast.sum() < (~stands).sum()
+
+
+def test_the_signal_in_the_band():
+    t = even()
+    clean = recorded(t, t)
+    rippled = replace(clean, effort=clean.effort + np.sin(2 * np.pi * 90 * t)[:, None])
+    motion = make_motion(rippled, FilterOptions(cutoff=30.0, band=20.0))
+    inner = slice(100, -100)
+    clear = 20 * np.cos(waves(motion.t)[0]) + 2 * waves(motion.t)[1] + 0.5 * waves(motion.t)[2]
+    np.testing.assert_allclose(in_band(motion, motion.effort)[inner], clear[inner], atol=0.05)
+
+
+def one_sine(t: np.ndarray) -> Recording:
+    q = np.stack([np.sin(2 * np.pi * 0.4 * t), 0.5 * np.sin(2 * np.pi * 0.4 * t), np.cos(2 * np.pi * 0.4 * t)], 1)
+    return Recording(t, q, q + 0.01, "torque", ("a", "b", "c"))
+
+
+def test_one_frequency_is_noticed():
+    t = even()
+    report = report_excitation(make_motion(one_sine(t)))
+    assert list(report.lines) == [1, 1, 1] and report.functions == 2 and report.poor
+    np.testing.assert_allclose(report.strongest, 0.4, atol=0.03)
+    assert any("at one frequency (0." in note for note in report.notes)
+    assert any("a–b" in note for note in report.notes)
+    rich = report_excitation(make_motion(recorded(t, t)))
+    assert list(rich.lines) == [3, 3] and not rich.poor and not rich.notes
+
+
+def test_a_repeat_is_recognised_however_it_is_shifted():
+    t = even(200.0, 24.0)
+    training = make_motion(recorded(t, t, noise=1e-5))
+    late = make_motion(recorded(t, t + 3.3, noise=1e-5, seed=1))  # all lines are multiples of 0.1 Hz: a period of 10 s
+    slower = make_motion(recorded(t, 0.5 * t, noise=1e-5, seed=2))
+    q, v, a = waves(t, ((0.35, 0.85, 1.15), (0.25, 0.55, 0.95)), 3.0)
+    other = make_motion(Recording(t, q, 20 * np.cos(q) + 2 * v + 0.5 * a, "torque", ("a", "b")))
+    assert repeats(training, late) > 0.99
+    assert repeats(training, training) == 1.0
+    assert repeats(training, slower) < 0.2
+    assert repeats(training, other) < 0.2

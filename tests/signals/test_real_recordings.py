@@ -1,0 +1,58 @@
+"""Recordings that nobody here made: what they hold, and what is found in them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib.data.excitation import repeats, report_excitation
+from calib.data.motion import make_motion
+from calib.data.recording_files import read_recording
+
+PANDA = "franka_panda_inria/traj1_first60pct.npz"
+LWR = "kuka_lwr4plus_iit/measurements_1.npz"
+UR = "ur10e_innopolis/ur-20_02_19_14harm50sec"
+
+
+@pytest.mark.parametrize(
+    ("file", "samples", "joints", "kind", "clock"),
+    [
+        (PANDA, 12326, 7, "torque", "counted"),
+        (LWR, 5027, 7, "torque", "even"),
+        ("staubli_tx40/tx40_first_5p4s.npz", 27000, 6, "torque", "stamps"),
+        ("kuka_kr300_tuk/traj_A.npz", 2501, 6, "torque", "stamps"),
+        ("tiago_laas/dynamic.npz", 5870, 8, "current", "even"),
+        (f"{UR}.npz", 4772, 6, "current", "stamps"),
+    ],
+)
+def test_every_archive_becomes_a_motion(data, file, samples, joints, kind, clock):
+    recording = read_recording(data / file)
+    assert (len(recording), recording.n, recording.kind) == (samples, joints, kind)
+    motion = make_motion(recording)
+    assert motion.sampling.clock == clock
+    assert np.isfinite(motion.a).all() and len(motion) > 0.9 * samples
+    assert 2.0 <= motion.cutoffs.dynamics <= 10.0  # robots' position loops; the slides' TX40: at most 10 Hz
+
+
+def test_the_pandas_samples_are_whole_milliseconds_apart(data):
+    report = make_motion(read_recording(data / PANDA)).sampling
+    assert report.rate == pytest.approx(1000.0, rel=2e-4)
+    assert report.repeated > 700 and report.lost > 800 and report.roughness["counted"] < 0.05
+
+
+def test_the_lwr_moves_at_one_frequency_and_its_second_half_repeats_the_first(data):
+    report = report_excitation(make_motion(read_recording(data / LWR)))
+    assert report.poor and report.functions == 2
+    np.testing.assert_allclose(report.strongest, 0.08, atol=0.005)
+    halves = [make_motion(read_recording(f"{data / LWR}@{part}")) for part in ("0:13", "13:")]
+    assert repeats(*halves) > 0.8
+
+
+def test_the_panda_and_the_ur10e_do_not_repeat_but_a_loaded_run_does(data):
+    first, rest = (make_motion(read_recording(f"{data / PANDA}@{part}")) for part in ("0:9.4", "9.4:"))
+    assert repeats(first, rest) < 0.05 and not report_excitation(first).poor
+    free, loaded, other = (
+        make_motion(read_recording(data / f"{name}.npz"))
+        for name in (UR, f"{UR}Load", "ur10e_innopolis/ur-20_02_10-30sec_12harm")
+    )
+    assert repeats(free, loaded) > 0.95 and repeats(other, free) < 0.1

@@ -1,0 +1,229 @@
+"""Recordings read from archives, tables and bags, cut, and refused with the row and the reason."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.data.recording import Joints, Recording, cut, parse_cut
+from calib.data.recording_files import read_recording
+from calib.data.recording_options import RecordingOptions
+from calib.errors import MeasurementError, UsageError
+
+LIMITS = {"lower": np.full(3, -3.0), "upper": np.full(3, 3.0), "effort": np.full(3, 100.0)}
+ROBOT = Joints(("a", "b", "c"), **LIMITS)
+
+
+def refused(path: Path | str, pattern: str, joints: Joints | None = ROBOT, **options) -> MeasurementError:
+    with pytest.raises(MeasurementError, match=pattern) as caught:
+        read_recording(path, joints, RecordingOptions(**options))
+    return caught.value
+
+
+def test_an_archive_comes_back_as_it_was_written(archive, series):
+    recording = read_recording(archive(), ROBOT)
+    np.testing.assert_array_equal(recording.q, series["q"])
+    np.testing.assert_array_equal(recording.effort, series["tau"])
+    assert recording.kind == "torque" and recording.joint_names == ("a", "b", "c") and not recording.notes
+    assert recording.n == 3 and recording.duration == pytest.approx(11.995)
+    with pytest.raises(ValueError, match="read-only"):
+        recording.q[0, 0] = 1.0
+
+
+def test_flobaroids_names_and_currents(tmp_path, series):
+    path = tmp_path / "floba.npz"
+    np.savez(path, times=series["t"], positions=series["q"], velocities=series["dq"], torques=series["tau"])
+    assert read_recording(path).v is not None
+    np.savez(path, time=series["t"], Position=series["q"], i=series["tau"], drive_gain=[1.0, 2.0, 3.0])
+    recording = read_recording(path)
+    assert recording.kind == "current" and recording.drive_gain is not None
+    assert read_recording(path, options=RecordingOptions(kind="torque")).kind == "torque"
+
+
+def test_joints_are_found_by_name_in_any_order(archive, series):
+    path = archive(joint_names=np.array(["gripper", "c", "b", "a"]), **{
+        key: np.column_stack([np.zeros(2400), series[key][:, ::-1]]) for key in ("q", "dq", "tau")
+    })  # fmt: skip
+    np.testing.assert_array_equal(read_recording(path, ROBOT).q, series["q"])
+    refused(path, r"has no joint 'arm_a'", Joints(("arm_a", "b", "c")))
+
+
+def test_a_rate_stands_in_for_stamps(archive):
+    assert read_recording(archive(t=None, frequency=200.0)).t[-1] == pytest.approx(2399 / 200)
+    assert read_recording(archive(t=None), options=RecordingOptions(rate=200.0)).duration == pytest.approx(2399 / 200)
+    refused(archive(t=None), "neither stamps nor a rate")
+
+
+def test_cuts(archive, recording):
+    part = read_recording(f"{archive()}@2:4.5", ROBOT)
+    assert part.t[0] == 2.0 and len(part) == 500 and part.rows[0] == 401
+    np.testing.assert_array_equal(part.q, cut(recording, 2.0, 4.5).q)
+    assert len(read_recording(f"{archive()}@10:")) == 400
+    assert parse_cut("a@b.npz") == ("a@b.npz", None, None) and parse_cut("x.npz@:3") == ("x.npz", None, 3.0)
+    refused(f"{archive()}@20:30", r"the cut @20:30 leaves no sample; the recording ends at 11.99 s")
+    for wrong in ("x.npz@3:1", "x.npz@a:b"):
+        with pytest.raises(UsageError):
+            parse_cut(wrong)
+
+
+def test_use_range_is_followed_unless_a_cut_says_otherwise(archive):
+    path = archive(use_range=np.array([400, 2000]))
+    recording = read_recording(path)
+    assert len(recording) == 1600 and recording.t[0] == 2.0 and recording.rows[0] == 401
+    assert recording.notes == ("rows 401 to 2000 of 2400 are used: its use_range",)
+    assert len(read_recording(f"{path}@0:12")) == 2400
+    assert len(read_recording(path, options=RecordingOptions(use_range=False))) == 2400
+
+
+def test_tables_with_units_and_names(tmp_path, series):
+    path = tmp_path / "log.csv"
+    q, t, tau = np.degrees(series["q"]), series["t"] * 1e3 + 5000, series["tau"]
+    np.savetxt(path, np.column_stack([t, q, tau]), delimiter=",", comments="",
+               header="time [ms],q1 [deg],q2 [deg],q3 [deg],tau_a [Nm],tau_b [Nm],tau_c [Nm]")  # fmt: skip
+    recording = read_recording(path, ROBOT)
+    np.testing.assert_allclose(recording.q, series["q"], atol=1e-12)
+    np.testing.assert_allclose(recording.t, series["t"], atol=1e-9)
+    assert recording.kind == "torque" and recording.v is None
+    np.savetxt(path, np.column_stack([t, q, tau]), delimiter=",", comments="",
+               header="t,position_c,position_b,position_a,current[0],current[1],current[2]")  # fmt: skip
+    options = RecordingOptions(units={"t": "ms", "q": "deg"})
+    by_name = read_recording(path, ROBOT, options)
+    np.testing.assert_allclose(by_name.q, series["q"][:, ::-1], atol=1e-12)
+    assert by_name.kind == "current"
+    refused(path, "looks like deg", units={"t": "ms"})
+    assert len(read_recording(f"{path}@1:2", ROBOT, options)) == 200
+
+
+def test_a_table_says_which_cell_is_wrong(tmp_path, series):
+    rows = np.column_stack([series["t"], series["q"], series["tau"]])
+    path = tmp_path / "log.csv"
+    header = "t,q1,q2,q3,tau1,tau2,tau3"
+    rows[700, 5] = np.nan
+    np.savetxt(path, rows, delimiter=",", comments="", header=header)
+    error = refused(path, "found nan")
+    assert (error.row, error.column) == (701, "torque of b (joint 2)")
+    np.savetxt(path, rows[:, :6], delimiter=",", comments="", header=header[:-5])
+    refused(path, "2 columns of torque")
+    np.savetxt(path, rows[:, :4], delimiter=",", comments="", header=header[:10])
+    refused(path, "no torques and no currents")
+    path.write_text(header.replace("tau2", "tau2 [furlong]") + "\n0,1,2,3,4,5,6\n")
+    refused(path, r"unit 'furlong'")
+
+
+@pytest.mark.parametrize("kind", ["mcap", "sqlite3"])
+def test_ros2_bags_without_ros(tmp_path, series, kind):
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    state, header, stamp = (
+        store.types[name]
+        for name in ("sensor_msgs/msg/JointState", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+    )
+    plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+    with Writer(tmp_path / "bag", version=9, storage_plugin=plugin) as writer:
+        topic = writer.add_connection("/joint_states", state.__msgtype__, typestore=store)
+        for k in range(600):
+            ns = 1_700_000_000 * 10**9 + k * 5_000_000
+            time = header(stamp=stamp(sec=ns // 10**9, nanosec=ns % 10**9), frame_id="")
+            q, v, tau = (series[key][k, ::-1].copy() for key in ("q", "dq", "tau"))
+            message = state(header=time, name=["c", "b", "a"], position=q, velocity=v, effort=tau)
+            writer.write(topic, ns + 300_000, store.serialize_cdr(message, state.__msgtype__))
+            if k % 10 == 0:
+                grip = state(header=time, name=["finger"], position=q[:1], velocity=v[:1], effort=tau[:1])
+                writer.write(topic, ns + 400_000, store.serialize_cdr(grip, state.__msgtype__))
+    recording = read_recording(tmp_path / "bag", ROBOT)
+    np.testing.assert_array_equal(recording.q, series["q"][:600])
+    np.testing.assert_array_equal(recording.effort, series["tau"][:600])
+    np.testing.assert_allclose(recording.t, series["t"][:600], atol=1e-9)
+    assert recording.kind == "torque" and recording.notes == ("60 messages lack one of the joints; left out",)
+    if kind == "mcap":
+        bare = next((tmp_path / "bag").glob("*.mcap"))
+        np.testing.assert_array_equal(read_recording(f"{bare}@1:2", ROBOT).q, series["q"][200:400])
+        refused(bare, "no joint states on '/states'", topic="/states")
+        refused(bare, "has no joint 'elbow'", Joints(("elbow",)))
+
+
+def test_broken_and_foreign_files(tmp_path, archive):
+    refused(tmp_path / "none.npz", "No such file")
+    (tmp_path / "empty.npz").write_bytes(b"")
+    refused(tmp_path / "empty.npz", "is empty")
+    (tmp_path / "cut.npz").write_bytes(archive().read_bytes()[:9000])
+    refused(tmp_path / "cut.npz", "damaged archive")
+    (tmp_path / "zeros.csv").write_bytes(bytes(10_000))
+    refused(tmp_path / "zeros.csv", "neither a NumPy archive")
+    (tmp_path / "x.mcap").write_bytes(b"nothing of the kind")
+    refused(tmp_path / "x.mcap", "cannot be read as a ROS bag")
+    refused(tmp_path, "cannot be read as a ROS bag")
+    np.savez(tmp_path / "objects.npz", t=np.arange(9.0), q=np.array([None] * 9))
+    refused(tmp_path / "objects.npz", "no torques and no currents")
+    np.savez(tmp_path / "objects.npz", t=np.arange(9.0), q=np.array([None] * 9), tau=np.ones((9, 1)))
+    refused(tmp_path / "objects.npz", "Python objects")
+
+
+def test_time_that_cannot_be(archive, series):
+    t = series["t"].copy()
+    t[500:] -= 1.0
+    error = refused(archive(t=t), r"time goes back from 2.495 s to 1.5 s \(1 times\)")
+    assert (error.row, error.column) == (501, "t")
+    t = series["t"].copy()
+    t[500] = t[499]
+    assert refused(archive(t=t), "two samples have the stamp").row == 501
+    refused(archive(t=series["t"] * 1e3), "the stamps look like ms")
+    refused(archive(t=(series["t"] * 1e9).astype(int)), "the stamps look like ns")
+    assert read_recording(archive(t=series["t"] * 1e3), options=RecordingOptions(units={"t": "ms"})).duration < 13
+    t = series["t"].copy()
+    t[7] = np.nan
+    assert refused(archive(t=t), "found nan").column == "t"
+
+
+def test_rows_written_twice_are_left_out(archive, series):
+    twice = {key: np.repeat(series[key], [2 if i in (5, 9) else 1 for i in range(2400)], axis=0) for key in series}
+    recording = read_recording(archive(**twice))
+    np.testing.assert_array_equal(recording.q, series["q"])
+    assert recording.notes == ("2 rows repeat the one before, stamp and all (first: row 7); dropped",)
+
+
+def test_values_that_cannot_be(archive, series):
+    tau = series["tau"].copy()
+    tau[12, 1] = tau[80, 2] = np.nan
+    error = refused(archive(tau=tau), r"found nan \(and in 1 more rows\)")
+    assert (error.row, error.column) == (13, "torque of b (joint 2)")
+    refused(archive(q=np.degrees(series["q"])), r"looks like deg; if so, say so \(a header 'q1 \[deg\]'")
+    refused(archive(dq=np.degrees(series["dq"])), "the velocities look like deg/s")
+    refused(archive(q=np.degrees(series["q"]), dq=series["dq"]), "deg", None)
+    tau = series["tau"].copy()
+    tau[:, 2] = 4.5
+    assert refused(archive(tau=tau), "is 4.5 in all 2400 rows while the joint moves").column == "torque of c (joint 3)"
+    refused(archive(**{key: series[key][:50] for key in series}), "50 samples are too few")
+    refused(f"{archive()}@0:0.25", "50 samples are too few")
+    refused(archive(tau=series["tau"][:, :2]), r"has shape \(2400, 2\)")
+    refused(archive(), r"has 3 joints .*, the robot has 2", Joints(("a", "b")))
+
+
+def test_what_is_odd_is_noted(archive, series):
+    still = series["q"].copy()
+    still[:, 1] = 0.7
+    (note,) = read_recording(archive(q=still, dq=None), ROBOT).notes
+    assert note.startswith("b never moves (its position is one number)")
+    notes = read_recording(archive(tau=-series["tau"]), ROBOT).notes
+    assert any("is their sign reversed?" in note for note in notes)
+    notes = read_recording(archive(tau=series["tau"] / 80), ROBOT).notes
+    assert any("are these currents" in note for note in notes)
+    notes = read_recording(archive(tau=series["tau"] * 10), ROBOT).notes
+    assert any("its limit is 100" in note for note in notes)
+    narrow = Joints(("a", "b", "c"), lower=np.full(3, -0.1), upper=np.full(3, 0.1))
+    assert len([note for note in read_recording(archive(), narrow).notes if "beyond its limits" in note]) == 3
+
+
+def test_recordings_and_options_are_held_to_their_shapes(recording):
+    with pytest.raises(MeasurementError, match="expected"):
+        Recording(recording.t, recording.q[:, :2], recording.effort, "torque", ("a", "b", "c"))
+    with pytest.raises(MeasurementError, match="none of torque, current"):
+        Recording(recording.t, recording.q, recording.effort, "force", ("a", "b", "c"))
+    with pytest.raises(UsageError, match="did you mean 'torque'"):
+        RecordingOptions(names={"torqe": "x"})
+    with pytest.raises(UsageError, match="none of rad"):
+        RecordingOptions(units={"q": "grad"})
