@@ -1,0 +1,390 @@
+"""Compiled closed loop (numba): a tree of rigid bodies with drives under a sampled controller, RK4 in between.
+
+Forward dynamics all in the base's frame, about its origin: velocities, forces and composite inertias then add up along
+the tree without a transformation, which takes half the operations of body-fixed recursions (`calib.dynamics.kernels`;
+tests hold one against the other). With S_i = [u_i; s_i] the twist of body i per unit rate,
+
+    V_i = V_p + S_i v,   A_i = A_p + V_i × S_i v,   f_i = I_i A_i + V_i ×* I_i V_i,
+    bias_c = Σ S_i · Σ_below f,   M_cd = Σ S_j · (Σ_below I) S_i      (Walker & Orin 1982; Featherstone 2008).
+
+Few arrays with many columns, and functions joined into their callers, because numba counts references to every array it
+passes on: half of the time otherwise. B bodies, n joints, T acts of friction that is not linear:
+
+    tree    (B, 3) whole numbers: parent (B for the base), kind, coordinate
+    body    (B + 1, 23): placement (rotation by rows, origin) with each joint about or along z, ten standard parameters
+            in such a frame, scale; row B, columns 0 to 2: the base's acceleration against gravity
+    linear  (n, 2 n + 1): added inertia, viscous friction, offset
+    kinds   (T, 2) torque row and code; acts (T, 4 + n): amount, three settings, weights of the joints' velocities
+    work    (B + 1, 46): pose, velocity 12, acceleration 18, twist 24, force 30, inertia about the origin 36 …
+"""
+
+from __future__ import annotations
+
+from math import cos, exp, sin, tanh
+
+import numpy as np
+from numba import njit
+
+OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
+JOINED = {**OPTIONS, "forceinline": True}
+FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
+SIGN, SPEED, CUBIC, STRIBECK = 0, 1, 2, 3
+MOST = 64  # steps that friction may ask for in one period
+REACH = 6.0  # smoothing widths from standstill within which the sign counts as stiff: one period away at most 6 v0
+FINE, SINGULAR, STIFF, DIVERGED = -1, 1, 2, 3
+
+
+@njit(**JOINED)
+def _body(tree, body, i, amount, rate, work):
+    """Write pose, velocity, acceleration at zero joint accelerations, and twist of body i, from its parent's."""
+    p, kind, scale = tree[i, 0], tree[i, 1], body[i, 22]
+    a, b, c = body[i, 0], body[i, 1], body[i, 2]
+    d, e, f = body[i, 3], body[i, 4], body[i, 5]
+    g, h, k = body[i, 6], body[i, 7], body[i, 8]
+    x, y, z = body[i, 9], body[i, 10], body[i, 11]
+    if kind == REVOLUTE:
+        co, si = cos(amount), sin(amount)
+        a, b = co * a + si * b, co * b - si * a
+        d, e = co * d + si * e, co * e - si * d
+        g, h = co * g + si * h, co * h - si * g
+    elif kind == PRISMATIC:
+        x, y, z = x + amount * c, y + amount * f, z + amount * k
+    for r in range(0, 9, 3):
+        r0, r1, r2 = work[p, r], work[p, r + 1], work[p, r + 2]
+        work[i, r] = r0 * a + r1 * d + r2 * g
+        work[i, r + 1] = r0 * b + r1 * e + r2 * h
+        work[i, r + 2] = r0 * c + r1 * f + r2 * k
+    x, y, z = (
+        work[p, 9] + work[p, 0] * x + work[p, 1] * y + work[p, 2] * z,
+        work[p, 10] + work[p, 3] * x + work[p, 4] * y + work[p, 5] * z,
+        work[p, 11] + work[p, 6] * x + work[p, 7] * y + work[p, 8] * z,
+    )
+    ux, uy, uz = work[i, 2], work[i, 5], work[i, 8]
+    wx, wy, wz, vx, vy, vz = work[p, 12], work[p, 13], work[p, 14], work[p, 15], work[p, 16], work[p, 17]
+    bx, by, bz, ax, ay, az = work[p, 18], work[p, 19], work[p, 20], work[p, 21], work[p, 22], work[p, 23]
+    work[i, 9], work[i, 10], work[i, 11] = x, y, z
+    sx, sy, sz = y * uz - z * uy, z * ux - x * uz, x * uy - y * ux
+    if kind == PRISMATIC:
+        sx, sy, sz, ux, uy, uz = ux, uy, uz, 0.0, 0.0, 0.0
+    ux, uy, uz, sx, sy, sz = scale * ux, scale * uy, scale * uz, scale * sx, scale * sy, scale * sz
+    work[i, 24], work[i, 25], work[i, 26], work[i, 27], work[i, 28], work[i, 29] = ux, uy, uz, sx, sy, sz
+    work[i, 18] = bx + rate * (wy * uz - wz * uy)
+    work[i, 19] = by + rate * (wz * ux - wx * uz)
+    work[i, 20] = bz + rate * (wx * uy - wy * ux)
+    work[i, 21] = ax + rate * (wy * sz - wz * sy + vy * uz - vz * uy)
+    work[i, 22] = ay + rate * (wz * sx - wx * sz + vz * ux - vx * uz)
+    work[i, 23] = az + rate * (wx * sy - wy * sx + vx * uy - vy * ux)
+    work[i, 12], work[i, 13], work[i, 14] = wx + rate * ux, wy + rate * uy, wz + rate * uz
+    work[i, 15], work[i, 16], work[i, 17] = vx + rate * sx, vy + rate * sy, vz + rate * sz
+
+
+@njit(**JOINED)
+def _load(body, i, work):
+    """Write the parameters of body i about the base's origin, and the wrench of its motion."""
+    r00, r01, r02 = work[i, 0], work[i, 1], work[i, 2]
+    r10, r11, r12 = work[i, 3], work[i, 4], work[i, 5]
+    r20, r21, r22 = work[i, 6], work[i, 7], work[i, 8]
+    x, y, z = work[i, 9], work[i, 10], work[i, 11]
+    xx, xy, xz = body[i, 12], body[i, 13], body[i, 14]
+    yy, yz, zz = body[i, 15], body[i, 16], body[i, 17]
+    mx, my, mz, mass = body[i, 18], body[i, 19], body[i, 20], body[i, 21]
+    gx, gy, gz = r00 * mx + r01 * my + r02 * mz, r10 * mx + r11 * my + r12 * mz, r20 * mx + r21 * my + r22 * mz
+    a0, a1, a2 = xx * r00 + xy * r01 + xz * r02, xy * r00 + yy * r01 + yz * r02, xz * r00 + yz * r01 + zz * r02
+    b0, b1, b2 = xx * r10 + xy * r11 + xz * r12, xy * r10 + yy * r11 + yz * r12, xz * r10 + yz * r11 + zz * r12
+    c0, c1, c2 = xx * r20 + xy * r21 + xz * r22, xy * r20 + yy * r21 + yz * r22, xz * r20 + yz * r21 + zz * r22
+    # J about the base's origin = R J Rᵀ + (2 t·g + m t·t) 1 - (g tᵀ + t gᵀ) - m t tᵀ, h = g + m t, with h and g it is
+    # R J Rᵀ + t·(g + h) 1 - (g tᵀ + t hᵀ), symmetric because h - g is along t
+    hx, hy, hz = gx + mass * x, gy + mass * y, gz + mass * z
+    px, py, pz = x * (gx + hx), y * (gy + hy), z * (gz + hz)
+    jxx, jyy = r00 * a0 + r01 * a1 + r02 * a2 + py + pz, r10 * b0 + r11 * b1 + r12 * b2 + px + pz
+    jzz = r20 * c0 + r21 * c1 + r22 * c2 + px + py
+    jxy = r10 * a0 + r11 * a1 + r12 * a2 - gx * y - x * hy
+    jxz = r20 * a0 + r21 * a1 + r22 * a2 - gx * z - x * hz
+    jyz = r20 * b0 + r21 * b1 + r22 * b2 - gy * z - y * hz
+    work[i, 36], work[i, 37], work[i, 38] = jxx, jxy, jxz
+    work[i, 39], work[i, 40], work[i, 41] = jyy, jyz, jzz
+    work[i, 42], work[i, 43], work[i, 44], work[i, 45] = hx, hy, hz, mass
+    wx, wy, wz, vx, vy, vz = work[i, 12], work[i, 13], work[i, 14], work[i, 15], work[i, 16], work[i, 17]
+    ex, ey, ez, ax, ay, az = work[i, 18], work[i, 19], work[i, 20], work[i, 21], work[i, 22], work[i, 23]
+    lx, ly, lz = mass * vx + wy * hz - wz * hy, mass * vy + wz * hx - wx * hz, mass * vz + wx * hy - wy * hx
+    kx = jxx * wx + jxy * wy + jxz * wz + hy * vz - hz * vy
+    ky = jxy * wx + jyy * wy + jyz * wz + hz * vx - hx * vz
+    kz = jxz * wx + jyz * wy + jzz * wz + hx * vy - hy * vx
+    work[i, 30] = jxx * ex + jxy * ey + jxz * ez + hy * az - hz * ay + wy * kz - wz * ky + vy * lz - vz * ly
+    work[i, 31] = jxy * ex + jyy * ey + jyz * ez + hz * ax - hx * az + wz * kx - wx * kz + vz * lx - vx * lz
+    work[i, 32] = jxz * ex + jyz * ey + jzz * ez + hx * ay - hy * ax + wx * ky - wy * kx + vx * ly - vy * lx
+    work[i, 33] = mass * ax + ey * hz - ez * hy + wy * lz - wz * ly
+    work[i, 34] = mass * ay + ez * hx - ex * hz + wz * lx - wx * lz
+    work[i, 35] = mass * az + ex * hy - ey * hx + wx * ly - wy * lx
+
+
+@njit(**JOINED)
+def dynamics(tree, body, linear, q, v, work, matrix, out):
+    """Write M(q) + added (lower triangle with diagonal), and take the bias c(q, v) + g(q) off out (n,)."""
+    count, n = tree.shape[0], q.shape[0]
+    for j in range(n):
+        for k in range(j + 1):
+            matrix[j, k] = linear[j, k]
+    for r in range(24):
+        work[count, r] = 1.0 if r == 0 or r == 4 or r == 8 else 0.0
+    work[count, 21], work[count, 22], work[count, 23] = body[count, 0], body[count, 1], body[count, 2]
+    for i in range(count):
+        c = tree[i, 2]
+        amount, rate = (body[i, 22] * q[c], v[c]) if c >= 0 else (0.0, 0.0)
+        _body(tree, body, i, amount, rate, work)
+        _load(body, i, work)
+    for i in range(count - 1, -1, -1):
+        p, c = tree[i, 0], tree[i, 2]
+        if c >= 0:
+            ux, uy, uz, sx, sy, sz = work[i, 24], work[i, 25], work[i, 26], work[i, 27], work[i, 28], work[i, 29]
+            out[c] -= ux * work[i, 30] + uy * work[i, 31] + uz * work[i, 32]
+            out[c] -= sx * work[i, 33] + sy * work[i, 34] + sz * work[i, 35]
+            hx, hy, hz, mass = work[i, 42], work[i, 43], work[i, 44], work[i, 45]
+            nx = work[i, 36] * ux + work[i, 37] * uy + work[i, 38] * uz + hy * sz - hz * sy
+            ny = work[i, 37] * ux + work[i, 39] * uy + work[i, 40] * uz + hz * sx - hx * sz
+            nz = work[i, 38] * ux + work[i, 40] * uy + work[i, 41] * uz + hx * sy - hy * sx
+            fx, fy, fz = mass * sx + uy * hz - uz * hy, mass * sy + uz * hx - ux * hz, mass * sz + ux * hy - uy * hx
+            matrix[c, c] += nx * ux + ny * uy + nz * uz + fx * sx + fy * sy + fz * sz
+            k = p
+            while k < count:
+                d = tree[k, 2]
+                if d >= 0:
+                    share = nx * work[k, 24] + ny * work[k, 25] + nz * work[k, 26]
+                    share += fx * work[k, 27] + fy * work[k, 28] + fz * work[k, 29]
+                    if d == c:  # a follower and its leader
+                        matrix[c, c] += 2.0 * share
+                    else:
+                        matrix[max(c, d), min(c, d)] += share
+                k = tree[k, 0]
+        if p < count:
+            for r in range(30, 46):
+                work[p, r] += work[i, r]
+
+
+@njit(**JOINED)
+def factorise(matrix):
+    """Overwrite the lower triangle with L, the diagonal with 1 / D, M = L D Lᵀ; False where M is not definite."""
+    for i in range(matrix.shape[0]):
+        for j in range(i):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] = total
+        pivot = matrix[i, i]
+        for j in range(i):
+            low = matrix[i, j] * matrix[j, j]
+            pivot -= matrix[i, j] * low
+            matrix[i, j] = low
+        if not pivot > 0.0:
+            return False
+        matrix[i, i] = 1.0 / pivot
+    return True
+
+
+@njit(**JOINED)
+def substitute(matrix, vector):
+    """Overwrite vector (n,) with M⁻¹ vector, M factorised."""
+    n = vector.shape[0]
+    for i in range(n):
+        total = vector[i]
+        for j in range(i):
+            total -= matrix[i, j] * vector[j]
+        vector[i] = total
+    for i in range(n - 1, -1, -1):
+        total = vector[i] * matrix[i, i]
+        for j in range(i + 1, n):
+            total -= matrix[j, i] * vector[j]
+        vector[i] = total
+
+
+@njit(**JOINED)
+def friction(linear, kinds, acts, v, out):
+    """Take off out (n,) what the drives' friction and offsets need."""
+    n = v.shape[0]
+    for j in range(n):
+        total = linear[j, 2 * n]
+        for k in range(n):
+            total += linear[j, n + k] * v[k]
+        out[j] -= total
+    for t in range(kinds.shape[0]):
+        rate = 0.0
+        for k in range(n):
+            rate += acts[t, 4 + k] * v[k]
+        code = kinds[t, 1]
+        if code == SPEED:
+            shape = abs(rate)
+        elif code == CUBIC:
+            shape = rate * rate * rate
+        else:
+            scaled = rate / acts[t, 3]
+            shape = 1.0 if scaled > 20.0 else -1.0 if scaled < -20.0 else tanh(scaled)
+            if code == STRIBECK:
+                shape *= exp(-((abs(rate) / acts[t, 1]) ** acts[t, 2]))
+        out[kinds[t, 0]] -= acts[t, 0] * shape
+
+
+@njit(**OPTIONS)
+def stiffness(kinds, acts, v, matrix, unit):
+    """Return a bound [1/s] of the fastest decay that smoothed signs bring in near standstill, M factorised.
+
+    The trace of M⁻¹ D, D the steepest slopes of the signs in reach (not the local ones: a step that enters the band
+    must not overshoot it): never below the largest eigenvalue.
+    """
+    total, n = 0.0, unit.shape[0]
+    for t in range(kinds.shape[0]):
+        if kinds[t, 1] != SIGN and kinds[t, 1] != STRIBECK:
+            continue
+        rate = 0.0
+        for k in range(n):
+            rate += acts[t, 4 + k] * v[k]
+        if abs(rate) > REACH * acts[t, 3]:
+            continue
+        for j in range(n):
+            unit[j] = 0.0
+        unit[kinds[t, 0]] = 1.0
+        substitute(matrix, unit)
+        slope = acts[t, 0] / acts[t, 3]
+        for k in range(n):
+            total += abs(slope * acts[t, 4 + k] * unit[k])
+    return total
+
+
+@njit(**OPTIONS)
+def accelerate(tree, body, linear, kinds, acts, q, v, tau, work, matrix, out):
+    """Write the accelerations (n,) under the torques of the drives; M is left factorised. False: M not definite."""
+    for j in range(q.shape[0]):
+        out[j] = tau[j]
+    dynamics(tree, body, linear, q, v, work, matrix, out)
+    friction(linear, kinds, acts, v, out)
+    if not factorise(matrix):
+        return False
+    substitute(matrix, out)
+    return True
+
+
+@njit(**OPTIONS)
+def forward_dynamics(tree, body, linear, kinds, acts, q, v, tau, out):
+    """Fill out (N, n); return the first sample whose inertia is not positive definite, or -1."""
+    work, matrix = np.empty((tree.shape[0] + 1, 46)), np.empty((q.shape[1], q.shape[1]))
+    for sample in range(q.shape[0]):
+        args = (q[sample], v[sample], tau[sample], work, matrix, out[sample])
+        if not accelerate(tree, body, linear, kinds, acts, *args):
+            return sample
+    return FINE
+
+
+@njit(**OPTIONS)
+def _advance(tree, body, linear, kinds, acts, q, v, tau, period, slopes, work, matrix, at, rate):
+    """Advance q, v (n,) by one control period under constant torques (Runge & Kutta's classical form).
+
+    In as many steps as friction near standstill asks for. On the negative axis the form's stability function
+    1 + z + z²/2 + z³/6 + z⁴/24 is positive wherever it is stable: the velocity creeps into the band of the smoothed
+    sign and does not change sides from step to step, which would be chatter; abs(z) <= 2 here. slopes[0] is known.
+    """
+    n = q.shape[0]
+    pieces = int(0.5 * period * stiffness(kinds, acts, v, matrix, at)) + 1
+    if pieces > MOST:
+        return STIFF
+    span = period / pieces
+    for piece in range(pieces):
+        for stage in range(4):
+            if stage == 0:
+                if piece == 0:
+                    continue
+                for j in range(n):
+                    at[j], rate[j] = q[j], v[j]
+            else:
+                part, half = (span, 0.5 * span) if stage == 3 else (0.5 * span, 0.5 * span)
+                for j in range(n):
+                    before = slopes[stage - 2, j] if stage > 1 else 0.0
+                    at[j] = q[j] + part * (v[j] + half * before)
+                    rate[j] = v[j] + part * slopes[stage - 1, j]
+            if not accelerate(tree, body, linear, kinds, acts, at, rate, tau, work, matrix, slopes[stage]):
+                return SINGULAR
+        for j in range(n):
+            first, inner, last = slopes[0, j], slopes[1, j] + slopes[2, j], slopes[3, j]
+            q[j] += span * (v[j] + span / 6.0 * (first + inner))
+            v[j] += span / 6.0 * (first + 2.0 * inner + last)
+    return FINE
+
+
+@njit(**OPTIONS)
+def _command(gains, aim, speed, seen, rate, integral, period, wish):
+    """Write what feedback asks for (n,) from reference and measurement; rows of `gains` as in `closed_loop`."""
+    for j in range(wish.shape[0]):
+        error = aim[j] - seen[j]
+        integral[j] = min(max(integral[j] + period * error, -gains[5, j]), gains[5, j])
+        wish[j] = gains[0, j] * error + gains[1, j] * (gains[3, j] * speed[j] - rate[j]) + gains[2, j] * integral[j]
+
+
+@njit(**OPTIONS)
+def _linearise(tree, model, linear, ahead, seen, rate, work, matrix, wish):
+    """Replace wish (n,), with ahead an acceleration, by M(q) wish + c(q, v) + g(q) of the controller's model."""
+    n = wish.shape[0]
+    wanted = wish + ahead
+    for j in range(n):
+        wish[j] = 0.0
+    dynamics(tree, model, linear, seen, rate, work, matrix, wish)
+    for j in range(n):
+        total = -wish[j]
+        for k in range(n):
+            total += matrix[max(j, k), min(j, k)] * wanted[k]
+        wish[j] = total
+
+
+@njit(**OPTIONS)
+def closed_loop(
+    tree, body, linear, kinds, acts, model, gains, reference, encoder, quantum, push, period, smoothing, late, every,
+    q, v, out,
+):  # fmt: skip
+    """Run the loop: measure, command, hold the torque for one period, integrate. Return (status, period reached).
+
+    gains (6, n): kp, kd, ki, share of the reference's velocity, torque limit, limit of the integral. reference
+    (4, N, n): position, velocity, torque ahead, acceleration ahead (for the controller's `model`, with 0 rows for
+    none). encoder, push (N, n) or (0, n): noise of the measured position, torque no model knows.
+    q, v (n,): the state, overwritten. `out` (5, M, n): true q, v, a, measured q, torque applied, every `every` periods.
+    """
+    count, n = reference.shape[1], q.shape[0]
+    work, matrix, slopes = np.empty((tree.shape[0] + 1, 46)), np.empty((n, n)), np.zeros((4, n))
+    at, rate, speed, seen, before = np.empty(n), np.empty(n), np.zeros(n), np.empty(n), np.empty(n)
+    integral, wish, tau, waiting = np.zeros(n), np.empty(n), np.empty(n), np.zeros((late + 1, n))
+    for k in range(count):
+        for j in range(n):
+            seen[j] = q[j] + (encoder[k, j] if encoder.shape[0] else 0.0)
+            if quantum[j] > 0.0:
+                seen[j] = quantum[j] * np.floor(seen[j] / quantum[j] + 0.5)
+            if k == 0:
+                speed[j] = v[j]
+            else:
+                speed[j] += smoothing * ((seen[j] - before[j]) / period - speed[j])
+            before[j] = seen[j]
+        _command(gains, reference[0, k], reference[1, k], seen, speed, integral, period, wish)
+        if model.shape[0]:
+            _linearise(tree, model, linear, reference[3, k], seen, speed, work, matrix, wish)
+        for j in range(n):
+            wish[j] += reference[2, k, j]
+            held = min(max(wish[j], -gains[4, j]), gains[4, j])
+            if held != wish[j] and (reference[0, k, j] - seen[j]) * wish[j] > 0.0:
+                integral[j] -= period * (reference[0, k, j] - seen[j])  # no winding up against the limit
+            waiting[k % (late + 1), j] = held
+            tau[j] = waiting[(k + 1) % (late + 1) if k >= late else 0, j]
+            if push.shape[0]:
+                at[j] = tau[j] + push[k, j]
+            else:
+                at[j] = tau[j]
+        if not accelerate(tree, body, linear, kinds, acts, q, v, at, work, matrix, slopes[0]):
+            return SINGULAR, k
+        if k % every == 0:
+            m = k // every
+            for j in range(n):
+                out[0, m, j], out[1, m, j], out[2, m, j] = q[j], v[j], slopes[0, j]
+                out[3, m, j], out[4, m, j] = seen[j], tau[j]
+        if k + 1 < count:
+            wish[:] = at
+            status = _advance(tree, body, linear, kinds, acts, q, v, wish, period, slopes, work, matrix, at, rate)
+            if status != FINE:
+                return status, k
+        for j in range(n):
+            if not abs(v[j]) < 1e6:
+                return DIVERGED, k
+    return FINE, count
