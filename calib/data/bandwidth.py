@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
-from scipy.signal import welch
+from scipy.signal import get_window
 
 from calib.arrays import frozen
 from calib.data.decimation import factor_for
@@ -67,8 +67,8 @@ def propose_cutoffs(sampled: Resampled, dynamics: float | None = None) -> Cutoff
     longest = np.bincount(sampled.segment).argmax()
     own = sampled.segment == longest
     size = min(int(own.sum()), max(64, int(WINDOW * sampled.rate)))
-    f, power = welch(sampled.series["q"][own], sampled.rate, "hann", size, axis=0, detrend="linear")
-    _, effort = welch(sampled.series["effort"][own], sampled.rate, "hann", size, axis=0)
+    f, power = spectrum(sampled.series["q"][own], sampled.rate, size)
+    _, effort = spectrum(sampled.series["effort"][own], sampled.rate, size)
     floor = np.median(power[int(0.6 * len(f)) : int(0.9 * len(f))], axis=0)
     active = _active(sampled.series["q"][own])
     read = [_joint_dynamics(f, power[:, j], floor[j]) if active[j] else (0.0, np.nan) for j in range(len(active))]
@@ -89,6 +89,24 @@ def propose_cutoffs(sampled: Resampled, dynamics: float | None = None) -> Cutoff
         dynamics, per_joint, position, band, factor, resonance, frozen(noise), frozen(f), frozen(power), frozen(effort),
         tuple(reasons),
     )  # fmt: skip
+
+
+def spectrum(values: np.ndarray, rate: float, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return frequencies (F,) [Hz] and one-sided power densities (F, n) [unit²/Hz] of `values` (N, n) by Welch's method.
+
+    Windows of `size` samples (Hann's), half overlapping, a straight line taken off each.
+    """
+    window = get_window("hann", size)
+    line = np.linalg.qr(np.stack([np.ones(size), np.arange(size)], axis=1))[0]
+    starts = range(0, len(values) - size + 1, max(1, size // 2))
+    power = np.zeros((size // 2 + 1, values.shape[1]))
+    for start in starts:
+        own = values[start : start + size]
+        own = own - line @ (line.T @ own)
+        power += np.abs(np.fft.rfft(own.T * window, axis=1).T) ** 2
+    power *= 2 / (len(starts) * rate * (window**2).sum())
+    power[0] /= 2
+    return np.arange(size // 2 + 1) * rate / size, power
 
 
 def check_cutoff(cutoff: float, rate: float, file: str = "") -> None:

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from calib.arrays import frozen
 from calib.data.motion import Motion, standstill
 
-LINE = 1e-3  # of the strongest line's power: a line that counts
+LINE = 3e-3  # of the strongest line's power: a line that counts; Hann's side lobes are at 7e-4
 TOGETHER = 0.98  # correlation of two joints that move as one
 FUNCTION = 0.02  # of the largest singular value: a function of time that counts
 STILL = 1e-3  # a joint that goes less far has not moved [rad or m]
@@ -24,7 +24,7 @@ class ExcitationReport:
     """How rich the motion of the joints is.
 
     Attributes:
-        lines: (n,) number of spectral lines of each joint's position that have 1e-3 or more of the strongest's power.
+        lines: (n,) number of spectral lines of each joint's position that have 3e-3 or more of the strongest's power.
         strongest: (n,) frequency of the strongest one [Hz]; NaN for a joint that does not move.
         share: (n,) part of the joint's power in it.
         correlation: (n, n) of the positions.

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.data.bandwidth import propose_cutoffs
+from calib.data.bandwidth import propose_cutoffs, spectrum
 from calib.data.clock import find_clock
 from calib.data.decimation import decimate, decimate_regressor
 from calib.data.excitation import repeats, report_excitation
@@ -238,3 +238,13 @@ def test_a_repeat_is_recognised_however_it_is_shifted():
     assert repeats(training, training) == 1.0
     assert repeats(training, slower) < 0.2
     assert repeats(training, other) < 0.2
+
+
+def test_the_spectrum_is_welchs():
+    from scipy.signal import welch
+
+    x = np.random.default_rng(5).normal(size=(3000, 2)) + np.arange(3000)[:, None] / 500
+    f, power = spectrum(x, 200.0, 400)
+    g, theirs = welch(x, 200.0, "hann", 400, axis=0, detrend="linear")
+    np.testing.assert_allclose(f, g)
+    np.testing.assert_allclose(power[:-1], theirs[:-1], rtol=1e-9, atol=1e-15)  # but for the Nyquist line, never used
