@@ -243,7 +243,7 @@ def r_factor(model: IdentificationModel, samples: Samples, loads: Loads = (None,
     return retriangulate(triangles.reshape(-1, p))
 
 
-def expressions(base: Base, digits: int = 4, smallest: float = 1e-4) -> tuple[str, ...]:
+def expressions(base: Base, digits: int = 5, smallest: float = 1e-4) -> tuple[str, ...]:
     """Return what each base parameter stands for, e.g. ``ZZ1R = ZZ1 + YY2``.
 
     Args:
@@ -256,7 +256,7 @@ def expressions(base: Base, digits: int = 4, smallest: float = 1e-4) -> tuple[st
         for coefficient, index in zip(row, base.split.dropped):
             if abs(coefficient) < smallest:
                 continue
-            size = f"{abs(coefficient):.{digits}g}"
+            size = f"{float(f'{abs(coefficient):.12g}'):.{digits}g}"  # ties must not hang on the last bit
             factor = "" if size == "1" else f"{size} "
             text += f" {'-' if coefficient < 0 else '+'} {factor}{base.standard[index]}"
         lines.append(f"{name} = {text}")

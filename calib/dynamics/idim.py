@@ -12,7 +12,7 @@ With torque sensors in the joints (Kolyubin, Shiriaev, Jubien 2019, section 6.2)
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,8 +20,10 @@ import numpy as np
 from calib.arrays import shaped
 from calib.dynamics import drives, rigid_body
 from calib.dynamics.drives import Term
-from calib.dynamics.tree import Tree
+from calib.dynamics.shapes import V0
+from calib.dynamics.tree import Tree, tree, with_payload
 from calib.errors import CalibError
+from calib.robot.chain import Chain
 
 KINDS = ("motor", "link", "both", "drive")
 MODELS = {1: "link", 2: "both", 3: "drive"}  # as the 2019 paper numbers them
@@ -143,6 +145,29 @@ class IdentificationModel:
         for label in payloads - set(carried):
             index = self.tree.labels.index(label)
             out[10 * index : 10 * index + 10] = 0.0
+
+
+def from_chain(
+    chain: Chain,
+    sets: str | Sequence[str] = "Ia Fv Fc off",
+    payload: np.ndarray | None = None,
+    kind: str = "motor",
+    v0: float | Sequence[float] = V0,
+) -> IdentificationModel:
+    """Return the model of a chain with the same drive terms on every joint, or with a set per joint.
+
+    Args:
+        sets: names out of `drives.standard`, one string for all joints or n strings.
+        payload: (4, 4) frame of a payload in the last body's frame (`Chain.tail` for the tip); None for none.
+        v0: smoothing of the Coulomb sign [rad/s or m/s], one or per joint.
+    """
+    each = [sets] * chain.n if isinstance(sets, str) else list(sets)
+    if len(each) != chain.n:
+        raise CalibError(f"robot '{chain.name}' has {chain.n} joints, but drive sets are given for {len(each)}")
+    bodies = tree(chain)
+    bodies = bodies if payload is None else with_payload(bodies, payload)
+    linear = [joint.kind == "prismatic" for joint in chain.joints]
+    return IdentificationModel(bodies, drives.standard(each, v0, linear), kind)
 
 
 def friction_states(model: IdentificationModel, q: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ from arms import motley, states
 from differences import check
 
 from calib.dynamics import drives, friction
-from calib.dynamics.idim import IdentificationModel, friction_states, stacked, with_load, with_terms
+from calib.dynamics.idim import IdentificationModel, friction_states, from_chain, stacked, with_load, with_terms
 from calib.dynamics.tree import tree
 from calib.errors import CalibError
 from calib.robot.load import load
@@ -119,6 +119,26 @@ def test_ripple_fades_with_speed():
 def test_units_of_a_prismatic_joint():
     terms = drives.standard(["Ia Fv Fc"] * 2, linear=[False, True])
     assert [one.unit for one in terms] == ["kg m²", "N m s/rad", "N m", "kg", "N s/m", "N"]
+
+
+def test_model_of_a_chain():
+    model = from_chain(motley(), "Ia Fc", payload=np.eye(4))
+    assert model.names[-10:] == ("Ia1", "Fc1", "Ia2", "Fc2", "Ia3", "Fc3", "Ia4", "Fc4", "Ia5", "Fc5")
+    assert model.units[-8:-6] == ("kg", "N") and model.names[50] == "XX6"
+    assert from_chain(TX40, ["Ia"] * 5 + [""]).p == 65
+    with pytest.raises(CalibError, match="has 6 joints, but drive sets are given for 2"):
+        from_chain(TX40, ["Ia", "Ia"])
+
+
+def test_absent_payload_has_no_columns():
+    q, v, a = states(5)
+    model = from_chain(motley(), "", payload=np.eye(4))
+    loaded, empty = model.regressor(q, v, a), model.regressor(q, v, a, carried=())
+    assert loaded[:, :, 50:].any() and not empty[:, :, 50:].any()
+    assert np.array_equal(loaded[:, :, :50], empty[:, :, :50])
+    assert np.array_equal(model.regressor(q, v, a, carried=("6",)), loaded)
+    with pytest.raises(CalibError, match="no payload 'box' in the model; it has 6"):
+        model.regressor(q, v, a, carried=("box",))
 
 
 def test_stacking_copies_nothing():
