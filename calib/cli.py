@@ -16,6 +16,8 @@ import typer
 for _pool in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_pool, "1")
 
+INTERRUPTED = "interrupted; nothing was left half-written, and the same command goes on from here"
+
 app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
@@ -169,6 +171,50 @@ def export(
         console.print(note, soft_wrap=True, markup=False)
 
 
+# Dynamics: identify
+
+
+@app.command("identify")
+def identify_dynamics(
+    robot: Robot,
+    recordings: Annotated[list[str], typer.Argument(help="recordings of q and torque or current; log.npz@0:9.4 cuts")],
+    out: Annotated[Path, typer.Option(help="folder for the identified model and its report")],
+    validate: Annotated[list[str] | None, typer.Option(help="recording of other motion; may be repeated")] = None,
+    method: Annotated[str | None, typer.Option(help="ols, wls, irls, tls or iv")] = None,
+    friction: Annotated[
+        str | None, typer.Option(help="auto, standard, or one rung: load, presliding, stribeck, root, ...")
+    ] = None,
+    options: Annotated[Path | None, typer.Option(help="TOML: drives, payloads, gains, filters, how to identify")] = None,
+    base: Base = None,
+    tip: Tip = None,
+    seed: Seed = 0,
+) -> None:
+    """Identify the dynamics of ROBOT from recordings, and say how well it predicts other motion."""
+    from calib.identification.options import read_options
+    from calib.procedure import identification_outputs, identification_plots, identification_show, identifying
+
+    chosen = read_options(options)
+    identification_outputs.check_target(out)
+    console = _console()
+    with _progress() as say:
+        found = identifying.gather(
+            robot, recordings, validate or [], options=chosen, method=method, friction=friction, base=base, tip=tip,
+            seed=seed, progress=say,
+        )  # fmt: skip
+        identification_outputs.check_target(out, found.source)
+    for line in identification_show.read_lines(found):
+        console.print(line, soft_wrap=True)
+    with _progress() as say:
+        outcome = identifying.run(found, progress=say)
+        say("writing")
+        identification_outputs.write_folder(outcome, out, identification_plots.write)
+    for line in identification_show.outcome_lines(outcome):
+        console.print(line, soft_wrap=True)
+    console.print(f"written to {out}", soft_wrap=True, markup=False)
+    if outcome.verdict.level == "fail":
+        raise typer.Exit(1)
+
+
 # The guided session: new, next, status, redo, demo
 
 Folder = Annotated[Path, typer.Argument(help="the session's folder")]
@@ -228,9 +274,8 @@ def demo(
     """Calibrate a simulated robot with a simulated instrument, and compare with the hidden truth."""
     from calib.procedure import demo as demonstration
 
-    console = _console()
-    with _progress() as progress:
-        found = demonstration.run(out, robot, seed, _plainly(console), progress)
+    with _told() as (console, say, progress):
+        found = demonstration.run(out, robot, seed, say, progress)
     console.print(f"\n{found.seconds:.1f} s. Look at", soft_wrap=True, markup=False)
     for words, name in demonstration.RESULTS:
         console.print(f"  {words:15} {found.session.folder / name}", soft_wrap=True, markup=False)
@@ -241,17 +286,23 @@ def demo(
 def _go_on(folder: Path, command: str, again: str = "") -> None:
     from calib.procedure import guided
 
-    console = _console()
-    with _progress() as progress:
-        stop = guided.go_on(folder, _plainly(console), progress, command, again)
+    with _told() as (console, say, progress):
+        stop = guided.go_on(folder, say, progress, command, again)
     for line in stop.lines:
         console.print(line, soft_wrap=True, markup=False)
     if stop.verdict == "fail":
         raise typer.Exit(1)
 
 
-def _plainly(console: Any) -> Any:
-    return lambda words: console.print(words, soft_wrap=True, markup=False)
+@contextmanager
+def _told() -> Iterator[tuple[Any, Any, Any]]:
+    """Yield a console, and two functions on it: for lines that stay, and for words that show while work goes on."""
+    from rich.markup import escape
+
+    console = _console()
+    with console.status("") as status:
+        say = lambda words: console.print(words, soft_wrap=True, markup=False)  # noqa: E731
+        yield console, say, lambda words: status.update(escape(words))
 
 
 def _numbers(text: str, count: int, option: str) -> list[float]:
@@ -275,14 +326,15 @@ def run(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code; errors become one message on stderr."""
     try:
         given = list(sys.argv[1:] if arguments is None else arguments)
-        return int(app(args=_spread(given), standalone_mode=False) or 0)
+        code = int(app(args=_spread(given), standalone_mode=False) or 0)
+        return _complain(INTERRUPTED, 130) if code == 130 else code  # Typer turns Ctrl-C into this code
     except typer.Exit as stop:
         return stop.exit_code
     except _USAGE as error:
         error.show()
         return 2
     except (KeyboardInterrupt, typer.Abort):
-        return _complain("interrupted; nothing was left half-written", 130)
+        return _complain(INTERRUPTED, 130)
     except Exception as error:
         code = _code(error)
         if code is None or os.environ.get("CALIB_DEBUG"):
@@ -291,7 +343,7 @@ def run(arguments: list[str] | None = None) -> int:
 
 
 def _spread(arguments: list[str]) -> list[str]:
-    """Return the arguments of ``fit`` with ``--validate a b`` written as ``--validate a --validate b``.
+    """Return the arguments of ``fit`` and ``identify`` with ``--validate a b`` written as ``--validate a --validate b``.
 
     Only where ROBOT and MEASURED have come before: what follows --validate then cannot be one of them.
     """
@@ -309,7 +361,7 @@ def _spread(arguments: list[str]) -> list[str]:
         else:
             positionals += 1
         result.append(word)
-    return result if "fit" in arguments[:2] else arguments
+    return result if {"fit", "identify"} & set(arguments[:2]) else arguments
 
 
 def _code(error: Exception) -> int | None:

@@ -41,6 +41,8 @@ def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], N
     )  # fmt: skip
     found = chosen.selection
     assert found.q is not None
+    if found.interrupted:  # a session is resumed, not gone on with half a search
+        raise KeyboardInterrupt
     gain = found.random_baseline / found.value if found.index == "cond" else found.value / found.random_baseline
     words = (
         f"{len(found.q)} poses by {found.method}, {found.index} = {found.value:.4g}, {gain:.2f} times the best of 1000 "

@@ -27,6 +27,7 @@ from calib.procedure.verdict import judge
 from calib.robot.chain import Chain
 
 Say = Callable[[str], None]
+GROSS = 8.0  # our choice
 
 
 def robot_file(session: Session) -> Path:
@@ -91,6 +92,9 @@ def select(session: Session, say: Say) -> list[str]:
     if wanted["validation"]:
         write_poses(session.path("2-poses/validation.csv"), chosen.validation, names, unit="deg", kinds=kinds)
         notes.append(f"{len(chosen.validation)} poses for validation, at random")
+    if not wanted["constraints"]:
+        notes.append("only joint limits were kept: look at every pose for collisions, or name a constraints file")
+    notes += chosen.record["notes"]
     files.write_json(session.path("2-poses/selection.json"), chosen.record)
     return notes
 
@@ -154,7 +158,13 @@ def fit(session: Session, say: Say) -> list[str]:
     )  # fmt: skip
     outputs.write_folder(outcome, session.path("4-fit"), report.write)
     count = len(outcome.climb.fit.free)
-    return [f"model {outcome.climb.chosen}, {count} parameters on {outcome.fit.poses} poses", *outcome.warnings]
+    notes = [f"model {outcome.climb.chosen}, {count} parameters on {outcome.fit.poses} poses", *outcome.warnings]
+    if outcome.outliers:
+        named = ", ".join(each.words for each in outcome.outliers[:3])
+        advice = "" if settings.fit["loss"] != "none" else '; look at these rows, or set loss = "huber" in session.toml'
+        count = len({(each.file, each.row) for each in outcome.outliers})
+        notes.append(f"{count} row{'s do' if count > 1 else ' does'} not fit: {named}{advice}")
+    return notes
 
 
 def validate(session: Session, say: Say) -> list[str]:
@@ -172,7 +182,7 @@ def validate(session: Session, say: Say) -> list[str]:
     fitted, validation = compared(session, given)
     asked = session.settings.fit["model"]
     verdict = judge(fitted, validation, asked=asked, **found.judged)
-    warnings = fitting.elsewhere(fitted, validation)
+    warnings = [*fitting.elsewhere(fitted, validation), *doubtful(validation)]
     tables = {name: each.table() | without_corrections(each) for name, each in validation.items()}
     metrics: dict[str, object] = {"validation": tables}
     metrics |= {"verdict": verdict.level, "reason": verdict.reason, "warnings": warnings}
@@ -199,6 +209,23 @@ def compared(session: Session, given: inputs.Inputs) -> tuple[comparing.Comparis
         for name, each in given.unseen.items()
     }
     return fitted, unseen
+
+
+def doubtful(validation: dict[str, comparing.Comparison]) -> list[str]:
+    """Name unseen rows whose error is more than `GROSS` times the median: they may be wrong measurements."""
+    result = []
+    for name, each in validation.items():
+        sizes, numbers = each.errors[1].main, [row for block in each.blocks for row in _numbers(block)]
+        far = np.flatnonzero(sizes > GROSS * np.median(sizes)) if len(sizes) == len(numbers) else []
+        if len(far):
+            rows = ", ".join(f"row {numbers[k]} ({1e3 * sizes[k]:.3g} mm)" for k in far[:5])
+            rest = np.delete(sizes, far)
+            without = 1e3 * float(np.sqrt(np.mean(rest**2)))
+            result.append(
+                f"{name}: {rows} far off the median of {1e3 * np.median(sizes):.3g} mm; measured wrongly? They count, "
+                f"for the verdict too; without them the rms is {without:.3f} mm"
+            )
+    return result
 
 
 def without_corrections(found: comparing.Comparison) -> dict[str, object]:

@@ -267,4 +267,5 @@ def _form(session: Session, target: str) -> str:
     full = session.settings.instrument["measures"] == "pose"
     columns = ", ".join((*(f"{joint} [deg]" for joint in joints), *(f"{axis} [mm]" for axis in "xyz")))
     quaternion = ", qx, qy, qz, qw" if full else ""
-    return f"Bring {session.path('3-measured')}/{target}, one row per pose: {columns}{quaternion}; then: calib next"
+    file = session.path("3-measured") / target
+    return f"Bring {file}, one row per pose: {columns}{quaternion}; then: calib next {session.folder}"
