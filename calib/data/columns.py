@@ -17,8 +17,9 @@ QUATERNION = ("qx", "qy", "qz", "qw")
 MATRIX = tuple(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))
 SIGMA = ("sigma_x", "sigma_y", "sigma_z")
 SIGMA_ROTATION = ("sigma_rx", "sigma_ry", "sigma_rz")
+BASE = ("base_x", "base_y", "base_z", "base_qx", "base_qy", "base_qz", "base_qw")
 LABELS = ("distance", "pair", "bar", "socket", "plane", "tool")
-OURS = (*POSITION, *QUATERNION, *MATRIX, *SIGMA, *SIGMA_ROTATION, "sigma_distance", *LABELS)
+OURS = (*POSITION, *QUATERNION, *MATRIX, *SIGMA, *SIGMA_ROTATION, "sigma_distance", *BASE, *LABELS)
 UNIT_GROUPS = ("joints", "position", "orientation", "distance", "sigma", "sigma_rotation")
 LABEL_OF = {"distance": "pair", "bar": "bar", "sockets": "socket", "plane": "plane"}
 _TARGET = re.compile(r"(sigma_)?[xyz]\d+")
@@ -37,6 +38,7 @@ class Layout:
         sigma_rotation: three names or none.
         distance, sigma_distance, tool: one name or "".
         group: the columns whose labels together name a row's group.
+        base: position and quaternion of a frame on the robot's base, seven names, or none.
         notes: what a user should be told of the choice.
     """
 
@@ -50,11 +52,12 @@ class Layout:
     sigma_distance: str = ""
     tool: str = ""
     group: tuple[str, ...] = ()
+    base: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
     def ignored(self, table: Table) -> tuple[str, ...]:
         """Return the columns of `table` that are not read, in its order."""
-        used = {*self.joints, *self.orientation, *self.sigma_rotation, *self.group}
+        used = {*self.joints, *self.orientation, *self.sigma_rotation, *self.group, *self.base}
         used |= {self.distance, self.sigma_distance, self.tool}
         used.update(name for names in (*self.positions, *self.sigmas) for name in names)
         return tuple(name for name in table.header if name not in used)
@@ -74,9 +77,9 @@ def find_layout(table: Table, options: FileOptions, joints: Sequence[str]) -> La
     positions, sigmas, notes = _find_targets(table, options)
     if not positions:
         table.index("x")
-    tool = _find(table, options, "tool")
+    tool, base = _find(table, options, "tool"), _family(table, options, BASE)
     if kind == "position":
-        return Layout(kind, columns, positions, sigmas, tool=tool, notes=notes)
+        return Layout(kind, columns, positions, sigmas, tool=tool, base=base, notes=notes)
     orientation = find_orientation(table, options)
     if not orientation:
         raise MeasurementError("kind 'pose' needs qx qy qz qw, or r11 to r33; the header has neither", table.file)
@@ -86,7 +89,7 @@ def find_layout(table: Table, options: FileOptions, joints: Sequence[str]) -> La
     if orientation[0] not in ("qx", "r11"):
         notes = (*notes, f"the orientation is read from {', '.join(orientation)}")
     rotation = _family(table, options, SIGMA_ROTATION)
-    return Layout(kind, columns, positions, sigmas, orientation, rotation, tool=tool, notes=notes)
+    return Layout(kind, columns, positions, sigmas, orientation, rotation, tool=tool, base=base, notes=notes)
 
 
 def _grouped_layout(table: Table, options: FileOptions, kind: str, joints: tuple[str, ...]) -> Layout:

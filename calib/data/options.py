@@ -11,7 +11,7 @@ TOML; every key is optional, and a key that is none of these is refused. Lengths
     check_limits = true              # refuse joint values outside the robot's limits
     socket_distance = 0.05           # between two sockets of the same fixture position
     socket_pairs = [["0", "1"]]      # which sockets that joins, where there are more than two
-    model = "auto"                   # auto, frames, offsets, geometry, stiffness, coupling, harmonics
+    model = "auto"                   # or frames, offsets, geometry, stiffness, bending, coupling, harmonics, wobble
     loss = "auto"                    # auto (cauchy where rows are grossly wrong), none, huber, cauchy
     loss_scale = 1.345               # its constant, in sigmas
     beta = true                      # a sixth element for nearly parallel axes of an MDH table
@@ -29,11 +29,8 @@ TOML; every key is optional, and a key that is none of these is refused. Lengths
     floor = 1e-6                     # sigmas in the file's columns [m] are raised to this
     [where]                          # keep the rows whose cell is (one of) this
     tool_position = ["back_left", "high"]
-    [prior]                          # standard deviation of a parameter about its nominal value
+    [prior]                          # standard deviation of a parameter about its nominal
     theta2 = 1e-3
-    [harmonics]
-    orders = [1, 2]                  # or max = 2
-    ridge = 1e-4
     [files."day2.csv"]               # for this file only: keys down to socket_pairs, columns, units, sigma, where
     kind = "pose"
 """
@@ -53,7 +50,7 @@ from calib.errors import UsageError
 
 FORMATS = ("csv", "robodk", "three_smr")
 EULER = ("wpr", "xyz", "vector")
-MODELS = ("auto", "frames", "offsets", "geometry", "stiffness", "coupling", "harmonics")
+MODELS = ("auto", "frames", "offsets", "geometry", "stiffness", "bending", "coupling", "harmonics", "wobble")
 LOSSES = ("auto", "none", "huber", "cauchy")
 
 
@@ -88,21 +85,13 @@ class FileOptions:
 
 
 @dataclass(frozen=True)
-class Harmonics:
-    """Orders of the joint harmonics to try, and the standard deviation of their coefficients [rad] (None: free)."""
-
-    orders: tuple[int, ...] = (1, 2)
-    ridge: float | None = None
-
-
-@dataclass(frozen=True)
 class FitOptions:
     """The options of one fit.
 
     Attributes:
         every: how files are read.
         files: file name → how that file is read.
-        model, loss, loss_scale, beta, fix, free, prior, harmonics: as in the options file.
+        model, loss, loss_scale, beta, fix, free, prior: as in the options file.
         source: the options file, for messages.
     """
 
@@ -115,7 +104,6 @@ class FitOptions:
     fix: tuple[str, ...] = ()
     free: tuple[str, ...] = ()
     prior: Mapping[str, float] = field(default_factory=dict)
-    harmonics: Harmonics = field(default_factory=Harmonics)
     source: str = ""
 
     def for_file(self, path: str | Path) -> FileOptions:
@@ -198,20 +186,6 @@ def _prior(value: Any, place: str) -> dict[str, float]:
     return {key: values.positive()(item, f"{place}.{key}") for key, item in values.table(value, place).items()}
 
 
-def _harmonics(value: Any, place: str) -> Harmonics:
-    values.known(values.table(value, place), {"orders", "max", "ridge"}, place)
-    if "orders" in value and "max" in value:
-        raise UsageError(f"{place}: has orders and max; take one away")
-    orders = value.get("orders", [1, 2])
-    if "max" in value:
-        orders = list(range(1, value["max"] + 1)) if isinstance(value["max"], int) else value["max"]
-    whole = isinstance(orders, list) and all(isinstance(k, int) and not isinstance(k, bool) for k in orders)
-    if not whole or not orders or min(orders) < 1:
-        raise values.refuse(orders, place, "orders: whole numbers from 1 on")
-    ridge = values.positive()(value["ridge"], f"{place}.ridge") if "ridge" in value else None
-    return Harmonics(tuple(sorted(set(orders))), ridge)
-
-
 _FILE: dict[str, Callable[[Any, str], Any]] = {
     "kind": values.one_of(*KINDS),
     "format": values.one_of(*FORMATS),
@@ -235,5 +209,4 @@ _FIT: dict[str, Callable[[Any, str], Any]] = {
     "fix": values.names,
     "free": values.names,
     "prior": _prior,
-    "harmonics": _harmonics,
 }

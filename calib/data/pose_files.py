@@ -6,6 +6,7 @@ Columns by default (a unit in brackets is converted, ``q1 [deg]``, ``x [mm]``; p
 joints              the robot's joint names, or ``q_<joint name>``, or ``q1`` to ``qn``
 position, pose      ``x y z``; with ``qx qy qz qw`` or ``r11`` to ``r33`` a pose; also with ``_meas``, ``_measured``
 several reflectors  ``x1 y1 z1 x2 y2 z2 ...``, each a row of its own; an empty triple is a reflector not seen
+base frame          ``base_x`` … ``base_qw``, measured with every row: the target is then seen from there
 sigmas              ``sigma_x``, ``_y``, ``_z`` (numbered as the reflectors, or common), ``sigma_rx``, ``_ry``, ``_rz``
 distance            ``distance`` with ``pair`` (two rows share a label), or with ``bar`` (the unknown other end);
                     ``sigma_distance``
@@ -26,6 +27,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.data import plausible, robodk
+from calib.data.base_frame import relative_to_base
 from calib.data.columns import OURS, SUFFIXES, Layout, find_layout
 from calib.data.grouped import labels, read_groups
 from calib.data.measurements import PoseMeasurements
@@ -142,7 +144,7 @@ def _read_targets(table: Table, options: FileOptions, layout: Layout, q: np.ndar
     elif layout.tool:
         names, tool = labels(table, (layout.tool,))
     sigma = _sigma(table, options, layout, seen)
-    return PoseMeasurements(
+    block = PoseMeasurements(
         layout.kind,
         q[index],
         layout.joints,
@@ -156,6 +158,16 @@ def _read_targets(table: Table, options: FileOptions, layout: Layout, q: np.ndar
         rows=table.rows[index],
         notes=_unseen(seen, layout),
     )
+    return _seen_from_base(block, table, options, layout, index) if layout.base else block
+
+
+def _seen_from_base(
+    block: PoseMeasurements, table: Table, options: FileOptions, layout: Layout, index: np.ndarray
+) -> PoseMeasurements:
+    """Return a block relative to the base frame that stands in the same rows."""
+    position = _numbers(table, options, layout.base[:3], "length", "position")
+    quaternion = plausible.unit_quaternions(_numbers(table, options, layout.base[3:], "", ""), table, layout.base[3:])
+    return relative_to_base(block, position[index], quaternion[index])
 
 
 def _position(table: Table, options: FileOptions, names: Sequence[str], gaps: bool) -> np.ndarray:

@@ -31,6 +31,7 @@ def fit(
     settings: Settings | None = None,
     torques: Sequence[np.ndarray | None] | None = None,
     drawn: bool = False,
+    prior: np.ndarray | None = None,
 ) -> GeometricFit:
     """Fit what can be told of the parameters `candidates`; the others keep their nominal values.
 
@@ -46,6 +47,8 @@ def fit(
         torques: gravity torques (m, n) per block [N m], for compliance terms.
         drawn: keep all independent parameters, drawn to their nominal as strongly as the data themselves say
             (`drawn_fit`), in place of sending the untold ones back.
+        prior: standard deviations of the whole parameter vector about its present values, where something is known
+            beforehand; infinite elsewhere. Parameters with a prior always take part.
 
     Raises:
         MeasurementError: fewer rows than unknowns.
@@ -56,24 +59,29 @@ def fit(
     blocks = prepare(cell, measured, torques)
     split = base_columns(cell, blocks, candidates, settings.tolerance)
     free = candidates[split.kept]
+    stated = np.full(len(table.names), np.inf) if prior is None else prior
     if drawn:
-        return replace(drawn_fit(cell, blocks, free, settings), split=split, candidates=candidates)
-    plausible = plausible_deviation(cell, free)
+        return replace(drawn_fit(cell, blocks, free, settings, stated[free]), split=split, candidates=candidates)
     start, found = cell, None
-    for prior in (plausible, *[None] * RETRIES):
-        if prior is not None and not np.isfinite(prior).any():
+    for attempt in range(1 + RETRIES):
+        plausible = np.where(np.isfinite(stated[free]), np.inf, plausible_deviation(cell, free))
+        if attempt == 0 and not np.isfinite(plausible).any():
             continue
-        once = settings if prior is None else replace(settings, passes=1)  # sigmas settle without the prior
-        found = fit_with_prior(start, blocks, free, prior, settings=once)
+        wide = attempt == 0  # sigmas settle without the wide prior
+        own = np.minimum(stated[free], plausible) if wide else stated[free]
+        once = replace(settings, passes=1) if wide else settings
+        found = fit_with_prior(start, blocks, free, own, settings=once, nominal=cell)
         told = told_columns(found, plausible)
-        if prior is None and len(told) == len(free):
+        if not wide and len(told) == len(free):
             break
-        start, free, plausible = _back_to_nominal(found.cell, cell, candidates, free[told]), free[told], plausible[told]
+        start, free = _back_to_nominal(found.cell, cell, candidates, free[told]), free[told]
     assert found is not None
     return replace(found, start=cell, split=split, candidates=candidates)
 
 
-def drawn_fit(cell: Installation, blocks: list[Block], free: np.ndarray, settings: Settings) -> GeometricFit:
+def drawn_fit(
+    cell: Installation, blocks: list[Block], free: np.ndarray, settings: Settings, stated: np.ndarray
+) -> GeometricFit:
     """Fit with a prior about the nominal whose widths are the most probable ones (evidence; MacKay 1992).
 
     One width for joint offsets, one for other angles, one for lengths. Where measurements come from a few places only
@@ -93,6 +101,7 @@ def drawn_fit(cell: Installation, blocks: list[Block], free: np.ndarray, setting
         moved = np.where(family >= 0, parameter_values(found.cell)[free] - nominal, 0.0)
         widths = relevance(gram(residual + matrix @ moved, matrix), family, prior).ridge
         prior = np.where(family >= 0, np.clip(widths, NARROWEST, plausible_deviation(cell, free)), np.inf)
+        prior = np.minimum(prior, stated)
         found = fit_with_prior(cell, blocks, free, prior, settings=settings)
     return found
 

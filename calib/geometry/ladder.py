@@ -4,8 +4,8 @@
 
 Every rung is judged on rows it was not fitted to (`calib.geometry.folds`). Of the effects, the one that lowers that
 error most is taken up, then the one that pays most beside it, until none pays: sag may show only once gear errors are
-gone. Without an instrument (sockets, planes, distances) the geometry is drawn to its
-nominal as strongly as the data say (`calib.geometry.fit.drawn_fit`).
+gone. Without an instrument (sockets, planes, distances) the geometry is drawn to its nominal as strongly as the data
+say (`calib.geometry.fit.drawn_fit`).
 """
 
 from __future__ import annotations
@@ -85,6 +85,7 @@ def climb(
     settings: Settings | None = None,
     torques: Sequence[np.ndarray | None] | None = None,
     fixed: np.ndarray | None = None,
+    prior: np.ndarray | None = None,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Climb:
@@ -98,6 +99,7 @@ def climb(
             ``cauchy``, for the fits and for the errors on unseen rows alike.
         torques: gravity torques (m, n) per block [N m]; None where the masses are not known.
         fixed: positions in the parameter vector that stay at their nominal.
+        prior: standard deviations of the parameter vector about its nominal; infinite where nothing is known.
         seed: of the regions.
         progress: called with (done, total, what).
 
@@ -108,10 +110,10 @@ def climb(
         raise UsageError(f"model '{model}' is none of auto, {', '.join(MODELS)}")
     tell = progress or (lambda done, total, what: None)
     folds, settings = transfer_folds(measured, seed), settings or Settings()
-    climber = _Climber(cell, measured, settings, torques, fixed, folds, tell)
+    climber = _Climber(cell, measured, settings, torques, fixed, prior, folds, tell)
     climber.rigid(model)
     if settings.loss == "auto" and outliers(climber.best, GROSS):
-        climber = _Climber(cell, measured, replace(settings, loss="cauchy"), torques, fixed, folds, tell)
+        climber = _Climber(cell, measured, replace(settings, loss="cauchy"), torques, fixed, prior, folds, tell)
         climber.rigid(model)
     if model == "auto" or model in [effect.name for effect in EFFECTS]:
         climber.effects(model)
@@ -128,11 +130,12 @@ class _Climber:
         settings: Settings,
         torques: Sequence[np.ndarray | None] | None,
         fixed: np.ndarray | None,
+        prior: np.ndarray | None,
         folds: Folds,
         tell: Progress,
     ):
         self.measured, self.settings, self.torques, self.folds, self.tell = measured, settings, torques, folds, tell
-        self.fixed = np.array([], dtype=int) if fixed is None else fixed
+        self.fixed, self.prior = np.array([], dtype=int) if fixed is None else fixed, prior
         tell(0, len(MODELS), "frames")
         self.nominal = polish_frames(cell, measured, settings)
         self.best, self.rungs, self.chosen = self.nominal, [], "frames"
@@ -155,7 +158,7 @@ class _Climber:
             self._tick(name)
             candidates = np.setdiff1d(candidates, self.fixed)
             found = self.nominal if name == "frames" else fit(
-                self.nominal.cell, self.measured, candidates, settings=self.settings, drawn=self.drawn
+                self.nominal.cell, self.measured, candidates, settings=self.settings, drawn=self.drawn, prior=self.prior
             )  # fmt: skip
             unseen = self._judge(found, ()).error_rigid()
             better = unseen < error * (1.0 - GAIN)

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.data.measurements import PoseMeasurements
-from calib.data.options import FitOptions, Harmonics
-from calib.errors import NotConverged, UsageError
+from calib.data.options import FitOptions
+from calib.errors import NotConverged
 from calib.geometry.diagnosis import diagnose
 from calib.geometry.explanation import explain
 from calib.geometry.first_guess import install
@@ -76,10 +76,6 @@ def run(
         NotConverged: where the chosen model's fit did not come to an end.
     """
     options, say = options or FitOptions(), progress or (lambda words: None)
-    if options.prior or options.harmonics != Harmonics():
-        raise UsageError(
-            f"{options.source}: prior and harmonics are not used: the ladder chooses ridges and orders itself"
-        )
     settings = combine(Settings(), loss=loss or options.loss, loss_scale=options.loss_scale)
     asked = model or options.model
     say("placing the instrument and the tool")
@@ -92,6 +88,7 @@ def run(
         settings=settings,
         torques=torques,
         fixed=fixed_parameters(start, options),
+        prior=stated_prior(start, options),
         seed=seed,
         progress=lambda done, total, what: say(f"fitting: {what}"),
     )
@@ -131,6 +128,16 @@ def fixed_parameters(start: Installation, options: FitOptions) -> np.ndarray:
     if options.free:
         fixed = np.union1d(fixed, np.setdiff1d(table.arm_index, table.find(options.free)))
     return fixed
+
+
+def stated_prior(start: Installation, options: FitOptions) -> np.ndarray | None:
+    """Return the standard deviations of the parameter vector that the options state; infinite elsewhere."""
+    if not options.prior:
+        return None
+    table = layout(start)
+    prior = np.full(len(table.names), np.inf)
+    prior[table.find(tuple(options.prior))] = list(options.prior.values())
+    return prior
 
 
 def cross_validated(found: Climb) -> float:

@@ -27,7 +27,7 @@ def test_the_schema_of_the_docstring_is_valid_and_complete(tmp_path):
     assert every.sigma_position == (1e-5, 1e-5, 2e-5) and every.sigma_orientation == (1e-4,) * 3
     assert (every.sigma_distance, every.sigma_floor) == (1e-5, 1e-6)
     assert every.where == {"tool_position": ("back_left", "high")} and every.columns == {"x": "X_leica"}
-    assert options.prior == {"theta2": 1e-3} and options.harmonics.orders == (1, 2) and options.harmonics.ridge == 1e-4
+    assert options.prior == {"theta2": 1e-3}
     assert options.fix == ("theta1",) and options.free == ("d3",) and options.loss_scale == 1.345
     for key in (*module._FILE, *module._FIT):
         assert re.search(rf"(?m)^    \[?{key}\b", schema), f"{key} is not in the docstring"
@@ -54,10 +54,6 @@ def test_a_files_table_adds_to_what_holds_for_every_file():
         check_files(options, ["day_2.csv", "a/day3.csv"])
 
 
-def test_harmonics_up_to_an_order():
-    assert parse_options({"harmonics": {"max": 3}}).harmonics.orders == (1, 2, 3)
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -79,9 +75,6 @@ def test_harmonics_up_to_an_order():
         ({"fix": "theta1"}, "fix: expected a list of names"),
         ({"fix": ["d3"], "free": ["d3"]}, "'d3' stands in fix and in free"),
         ({"prior": {"d3": 0}}, "prior.d3: expected a number above 0"),
-        ({"harmonics": {"orders": [0, 1]}}, "whole numbers from 1 on"),
-        ({"harmonics": {"orders": [1], "max": 2}}, "orders and max"),
-        ({"harmonics": {"ordres": [1]}}, "did you mean 'orders'"),
         ({"where": {"day": True}}, "where.day: expected a text or a number"),
         ({"columns": {"x": 3}}, "columns.x: expected a text"),
     ],

@@ -235,3 +235,19 @@ def test_a_row_is_an_outlier_beyond_four_robust_sigmas_per_component():
         value[:, 7] = size * robust.spread(value) * np.array([1.0, -1.0, 1.0])
         changed = replace(found, pieces=[replace(piece, part=replace(piece.part, value=value))])
         assert [item[1] for item in outliers(changed)] == expected
+
+
+def test_a_prior_holds_where_it_is_tight_and_is_not_felt_where_it_is_loose():
+    nominal = load("ur5")
+    measured = measure(cell(perturb(nominal, 3, 1e-3, 2e-3), 3), "pose", 60, 3, sigma=SIGMA, sigma_rotation=2e-4)
+    start = polish_frames(install(nominal, [measured]), [measured]).cell
+    place = list(nominal.names).index("theta3")
+    prior = np.full(len(layout(start).names), np.inf)
+    free = fit(start, [measured], prior=prior)
+    prior[place] = 1e-9
+    held = fit(start, [measured], prior=prior)
+    prior[place] = 1.0
+    loose = fit(start, [measured], prior=prior)
+    assert abs(free.cell.chain.values[place] - nominal.values[place]) > 1e-4
+    assert abs(held.cell.chain.values[place] - nominal.values[place]) < 1e-8
+    np.testing.assert_allclose(loose.cell.chain.values, free.cell.chain.values, atol=1e-7)
