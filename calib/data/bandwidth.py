@@ -92,11 +92,11 @@ def propose_cutoffs(sampled: Resampled, dynamics: float | None = None) -> Cutoff
 
 
 def spectrum(values: np.ndarray, rate: float, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return frequencies (F,) [Hz] and one-sided power densities (F, n) [unit²/Hz] of `values` (N, n) by Welch's method.
+    """Return frequencies (F,) [Hz] and one-sided power densities (F, n) [unit²/Hz] of `values` (N, n), by Welch.
 
     Windows of `size` samples (Hann's), half overlapping, a straight line taken off each.
     """
-    window = get_window("hann", size)
+    window = np.asarray(get_window("hann", size))
     line = np.linalg.qr(np.stack([np.ones(size), np.arange(size)], axis=1))[0]
     starts = range(0, len(values) - size + 1, max(1, size // 2))
     power = np.zeros((size // 2 + 1, values.shape[1]))

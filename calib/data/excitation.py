@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import detrend, find_peaks, get_window, periodogram
-from scipy.spatial import cKDTree
+from scipy.signal import detrend, find_peaks, get_window
+from scipy.spatial import KDTree
 
 from calib.arrays import frozen
 from calib.data.motion import Motion, standstill
@@ -89,19 +89,19 @@ def repeats(training: Motion, other: Motion) -> float:
     if not len(seen) or not len(new):
         return 0.0
     limit = NEAR * np.sqrt(seen.shape[1])
-    distance, _ = cKDTree(seen).query(new, distance_upper_bound=limit)
+    distance, _ = KDTree(seen).query(new, distance_upper_bound=limit)
     return float(np.isfinite(distance).mean())
 
 
 def _lines(q: np.ndarray, rate: float) -> tuple[int, float, float]:
     """Return the number of lines, the strongest one's frequency [Hz], and its part of the power of a series (N,)."""
-    window = get_window("hann", len(q))
-    f, power = periodogram(q - window @ q / window.sum(), rate, window, nfft=4 * len(q), detrend=False)
+    window = np.asarray(get_window("hann", len(q)))
+    power = np.abs(np.fft.rfft(window * (q - window @ q / window.sum()), 4 * len(q))) ** 2
     peaks, _ = find_peaks(power, height=LINE * power.max(), distance=8, prominence=0.5 * LINE * power.max())
     top = int(np.argmax(power))
     width = 8  # half the main lobe of Hann's window, in steps of the padded transform
     share = power[max(0, top - width) : top + width + 1].sum() / power.sum()
-    return max(1, len(peaks)), float(f[top]), float(share)
+    return max(1, len(peaks)), top * rate / (4 * len(q)), float(share)
 
 
 def _notes(

@@ -53,7 +53,7 @@ def _reader(path: Path) -> Reader:
         return read_bag
     try:
         with open(path, "rb") as file:
-            head = file.read(4096)
+            head = file.read(1 << 16)
     except OSError as error:
         raise MeasurementError(f"cannot be read: {error.strerror}", path) from error
     if head[:2] == b"PK":
@@ -61,4 +61,6 @@ def _reader(path: Path) -> Reader:
     if not head or b"\0" in head:
         found = "is empty" if not head else "is neither a NumPy archive, a bag nor text"
         raise MeasurementError(f"{found}: expected .npz, .csv, .mcap, .bag or a ROS 2 bag's folder", path)
+    if len(head) == 1 << 16 and b"\n" not in head:
+        raise MeasurementError("has a first line of more than 64 kB: this is no table", path)
     return read_log

@@ -154,6 +154,8 @@ def test_broken_and_foreign_files(tmp_path, archive):
     refused(tmp_path / "cut.npz", "damaged archive")
     (tmp_path / "zeros.csv").write_bytes(bytes(10_000))
     refused(tmp_path / "zeros.csv", "neither a NumPy archive")
+    (tmp_path / "endless.csv").write_bytes(b"y" * 200_000)
+    refused(tmp_path / "endless.csv", "this is no table")
     (tmp_path / "x.mcap").write_bytes(b"nothing of the kind")
     refused(tmp_path / "x.mcap", "cannot be read as a ROS bag")
     refused(tmp_path, "cannot be read as a ROS bag")
