@@ -1,0 +1,90 @@
+"""One recording as identification sees it: its motion, the torques to explain, and what the robot carried."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.arrays import frozen
+from calib.data.motion import Motion, moving
+from calib.errors import MeasurementError, UsageError
+
+FULL = 20  # of a recording's length, the filter of the parallel decimation may eat one part in so many (our choice)
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A motion and its torques.
+
+    Attributes:
+        name: the recording's, unique among all.
+        motion: q, v, a at the full rate.
+        target: (N, rows) what the model's rows have to explain, unfiltered [N m or N; A where no gain is known].
+        carried: labels of the payloads on board.
+        present: (N, rows) which rows may be learnt from: no lost samples, and no slow ones where they are cut.
+    """
+
+    name: str
+    motion: Motion
+    target: np.ndarray
+    carried: tuple[str, ...]
+    present: np.ndarray
+
+    @property
+    def duration(self) -> float:
+        """Length of what the filters left [s]."""
+        return len(self.motion) / self.motion.rate
+
+
+def make_case(
+    name: str,
+    motion: Motion,
+    kind: str = "motor",
+    *,
+    gains: np.ndarray | None = None,
+    carried: Sequence[str] = (),
+    slow: float | Sequence[float] | None = None,
+) -> Case:
+    """Return the case of a motion.
+
+    Args:
+        kind: of the model's rows (`calib.dynamics.idim.KINDS`); ``link``, ``both`` and ``drive`` need joint torque
+            sensors (`Motion.tau_link`).
+        gains: (n,) torque per unit of the effort; None: 1.
+        carried: labels of payloads.
+        slow: rows of joints slower than this are not learnt from: a share of the peak speed or (n,) speeds; None: all
+            are.
+    """
+    effort = np.array(motion.effort) if gains is None else motion.effort * gains
+    if kind != "motor" and motion.tau_link is None:
+        raise MeasurementError(f"rows '{kind}' need torques of sensors behind the gear (tau_link)", motion.file)
+    link = effort if motion.tau_link is None else np.asarray(motion.tau_link)
+    target = {"motor": effort, "link": link, "both": np.hstack([link, effort]), "drive": effort - link}[kind]
+    known = np.repeat(motion.weight[:, None] > 0.5, motion.n, axis=1)
+    if slow is not None:
+        known &= moving(motion, slow)
+    present = np.hstack([known, known]) if kind == "both" else known
+    return Case(name, motion, frozen(target), tuple(carried), frozen(present, bool))
+
+
+def case_names(paths: Sequence[str]) -> tuple[str, ...]:
+    """Return a unique name per recording: the file's, with the cut (or the folder) where that is needed.
+
+    Raises:
+        UsageError: where the same recording and cut is given twice.
+    """
+    twice = sorted({path for path in paths if list(paths).count(path) > 1})
+    if twice:
+        raise UsageError(f"{twice[0]} is given twice")
+    plain = [_file(path) for path in paths]
+    tail = [path.replace("\\", "/").rsplit("/", 1)[-1] for path in paths]
+    chosen = [p if plain.count(p) == 1 else t for p, t in zip(plain, tail)]
+    return tuple(c if chosen.count(c) == 1 else path for c, path in zip(chosen, paths))
+
+
+def _file(path: str) -> str:
+    from calib.data.recording import parse_cut
+
+    return parse_cut(path)[0].replace("\\", "/").rstrip("/").rsplit("/", 1)[-1]

@@ -1,0 +1,108 @@
+"""The estimators of the LS family by name, on rows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.errors import UsageError
+from calib.estimation.estimate import Estimate
+from calib.estimation.linear import LinearFit, ols, settled_std, wls
+from calib.estimation.samples import irls, stack
+from calib.estimation.total import tls
+from calib.estimation.triangles import Triangles
+from calib.estimation.whiteness import inflation
+from calib.identification.rows import Rows, pool, segments
+
+METHODS = ("ols", "wls", "irls", "tls", "iv")
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A fit of base parameters.
+
+    Attributes:
+        fit: the estimate and what it rests on.
+        pooled: triangles of all rows, one group per row.
+        std: (rows,) standard deviation of the residuals of each row.
+        inflation: (rows,) how many rows count as one, from the residuals' autocorrelation.
+        method: one of `METHODS`.
+    """
+
+    fit: LinearFit
+    pooled: Triangles
+    std: np.ndarray
+    inflation: np.ndarray
+    method: str
+
+    @property
+    def estimate(self) -> Estimate:
+        return self.fit.estimate
+
+
+def fit_rows(all_rows: Sequence[Rows], data: Triangles, method: str = "wls") -> Fitted:
+    """Estimate the columns' parameters, with a covariance that knows that residuals are correlated in time.
+
+    Args:
+        all_rows: of all cases.
+        data: their triangles (`rows.triangulate`).
+        method: ``ols``, ``wls``, ``irls`` (across joints, with a gate) or ``tls`` (noise in the columns of accelerations
+            in proportion to their size).
+    """
+    if method not in METHODS:
+        raise UsageError(f"method '{method}' is none of {', '.join(METHODS)}")
+    rows = all_rows[0].target.shape[1]
+    pooled = pool(data, rows)
+    std = settled_std(pooled)
+    first = wls(pooled, std)
+    tau = residual_inflation(all_rows, first.estimate.values)
+    if method == "ols":
+        fit = ols(pooled, tau)
+    elif method == "irls":
+        fit = _irls(all_rows, float(np.median(tau)))
+    elif method == "tls":
+        fit = _tls(pooled, std)
+    else:
+        fit = wls(pooled, std, tau)
+    return Fitted(fit, pooled, std, tau, method)
+
+
+def residual_inflation(all_rows: Sequence[Rows], values: np.ndarray) -> np.ndarray:
+    """Return the integrated autocorrelation of each row's residuals (rows,), averaged over cases by length."""
+    rows = all_rows[0].target.shape[1]
+    total, weight = np.zeros(rows), 0.0
+    for part in all_rows:
+        residual = part.target - part.matrix @ values
+        total += len(residual) * np.array([inflation(residual[:, row]) for row in range(rows)])
+        weight += len(residual)
+    return np.maximum(total / max(weight, 1.0), 1.0)
+
+
+def _irls(all_rows: Sequence[Rows], inflated: float) -> LinearFit:
+    matrix = np.concatenate([part.matrix for part in all_rows])
+    target = np.concatenate([part.target for part in all_rows])
+    present = np.concatenate([part.present for part in all_rows])
+    samples = stack(matrix, target, present, all_rows[0].names, all_rows[0].units)
+    return irls(samples, inflation=inflated).fit
+
+
+def _tls(pooled: Triangles, std: np.ndarray) -> LinearFit:
+    """Return the scaled TLS fit: every column that moves is as noisy, relative to its size, as y is.
+
+    Columns of ones (offsets) and of signs are exact. The common level is the smallest singular value's (our choice:
+    without repeated measurements the ratio of the noises is not known).
+    """
+    p = pooled.parameters
+    stacked = np.sum((pooled.factors / std[:, None, None]) ** 2, axis=(0, 1))
+    size = np.sqrt(stacked / max(float(pooled.rows.sum()), 1.0))
+    exact = np.array([name.startswith(("off", "Fc")) for name in pooled.names])
+    small = 0.01  # of a column's rms: what filtered derivatives miss (our choice)
+    noise = np.append(np.where(exact, 0.0, small * size[:p]), 1.0)
+    return tls(pooled, noise, std)
+
+
+def spans(part: Rows) -> list[tuple[int, int]]:
+    """Return the runs of one block."""
+    return segments(part.block)

@@ -1,0 +1,186 @@
+"""From cases to an identified model: base parameters, friction that pays, an estimate with covariance, a prediction."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.data.decimation import Decimator, design_decimator
+from calib.dynamics import base as bases
+from calib.dynamics.base import Base
+from calib.dynamics.idim import IdentificationModel, with_terms
+from calib.errors import MeasurementError, UsageError
+from calib.estimation.essential import Elimination, Rule, eliminate
+from calib.estimation.linear import LinearFit, ridge
+from calib.estimation.triangles import condition_numbers
+from calib.identification.cases import Case
+from calib.identification.estimators import Fitted, fit_rows, residual_inflation
+from calib.identification.ladder import Climb, Ground, Rung, climb
+from calib.identification.prediction import Dynamics, transmitted
+from calib.identification.rows import Rows, extend, observe, observe_terms, pool, triangulate, with_blocks
+from calib.identification.settings import Settings, make_model, per_joint
+from calib.identification.unseen import estimate
+from calib.robot.chain import Chain, sampling_limits
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """What was identified.
+
+    Attributes:
+        dynamics: the model with numbers.
+        base: which columns were kept of the standard model, and what they stand for.
+        fitted: the estimate of base parameters and friction.
+        elimination: the way to the essential ones; None where not asked for.
+        climb: the friction ladder.
+        settings: how.
+        rows: what was learnt from.
+        condition: of the observation matrix, in its units and with columns of unit norm.
+    """
+
+    dynamics: Dynamics
+    base: Base
+    fitted: Fitted
+    elimination: Elimination | None
+    climb: Climb
+    settings: Settings
+    rows: tuple[Rows, ...]
+    condition: tuple[float, float]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the estimate's parameters: base ones, then richer friction."""
+        return (*self.base.names, *(one.name for one in self.climb.terms))
+
+    @property
+    def rungs(self) -> tuple[Rung, ...]:
+        return self.climb.rungs
+
+
+def identify(
+    chain: Chain,
+    cases: Sequence[Case],
+    settings: Settings | None = None,
+    nominal: Chain | None = None,
+    progress: Progress | None = None,
+) -> Identification:
+    """Identify the dynamics of a chain from recordings.
+
+    Args:
+        chain: the calibrated robot (or the nominal one, where there is no other).
+        cases: recordings to learn from.
+        nominal: the chain that base columns are chosen on; None: `chain`.
+        progress: called with a few words at each stage.
+    """
+    settings, say = settings or Settings(), progress or (lambda words: None)
+    if not cases:
+        raise UsageError("no recording to identify from")
+    model = make_model(chain, settings)
+    say("base parameters")
+    base = find_base(chain, model, settings, nominal, cases)
+    decimator = common_decimator(cases, settings)
+    say("observation matrix")
+    rows = with_blocks([observe(model, base.kept, case, decimator) for case in cases], settings.folds)
+    _require_enough(rows, base)
+    say("first fit")
+    std, tau, values = _first(rows)
+    first = Dynamics(model, bases.to_standard(base, values))
+    loads = [transmitted(first, case) for case in cases]
+    n = chain.n
+    ground = Ground(
+        cases, rows, loads, decimator, std, tau, np.array(per_joint(settings.v0, n, "v0")),
+        np.array([joint.kind == "prismatic" for joint in chain.joints]),
+    )  # fmt: skip
+    climbed = climb(ground, settings.friction, progress) if settings.kind == "motor" else Climb((), (), ())
+    say("estimate")
+    full = [
+        extend(part, climbed.terms, observe_terms(climbed.terms, case, decimator, load))
+        for part, case, load in zip(rows, cases, loads)
+    ]
+    fitted, condition = _estimate(full, climbed, settings)
+    richer = with_terms(model, *climbed.terms)
+    values = fitted.estimate.values
+    standard = np.concatenate([bases.to_standard(base, values[: base.b]), values[base.b :]])
+    say("essential parameters")
+    gone = _essential(fitted, settings)
+    return Identification(
+        Dynamics(richer, standard), base, fitted, gone, climbed, settings, tuple(full), condition
+    )  # fmt: skip
+
+
+def find_base(
+    chain: Chain, model: IdentificationModel, settings: Settings, nominal: Chain | None, cases: Sequence[Case]
+) -> Base:
+    """Return base columns chosen on the nominal chain and regrouped on the calibrated one."""
+    loads = tuple(dict.fromkeys(tuple(sorted(case.carried)) for case in cases))
+    original = model if nominal is None else make_model(nominal, settings)
+    lower, upper = sampling_limits(chain)
+    samples = bases.random_samples(original, seed=settings.seed, lower=lower, upper=upper)
+    found = bases.find(original, samples, loads)
+    return found if nominal is None else bases.regroup(found, model, samples, loads)
+
+
+def common_decimator(cases: Sequence[Case], settings: Settings) -> Decimator:
+    """Return the filter that thins all cases to at most ``settings.samples`` rows per torque, in one band."""
+    rates = [case.motion.rate for case in cases]
+    if max(rates) > 1.02 * min(rates):
+        slowest, fastest = min(rates), max(rates)
+        raise MeasurementError(
+            f"recordings of {slowest:.4g} Hz and {fastest:.4g} Hz do not go together; resample one of them"
+        )
+    total = sum(len(case.motion) for case in cases)
+    factor = max(1, int(np.ceil(total / settings.samples)))
+    return design_decimator(rates[0], min(factor, cases[0].motion.decimator.factor))
+
+
+def _first(rows: Sequence[Rows]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the residuals' standard deviation and inflation (rows,), and values (b,), of a robustly solvable first fit."""
+    count = rows[0].target.shape[1]
+    data = pool(triangulate(rows), count)
+    std, tau = np.ones(count), np.ones(count)
+    values = np.zeros(data.parameters)
+    for _ in range(4):
+        values, _ = estimate(data, std, tau, np.full(data.parameters, -1))
+        residuals = np.concatenate([np.where(part.present, part.target - part.matrix @ values, 0.0) for part in rows])
+        used = np.concatenate([part.present for part in rows]).sum(axis=0)
+        std = np.sqrt((residuals**2).sum(axis=0) / np.maximum(used, 1))
+        std = np.maximum(std, 1e-9 * max(float(std.max()), 1e-300))
+    return std, residual_inflation(rows, values), values
+
+
+def _estimate(rows: Sequence[Rows], climbed: Climb, settings: Settings) -> tuple[Fitted, tuple[float, float]]:
+    """Return the final fit; richer friction keeps the ridge that the evidence chose."""
+    data = triangulate(rows)
+    fitted = fit_rows(rows, data, settings.method)
+    condition = condition_numbers(fitted.pooled.factors.reshape(-1, data.parameters + 1)[:, :-1])
+    if not climbed.terms or settings.method not in ("wls", "iv"):
+        return fitted, condition
+    group = np.concatenate([np.full(data.parameters - len(climbed.terms), -1), climbed.groups]).astype(int)
+    _, prior = estimate(fitted.pooled, fitted.std, fitted.inflation, group)
+    prior = np.where(prior > 0.0, prior, 1e-12)
+    drawn: LinearFit = ridge(
+        fitted.pooled, np.zeros(len(prior)), np.diag(prior**2), fitted.std * np.sqrt(fitted.inflation)
+    )  # fmt: skip
+    return replace(fitted, fit=drawn), condition
+
+
+def _essential(fitted: Fitted, settings: Settings) -> Elimination | None:
+    if settings.essential == "none":
+        return None
+    return eliminate(
+        fitted.pooled, Rule(settings.essential), ratio=settings.ratio, level=settings.level, keep=settings.keep,
+        drop=settings.drop, std=fitted.std, inflation=fitted.inflation,
+    )  # fmt: skip
+
+
+def _require_enough(rows: Sequence[Rows], base: Base) -> None:
+    count = sum(int(part.present.sum()) for part in rows)
+    if count < 2 * base.b:
+        raise MeasurementError(
+            f"{count} rows are left for {base.b} base parameters after filtering and thinning: record longer, or raise "
+            "the identification band ([filter] band)"
+        )

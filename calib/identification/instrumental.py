@@ -1,0 +1,309 @@
+"""IDIM-IV: instruments from a closed-loop simulation with the last estimate, until both come to rest.
+
+    simulate with x_k → Z = W(q_s, v_s, a_s), filtered and thinned like W → x_{k+1} = (Zᵀ Ω⁻¹ W)⁻¹ Zᵀ Ω⁻¹ y
+
+(Janot, Vandanjon & Gautier 2014). Same reference, same controller: the simulation feels what the robot was asked to do,
+and not its noise, so Z is uncorrelated with the noise that the feedback brings into W. It starts from a regular robot:
+inertia diag(J), no gravity, no friction. DIDIM (Gautier, Janot & Vandanjon 2013) estimates from the simulated W alone,
+x_{k+1} = W_s⁺ y. A prior inequality on base parameters makes it PC-IDIM-IV (`calib.estimation.constrained`); constraints
+do not cure a bias.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.arrays import frozen
+from calib.data.decimation import Decimator
+from calib.dynamics import base as bases
+from calib.dynamics.base import Base
+from calib.dynamics.drives import standard
+from calib.dynamics.idim import IdentificationModel
+from calib.errors import CalibError, NotConverged, UsageError
+from calib.estimation import instruments
+from calib.estimation.constrained import Constrained, within
+from calib.estimation.instruments import Instruments, Strength, Verdict
+from calib.estimation.linear import LinearFit, settled_std, wls
+from calib.estimation.triangles import collect
+from calib.estimation.whiteness import inflation
+from calib.identification.cases import Case
+from calib.identification.rows import Rows, observe
+from calib.simulation.closed_loop import Plant, Run, Sensing, inertia_diagonal, simulate, with_parameters
+from calib.simulation.controllers import Controller, scaled
+from calib.simulation.references import Reference
+
+METHODS = ("iv", "didim")
+LIMIT = 10  # iterations; 3 to 6 are usual
+RETREATS = 6  # halvings of a step to parameters that cannot be simulated
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """The closed loop that a recording came from.
+
+    Attributes:
+        controller: given, identified from the log (`calib.identification.controller`) or guessed: a third of the
+            bandwidth still serves.
+        reference: at the controller's rate; its first instant is the recording's.
+        every: control periods per recorded sample.
+        design: (n,) inertia for which the gains are what they say [kg m²]; the simulated robot then gets gains times
+            J(x_k) / design, so that its bandwidth stays (Gautier & Janot). None: gains as they are.
+    """
+
+    controller: Controller
+    reference: Reference
+    every: int = 1
+    design: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Round:
+    """One iteration.
+
+    Attributes:
+        change: largest |Δx_j| / max(|x_j|, 8 σ_j), 8 = 0.2 / 2.5 %, see `calib.estimation.instruments.settled`.
+        residual: standard deviation of the weighted residuals.
+        retreats: halvings until the new parameters could be simulated.
+    """
+
+    change: float
+    residual: float
+    retreats: int
+
+
+@dataclass(frozen=True, eq=False)
+class Instrumental:
+    """What IDIM-IV found.
+
+    Attributes:
+        fit: the estimate.
+        ordinary: weighted least squares of the same rows, to compare.
+        columns: of the base parameters that were estimated.
+        plant: the simulated robot with the estimate.
+        rounds: what happened.
+        strength: how well the instruments stand for W.
+        verdict: whether least squares is biased (Durbin, Wu, Hausman).
+        std, inflation: of the rows, (rows,), and of all together.
+        distance: (n,) 100 ‖q - q_s‖ / ‖q - mean q‖ [%] of filtered measured and simulated positions: large where the
+            controller is not the robot's.
+        constrained: the optimum under constraints, where there are any; `fit` has its values and covariance.
+    """
+
+    fit: LinearFit
+    ordinary: LinearFit
+    columns: np.ndarray
+    plant: Plant
+    rounds: tuple[Round, ...]
+    strength: Strength
+    verdict: Verdict
+    std: np.ndarray
+    inflation: float
+    distance: np.ndarray
+    constrained: Constrained | None
+
+    @property
+    def valid(self) -> bool:
+        """Whether the instruments may be trusted: full rank, not weak, and the simulated robot follows the real one."""
+        return not self.strength.weak and bool(np.all(self.distance < 10.0))
+
+
+def identify_instrumental(
+    model: IdentificationModel,
+    base: Base,
+    cases: Sequence[tuple[Case, Loop]],
+    decimator: Decimator,
+    *,
+    method: str = "iv",
+    columns: np.ndarray | None = None,
+    inertia: np.ndarray | None = None,
+    positive: Sequence[str] = (),
+    tolerance: float = 0.025,
+    limit: int = LIMIT,
+) -> Instrumental:
+    """Estimate base parameters with instruments from simulation.
+
+    Args:
+        model: rows of kind ``motor``.
+        base: its base columns.
+        cases: recordings, each with the loop it came from.
+        decimator: the parallel filter of W, Z and y.
+        method: ``iv`` or ``didim``.
+        columns: indices of the base parameters to estimate (essential ones), the others zero; None: all.
+        inertia: (n,) of the regular robot it starts from [kg m²]; None: kd² / (2 kp), for which the first controller
+            would be damped by 0.7.
+        positive: names of base parameters that must not be negative (PC-IDIM-IV).
+        tolerance: of parameters and of the residual, relative.
+        limit: most iterations.
+
+    Raises:
+        Unidentifiable: where the instruments do not tell the parameters apart.
+        NotConverged: with the last `LinearFit`, after `limit` iterations.
+    """
+    if method not in METHODS:
+        raise UsageError(f"method '{method}' is none of {', '.join(METHODS)}")
+    if model.kind != "motor" or not cases:
+        raise UsageError("instruments from simulation need motor torques, and a recording with its reference")
+    kept = np.arange(base.b) if columns is None else np.asarray(columns, dtype=int)
+    observed = [observe(model, base.kept[kept], case, decimator) for case, _ in cases]
+    observed = [replace(rows, names=tuple(base.names[k] for k in kept)) for rows in observed]
+    problem = _stack(observed, [rows.matrix for rows in observed])
+    ordinary = wls(instruments.least_squares(problem))
+    plant, now, std = _regular(model, cases[0][1], inertia), ordinary, ordinary.group_std
+    before: LinearFit | None = None
+    bound, tau, rounds = None, 1.0, []
+    runs = _runs(plant, cases)
+    for _ in range(limit):
+        simulated = [_observe_run(model, base.kept[kept], case, run, loop, decimator) for (case, loop), run in runs]
+        problem = _stack(observed, simulated)
+        now = _estimate(problem, observed, method, std)
+        tau = _inflation(observed, now, std)
+        now = _estimate(problem, observed, method, std, tau)
+        now, bound = _constrain(problem, now, std, positive)
+        values = np.zeros(base.b)
+        values[kept] = now.estimate.values
+        plant, runs, retreats = _simulate_new(plant, _with_values(plant, bases.to_standard(base, values)), cases)
+        rounds.append(Round(_change(before, now), now.estimate.residual_std, retreats))
+        if before is not None and retreats == 0 and instruments.settled(before, now, tolerance, tolerance):
+            break
+        before, std = now, now.group_std
+    else:
+        last = rounds[-1]
+        raise NotConverged(
+            f"instruments from simulation: parameters still change by {100 * last.change:.3g} % after {limit} rounds; "
+            "estimate fewer (essential ones), or look at the controller's gains",
+            now,
+        )
+    verdict = instruments.exogeneity(problem, std, tau)
+    return Instrumental(
+        now, ordinary, frozen(kept, int), plant, tuple(rounds), instruments.strength(problem, std), verdict,
+        frozen(std), tau, _distance(runs), bound,
+    )  # fmt: skip
+
+
+def simulated_case(case: Case, run: Run, loop: Loop) -> Case:
+    """Return the case with the simulated motion at the instants of the recorded one."""
+    step = loop.reference.period * loop.every
+    index = np.rint(case.motion.t / step).astype(int)
+    if index[-1] >= len(run.t) or np.abs(index * step - case.motion.t).max() > 0.01 * step:
+        raise CalibError(
+            f"the recording runs to {case.motion.t[-1]:.6g} s in steps of {1 / case.motion.rate:.6g} s, the simulation "
+            f"to {run.t[-1]:.6g} s in steps of {step:.6g} s: give the whole reference, and `every`"
+        )
+    return replace(case, motion=replace(case.motion, q=run.q[index], v=run.v[index], a=run.a[index]))
+
+
+def _regular(model: IdentificationModel, loop: Loop, inertia: np.ndarray | None) -> Plant:
+    """Return a robot of inertia diag(J) and nothing else; its last n terms hold J."""
+    if inertia is None:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inertia = loop.controller.kd**2 / (2.0 * loop.controller.kp)
+        if not np.all(np.isfinite(inertia)) or not np.all(inertia > 0.0):
+            raise UsageError("no regular inertia follows from these gains; state it, (n,) [kg m²]")
+    n = model.tree.n
+    extra = tuple(replace(one, name=f"regular {one.name}") for one in standard(["Ia"] * n))
+    return Plant(model.tree, (*model.terms, *extra), np.concatenate([np.zeros(model.p), inertia]))
+
+
+def _with_values(plant: Plant, values: np.ndarray) -> Plant:
+    return with_parameters(plant, np.concatenate([values, np.zeros(len(plant.parameters) - len(values))]))
+
+
+Runs = list[tuple[tuple[Case, Loop], Run]]
+
+
+def _runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
+    """Simulate every loop without noise."""
+    result: Runs = []
+    for case, loop in cases:
+        controller = loop.controller
+        if loop.design is not None:
+            controller = scaled(controller, inertia_diagonal(plant, loop.reference.q[::200]) / loop.design)
+        result.append(((case, loop), simulate(plant, controller, loop.reference, Sensing(every=loop.every))))
+    return result
+
+
+def _simulate_new(old: Plant, new: Plant, cases: Sequence[tuple[Case, Loop]]) -> tuple[Plant, Runs, int]:
+    """Simulate the new parameters, or those on the way to them that can be (our choice)."""
+    for retreats in range(RETREATS):
+        share = 0.5**retreats
+        tried = with_parameters(new, share * new.parameters + (1.0 - share) * old.parameters)
+        try:
+            return tried, _runs(tried, cases), retreats
+        except CalibError as error:
+            problem = error
+    raise NotConverged(f"the estimate cannot be simulated, nor anything near: {problem}", new)
+
+
+def _observe_run(
+    model: IdentificationModel, columns: np.ndarray, case: Case, run: Run, loop: Loop, decimator: Decimator
+) -> np.ndarray:
+    return observe(model, columns, simulated_case(case, run, loop), decimator).matrix
+
+
+def _stack(observed: Sequence[Rows], simulated: Sequence[np.ndarray]) -> Instruments:
+    """Return the triangles of [Z W y], one group per torque row."""
+    problem: Instruments | None = None
+    for rows, z in zip(observed, simulated, strict=True):
+        samples, count, p = rows.matrix.shape
+        used = rows.present.T.ravel()
+        group = np.repeat(np.arange(count), samples)[used]
+        w, z = (x.transpose(1, 0, 2).reshape(-1, p)[used] for x in (rows.matrix, z))
+        target = rows.target.T.ravel()[used]
+        problem = instruments.instrument(z, w, target, group, rows.names, rows.units, problem)
+    assert problem is not None  # `cases` is not empty
+    return problem
+
+
+def _estimate(
+    problem: Instruments, observed: Sequence[Rows], method: str, std: np.ndarray, tau: float = 1.0
+) -> LinearFit:
+    if method == "iv":
+        return instruments.iv(problem, std, tau)
+    p = len(problem.names)
+    swapped = replace(problem.data, factors=problem.data.factors[:, :, [*range(p), 2 * p]])
+    data = collect(np.zeros((0, p)), np.zeros(0), None, problem.names, problem.data.units[p:])
+    stacked = replace(data, factors=_square(swapped.factors), rows=problem.data.rows)
+    return wls(stacked, std, np.full(problem.data.groups, tau))
+
+
+def _square(factors: np.ndarray) -> np.ndarray:
+    """Return the R factors of [Z y], (g, p + 1, p + 1), from the same columns of triangles of [Z W y]."""
+    size = factors.shape[2]
+    return np.stack([np.linalg.qr(factor, mode="r")[:size] for factor in factors])
+
+
+def _inflation(observed: Sequence[Rows], fit: LinearFit, std: np.ndarray) -> float:
+    """Return how many rows count as one, the mean over torque rows of the residuals' integrated autocorrelation."""
+    series = [rows.target - rows.matrix @ fit.estimate.values for rows in observed]
+    longest = max(series, key=len)
+    return max(1.0, float(np.mean([inflation(longest[:, row]) for row in range(longest.shape[1])])))
+
+
+def _constrain(
+    problem: Instruments, fit: LinearFit, std: np.ndarray, positive: Sequence[str]
+) -> tuple[LinearFit, Constrained | None]:
+    """Return the estimate under x_j >= 0 for the names given (two-stage least squares; see the module)."""
+    if not positive:
+        return fit, None
+    unknown = [name for name in positive if name not in problem.names]
+    if unknown:
+        raise UsageError(f"'{unknown[0]}' is none of the estimated parameters {', '.join(problem.names)}")
+    lower = np.where([name in positive for name in problem.names], 0.0, -np.inf)
+    found = within(instruments.projected(problem, std), np.eye(len(lower)), lower, np.full(len(lower), np.inf))
+    return replace(fit, estimate=replace(fit.estimate, values=found.values)), found
+
+
+def _change(before: LinearFit | None, now: LinearFit) -> float:
+    if before is None:
+        return float("inf")
+    size = np.maximum(np.abs(before.estimate.values), 8.0 * now.estimate.sigma)
+    return float(np.max(np.abs(now.estimate.values - before.estimate.values) / np.maximum(size, 1e-300)))
+
+
+def _distance(runs: Runs) -> np.ndarray:
+    case, loop, run = runs[0][0][0], runs[0][0][1], runs[0][1]
+    q, own = case.motion.q, simulated_case(case, run, loop).motion.q
+    return frozen(100.0 * np.linalg.norm(q - own, axis=0) / np.linalg.norm(q - q.mean(axis=0), axis=0))

@@ -1,0 +1,176 @@
+"""Cases as rows of y = W x: built a block at a time at the full rate, low-passed and thinned alike on both sides."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.data.decimation import Decimator, decimate, decimate_blocks, kept
+from calib.dynamics import drives
+from calib.dynamics.drives import Term
+from calib.dynamics.idim import IdentificationModel
+from calib.estimation.triangles import Triangles, absorb, empty, retriangulate
+from calib.identification.cases import Case
+
+BLOCK = 4096  # samples of the full rate at a time
+MARGIN = 2  # thinned samples beside a cut between blocks that share a filter window: not judged
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """M thinned samples of one case.
+
+    Attributes:
+        names, units: of the p columns.
+        matrix: (M, rows, p).
+        target: (M, rows).
+        present: (M, rows) bool, rows to learn from.
+        block: (M,) number of the time block, for cross-validation; -1 beside a cut.
+        rate: [Hz].
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    matrix: np.ndarray
+    target: np.ndarray
+    present: np.ndarray
+    block: np.ndarray
+    rate: float
+
+
+def observe(
+    model: IdentificationModel, columns: np.ndarray, case: Case, decimator: Decimator, load: np.ndarray | None = None
+) -> Rows:
+    """Return the rows of a case in the model's `columns`, filtered and thinned by `decimator`.
+
+    Args:
+        load: (N, n) transmitted torques at the full rate, where a term needs them.
+    """
+    motion = case.motion
+    states = segmented_states(model.columns, case)
+    unfiltered = len(decimator.taps) == 1
+    parts = []
+    for start, stop in segments(motion.segment):
+        blocks = (
+            _block(model, columns, case, slice(i, min(i + BLOCK, stop)), load, states)
+            for i in range(start, stop, BLOCK)
+        )
+        parts += list(blocks if unfiltered else decimate_blocks(blocks, decimator))
+    matrix = np.concatenate(parts) if parts else np.zeros((0, model.rows, len(columns)))
+    names, units = model.names, model.units
+    return _rows([names[k] for k in columns], [units[k] for k in columns], matrix, case, decimator)
+
+
+def observe_terms(
+    terms: Sequence[Term], case: Case, decimator: Decimator, load: np.ndarray | None = None
+) -> np.ndarray:
+    """Return the columns of drive terms alone, (M, n, k), filtered and thinned; for a model of kind ``motor``."""
+    motion = case.motion
+    if not terms:
+        return np.zeros((len(kept(motion.segment, decimator)), motion.n, 0))
+    full = term_columns(terms, case, load)
+    return np.asarray(decimate(full, decimator, motion.segment))
+
+
+def term_columns(terms: Sequence[Term], case: Case, load: np.ndarray | None = None) -> np.ndarray:
+    """Return the columns of drive terms at the full rate, (N, n, k)."""
+    motion = case.motion
+    motions = [np.ascontiguousarray(x.T) for x in (motion.q, motion.v, motion.a)]
+    out = np.zeros((len(terms), motion.n, len(motion)))
+    drives.fill(terms, out, [*motions, None if load is None else load.T], segmented_states(terms, case))
+    return out.transpose(2, 1, 0)
+
+
+def segmented_states(terms: Sequence[Term], case: Case) -> np.ndarray:
+    """Return the states (s, N) of friction with memory; each segment starts unstressed."""
+    parts = [
+        drives.friction_states(terms, np.ascontiguousarray(case.motion.q[a:b].T))
+        for a, b in segments(case.motion.segment)
+    ]
+    return np.concatenate(parts, axis=1)
+
+
+def segments(segment: np.ndarray) -> list[tuple[int, int]]:
+    """Return (start, stop) of each run of equal numbers."""
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(segment)) + 1, [len(segment)]])
+    return [(int(a), int(b)) for a, b in zip(edges, edges[1:])]
+
+
+def extend(rows: Rows, terms: Sequence[Term], columns: np.ndarray) -> Rows:
+    """Return rows with more columns (M, rows, k) behind their own."""
+    return replace(
+        rows,
+        names=(*rows.names, *(one.name for one in terms)),
+        units=(*rows.units, *(one.unit for one in terms)),
+        matrix=np.concatenate([rows.matrix, columns], axis=2),
+    )
+
+
+def with_blocks(all_rows: Sequence[Rows], count: int) -> list[Rows]:
+    """Number the time blocks of all cases: contiguous, about `count` in all, at least one per case.
+
+    Samples within `MARGIN` of a cut get -1: the filter's window reaches over it.
+    """
+    total = sum(len(rows.target) for rows in all_rows)
+    result, first = [], 0
+    for rows in all_rows:
+        size = len(rows.target)
+        own = 1 if len(all_rows) >= count else max(1, round(count * size / max(total, 1)))
+        number = first + (np.arange(size) * own) // max(size, 1)
+        cut = np.flatnonzero(np.diff(number)) + 1
+        near = np.abs(np.arange(size)[:, None] - cut[None, :]).min(axis=1, initial=size) <= MARGIN
+        result.append(replace(rows, block=np.where(near, -1, number)))
+        first += own
+    return result
+
+
+def triangulate(all_rows: Sequence[Rows]) -> Triangles:
+    """Return the triangles of all rows, one group per (block, row): group = block · rows + row.
+
+    The last block holds the samples beside cuts.
+    """
+    rows = all_rows[0].target.shape[1]
+    blocks = 1 + max((int(part.block.max(initial=-1)) for part in all_rows), default=-1)
+    result = empty(all_rows[0].names, all_rows[0].units, (blocks + 1) * rows)
+    for part in all_rows:
+        block = np.where(part.block < 0, blocks, part.block)
+        for row in range(rows):
+            used = part.present[:, row]
+            result = absorb(result, part.matrix[used, row], part.target[used, row], block[used] * rows + row)
+    return result
+
+
+def pool(data: Triangles, rows: int, blocks: Sequence[int] | None = None) -> Triangles:
+    """Return triangles with one group per row, of all blocks or of those named."""
+    count = data.groups // rows
+    wanted = range(count) if blocks is None else blocks
+    index = np.array([[block * rows + row for block in wanted] for row in range(rows)], dtype=int)
+    size = data.parameters + 1
+    factors = np.stack([retriangulate(data.factors[own].reshape(-1, size)) for own in index])
+    return replace(data, factors=factors, rows=data.rows[index].sum(axis=1))
+
+
+def _block(
+    model: IdentificationModel,
+    columns: np.ndarray,
+    case: Case,
+    part: slice,
+    load: np.ndarray | None,
+    states: np.ndarray,
+) -> np.ndarray:
+    motion = case.motion
+    own = None if load is None else load[part]
+    full = model.regressor(motion.q[part], motion.v[part], motion.a[part], own, case.carried, states[:, part])
+    return full.transpose(2, 1, 0)[columns].transpose(2, 1, 0)
+
+
+def _rows(names: Sequence[str], units: Sequence[str], matrix: np.ndarray, case: Case, decimator: Decimator) -> Rows:
+    segment = case.motion.segment
+    index = kept(segment, decimator)
+    target = decimate(case.target, decimator, segment)
+    share = decimate(case.present.astype(float), decimator, segment)
+    present = (share > 0.5) & case.present[index] if len(decimator.taps) == 1 else share > 0.5
+    rate = case.motion.rate / decimator.factor
+    return Rows(tuple(names), tuple(units), matrix, target, present, np.zeros(len(index), dtype=int), rate)

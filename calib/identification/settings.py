@@ -1,0 +1,103 @@
+"""How to identify: which terms the drives have, how rows are weighed, what may be left out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
+
+import numpy as np
+
+from calib.dynamics import drives
+from calib.dynamics.drives import Term
+from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.shapes import V0
+from calib.dynamics.tree import tree, with_gravity, with_payload
+from calib.errors import UsageError
+from calib.robot.chain import Chain
+
+T = TypeVar("T")
+RULES = ("none", "rsd", "f", "both")
+PRIORS = ("auto", "none", "cad")
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """A gear whose motor turns with the sum of two joints (from 0), see `calib.dynamics.drives.coupled`."""
+
+    joints: tuple[int, int]
+    label: str = ""
+
+
+@dataclass(frozen=True)
+class Payload:
+    """A body at the flange: its known mass [kg] (None: not known), known centre of mass in the tip's frame [m]."""
+
+    mass: float | None = None
+    com: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The choices of an identification; the defaults suit a serial arm with motor torques.
+
+    Attributes:
+        sets: names of the standard drive terms, one text per joint, or one for all.
+        v0: smoothing of the Coulomb sign [rad/s or m/s], one per joint, or one for all.
+        kind: of the rows, `calib.dynamics.idim.KINDS`.
+        couplings, terms: what a joint-by-joint model lacks.
+        friction: ``auto``, ``standard`` or a rung (`calib.identification.ladder`).
+        method: see `calib.identification.estimators`.
+        essential: when to stop leaving out, one of `RULES`.
+        ratio, level: r_σ of the RSD rule, level of the F rule.
+        keep, drop: parameters never, or first, left out.
+        prior: draw what the motion cannot tell to the CAD's values: ``auto`` where it has to.
+        payloads: label → what is known of it.
+        gravity: in the base frame [m/s²]; None: the robot's.
+        samples: most rows (per torque) that are held at once; longer recordings are thinned further.
+        folds: number of time blocks for cross-validation.
+        seed: for random states.
+    """
+
+    sets: tuple[str, ...] = ("Ia Fv Fc off",)
+    v0: tuple[float, ...] = (V0,)
+    kind: str = "motor"
+    couplings: tuple[Coupling, ...] = ()
+    terms: tuple[Term, ...] = ()
+    friction: str = "auto"
+    method: str = "wls"
+    essential: str = "both"
+    ratio: float = 20.0
+    level: float = 0.05
+    keep: tuple[str, ...] = ()
+    drop: tuple[str, ...] = ()
+    prior: str = "auto"
+    payloads: Mapping[str, Payload] = field(default_factory=dict)
+    gravity: tuple[float, float, float] | None = None
+    samples: int = 20_000
+    folds: int = 6
+    seed: int = 0
+
+
+def make_model(chain: Chain, settings: Settings) -> IdentificationModel:
+    """Return the model of a chain: its bodies, payloads at its tip, and the drives' standard terms."""
+    bodies = tree(chain)
+    if settings.gravity is not None:
+        bodies = with_gravity(bodies, np.array(settings.gravity))
+    for label in settings.payloads:
+        bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1)
+    linear = [joint.kind == "prismatic" for joint in chain.joints]
+    sets = per_joint(settings.sets, chain.n, "drives")
+    v0 = per_joint(settings.v0, chain.n, "v0")
+    own = list(drives.standard(sets, v0, linear))
+    for coupling in settings.couplings:
+        own += drives.coupled(*coupling.joints, v0=v0[coupling.joints[1]], label=coupling.label or None)
+    own += [replace(one, linear=linear[one.acts[0][0]]) if one.acts else one for one in settings.terms]
+    return IdentificationModel(bodies, tuple(own), settings.kind)
+
+
+def per_joint(values: Sequence[T], n: int, name: str) -> tuple[T, ...]:
+    """Return n values from one or n."""
+    if len(values) not in (1, n):
+        raise UsageError(f"{name}: {len(values)} values for {n} joints; give one, or one per joint")
+    return tuple(values) * n if len(values) == 1 else tuple(values)

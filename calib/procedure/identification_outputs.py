@@ -1,0 +1,234 @@
+"""The folder of an identification: written whole, beside its place, then moved there."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib import files
+from calib.dynamics.base import expressions
+from calib.errors import UsageError
+from calib.identification.scores import Part, Score
+from calib.procedure.identifying import IdentificationOutcome
+from calib.robot import description
+
+OURS = ("robot.toml", "dynamics.json", "estimate.csv", "covariance.csv", "metrics.json")
+"""Files of an earlier identification that a new one replaces; besides plots, ``plot_*.png``."""
+HEADER = ("name", "expression", "unit", "value", "sigma", "rsd", "essential")
+
+
+def check_target(out: Path, source: Path | None = None) -> None:
+    """Refuse, before any work is done, a folder that cannot be written or whose files are not ours to replace."""
+    if out.exists() and not out.is_dir():
+        raise UsageError(f"{out} is a file; --out needs a folder")
+    if source is not None and source.resolve().parent == out.resolve():
+        raise UsageError(f"{out} holds the robot that is to be identified; choose another folder for --out")
+    present = [name for name in OURS if (out / name).exists()]
+    if present and not ((out / "metrics.json").exists() and (out / "dynamics.json").exists()):
+        raise UsageError(f"{out} holds {', '.join(present)} which no earlier identification left there; choose another")
+    folder = out if out.is_dir() else next(parent for parent in out.absolute().parents if parent.exists())
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise UsageError(f"cannot write to {folder}: {error.strerror or error}; nothing was changed there") from error
+
+
+def write_folder(
+    outcome: IdentificationOutcome, out: Path, plots: Callable[[IdentificationOutcome, Path], None] | None = None
+) -> Path:
+    """Write all files into a temporary folder beside `out` and move them there; see `calib.procedure.outputs`."""
+    check_target(out, outcome.inputs.source)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        staging = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}.", suffix=".part"))
+    except OSError as error:
+        raise UsageError(f"cannot write beside {out}: {error.strerror or error}; nothing was changed there") from error
+    try:
+        _write_all(outcome, staging)
+        if plots is not None:
+            plots(outcome, staging)
+        os.chmod(staging, 0o755)
+        if out.exists():
+            _move_files(staging, out)
+        else:
+            os.replace(staging, out)
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+    return out
+
+
+def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
+    inputs, found = outcome.inputs, outcome.found
+    nominal = (inputs.nominal or inputs.chain).values.tolist()
+    extra = {"provenance": {"robot": str(inputs.source), "nominal": nominal}}
+    description.write(folder / "robot.toml", inputs.chain, extra, source=f"identified from {inputs.source}")
+    files.write_table(folder / "estimate.csv", HEADER, estimate_rows(outcome))
+    estimate = found.fitted.estimate
+    rows = ([name, *map(float, row)] for name, row in zip(found.names, estimate.covariance))
+    files.write_table(folder / "covariance.csv", ("name", *found.names), rows)
+    files.write_json(folder / "dynamics.json", dynamics_table(outcome))
+    files.write_json(folder / "metrics.json", metrics(outcome))
+
+
+def estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:
+    """Return name, expression, unit, value, σ, RSD [%] and the essential value of each parameter."""
+    found = outcome.found
+    estimate = found.fitted.estimate
+    words = [line.split(" = ", 1)[1] for line in expressions(found.base)]
+    words += [one.shape for one in found.climb.terms]
+    essential = {}
+    if found.elimination is not None:
+        kept = found.elimination.essential.estimate
+        essential = dict(zip(kept.names, kept.values))
+    return [
+        (name, expression, unit, float(value), float(sigma), _finite(rsd), _number(essential.get(own)))
+        for name, own, expression, unit, value, sigma, rsd in zip(
+            found.names, estimate.names, words, estimate.units, estimate.values, estimate.sigma, estimate.rsd
+        )
+    ]
+
+
+def dynamics_table(outcome: IdentificationOutcome) -> dict[str, Any]:
+    """Return the model with numbers, enough to predict torques: `robot.toml` holds the geometry."""
+    found = outcome.found
+    model = found.dynamics.model
+    return {
+        "robot": "robot.toml",
+        "kind": model.kind,
+        "gravity": model.tree.gravity.tolist(),
+        "payloads": sorted(found.settings.payloads),
+        "bodies": dict(zip(model.tree.names, found.dynamics.values[: 10 * model.tree.bodies].tolist())),
+        "terms": [
+            {
+                "name": one.name,
+                "shape": one.shape,
+                "acts": [[row, [list(pair) for pair in motion]] for row, motion in one.acts],
+                "settings": [_json_number(x) for x in one.settings],
+                "side": one.side,
+                "linear": one.linear,
+                "value": float(value),
+                "unit": one.unit,
+            }
+            for one, value in zip(model.columns, found.dynamics.values[10 * model.tree.bodies :])
+        ],
+        "base": {name: line for name, line in zip(found.base.names, expressions(found.base))},
+        "covariance": "covariance.csv",
+        "note": "regrouped parameters hold base values, the others are zero: torques are right, single ones need not be",
+    }
+
+
+def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
+    """Return the content of ``metrics.json``."""
+    found = outcome.found
+    essential = found.base.b + len(found.climb.terms)
+    if found.elimination is not None:
+        essential = len(found.elimination.kept)
+    return {
+        "identification": {name: score_table(found_score) for name, found_score in outcome.fit.items()},
+        "validation": {
+            name: score_table(found_score) | {"evidence": name not in outcome.repeated}
+            for name, found_score in outcome.validation.items()
+        },
+        "parameters": {
+            "standard": found.dynamics.model.p,
+            "base": found.base.b + len(found.climb.terms),
+            "essential": essential,
+        },
+        "condition_number": {"raw": _finite(found.condition[0]), "normalised": _finite(found.condition[1])},
+        "friction": found.climb.chosen,
+        "method": found.fitted.method,
+        "ladder": [
+            {
+                "model": rung.model,
+                "parameters": rung.parameters,
+                "cross_validated_percent": _finite(rung.cross_validated),
+                "joints_percent": [_finite(x) for x in rung.joints],
+                "kept_at_joints": [joint + 1 for joint in rung.kept_at],
+                "kept": rung.kept,
+                "note": rung.note,
+            }
+            for rung in found.rungs
+        ],
+        "elimination": elimination_table(outcome),
+        "filters": {case.name: filter_table(case.motion) for case in (*outcome.inputs.cases, *outcome.inputs.unseen)},
+        "repeated": dict(outcome.repeated),
+        "warnings": list(outcome.warnings),
+        "verdict": outcome.verdict.level,
+        "reason": outcome.verdict.reason,
+        "seed": outcome.seed,
+    }
+
+
+def score_table(found: Score) -> dict[str, Any]:
+    """Return M of the contract, and what stands beside it."""
+    return {
+        "raw": part_table(found.raw),
+        "filtered": part_table(found.filtered),
+        "moving": part_table(found.moving),
+        "standing": part_table(found.standing),
+        "above_band_percent": [_finite(x) for x in found.above],
+        "r_squared": [_finite(x) for x in found.r_squared],
+        "whiteness": [
+            None
+            if w is None
+            else {"outside": w.outside, "ljung_box_p": w.ljung_box_p, "normal_p": w.normal_p, "kurtosis": w.kurtosis}
+            for w in found.whiteness
+        ],
+        "filtered_rate": found.rate,
+    }
+
+
+def part_table(part: Part) -> dict[str, Any]:
+    relative = {"total": _finite(part.total), "joints": [_finite(x) for x in part.joints]}
+    return {"relative_error_percent": relative, "rms": [_finite(x) for x in part.rms], "samples": part.samples}
+
+
+def filter_table(motion: Any) -> dict[str, Any]:
+    return {
+        "rate": float(motion.rate),
+        "cutoff": [float(x) for x in motion.cutoff],
+        "band": float(motion.band),
+        "decimation": int(motion.decimator.factor),
+    }
+
+
+def elimination_table(outcome: IdentificationOutcome) -> list[dict[str, Any]]:
+    gone = outcome.found.elimination
+    if gone is None:
+        return []
+    return [
+        {"name": step.name, "rsd": _finite(step.rsd), "f": _finite(step.f), "p": _finite(step.p), "listed": step.listed}
+        for step in gone.steps
+    ]
+
+
+def _move_files(staging: Path, out: Path) -> None:
+    """Replace the files of an earlier identification one by one, the metrics last."""
+    fresh = sorted(path.name for path in staging.iterdir())
+    stale = {path.name for path in out.glob("plot_*.png")} - set(fresh)
+    try:
+        for name in sorted(fresh, key=lambda name: name == "metrics.json"):
+            os.replace(staging / name, out / name)
+        for name in stale:
+            (out / name).unlink(missing_ok=True)
+    except OSError as error:
+        raise UsageError(f"cannot write to {out}: {error.strerror or error}") from error
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _number(value: float | None) -> float | None:
+    return None if value is None else float(value)
+
+
+def _json_number(value: float) -> float | str:
+    return float(value) if np.isfinite(value) else "inf"

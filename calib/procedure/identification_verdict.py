@@ -1,0 +1,107 @@
+"""May one trust an identified model? What a user is told; all thresholds are our choice."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from calib.data.excitation import ExcitationReport
+from calib.data.motion import moving
+from calib.identification.cases import Case
+from calib.identification.identify import Identification
+from calib.identification.scores import Score
+from calib.procedure.verdict import Verdict
+
+TRANSFER = 2.0  # unseen errors this many times the fit's own: the model does not transfer
+GOOD = 10.0  # relative error of the torque on other motion below which the model passes [%]
+POOR = 30.0  # and above which it fails
+CONDITION = 200.0  # of the observation matrix with columns of unit norm
+SLOW_SHARE = 0.1  # share of samples near standstill from which on Coulomb friction is drawn down
+
+
+def judge(
+    fit: Mapping[str, Score],
+    validation: Mapping[str, Score],
+    repeated: Mapping[str, float],
+    excitation: Mapping[str, ExcitationReport],
+) -> Verdict:
+    """Judge an identification by motion it has not seen; the first rule that holds.
+
+    1. the unseen error is above `POOR`: fail;
+    2. no unseen motion (or a repeat of the training's only): marginal;
+    3. the training motion is too poor to tell parameters apart: marginal;
+    4. the unseen error is above `GOOD`, or `TRANSFER` times the fit's own: marginal;
+    5. else pass.
+
+    Args:
+        fit, validation: scores by file; validation without repeats.
+        repeated: validation files that repeat the training motion.
+        excitation: of the training files.
+    """
+    own = max((found.raw.total for found in fit.values()), default=np.nan)
+    if not validation:
+        why = (
+            "the validation motion repeats the training motion" if repeated else "there is no unseen motion: --validate"
+        )
+        return Verdict("marginal", f"{why}; on the training motion {own:.2f} % of the torque is unexplained")
+    name = max(validation, key=lambda key: validation[key].raw.total)
+    worst = validation[name].raw.total
+    told = f"on {name}, unseen: {worst:.2f} % of the torque unexplained, {own:.2f} % on the training motion"
+    if worst > POOR:
+        return Verdict("fail", told)
+    if any(report.poor for report in excitation.values()) and all(report.poor for report in excitation.values()):
+        return Verdict("marginal", f"{told}; but the training motion cannot tell the parameters apart")
+    if worst > GOOD or worst > TRANSFER * own:
+        return Verdict("marginal", told)
+    return Verdict("pass", told)
+
+
+def warnings(
+    cases: Sequence[Case],
+    unseen: Sequence[Case],
+    found: Identification,
+    validation: Mapping[str, Score],
+    repeated: Mapping[str, float],
+    excitation: Mapping[str, ExcitationReport],
+) -> tuple[str, ...]:
+    """Return what a user should know, worst first."""
+    told = [
+        f"{name}: {100 * share:.0f} % of its states were met in training: a repeat proves nothing, it is no evidence"
+        for name, share in repeated.items()
+    ]
+    for name, report in excitation.items():
+        told += [f"{name}: {note}" for note in report.notes]
+    normalised = found.condition[1]
+    if normalised > CONDITION:
+        told.append(
+            f"condition number {normalised:.0f} (columns of unit norm): the motion tells some parameters apart badly; "
+            "design an excitation"
+        )
+    told += _slow_bias(cases, found)
+    told += _currents([*cases, *unseen])
+    return tuple(dict.fromkeys(told))
+
+
+def _slow_bias(cases: Sequence[Case], found: Identification) -> list[str]:
+    """Notice that rows of joints near standstill, where friction takes any value, are in the fit."""
+    total = np.zeros(cases[0].motion.n)
+    size = 0
+    for case in cases:
+        used = np.asarray(case.present)[:, : case.motion.n]
+        total += (~moving(case.motion) & used).sum(axis=0)
+        size += len(case.motion)
+    share = total / max(size, 1)
+    slow = [j for j in np.flatnonzero(share > SLOW_SHARE) if f"Fc{j + 1}" in found.names]
+    if not slow:
+        return []
+    shown = ", ".join(f"{100 * share[j]:.0f} % at joint {j + 1}" for j in slow)
+    return [
+        f"rows of nearly standing joints are in the fit ({shown}): they draw Coulomb friction down; set cut_slow = true"
+    ]
+
+
+def _currents(cases: Sequence[Case]) -> list[str]:
+    unknown = [case.name for case in cases if case.motion.kind == "current" and case.motion.drive_gain is None]
+    del unknown
+    return []

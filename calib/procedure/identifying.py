@@ -1,0 +1,224 @@
+"""The identification as the guided procedure runs it: read, identify, predict other motion, say how far to trust it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from calib.data.excitation import ExcitationReport, repeats, report_excitation
+from calib.data.motion import Motion, make_motion
+from calib.data.recording import Joints
+from calib.data.recording_files import read_recording
+from calib.errors import UsageError
+from calib.identification.cases import Case, case_names, make_case
+from calib.identification.identify import Identification, identify
+from calib.identification.options import FileSettings, IdentifyOptions
+from calib.identification.prediction import predict
+from calib.identification.scores import Score, score
+from calib.identification.settings import Settings
+from calib.procedure.identification_verdict import judge, warnings
+from calib.procedure.inputs import joint_kinds
+from calib.procedure.verdict import Verdict
+from calib.robot import description
+from calib.robot.chain import Chain
+from calib.robot.load import load, resolve
+
+REPEAT = 0.5  # share of states met in training from which on a validation file proves nothing (our choice)
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class IdentificationInputs:
+    """A robot and its recordings.
+
+    Attributes:
+        chain: the calibrated arm.
+        nominal: the arm before calibration; None where the robot is not the outcome of a fit.
+        source: the file it came from.
+        cases: recordings to learn from.
+        unseen: recordings to be predicted.
+        options: the options file's content, the command's choices put in.
+        notes: what a user should know about how the files were understood.
+    """
+
+    chain: Chain
+    nominal: Chain | None
+    source: Path
+    cases: tuple[Case, ...]
+    unseen: tuple[Case, ...]
+    options: IdentifyOptions
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class IdentificationOutcome:
+    """What an identification came to.
+
+    Attributes:
+        inputs: what it worked on.
+        found: the model and how it came about.
+        fit, validation: case name → its score.
+        predictions: case name → predicted torques (N, rows) at the full rate.
+        repeated: validation case → share of its states that the training motion has been in, where it is no proof.
+        excitation: case name → what the motion can tell.
+        warnings, verdict: as of `calib.procedure.identification_verdict`.
+        seed: that reproduces it.
+    """
+
+    inputs: IdentificationInputs
+    found: Identification
+    fit: Mapping[str, Score]
+    validation: Mapping[str, Score]
+    predictions: Mapping[str, np.ndarray]
+    repeated: Mapping[str, float]
+    excitation: Mapping[str, ExcitationReport]
+    warnings: tuple[str, ...]
+    verdict: Verdict
+    seed: int = 0
+    extra: Mapping[str, object] = field(default_factory=dict)
+
+
+def gather(
+    robot: str | Path,
+    recordings: Sequence[str],
+    validate: Sequence[str] = (),
+    *,
+    options: IdentifyOptions | None = None,
+    method: str | None = None,
+    friction: str | None = None,
+    base: str | None = None,
+    tip: str | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> IdentificationInputs:
+    """Read the robot and all recordings, and make motions of them.
+
+    Args:
+        robot: see `calib.robot.load`.
+        recordings, validate: paths, each with a cut if wanted (``log.npz@0:9.4``).
+        options: the options file's content.
+        method, friction: in place of the options'.
+        base, tip: links of a URDF.
+        seed: for everything random.
+    """
+    say = progress or (lambda words: None)
+    options = with_choices(options or IdentifyOptions(), method, friction, seed)
+    if not recordings:
+        raise UsageError("no recording given")
+    check_files(options, [*recordings, *validate])
+    chain, nominal, source = load_robot(robot, base, tip)
+    names = case_names([*map(str, recordings), *map(str, validate)])
+    cases: list[Case] = []
+    notes: list[str] = []
+    for name, path in zip(names, [*recordings, *validate]):
+        say(f"reading {name}")
+        case = read_case(str(path), name, chain, options)
+        cases.append(case)
+        notes += [f"{name}: {note}" for note in case.motion.notes]
+    count = len(recordings)
+    return IdentificationInputs(
+        chain, nominal, source, tuple(cases[:count]), tuple(cases[count:]), options, tuple(notes)
+    )  # fmt: skip
+
+
+def run(inputs: IdentificationInputs, progress: Progress | None = None) -> IdentificationOutcome:
+    """Identify, predict every recording, and judge."""
+    say, settings = progress or (lambda words: None), inputs.options.settings
+    found = identify(inputs.chain, inputs.cases, settings, inputs.nominal, progress)
+    predictions, scores = {}, {}
+    for case in (*inputs.cases, *inputs.unseen):
+        say(f"predicting {case.name}")
+        predictions[case.name] = predict(found.dynamics, case)
+        scores[case.name] = score(case, predictions[case.name], inputs.options.slow)
+    say("judging")
+    shares = {
+        case.name: max(repeats(own.motion, case.motion) for own in inputs.cases) for case in inputs.unseen
+    }  # fmt: skip
+    repeated = {name: share for name, share in shares.items() if share >= REPEAT}
+    excitation = {case.name: report_excitation(case.motion) for case in inputs.cases}
+    fit = {case.name: scores[case.name] for case in inputs.cases}
+    validation = {case.name: scores[case.name] for case in inputs.unseen}
+    told = warnings(inputs.cases, inputs.unseen, found, validation, repeated, excitation)
+    proofs = {name: found_score for name, found_score in validation.items() if name not in repeated}
+    verdict = judge(fit, proofs, repeated, excitation)
+    return IdentificationOutcome(
+        inputs, found, fit, validation, predictions, repeated, excitation, told, verdict, settings.seed
+    )  # fmt: skip
+
+
+def with_choices(options: IdentifyOptions, method: str | None, friction: str | None, seed: int) -> IdentifyOptions:
+    """Return the options with the command's choices in them, held against what exists."""
+    from calib.identification.estimators import METHODS
+    from calib.identification.ladder import NAMES
+
+    settings: Settings = replace(options.settings, seed=seed)
+    for value, allowed, key in ((method, METHODS, "method"), (friction, NAMES, "friction")):
+        if value is None:
+            continue
+        if value not in allowed:
+            raise UsageError(f"--{key} {value}: expected {', '.join(allowed)}")
+        settings = replace(settings, **{key: value})
+    return replace(options, settings=settings)
+
+
+def load_robot(robot: str | Path, base: str | None, tip: str | None) -> tuple[Chain, Chain | None, Path]:
+    """Return the chain, the one before its calibration (None where there was none), and the file."""
+    source = resolve(robot)
+    chain = load(robot, base, tip)
+    values = description.read_extra(source).get("provenance", {}).get("nominal") if source.suffix == ".toml" else None
+    if values is None or len(values) != len(chain.elements) or np.array_equal(values, chain.values):
+        return chain, None, source
+    return chain, chain.with_values(np.asarray(values, dtype=float)), source
+
+
+def read_case(path: str, name: str, chain: Chain, options: IdentifyOptions) -> Case:
+    """Return the case of one recording; filters and payload as the options say."""
+    own = file_settings(options, path)
+    motion = read_motion(path, chain, own)
+    gains = drive_gains(motion, own, options)
+    slow = (options.slow if options.slow is not None else 0.01) if options.cut_slow else None
+    return make_case(name, motion, options.settings.kind, gains=gains, carried=own.payload, slow=slow)
+
+
+def read_motion(path: str, chain: Chain, own: FileSettings) -> Motion:
+    """Return the motion of a recording, held against the robot's joints and limits."""
+    joints = Joints(
+        chain.joint_names, tuple(joint_kinds(chain)), chain.lower, chain.upper,
+        np.array([joint.velocity for joint in chain.joints]), np.array([joint.effort for joint in chain.joints]),
+    )  # fmt: skip
+    return make_motion(read_recording(path, joints, own.recording), own.filter)
+
+
+def drive_gains(motion: Motion, own: FileSettings, options: IdentifyOptions) -> np.ndarray | None:
+    """Return the torque per current (n,): stated for the file, for all, by the file itself; None where nobody says."""
+    del options
+    if own.gains is not None:
+        if len(own.gains) != motion.n:
+            raise UsageError(f"gains: {len(own.gains)} values for {motion.n} joints ({motion.file})")
+        return np.array(own.gains)
+    return motion.drive_gain if motion.kind == "current" else None
+
+
+def file_settings(options: IdentifyOptions, path: str) -> FileSettings:
+    """Return the settings of a recording that may have a cut behind its name."""
+    from calib.data.recording import parse_cut
+
+    return options.for_file(parse_cut(path)[0])
+
+
+def check_files(options: IdentifyOptions, paths: Sequence[str]) -> None:
+    """Refuse a [files] table that names none of the recordings."""
+    from calib.data.recording import parse_cut
+    from calib.data.tables import nearest
+
+    plain = [Path(parse_cut(str(path))[0]) for path in paths]
+    for name in options.files:
+        wanted = Path(name).parts
+        if not any(path.parts[-len(wanted) :] == wanted for path in plain):
+            shown = [path.name for path in plain]
+            message = f'{options.source}: files."{name}" is none of the recordings{nearest(name, shown)}'
+            raise UsageError(f"{message}: {', '.join(shown)}")
