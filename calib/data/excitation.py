@@ -12,6 +12,7 @@ from calib.arrays import frozen
 from calib.data.motion import Motion, standstill
 
 LINE = 3e-3  # of the strongest line's power: a line that counts; Hann's side lobes are at 7e-4
+SINE = 0.98  # of the variance: a joint that moves as one sine
 TOGETHER = 0.98  # correlation of two joints that move as one
 FUNCTION = 0.02  # of the largest singular value: a function of time that counts
 STILL = 1e-3  # a joint that goes less far has not moved [rad or m]
@@ -25,8 +26,8 @@ class ExcitationReport:
 
     Attributes:
         lines: (n,) number of spectral lines of each joint's position that have 3e-3 or more of the strongest's power.
-        strongest: (n,) frequency of the strongest one [Hz]; NaN for a joint that does not move.
-        share: (n,) part of the joint's power in it.
+        strongest: (n,) frequency of the sine that fits best [Hz]; NaN for a joint that does not move.
+        share: (n,) part of the joint's variance that one sine at about that frequency explains.
         correlation: (n, n) of the positions.
         functions: number of independent functions of time that all positions are made of (2 for one sine).
         still: (n,) joints that never move.
@@ -45,7 +46,7 @@ class ExcitationReport:
     def poor(self) -> bool:
         """Whether the motion is one frequency, or fewer functions of time than half the joints that move."""
         moving = ~self.still
-        return bool((self.lines[moving] <= 1).all()) or self.functions < 0.5 * moving.sum()
+        return bool((self.share[moving] > SINE).all()) or self.functions < 0.5 * moving.sum()
 
 
 def report_excitation(motion: Motion) -> ExcitationReport:
@@ -61,7 +62,7 @@ def report_excitation(motion: Motion) -> ExcitationReport:
     singular = np.linalg.svd(unit[:: max(1, len(unit) // MOST)], compute_uv=False)
     functions = int((singular > FUNCTION * singular[0]).sum())
     lines, strongest, share = (np.array(part) for part in zip(*found))
-    notes = _notes(motion.joint_names, lines, strongest, correlation, functions, still)
+    notes = _notes(motion.joint_names, share, strongest, correlation, functions, still)
     return ExcitationReport(
         frozen(lines, int), frozen(strongest), frozen(share), frozen(correlation), functions, frozen(still, bool), notes
     )
@@ -94,19 +95,31 @@ def repeats(training: Motion, other: Motion) -> float:
 
 
 def _lines(q: np.ndarray, rate: float) -> tuple[int, float, float]:
-    """Return the number of lines, the strongest one's frequency [Hz], and its part of the power of a series (N,)."""
+    """Return the number of lines of a series (N,), the best sine's frequency [Hz], and the variance it explains."""
     window = np.asarray(get_window("hann", len(q)))
     power = np.abs(np.fft.rfft(window * (q - window @ q / window.sum()), 4 * len(q))) ** 2
     peaks, _ = find_peaks(power, height=LINE * power.max(), distance=8, prominence=0.5 * LINE * power.max())
-    top = int(np.argmax(power))
-    width = 8  # half the main lobe of Hann's window, in steps of the padded transform
-    share = power[max(0, top - width) : top + width + 1].sum() / power.sum()
-    return max(1, len(peaks)), top * rate / (4 * len(q)), float(share)
+    best, frequency = max((_one_sine(q, f, rate), f) for f in _about(int(np.argmax(power)), rate, len(q)))
+    return max(1, len(peaks)), frequency, best
+
+
+def _about(top: int, rate: float, n: int) -> list[float]:
+    """Return frequencies about the strongest line of the padded transform, an eighth of its step apart [Hz]."""
+    return [(top + i / 8) * rate / (4 * n) for i in range(-16, 17) if top + i / 8 > 0.5]
+
+
+def _one_sine(q: np.ndarray, f: float, rate: float) -> float:
+    """Return the part of the variance of `q` (N,) that one sine of frequency `f` [Hz] and a constant explain."""
+    thin = max(1, int(rate / (20 * f)), len(q) // MOST)
+    y, angle = q[::thin] - q[::thin].mean(), 2 * np.pi * f * np.arange(0, len(q), thin) / rate
+    basis = np.stack([np.ones(len(y)), np.sin(angle), np.cos(angle)], axis=1)
+    left = y - basis @ np.linalg.lstsq(basis, y, rcond=None)[0]
+    return float(1 - (left @ left) / (y @ y))
 
 
 def _notes(
     names: tuple[str, ...],
-    lines: np.ndarray,
+    share: np.ndarray,
     strongest: np.ndarray,
     correlation: np.ndarray,
     functions: int,
@@ -114,7 +127,7 @@ def _notes(
 ) -> tuple[str, ...]:
     moving = np.flatnonzero(~still)
     notes = [f"{names[j]} never moves" for j in np.flatnonzero(still)]
-    if len(moving) and (lines[moving] <= 1).all():
+    if len(moving) and (share[moving] > SINE).all():
         low, high = strongest[moving].min(), strongest[moving].max()
         hertz = f"{low:.3g} Hz" if high - low < 0.1 * high else f"{low:.3g} to {high:.3g} Hz"
         notes.append(f"each joint moves at one frequency ({hertz}): inertia and gravity or stiffness look alike")
