@@ -57,8 +57,8 @@ class Motion:
     Attributes:
         t: (N,) [s]; within a segment in steps of 1/rate.
         q, v, a: (N, n) filtered position [rad or m] and its central differences [/s], [/s²].
-        effort: (N, n) torque [N·m or N] or current [A] (`kind`), not filtered; the mean of neighbours where a sample
-            is missing.
+        effort: (N, n) torque [N·m or N] or current [A] (`kind`), not filtered; interpolated where a sample is
+            missing (weight 0).
         weight: (N,) 1 at a sample, 0 at one that was lost and interpolated.
         segment: (N,) number of the segment, rising.
         rate: [Hz].
@@ -142,6 +142,11 @@ def make_motion(recording: Recording, options: FilterOptions | None = None) -> M
         v_measured=v_measured,
         **others,
     )
+
+
+def filters_of(motion: Motion) -> FilterOptions:
+    """Return the options that treat another recording as `motion` was: validation wants the filters of the fit."""
+    return FilterOptions(cutoff=tuple(float(f) for f in motion.cutoff), band=motion.band * (1 - 1e-9))
 
 
 def thin(motion: Motion) -> Motion:

@@ -11,7 +11,7 @@ from calib.data.bandwidth import propose_cutoffs, spectrum
 from calib.data.clock import find_clock
 from calib.data.decimation import decimate, decimate_regressor
 from calib.data.excitation import repeats, report_excitation
-from calib.data.motion import FilterOptions, in_band, make_motion, moving, standstill, thin
+from calib.data.motion import FilterOptions, filters_of, in_band, make_motion, moving, standstill, thin
 from calib.data.recording import Recording, take
 from calib.data.resampling import resample
 from calib.errors import MeasurementError, UsageError
@@ -149,6 +149,13 @@ def test_cutoffs_are_one_or_one_per_joint():
     with pytest.raises(UsageError, match="3 values for 2 joints"):
         make_motion(recorded(t, t), FilterOptions(cutoff=(1.0, 2.0, 3.0)))
     assert list(make_motion(recorded(t, t), FilterOptions(cutoff=(20.0, 30.0))).cutoff) == [20.0, 30.0]
+
+
+def test_another_recording_gets_the_same_filters():
+    t = even()
+    first = make_motion(recorded(t, t))
+    again = make_motion(recorded(t, 0.3 * t), filters_of(first))
+    assert list(again.cutoff) == list(first.cutoff) and again.decimator.factor == first.decimator.factor
 
 
 def test_proposed_cutoffs_follow_the_motion_and_the_noise():
