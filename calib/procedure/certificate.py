@@ -245,15 +245,9 @@ def outlier_table(metrics: Mapping[str, Any], most: int = 20) -> Table:
 
 def identifiability(report: Report) -> list[str]:
     """Return what the poses can and cannot tell, in words."""
-    values, rank = report.singular_values, report.rank
-    lines = []
-    if values:
-        line = f"Of {len(values)} candidate parameters the poses tell {rank} apart"
-        if rank < len(values):
-            dropped = max(values[rank], 1e-300)
-            gap = values[rank - 1] / dropped
-            line += f"; the gap in the singular values behind them is {'10¹² or more' if gap > 1e12 else f'{gap:.2g}'}"
-        lines.append(line + ".")
+    values, rank, lines = report.singular_values, report.rank, []
+    if values and not report.metrics["not_identifiable"]:
+        lines.append(f"All {len(values)} candidate parameters can be told apart.")
     fitted = report.metrics["fit"]["parameters"]
     if values and fitted < rank:
         lines.append(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from calib.robot import urdf
 from calib.robot.kinematics import forward
 from calib.robot.load import load
 
+README = (Path(__file__).parents[2] / "README.md").read_text()
+
 
 def test_demo_of_the_lwr4plus(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     out = tmp_path / "demo"
@@ -26,6 +29,10 @@ def test_demo_of_the_lwr4plus(tmp_path: Path, capsys: pytest.CaptureFixture) -> 
     assert {state.kind for state in steps.states(open_session(out))} == {steps.DONE}
     nominal, calibrated = map(float, re.findall(r"([\d.]+) mm", (out / "truth.txt").read_text())[:2])
     assert calibrated < nominal / 15
+    stated = re.search(r"([\d.]+) mm with, ([\d.]+) mm without", README)
+    found = json.loads((out / "5-validation/metrics.json").read_text())["validation"]["validation.csv"]
+    measured = [found[arm]["position_mm"]["rms"] for arm in ("calibrated", "urdf_alone")]
+    assert stated and [float(number) for number in stated.groups()] == pytest.approx(measured, rel=0.1)
     chain, read = load(out / "6-export"), urdf.read(out / "6-export/robot.urdf")
     q = np.random.default_rng(0).uniform(-1.5, 1.5, (5, 7))
     np.testing.assert_allclose(forward(read, q), forward(chain, q), atol=1e-9)
@@ -33,6 +40,6 @@ def test_demo_of_the_lwr4plus(tmp_path: Path, capsys: pytest.CaptureFixture) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("robot", ["ur10e", "panda", "tx40", "rv2sq"])
+@pytest.mark.parametrize("robot", ["ur10e", "rv2sq"])
 def test_demo_of_other_robots(robot: str, tmp_path: Path) -> None:
     assert cli.run(["demo", "--out", str(tmp_path / "demo"), "--robot", robot, "--seed", "3"]) == 0
