@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
@@ -12,22 +11,17 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
-from calib.data.measurements import PoseMeasurements
 from calib.data.options import FileOptions, FitOptions, read_options
 from calib.data.plans import check_against, read_poses, write_poses
-from calib.errors import SessionError
-from calib.geometry.accuracy import errors, summary
-from calib.geometry.deflection import Deflection
 from calib.geometry.fit import polish_frames
 from calib.geometry.weighing import Settings as FitSettings
 from calib.geometry.weighing import combine
-from calib.procedure import calibrated, certificate, comparing, fitting, inputs, outputs, report
+from calib.procedure import calibrated, certificate, comparing, fitting, inputs, outputs, proof, report
 from calib.procedure.session import Session, fingerprint
 from calib.procedure.verdict import judge
 from calib.robot.chain import Chain
 
 Say = Callable[[str], None]
-GROSS = 8.0  # our choice
 
 
 def robot_file(session: Session) -> Path:
@@ -182,12 +176,12 @@ def validate(session: Session, say: Say) -> list[str]:
     fitted, validation = compared(session, given)
     asked = session.settings.fit["model"]
     verdict = judge(fitted, validation, asked=asked, **found.judged)
-    warnings = [*fitting.elsewhere(fitted, validation), *doubtful(validation)]
-    tables = {name: each.table() | without_corrections(each) for name, each in validation.items()}
+    warnings = [*fitting.elsewhere(fitted, validation), *proof.doubtful(validation)]
+    tables = {name: each.table() | proof.without_corrections(each) for name, each in validation.items()}
     metrics: dict[str, object] = {"validation": tables}
     metrics |= {"verdict": verdict.level, "reason": verdict.reason, "warnings": warnings}
     sets = [report.rows_of(name, each, each.proves) for name, each in validation.items()]
-    write_errors(folder / "errors.csv", given.chain, validation)
+    proof.write_errors(folder / "errors.csv", given.chain, validation)
     files.write_json(folder / "rows.json", sets)
     files.write_json(folder / "metrics.json", metrics)
     return [*notes, f"verdict {verdict.level}: {verdict.reason}", *warnings]
@@ -209,53 +203,6 @@ def compared(session: Session, given: inputs.Inputs) -> tuple[comparing.Comparis
         for name, each in given.unseen.items()
     }
     return fitted, unseen
-
-
-def doubtful(validation: dict[str, comparing.Comparison]) -> list[str]:
-    """Name unseen rows whose error is more than `GROSS` times the median: they may be wrong measurements."""
-    result = []
-    for name, each in validation.items():
-        sizes, numbers = each.errors[1].main, [row for block in each.blocks for row in _numbers(block)]
-        far = np.flatnonzero(sizes > GROSS * np.median(sizes)) if len(sizes) == len(numbers) else []
-        if len(far):
-            rows = ", ".join(f"row {numbers[k]} ({1e3 * sizes[k]:.3g} mm)" for k in far[:5])
-            rest = np.delete(sizes, far)
-            without = 1e3 * float(np.sqrt(np.mean(rest**2)))
-            result.append(
-                f"{name}: {rows} far off the median of {1e3 * np.median(sizes):.3g} mm; measured wrongly? They count, "
-                f"for the verdict too; without them the rms is {without:.3f} mm"
-            )
-    return result
-
-
-def without_corrections(found: comparing.Comparison) -> dict[str, object]:
-    """Return the errors of the calibrated geometry alone, as a URDF holds it; nothing where that is all there is."""
-    cell = found.cells[1]
-    if not cell.deflection.terms:
-        return {}
-    bare = replace(cell, deflection=Deflection())
-    return {"urdf_alone": summary(errors(bare, found.blocks))}
-
-
-def write_errors(path: Path, chain: Chain, validation: dict[str, comparing.Comparison]) -> None:
-    """Write the errors of both arms at every unseen row."""
-    rows: list[list[object]] = []
-    for name, each in validation.items():
-        q = np.concatenate([block.q for block in each.blocks])
-        numbers = [row for block in each.blocks for row in _numbers(block)]
-        sizes = [found.main for found in each.errors]
-        if len(sizes[0]) == len(q):
-            rows += [
-                [name, number, *map(float, joints), 1e3 * float(a), 1e3 * float(b)]
-                for number, joints, a, b in zip(numbers, q, *sizes)
-            ]
-    joints = [f"{joint.name} [{joint.unit}]" for joint in chain.joints]
-    files.write_table(path, ["file", "row", *joints, "nominal [mm]", "calibrated [mm]"], rows)
-
-
-def _numbers(block: PoseMeasurements) -> list[int]:
-    assert block.rows is not None
-    return [int(row) for row in block.rows]
 
 
 def _verdict(metrics: dict, validation: dict) -> dict:
@@ -349,14 +296,3 @@ def clear_staging(session: Session) -> None:
             shutil.rmtree(path, ignore_errors=True)
         else:
             path.unlink(missing_ok=True)
-
-
-def require(path: Path, what: str) -> Path:
-    """Return a path that has to be there.
-
-    Raises:
-        SessionError: where it is not.
-    """
-    if not os.path.exists(path):
-        raise SessionError(f"{path} is missing: {what}")
-    return path
