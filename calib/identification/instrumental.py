@@ -5,8 +5,8 @@
 (Janot, Vandanjon & Gautier 2014). Same reference, same controller: the simulation feels what the robot was asked to do,
 and not its noise, so Z is uncorrelated with the noise that the feedback brings into W. It starts from a regular robot:
 inertia diag(J), no gravity, no friction. DIDIM (Gautier, Janot & Vandanjon 2013) estimates from the simulated W alone,
-x_{k+1} = W_s⁺ y. A prior inequality on base parameters makes it PC-IDIM-IV (`calib.estimation.constrained`); constraints
-do not cure a bias.
+x_{k+1} = W_s⁺ y. Inequalities on base parameters make it PC-IDIM-IV (`calib.estimation.constrained`); they do not cure
+a bias.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 
 from calib.arrays import frozen
 from calib.data.decimation import Decimator
+from calib.data.filtering import curvature, low_pass, slope
 from calib.dynamics import base as bases
 from calib.dynamics.base import Base
 from calib.dynamics.drives import standard
@@ -27,7 +28,7 @@ from calib.estimation import instruments
 from calib.estimation.constrained import Constrained, within
 from calib.estimation.instruments import Instruments, Strength, Verdict
 from calib.estimation.linear import LinearFit, settled_std, wls
-from calib.estimation.triangles import collect
+from calib.estimation.triangles import absorb, empty, select
 from calib.estimation.whiteness import inflation
 from calib.identification.cases import Case
 from calib.identification.rows import Rows, observe
@@ -66,7 +67,7 @@ class Round:
     Attributes:
         change: largest |Δx_j| / max(|x_j|, 8 σ_j), 8 = 0.2 / 2.5 %, see `calib.estimation.instruments.settled`.
         residual: standard deviation of the weighted residuals.
-        retreats: halvings until the new parameters could be simulated.
+        retreats: halvings before it, until the parameters could be simulated.
     """
 
     change: float
@@ -149,25 +150,26 @@ def identify_instrumental(
     kept = np.arange(base.b) if columns is None else np.asarray(columns, dtype=int)
     observed = [observe(model, base.kept[kept], case, decimator) for case, _ in cases]
     observed = [replace(rows, names=tuple(base.names[k] for k in kept)) for rows in observed]
-    problem = _stack(observed, [rows.matrix for rows in observed])
-    ordinary = wls(instruments.least_squares(problem))
+    ordinary = _ordinary(observed)
     plant, now, std = _regular(model, cases[0][1], inertia), ordinary, ordinary.group_std
     before: LinearFit | None = None
     bound, tau, rounds = None, 1.0, []
     runs = _runs(plant, cases)
+    retreats = 0
     for _ in range(limit):
         simulated = [_observe_run(model, base.kept[kept], case, run, loop, decimator) for (case, loop), run in runs]
         problem = _stack(observed, simulated)
-        now = _estimate(problem, observed, method, std)
+        now = _estimate(problem, method, std, tau)
         tau = _inflation(observed, now, std)
-        now = _estimate(problem, observed, method, std, tau)
+        now = _estimate(problem, method, std, tau)
         now, bound = _constrain(problem, now, std, positive)
         values = np.zeros(base.b)
         values[kept] = now.estimate.values
-        plant, runs, retreats = _simulate_new(plant, _with_values(plant, bases.to_standard(base, values)), cases)
+        found = _with_values(plant, bases.to_standard(base, values))
         rounds.append(Round(_change(before, now), now.estimate.residual_std, retreats))
         if before is not None and retreats == 0 and instruments.settled(before, now, tolerance, tolerance):
             break
+        plant, runs, retreats = _simulate_new(plant, found, cases)
         before, std = now, now.group_std
     else:
         last = rounds[-1]
@@ -178,13 +180,17 @@ def identify_instrumental(
         )
     verdict = instruments.exogeneity(problem, std, tau)
     return Instrumental(
-        now, ordinary, frozen(kept, int), plant, tuple(rounds), instruments.strength(problem, std), verdict,
+        now, ordinary, frozen(kept, int), found, tuple(rounds), instruments.strength(problem, std), verdict,
         frozen(std), tau, _distance(runs), bound,
     )  # fmt: skip
 
 
 def simulated_case(case: Case, run: Run, loop: Loop) -> Case:
-    """Return the case with the simulated motion at the instants of the recorded one."""
+    """Return the case with the simulated motion at the instants of the recorded one, filtered like that one.
+
+    The same low-pass and differences: what they do to a motion (they round off reversals) is in W and in Z alike, and
+    what tells W from Z is noise.
+    """
     step = loop.reference.period * loop.every
     index = np.rint(case.motion.t / step).astype(int)
     if index[-1] >= len(run.t) or np.abs(index * step - case.motion.t).max() > 0.01 * step:
@@ -192,7 +198,11 @@ def simulated_case(case: Case, run: Run, loop: Loop) -> Case:
             f"the recording runs to {case.motion.t[-1]:.6g} s in steps of {1 / case.motion.rate:.6g} s, the simulation "
             f"to {run.t[-1]:.6g} s in steps of {step:.6g} s: give the whole reference, and `every`"
         )
-    return replace(case, motion=replace(case.motion, q=run.q[index], v=run.v[index], a=run.a[index]))
+    motion, q = case.motion, np.empty_like(run.q)
+    for j, cutoff in enumerate(motion.cutoff):
+        q[:, j] = low_pass(run.q[:, j], motion.rate, float(cutoff))
+    v, a = slope(q, motion.rate), curvature(q, motion.rate)
+    return replace(case, motion=replace(motion, q=q[index], v=v[index], a=a[index]))
 
 
 def _regular(model: IdentificationModel, loop: Loop, inertia: np.ndarray | None) -> Plant:
@@ -257,22 +267,24 @@ def _stack(observed: Sequence[Rows], simulated: Sequence[np.ndarray]) -> Instrum
     return problem
 
 
-def _estimate(
-    problem: Instruments, observed: Sequence[Rows], method: str, std: np.ndarray, tau: float = 1.0
-) -> LinearFit:
+def _ordinary(observed: Sequence[Rows]) -> LinearFit:
+    """Return weighted least squares of the rows as they are."""
+    count, first = observed[0].target.shape[1], observed[0]
+    data = empty(first.names, first.units, count)
+    for rows in observed:
+        for row in range(count):
+            used = rows.present[:, row]
+            data = absorb(data, rows.matrix[used, row], rows.target[used, row], row)
+    return wls(data, settled_std(data, 1e-3))
+
+
+def _estimate(problem: Instruments, method: str, std: np.ndarray, tau: float = 1.0) -> LinearFit:
+    """Return the estimate from the triangles of [Z W y]: by instruments, or (DIDIM) from [Z y] alone."""
     if method == "iv":
         return instruments.iv(problem, std, tau)
     p = len(problem.names)
-    swapped = replace(problem.data, factors=problem.data.factors[:, :, [*range(p), 2 * p]])
-    data = collect(np.zeros((0, p)), np.zeros(0), None, problem.names, problem.data.units[p:])
-    stacked = replace(data, factors=_square(swapped.factors), rows=problem.data.rows)
-    return wls(stacked, std, np.full(problem.data.groups, tau))
-
-
-def _square(factors: np.ndarray) -> np.ndarray:
-    """Return the R factors of [Z y], (g, p + 1, p + 1), from the same columns of triangles of [Z W y]."""
-    size = factors.shape[2]
-    return np.stack([np.linalg.qr(factor, mode="r")[:size] for factor in factors])
+    simulated = replace(select(problem.data, np.arange(p)), names=problem.names)
+    return wls(simulated, std, np.full(problem.data.groups, tau))
 
 
 def _inflation(observed: Sequence[Rows], fit: LinearFit, std: np.ndarray) -> float:

@@ -62,7 +62,8 @@ class Sensing:
         sigma_q: (n,) white noise of every measured position [rad or m].
         quantum: (n,) resolution of the encoders [rad or m]; 0 for none.
         sigma_tau: (n,) white noise of the recorded torque [N m or N]; it does not act.
-        push: (n,) white torque that acts and is not recorded: ripple, cables, all that no model holds [N m or N].
+        push: (n,) torque that acts and is not recorded: ripple, cables, all that no model holds [N m or N].
+        push_band: cut-off of the first-order low-pass that colours it, σ kept [Hz]; None: white.
         every: control periods per recorded sample.
     """
 
@@ -70,6 +71,7 @@ class Sensing:
     quantum: np.ndarray | float = 0.0
     sigma_tau: np.ndarray | float = 0.0
     push: np.ndarray | float = 0.0
+    push_band: float | None = None
     every: int = 1
 
 
@@ -120,6 +122,8 @@ def simulate(
     rng = np.random.default_rng(seed)
     noise = {name: np.broadcast_to(getattr(sensing, name), (n,)) for name in ("sigma_q", "push", "sigma_tau")}
     drawn = {name: _draw(rng, size, count) for name, size in noise.items()}
+    if sensing.push_band is not None:
+        drawn["push"] = _coloured(drawn["push"], 2.0 * np.pi * sensing.push_band * reference.period)
     q, v = (np.array(x, dtype=float) for x in (start if start is not None else (reference.q[0], reference.v[0])))
     out = np.empty((5, -(-count // sensing.every), n))
     model = np.empty((0, 0)) if controller.model is None else _body(plant.tree, controller.model)
@@ -169,6 +173,14 @@ def _draw(rng: np.random.Generator, sigma: np.ndarray, count: int) -> np.ndarray
     if not np.any(sigma):
         return np.empty((0, len(sigma)))
     return rng.standard_normal((count, len(sigma))) * sigma
+
+
+def _coloured(white: np.ndarray, step: float) -> np.ndarray:
+    """Return x_k = p x_{k-1} + √(1 - p²) w_k, p = exp(-step), as wide as the white noise w (N, n)."""
+    from scipy.signal import lfilter
+
+    pole = float(np.exp(-step))
+    return np.ascontiguousarray(lfilter([np.sqrt(1.0 - pole**2)], [1.0, -pole], white, axis=0))
 
 
 def _packed(plant: Plant) -> Packed:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -27,20 +28,26 @@ def plant(name: str, coupled: bool = False, offset: np.ndarray | None = None) ->
     """Return the TX40 or RV-2SQ with Ia, Fv, Fc of every joint.
 
     Args:
-        coupled: with the TX40's wrist coupling Iam6, Fvm6, Fcm6.
+        coupled: with the TX40's wrist coupling: Ia6 on both rows, Fvm6, Fcm6.
         offset: (n,) torque offsets, terms ``off1`` …; None for none.
     """
     chain, known = description.read(library.path(name)), truth(name)
     own = "Ia Fv Fc" if offset is None else "Ia Fv Fc off"
     values = {key: known["drives"][key] for key in ("Ia", "Fv", "Fc")}
     values["off"] = np.zeros(chain.n) if offset is None else offset
-    terms = drives.standard([own] * chain.n, known["drives"]["v0"])
+    terms = list(drives.standard([own] * chain.n, known["drives"]["v0"]))
     amounts = [values[key][joint] for joint in range(chain.n) for key in own.split()]
     if coupled:
         link = known["coupling"]
-        terms += drives.coupled(link["joints"][0] - 1, link["joints"][1] - 1, known["drives"]["v0"])
-        amounts += [link["Iam"], link["Fvm"], link["Fcm"]]
-    return Plant(tree(chain), terms, np.concatenate([standard_parameters(chain), amounts]))
+        first, second = (joint - 1 for joint in link["joints"])
+        gear = drives.coupled(first, second, known["drives"]["v0"])
+        place = [one.name for one in terms].index(f"Ia{second + 1}")
+        # one motor inertia: Iam6 is Ia6, which acts on row 5 by a6 and on row 6 by a5 + a6
+        both = ((first, ((second, 1.0),)), (second, ((first, 1.0), (second, 1.0))))
+        terms[place] = replace(terms[place], acts=both)
+        terms += gear[1:]
+        amounts += [link["Fvm"], link["Fcm"]]
+    return Plant(tree(chain), tuple(terms), np.concatenate([standard_parameters(chain), amounts]))
 
 
 def controller(name: str) -> Controller:
