@@ -1,0 +1,41 @@
+"""A robot for the tests: the LWR4+ of the library as callables, and a two-joint arm written out by hand."""
+
+from __future__ import annotations
+
+from functools import cache, partial
+
+import numpy as np
+
+from calib.dynamics import base, drives
+from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.tree import standard_parameters, tree
+from calib.robot.chain import Chain
+from calib.robot.kinematics import element_jacobian, joint_jacobian, sweep
+from calib.robot.load import load
+
+FC = (11.9, 11.5, 8.98, 8.35, 8.31, 4.72, 6.04)  # [N m], total, Jubien et al. 2014 as quoted in facts
+FV = (14.4, 15.3, 6.55, 11.0, 4.29, 2.26, 1.6)  # [N m s/rad]
+
+
+@cache
+def lwr(v0: float = 0.05) -> tuple[base.BaseModel, np.ndarray, Chain]:
+    """Return the base model with 64 columns (43 inertial, Fv Fc off), its parameters, and the chain."""
+    chain = load("lwr4plus")
+    model = IdentificationModel(tree(chain), drives.standard(["Fv Fc off"] * 7, v0))
+    found = base.find(model)
+    values = np.concatenate([standard_parameters(chain), np.column_stack([FV, FC, np.zeros(7)]).ravel()])
+    return base.BaseModel(model, found), found.transform @ values, chain
+
+
+def tool_points(chain: Chain, q: np.ndarray) -> np.ndarray:
+    return sweep(chain, q).position.T[:, None]
+
+
+def tool_product(chain: Chain, q: np.ndarray, G: np.ndarray) -> np.ndarray:
+    walked = sweep(chain, q)
+    jacobian = joint_jacobian(chain, element_jacobian(chain, walked, walked.position))[:, :3]
+    return np.einsum("nim,mi->mn", jacobian, G[:, 0])
+
+
+def tool(chain: Chain):
+    return partial(tool_points, chain), partial(tool_product, chain)

@@ -1,0 +1,113 @@
+"""The families: derivatives with respect to time and to the variables, rest at both ends, bounds, refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from differences import check
+
+from trajectories.basis import aligned_period, sample_times
+from trajectories.bspline import bspline
+from trajectories.errors import BadInput
+from trajectories.fourier import evaluate, fourier
+
+FAMILIES = [
+    fourier((3, 5, 2), 4.0),
+    fourier(3, 4.0, 3, rest=False),
+    fourier(4, 4.0, 3, start=np.array([0.3, -1.0, 2.0])),
+    bspline(9, 4.0, 3),
+    bspline((12, 9, 1), 4.0, start=np.array([0.3, -1.0, 2.0])),
+]
+IDS = ["fourier", "not at rest", "given start", "spline", "spline, one joint locked"]
+
+
+def drawn(family, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=family.basis(np.zeros(1)).p)
+
+
+@pytest.mark.parametrize("family", FAMILIES, ids=IDS)
+def test_each_order_is_the_derivative_of_the_one_before(family):
+    x, t = drawn(family), np.array([0.37, 1.9, 3.61])
+    orders = family.basis(t).motion(x).orders
+    for order in range(3):
+
+        def at(s, order=order):
+            return family.basis(t + s[0]).motion(x).orders[order]
+
+        check(at, orders[order + 1][..., None], np.zeros(1), tolerance=1e-6)
+
+
+@pytest.mark.parametrize("family", FAMILIES, ids=IDS)
+def test_adjoint_is_the_derivative_by_the_variables(family):
+    basis = family.basis(sample_times(4.0, 11))
+    weights = np.random.default_rng(1).normal(size=(4, 11, 3))
+
+    def f(x):
+        return sum((w * o).sum() for w, o in zip(weights, basis.motion(x).orders))
+
+    check(f, basis.adjoint(weights[None])[0], drawn(family))
+
+
+@pytest.mark.parametrize("family", [f for f, name in zip(FAMILIES, IDS) if name != "not at rest"])
+def test_any_variables_start_and_end_at_rest(family):
+    motion = family.basis(np.array([0.0, 4.0 - 1e-12])).motion(drawn(family))
+    assert np.abs(motion.v).max() < 1e-7 and np.abs(motion.a).max() < 1e-6
+    assert np.allclose(motion.q[0], motion.q[1], atol=1e-9)
+
+
+def test_a_given_start_is_kept():
+    family = fourier(4, 4.0, 3, start=np.array([0.3, -1.0, 2.0]))
+    assert np.allclose(family.basis(np.zeros(1)).motion(drawn(family)).q, [[0.3, -1.0, 2.0]])
+
+
+def test_equation_23_term_by_term_agrees_with_the_tables():
+    family = FAMILIES[0]
+    x, t = drawn(family), np.linspace(0, 4, 17)
+    for order, values in enumerate(family.basis(t).motion(x).orders):
+        assert np.allclose(evaluate(family.coefficients(x), 4.0, t, order), values, atol=1e-9)
+
+
+@pytest.mark.parametrize("family", FAMILIES, ids=IDS)
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_the_bound_on_a_derivative_holds_and_is_not_idle(family, order):
+    for seed in range(5):
+        x = drawn(family, seed)
+        peak = np.abs(family.basis(np.linspace(0, 4, 4001)).motion(x).orders[order]).max(axis=0)
+        bound = family.largest(x, order)
+        assert (peak <= bound + 1e-9).all()
+        assert (bound <= 6 * peak + 1e-12).all()
+
+
+@pytest.mark.parametrize("family", FAMILIES, ids=IDS)
+def test_variables_are_read_back_from_coefficients(family):
+    x = drawn(family)
+    assert np.allclose(family.variables(family.coefficients(x)), x, atol=1e-12)
+
+
+def test_a_locked_joint_stands_still():
+    family = fourier((3, 0, 2), 4.0)
+    motion = family.basis(sample_times(4.0, 20)).motion(drawn(family))
+    assert np.ptp(motion.q[:, 1]) == 0 and np.ptp(motion.q[:, 0]) > 0
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: fourier(5, 2.0, 7, resonance=15.0), "not below the resonance"),
+        (lambda: fourier(5, 1.00037, 7, rate=1000.0), "take 1 s"),
+        (lambda: fourier(1, 2.0, 7), "cannot start at rest"),
+        (lambda: fourier(5, 0.0, 7), "period 0"),
+        (lambda: fourier(5, float("nan"), 7), "period nan"),
+        (lambda: fourier(2, 4.0, 2, start=np.array([0.0, np.nan])), "2 finite joint values"),
+        (lambda: bspline(5, 4.0, 3), "more than the degree"),
+        (lambda: bspline(9, 4.0, 3, degree=3), "jerk"),
+    ],
+)
+def test_refusals_say_what_to_do(make, words):
+    with pytest.raises(BadInput, match=words):
+        make()
+
+
+def test_aligned_periods_count_samples():
+    assert aligned_period(20.0, 1000.0) == 20000
+    assert aligned_period(0.3, 1000.0) == 300

@@ -1,0 +1,154 @@
+"""Every objective, every constraint and their assembly: exact gradients, against differences."""
+
+from __future__ import annotations
+
+import excited_arm as arm
+import numpy as np
+import pytest
+from differences import check
+
+from trajectories.constraints import BoxLimit, Clearance, TorqueLimit, Workspace, gathered
+from trajectories.errors import BadInput, NotExciting
+from trajectories.fourier import fourier
+from trajectories.objectives import (
+    Duration,
+    Excitation,
+    FrictionCoverage,
+    TorqueSlack,
+    condition_numbers,
+    information,
+)  # fmt: skip
+from trajectories.problem import Problem, evaluate
+
+BASE, CHI, CHAIN = arm.lwr(0.3)
+LIMITS = np.array([joint.effort for joint in CHAIN.joints])
+FAMILY = fourier(4, 6.0, 7)
+PAST = np.random.default_rng(5).normal(size=(80, 64))
+OBJECTIVES = [
+    Excitation("cond", "raw"),
+    Excitation("cond", "normalised"),
+    Excitation("cond", "normalised", sharpness=6.0),
+    Excitation("cond", np.linspace(0.5, 2.0, 64), sharpness=10.0),
+    Excitation("logdet", "raw", sigmas=np.linspace(0.2, 2.0, 7)),
+    Excitation("logdet", "normalised", existing=PAST.T @ PAST),
+    Excitation("smallest", "raw"),
+    Excitation("smallest", "normalised", sharpness=8.0, existing=PAST.T @ PAST),
+    TorqueSlack((5, 6), CHI, LIMITS),
+    FrictionCoverage(np.full(7, 0.2), np.full(7, 1.0), wanted=0.4),
+    Duration(),
+]
+
+
+def problem(objective, constraints=(), stretch=(1.0, 1.0)) -> Problem:
+    return Problem(
+        FAMILY, BASE.regressor, BASE.regressor_gradient, ((objective, 1.0),), constraints, samples=60, stretch=stretch
+    )
+
+
+def drawn(extra: int = 0, seed: int = 1) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    x = FAMILY.random(rng, np.array([0.2, 0.7, -0.3, 1.0, 0.4, -0.8, 0.1]), np.full(7, 0.9))
+    return np.concatenate([x, np.full(extra, 1.2)])
+
+
+def along(f, y: np.ndarray, count: int = 6):
+    """Return f on a random subspace through y, and the subspace (p, count): a full difference would take long."""
+    directions = np.random.default_rng(2).normal(size=(len(y), count)) / np.sqrt(len(y))
+    return (lambda s: f(y + directions @ s)), directions
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES, ids=lambda o: f"{o.name} {getattr(o, 'sharpness', '')}")
+def test_objectives(objective):
+    spot = problem(objective, stretch=(0.5, 2.0))
+    basis, y = spot.basis(), drawn(1)
+    sharp = (getattr(objective, "sharpness", 1.0), 10.0)
+    f, directions = along(lambda z: evaluate(spot, basis, z, sharp).values[0], y)
+    slope = evaluate(spot, basis, y, sharp).slopes[0] @ directions
+    scale = max(1.0, np.abs(slope).max())
+    check(lambda s: f(s) / scale, slope / scale, np.zeros(6), tolerance=2e-6)
+
+
+def constraints():
+    covariance = np.diag((0.05 * np.abs(CHI) + 0.01) ** 2)
+    points, product = arm.tool(CHAIN)
+    bounds = np.linspace(1.0, 2.0, 7)
+    return [
+        BoxLimit(0, -bounds, bounds),
+        BoxLimit(1, -bounds, np.where(np.arange(7) == 3, np.inf, bounds)),
+        BoxLimit(2, -bounds, bounds),
+        BoxLimit(3, -bounds, bounds),
+        TorqueLimit(BASE.regressor, BASE.regressor_gradient, CHI, LIMITS, margin=0.1),
+        TorqueLimit(BASE.regressor, BASE.regressor_gradient, CHI, LIMITS, covariance),
+        Workspace(points, product, radius=0.3, lowest=-0.2, highest=0.9),
+        Clearance(lambda q: q[:, :2] ** 2 + 1, lambda q, G: np.pad(2 * q[:, :2] * G, ((0, 0), (0, 5))), ("a", "b")),
+    ]
+
+
+@pytest.mark.parametrize("constraint", constraints(), ids=lambda c: c.name)
+def test_constraints(constraint):
+    spot = problem(Duration(), (constraint,), stretch=(0.5, 2.0))
+    basis, y, sharp = spot.basis(), drawn(1), (1.0, 20.0)
+    f, directions = along(lambda z: evaluate(spot, basis, z, sharp).constraints, y)
+    check(f, evaluate(spot, basis, y, sharp).rows @ directions, np.zeros(6), tolerance=1e-6)
+
+
+@pytest.mark.parametrize("constraint", constraints(), ids=lambda c: c.name)
+def test_the_smoothed_constraint_lies_above_the_largest_value(constraint):
+    motion = FAMILY.basis(np.linspace(0, 6, 60, endpoint=False)).motion(drawn())
+    largest = (constraint.values(motion) / constraint.scale).max(axis=0)
+    for sharpness in (20.0, 400.0):
+        c, _, excess = gathered(constraint, motion, sharpness)
+        groups = [largest[constraint.groups == r].max() for r in range(len(c))]
+        assert (c >= np.array(groups) - 1e-12).all()
+        assert (c <= np.array(groups) + np.log(120 * len(largest)) / sharpness).all()
+        assert excess == pytest.approx(largest.max())
+
+
+def test_condition_numbers_agree_with_numpy_and_the_smoothed_ones_bound_them():
+    motion = FAMILY.basis(np.linspace(0, 6, 60, endpoint=False)).motion(drawn())
+    Y = BASE.regressor(motion.q, motion.v, motion.a)
+    W = Y.transpose(1, 0, 2).reshape(-1, 64)
+    found = condition_numbers(Y)
+    assert found["raw"] == pytest.approx(np.linalg.cond(W), rel=1e-9)
+    assert found["normalised"] == pytest.approx(np.linalg.cond(W / np.linalg.norm(W, axis=0)), rel=1e-9)
+    for scaling in ("raw", "normalised"):
+        assert Excitation("cond", scaling).evaluate(motion, Y).value == pytest.approx(found[scaling], rel=1e-6)
+        smooth = Excitation("cond", scaling, sharpness=10.0).evaluate(motion, Y).value
+        assert found[scaling] <= smooth <= found[scaling] * 64**0.1
+    existing = information(np.concatenate([W, W]))
+    stacked = np.concatenate([W, W, W])
+    assert condition_numbers(Y, existing=existing)["raw"] == pytest.approx(np.linalg.cond(stacked), rel=1e-6)
+
+
+def test_the_slack_is_what_the_paper_minimises_up_to_the_stated_smoothing():
+    motion = FAMILY.basis(np.linspace(0, 6, 60, endpoint=False)).motion(drawn())
+    Y = BASE.regressor(motion.q, motion.v, motion.a)
+    exact = np.mean(1 - np.abs((Y @ CHI)[:, 5:]) / LIMITS[5:])
+    slack = TorqueSlack((5, 6), CHI, LIMITS).evaluate(motion, Y).value
+    assert exact <= slack <= exact + 1e-3
+
+
+def test_coverage_is_zero_where_every_range_is_visited_enough():
+    coverage = FrictionCoverage(np.array([0.4]), np.array([0.8]), wanted=0.1)
+    motion = fourier(1, 6.0, 1, rest=False).basis(np.linspace(0, 6, 600, endpoint=False))
+    fast = motion.motion(np.array([0.0, 1.0, 0.0]) * 6 / 2 / np.pi)
+    slow = motion.motion(np.array([0.0, 0.3, 0.0]) * 6 / 2 / np.pi)
+    assert coverage.evaluate(fast, np.zeros(0)).value == 0.0
+    assert (coverage.shares(fast) > 0.1).all()
+    assert coverage.evaluate(slow, np.zeros(0)).value > 0.3  # never fast: half of the four ranges empty
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "words"),
+    [
+        (lambda: BoxLimit(0, np.array([1.0]), np.array([0.0])), BadInput, "lower 1 is not below upper 0"),
+        (lambda: BoxLimit(1, np.array([0.1]), np.array([0.5])), BadInput, "hold zero"),
+        (lambda: TorqueLimit(BASE.regressor, BASE.regressor_gradient, CHI * np.nan, LIMITS), BadInput, "not finite"),
+        (lambda: TorqueLimit(BASE.regressor, BASE.regressor_gradient, CHI, 0 * LIMITS), BadInput, "above zero"),
+        (lambda: Excitation("det"), BadInput, "none of cond"),  # type: ignore[arg-type]
+        (lambda: Excitation().of_information(np.diag([1.0, 0.0])), NotExciting, "column 1"),
+    ],
+)
+def test_refusals(make, error, words):
+    with pytest.raises(error, match=words):
+        make()

@@ -1,0 +1,164 @@
+"""Motions that are linear in free variables: what the Fourier and the B-spline family have in common.
+
+    d^r q_j / dt^r (t_i) = offset_j[r, i] + Σ_c table_j[r, i, c] · x_{j,c},      r = 0 … 3
+
+Rest at start and end is an equation on a family's coefficients; it is eliminated by c_j = particular_j + null_j x_j, so
+every x gives a motion that starts and ends at rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy.linalg import null_space
+
+from trajectories.errors import BadInput
+
+ORDERS = ("position", "velocity", "acceleration", "jerk")
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Samples of a motion.
+
+    Attributes:
+        times: (N,) [s].
+        q, v, a, jerk: (N, n) [rad or m, and per s, s², s³].
+    """
+
+    times: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    jerk: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @property
+    def orders(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        return self.q, self.v, self.a, self.jerk
+
+    def part(self, rows: np.ndarray) -> Motion:
+        """Return the samples of the given indices."""
+        return Motion(self.times[rows], *(x[rows] for x in self.orders))
+
+
+@dataclass(frozen=True, eq=False)
+class Basis:
+    """A family at fixed times.
+
+    Attributes:
+        times: (N,) [s].
+        offsets: (4, N, n) what no variable changes.
+        tables: (n, 4, N, c) slopes by the variables of each joint, zero where a joint has fewer than c.
+        used: (n, c) which of these variables exist; x holds them joint after joint.
+    """
+
+    times: np.ndarray
+    offsets: np.ndarray
+    tables: np.ndarray
+    used: np.ndarray
+
+    @property
+    def p(self) -> int:
+        """Number of variables."""
+        return int(self.used.sum())
+
+    @property
+    def n(self) -> int:
+        return len(self.used)
+
+    def motion(self, x: np.ndarray) -> Motion:
+        """Return the motion of variables x (p,)."""
+        spread = np.zeros(self.used.shape)
+        spread[self.used] = x
+        n, _, count, c = self.tables.shape
+        moved = (self.tables.reshape(n, 4 * count, c) @ spread[:, :, None]).reshape(n, 4, count)
+        return Motion(self.times, *(self.offsets + moved.transpose(1, 2, 0)))
+
+    def adjoint(self, slopes: np.ndarray) -> np.ndarray:
+        """Return gradients by x (m, p) of m functions with slopes (m, 4, N, n) by q, v, a and jerk."""
+        m, _, count, n = slopes.shape
+        flat = slopes.transpose(3, 0, 1, 2).reshape(n, m, 4 * count)
+        found = flat @ self.tables.reshape(n, 4 * count, -1)
+        return found.transpose(1, 0, 2)[:, self.used]
+
+
+class Family(Protocol):
+    """What an optimiser needs of a family of periodic motions; `Fourier` and `BSpline` have it."""
+
+    @property
+    def period(self) -> float: ...
+    @property
+    def n(self) -> int: ...
+    def basis(self, times: np.ndarray) -> Basis: ...
+    def coefficients(self, x: np.ndarray) -> tuple[np.ndarray, ...]: ...
+    def variables(self, coefficients: Sequence[np.ndarray]) -> np.ndarray: ...
+    def largest(self, x: np.ndarray, order: int) -> np.ndarray: ...
+    def random(self, rng: np.random.Generator, centre: np.ndarray, amplitude: np.ndarray) -> np.ndarray: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Freedom:
+    """The coefficients (C,) of one joint that keep its equations: particular (C,) + null (C, c) x."""
+
+    particular: np.ndarray
+    null: np.ndarray
+
+
+def freedom(rows: np.ndarray, values: np.ndarray) -> Freedom:
+    """Return the solutions of rows (e, C) · coefficients = values (e,), with an orthonormal null-space basis."""
+    if not len(rows):
+        return Freedom(np.zeros(rows.shape[1]), np.eye(rows.shape[1]))
+    particular = np.linalg.lstsq(rows, values, rcond=None)[0]
+    if not np.allclose(rows @ particular, values, atol=1e-9):
+        raise BadInput("a joint has too few coefficients to start at rest at the given pose: allow more harmonics")
+    return Freedom(particular, null_space(rows))
+
+
+def assemble(times: np.ndarray, tables: Sequence[np.ndarray], freedoms: Sequence[Freedom]) -> Basis:
+    """Return the basis of joints with coefficient tables (4, N, C_j) under their equations."""
+    n, widest = len(tables), max(max(f.null.shape[1] for f in freedoms), 1)
+    offsets = np.zeros((4, len(times), n))
+    stacked, used = np.zeros((n, 4, len(times), widest)), np.zeros((n, widest), dtype=bool)
+    for j, (table, free) in enumerate(zip(tables, freedoms, strict=True)):
+        offsets[:, :, j] = table @ free.particular
+        stacked[j, :, :, : free.null.shape[1]] = table @ free.null
+        used[j, : free.null.shape[1]] = True
+    return Basis(np.asarray(times, dtype=float), offsets, stacked, used)
+
+
+def joined(freedoms: Sequence[Freedom], x: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return the coefficients (C_j,) of every joint for variables x."""
+    ends = np.cumsum([free.null.shape[1] for free in freedoms])[:-1]
+    return tuple(free.particular + free.null @ part for free, part in zip(freedoms, np.split(x, ends)))
+
+
+def projected(freedoms: Sequence[Freedom], coefficients: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the variables whose coefficients are nearest to the given ones."""
+    return np.concatenate([f.null.T @ (np.asarray(c) - f.particular) for f, c in zip(freedoms, coefficients)])
+
+
+def sample_times(period: float, count: int, shift: float = 0.0) -> np.ndarray:
+    """Return `count` instants over one whole period, the end left out [s]; `shift` in steps."""
+    return (np.arange(count) + shift) * (period / count)
+
+
+def aligned_period(period: float, rate: float) -> int:
+    """Return how many samples of a controller's rate [Hz] one period [s] holds.
+
+    Raises:
+        BadInput: where it holds no whole number, so that averaging over periods would mix instants.
+    """
+    count = period * rate
+    if not np.isfinite(count) or count < 1 or abs(count - round(count)) > 1e-6:
+        near = max(1, round(count)) / rate if np.isfinite(count) else float("nan")
+        raise BadInput(
+            f"a period of {period:g} s is {count:g} samples at {rate:g} Hz, which is not whole: periods could not be "
+            f"averaged sample by sample; take {near:.12g} s"
+        )
+    return round(count)

@@ -1,0 +1,114 @@
+"""Periodic B-splines, with the interface of `trajectories.fourier`.
+
+q_j(t) = Σ_{i=1}^{C} c_ji B_i(t),    uniform knots over one period, B_i periodic of a stated degree (5: smooth jerk)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import BSpline as ScipyBSpline
+
+from trajectories.basis import Basis, Freedom, aligned_period, assemble, freedom, joined, projected
+from trajectories.errors import BadInput
+
+
+@dataclass(frozen=True, eq=False)
+class BSpline:
+    """A family of periodic splines.
+
+    Attributes:
+        period: T0 [s].
+        counts: (n,) control points C of each joint; 1 holds it at a constant.
+        degree: of the pieces.
+        freedoms: per joint.
+    """
+
+    period: float
+    counts: tuple[int, ...]
+    degree: int
+    freedoms: tuple[Freedom, ...]
+
+    @property
+    def n(self) -> int:
+        return len(self.counts)
+
+    def basis(self, times: np.ndarray) -> Basis:
+        """Return the family at times (N,) [s]."""
+        return assemble(times, [table(times, self.period, c, self.degree) for c in self.counts], self.freedoms)
+
+    def coefficients(self, x: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return the control points (C,) of every joint [rad or m]."""
+        return joined(self.freedoms, x)
+
+    def variables(self, coefficients: Sequence[np.ndarray]) -> np.ndarray:
+        """Return the variables nearest to given control points."""
+        return projected(self.freedoms, coefficients)
+
+    def largest(self, x: np.ndarray, order: int) -> np.ndarray:
+        """Return a bound (n,) on abs(d^r q / dt^r): the largest control point of the r-th derivative.
+
+        The derivative of a uniform spline has control points Δc / h one degree lower (de Boor), and a spline lies in
+        the hull of its control points.
+        """
+        bounds = []
+        for count, points in zip(self.counts, self.coefficients(x)):
+            for _ in range(order):
+                points = (points - np.roll(points, 1)) * count / self.period
+            bounds.append(np.abs(points).max())
+        return np.array(bounds)
+
+    def random(self, rng: np.random.Generator, centre: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
+        """Return variables of a random motion about a centre (n,) with control points spread by amplitude (n,)."""
+        return self.variables([m + s * rng.normal(size=c) for c, m, s in zip(self.counts, centre, amplitude)])
+
+
+def bspline(
+    points: int | Sequence[int],
+    period: float,
+    joints: int | None = None,
+    *,
+    degree: int = 5,
+    rest: bool = True,
+    start: np.ndarray | None = None,
+    rate: float | None = None,
+) -> BSpline:
+    """Return the family of periodic splines with `points` control points (one number, or (n,); 1 locks a joint).
+
+    Args:
+        degree: 4 or more, so that the jerk is continuous at 5.
+        period, joints, rest, start, rate: as of `trajectories.fourier.fourier`.
+    """
+    counts = tuple(int(k) for k in (np.full(joints or 0, points) if np.ndim(points) == 0 else points))  # type: ignore[arg-type]
+    if not counts or any(c != 1 and c <= degree for c in counts) or max(counts) == 1:
+        raise BadInput(f"control points {points} for {joints} joints: expected more than the degree {degree} (or 1)")
+    if degree < 4:
+        raise BadInput(f"degree {degree}: 4 at least, or the jerk is no function of time")
+    if not np.isfinite(period) or period <= 0:
+        raise BadInput(f"period {period} s: expected a positive number")
+    if rate is not None:
+        aligned_period(period, rate)
+    freedoms = []
+    for j, count in enumerate(counts):
+        at_start = table(np.zeros(1), period, count, degree)[:, 0]
+        orders = [0] * (start is not None) + ([1, 2] if rest and count > 1 else [])
+        values = ([] if start is None else [float(start[j])]) + [0.0] * (2 if rest and count > 1 else 0)
+        freedoms.append(freedom(at_start[orders], np.array(values)))
+    return BSpline(float(period), counts, degree, tuple(freedoms))
+
+
+def table(times: np.ndarray, period: float, count: int, degree: int) -> np.ndarray:
+    """Return the slopes (4, N, count) of q, v, a, jerk by the control points."""
+    result = np.zeros((4, len(times), count))
+    if count == 1:
+        result[0] = 1.0
+        return result
+    knots = period / count * np.arange(-degree, count + degree + 1)
+    where = np.mod(times, period)
+    full = ScipyBSpline(knots, np.eye(count + degree), degree)
+    for order in range(4):
+        values = full.derivative(order)(where) if order else full(where)
+        np.add.at(result[order].T, np.arange(count + degree) % count, values.T)
+    return result

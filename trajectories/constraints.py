@@ -1,0 +1,326 @@
+"""What a motion must keep, as values that are at most zero at every sample, with exact slopes.
+
+Joint, velocity, acceleration and jerk limits are linear in the variables; torques come from a regressor and parameters,
+with a margin for their uncertainty; places of the tool and of named points, and distances between bodies, come from
+callables with derivative products. An optimiser sees each group of columns (a joint's limit, both signs) as one smooth
+function,
+
+    c_r = (1/ρ) log Σ_{i, k in r} exp(ρ g_ik / scale_k)  ≥  max g / scale      (Kreisselmeier & Steinhauser 1979)
+
+so a feasible c means feasible samples; what happens between the samples is `trajectories.verify`'s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from trajectories.basis import ORDERS, Motion
+from trajectories.errors import BadInput
+
+Regressor = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+Product = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
+UNITS = ("rad", "rad/s", "rad/s²", "rad/s³")
+
+
+class Constraint(Protocol):
+    """Values (N, k), feasible where ≤ 0, that depend on one sample each.
+
+    Attributes:
+        name, unit: what messages call it, and what its values are in.
+        labels: (k,) names of the columns.
+        scale: (k,) [unit] what makes values of different constraints comparable.
+        groups: (k,) columns of one group are one function to the optimiser.
+    """
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def unit(self) -> str: ...
+    @property
+    def labels(self) -> tuple[str, ...]: ...
+    @property
+    def scale(self) -> np.ndarray: ...
+    @property
+    def groups(self) -> np.ndarray: ...
+    def values(self, motion: Motion) -> np.ndarray: ...
+    def slopes(self, motion: Motion, weights: np.ndarray) -> np.ndarray:
+        """Return the slopes (4, N, n) of Σ weights (N, k) · values by q, v, a, jerk."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class BoxLimit:
+    """lower ≤ d^r q / dt^r ≤ upper.
+
+    Attributes:
+        order: r, 0 to 3.
+        lower, upper: (n,); infinite where there is no limit.
+        unit: of the values.
+    """
+
+    order: int
+    lower: np.ndarray
+    upper: np.ndarray
+    unit: str = ""
+    joints: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        lower, upper = np.asarray(self.lower, dtype=float), np.asarray(self.upper, dtype=float)
+        kind = ORDERS[self.order]
+        if lower.shape != upper.shape or lower.ndim != 1 or np.isnan(lower).any() or np.isnan(upper).any():
+            raise BadInput(f"{kind} limits: expected two (n,) arrays of numbers, found {lower} and {upper}")
+        if not (lower < upper).all():
+            j = int(np.argmax(lower >= upper))
+            raise BadInput(
+                f"{kind} limits of joint {j + 1}: lower {lower[j]:g} is not below upper {upper[j]:g}; a joint that may "
+                "not move is locked with 0 harmonics"
+            )
+        if self.order and not ((lower < 0) & (upper > 0)).all():
+            raise BadInput(f"{kind} limits have to hold zero inside: the motion starts at rest; found {lower}, {upper}")
+        object.__setattr__(self, "lower", lower)
+        object.__setattr__(self, "upper", upper)
+        object.__setattr__(self, "unit", self.unit or UNITS[self.order])
+        object.__setattr__(self, "joints", np.flatnonzero(np.isfinite(lower) & np.isfinite(upper)))
+
+    @property
+    def name(self) -> str:
+        return ORDERS[self.order]
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return tuple(f"joint {j + 1} {side}" for side in ("upper", "lower") for j in self.joints)
+
+    @property
+    def scale(self) -> np.ndarray:
+        return np.tile((self.upper - self.lower)[self.joints] / 2, 2)
+
+    @property
+    def groups(self) -> np.ndarray:
+        return np.tile(np.arange(len(self.joints)), 2)
+
+    def values(self, motion: Motion) -> np.ndarray:
+        x = motion.orders[self.order][:, self.joints]
+        return np.concatenate([x - self.upper[self.joints], self.lower[self.joints] - x], axis=1)
+
+    def slopes(self, motion: Motion, weights: np.ndarray) -> np.ndarray:
+        result = np.zeros((4, *motion.q.shape))
+        k = len(self.joints)
+        result[self.order][:, self.joints] = weights[:, :k] - weights[:, k:]
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class TorqueLimit:
+    """|Y χ| + k √(y Σ yᵀ) ≤ (1 - margin) τ_max: the model's uncertainty is a margin.
+
+    Attributes:
+        regressor, product: Y (N, n, b) of q, v, a, and its derivative product.
+        parameters: (b,) χ.
+        limits: (n,) τ_max [N m or N]; infinite where there is none.
+        covariance: (b, b) Σ of χ; None: exact.
+        deviations: k.
+        margin: a share of the limits besides.
+    """
+
+    regressor: Regressor
+    product: Product
+    parameters: np.ndarray
+    limits: np.ndarray
+    covariance: np.ndarray | None = None
+    deviations: float = 2.0
+    margin: float = 0.0
+    name: str = "torque"
+    unit: str = "N m"
+    joints: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.parameters).all():
+            k = int(np.argmin(np.isfinite(self.parameters)))
+            raise BadInput(f"torque model: parameter {k + 1} is not finite ({self.parameters[k]})")
+        if not (self.limits > 0).all():
+            raise BadInput(f"torque limits have to be above zero, found {self.limits}")
+        if not 0 <= self.margin < 1:
+            raise BadInput(f"torque margin {self.margin}: expected a share of the limits from 0 to below 1")
+        object.__setattr__(self, "joints", np.flatnonzero(np.isfinite(self.limits)))
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return tuple(f"joint {j + 1} {side}" for side in ("upper", "lower") for j in self.joints)
+
+    @property
+    def scale(self) -> np.ndarray:
+        return np.tile(self.limits[self.joints], 2)
+
+    @property
+    def groups(self) -> np.ndarray:
+        return np.tile(np.arange(len(self.joints)), 2)
+
+    def values(self, motion: Motion) -> np.ndarray:
+        Y = self.regressor(motion.q, motion.v, motion.a)[:, self.joints]
+        torque, bound = Y @ self.parameters, (1 - self.margin) * self.limits[self.joints]
+        if self.covariance is not None:
+            bound = bound - self.deviations * np.sqrt(np.einsum("njb,njb->nj", Y @ self.covariance, Y))
+        return np.concatenate([torque - bound, -torque - bound], axis=1)
+
+    def slopes(self, motion: Motion, weights: np.ndarray) -> np.ndarray:
+        k = len(self.joints)
+        G = np.zeros((*motion.q.shape, len(self.parameters)))
+        G[:, self.joints] = (weights[:, :k] - weights[:, k:])[:, :, None] * self.parameters
+        if self.covariance is not None:
+            Y = self.regressor(motion.q, motion.v, motion.a)[:, self.joints]
+            seen = Y @ self.covariance
+            spread = np.sqrt(np.maximum(np.einsum("njb,njb->nj", seen, Y), 1e-30))
+            both = self.deviations * (weights[:, :k] + weights[:, k:]) / spread
+            G[:, self.joints] += both[:, :, None] * seen
+        result = np.zeros((4, *motion.q.shape))
+        result[:3] = self.product(motion.q, motion.v, motion.a, G)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class Workspace:
+    """Distance of points from the base's z axis and their height: d_xy ≥ least_radius, lowest ≤ z ≤ highest.
+
+    Written least² - x² - y² ≤ 0 over 2 · least, which is smooth on the axis too and a length near the limit.
+
+    Attributes:
+        points: q (N, n) -> (N, k, 3) [m].
+        product: (q, G (N, k, 3)) -> (N, n), the slopes of Σ G · points.
+        names: (k,).
+        radius, lowest, highest: [m]; None: no such limit.
+    """
+
+    points: Callable[[np.ndarray], np.ndarray]
+    product: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    names: tuple[str, ...] = ("tool",)
+    radius: float | None = None
+    lowest: float | None = None
+    highest: float | None = None
+    name: str = "workspace"
+    unit: str = "m"
+
+    @property
+    def _kinds(self) -> tuple[str, ...]:
+        kinds = (("distance from the axis", self.radius), ("lowest", self.lowest), ("highest", self.highest))
+        return tuple(kind for kind, bound in kinds if bound is not None)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return tuple(f"{name} {kind}" for kind in self._kinds for name in self.names)
+
+    @property
+    def scale(self) -> np.ndarray:
+        return np.full(len(self.labels), 1.0)
+
+    @property
+    def groups(self) -> np.ndarray:
+        return np.arange(len(self.labels))
+
+    def values(self, motion: Motion) -> np.ndarray:
+        x = self.points(motion.q)
+        found = []
+        if self.radius is not None:
+            found.append((self.radius**2 - (x[..., :2] ** 2).sum(-1)) / (2 * max(self.radius, 1e-3)))
+        found += [self.lowest - x[..., 2]] if self.lowest is not None else []
+        found += [x[..., 2] - self.highest] if self.highest is not None else []
+        return np.concatenate(found, axis=1)
+
+    def slopes(self, motion: Motion, weights: np.ndarray) -> np.ndarray:
+        x, k = self.points(motion.q), len(self.names)
+        G = np.zeros_like(x)
+        parts = dict(zip(self._kinds, np.split(weights, len(self._kinds), axis=1)))
+        if self.radius is not None:
+            G[..., :2] -= parts["distance from the axis"][..., None] * x[..., :2] / max(self.radius, 1e-3)
+        G[..., 2] += parts.get("highest", np.zeros(k)) - parts.get("lowest", np.zeros(k))
+        result = np.zeros((4, *motion.q.shape))
+        result[0] = self.product(motion.q, G)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class Clearance:
+    """Distances between bodies of at least `least` [m].
+
+    Attributes:
+        distances: q (N, n) -> (N, k) [m], negative inside.
+        product: (q, G (N, k)) -> (N, n), the slopes of Σ G · distances.
+        labels: (k,) names of the pairs.
+    """
+
+    distances: Callable[[np.ndarray], np.ndarray]
+    product: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    labels: tuple[str, ...]
+    least: float = 0.0
+    name: str = "clearance"
+    unit: str = "m"
+
+    @property
+    def scale(self) -> np.ndarray:
+        return np.full(len(self.labels), 0.3)
+
+    @property
+    def groups(self) -> np.ndarray:
+        return np.zeros(len(self.labels), dtype=int)
+
+    def values(self, motion: Motion) -> np.ndarray:
+        return self.least - self.distances(motion.q)
+
+    def slopes(self, motion: Motion, weights: np.ndarray) -> np.ndarray:
+        result = np.zeros((4, *motion.q.shape))
+        result[0] = -self.product(motion.q, weights)
+        return result
+
+
+def box_limits(
+    lower: np.ndarray,
+    upper: np.ndarray,
+    velocity: np.ndarray | None = None,
+    acceleration: np.ndarray | None = None,
+    jerk: np.ndarray | None = None,
+    linear: Sequence[bool] | None = None,
+) -> tuple[BoxLimit, ...]:
+    """Return the limits of position (lower, upper) and of the moduli of velocity, acceleration and jerk, each (n,)."""
+    units = UNITS if not linear or not all(linear) else ("m", "m/s", "m/s²", "m/s³")
+    found = [BoxLimit(0, lower, upper, units[0])]
+    for order, bound in enumerate((velocity, acceleration, jerk), 1):
+        if bound is None:
+            continue
+        sizes = np.asarray(bound, dtype=float)
+        if not (sizes > 0).all():
+            j = int(np.argmin(np.where(np.isnan(sizes), -1.0, sizes)))
+            raise BadInput(
+                f"{ORDERS[order]} limit of joint {j + 1} is {sizes[j]:g}: it has to be above zero; a joint that may "
+                "not move is locked with 0 harmonics"
+            )
+        found.append(BoxLimit(order, -sizes, sizes, units[order]))
+    return tuple(limit for limit in found if len(limit.joints))
+
+
+def gathered(
+    constraint: Constraint, motion: Motion, sharpness: float, tightening: float = 0.0
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the smoothed constraints c (r,), their slopes (r, 4, N, n) by the motion, and max g / scale + tightening.
+
+    Args:
+        sharpness: ρ.
+        tightening: added to every value, as a share of its scale.
+    """
+    scaled = constraint.values(motion) / constraint.scale + tightening
+    groups = constraint.groups
+    count = int(groups.max()) + 1
+    c, slopes = np.empty(count), np.zeros((count, 4, *motion.q.shape))
+    for r in range(count):
+        columns = np.flatnonzero(groups == r)
+        top = scaled[:, columns].max()
+        shares = np.exp(sharpness * (scaled[:, columns] - top))
+        total = shares.sum()
+        c[r] = top + np.log(total) / sharpness
+        rows = np.flatnonzero(shares.max(axis=1) > 1e-12 * total)
+        weights = np.zeros((len(rows), len(groups)))
+        weights[:, columns] = shares[rows] / total / constraint.scale[columns]
+        slopes[r][:, rows] = constraint.slopes(motion.part(rows), weights)
+    return c, slopes, float(scaled.max())

@@ -1,0 +1,155 @@
+"""Finite Fourier series (Swevers et al. 1997), as in Kolyubin, Shiriaev, Jubien 2019, eq. 23:
+
+    q_j(t) = q_j0 + Σ_{k=1}^{n_f,j} a_jk sin(k ω0 t) + b_jk cos(k ω0 t),      ω0 = 2π / T0
+
+Rest at the start, and by periodicity at the end: Σ k a_jk = 0 and Σ k² b_jk = 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from trajectories.basis import Basis, Freedom, aligned_period, assemble, freedom, joined, projected
+from trajectories.errors import BadInput
+
+
+@dataclass(frozen=True, eq=False)
+class Fourier:
+    """A family of Fourier series.
+
+    Attributes:
+        period: T0 [s].
+        harmonics: (n,) n_f of each joint; 0 holds it at a constant.
+        freedoms: per joint, coefficients ordered q0, a_1 … a_nf, b_1 … b_nf.
+    """
+
+    period: float
+    harmonics: tuple[int, ...]
+    freedoms: tuple[Freedom, ...]
+
+    @property
+    def n(self) -> int:
+        return len(self.harmonics)
+
+    def basis(self, times: np.ndarray) -> Basis:
+        """Return the family at times (N,) [s]."""
+        return assemble(times, [table(times, self.period, count) for count in self.harmonics], self.freedoms)
+
+    def coefficients(self, x: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return q0, a, b (1 + 2 n_f,) of every joint."""
+        return joined(self.freedoms, x)
+
+    def variables(self, coefficients: Sequence[np.ndarray]) -> np.ndarray:
+        """Return the variables nearest to given coefficients."""
+        return projected(self.freedoms, coefficients)
+
+    def largest(self, x: np.ndarray, order: int) -> np.ndarray:
+        """Return a bound (n,) on abs(d^r q / dt^r) over all times, r ≥ 1: Σ_k (k ω0)^r √(a_k² + b_k²)."""
+        bounds = []
+        for count, c in zip(self.harmonics, self.coefficients(x)):
+            rates = 2 * np.pi / self.period * np.arange(1, count + 1)
+            bounds.append((rates**order * np.hypot(c[1 : 1 + count], c[1 + count :])).sum())
+        return np.array(bounds)
+
+    def random(self, rng: np.random.Generator, centre: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
+        """Return variables of a random motion about a centre (n,); amplitudes (n,) spread over the harmonics as 1/k."""
+        drawn = []
+        for count, middle, size in zip(self.harmonics, centre, amplitude):
+            fall = 1.0 / np.arange(1, count + 1)
+            fall = fall / max(np.sqrt((fall**2).sum()), 1.0)
+            drawn.append(np.concatenate([[middle], size * np.tile(fall, 2) * rng.normal(size=2 * count)]))
+        return self.variables(drawn)
+
+
+def fourier(
+    harmonics: int | Sequence[int],
+    period: float,
+    joints: int | None = None,
+    *,
+    rest: bool = True,
+    start: np.ndarray | None = None,
+    resonance: float | None = None,
+    rate: float | None = None,
+) -> Fourier:
+    """Return the family of Fourier series of a period.
+
+    Args:
+        harmonics: n_f, one for all joints or (n,); 0 locks a joint.
+        period: T0 [s].
+        joints: n, where `harmonics` is one number.
+        rest: velocity and acceleration are zero at t = 0 and T0, whatever the variables.
+        start: (n,) pose to start from [rad or m]; None: free.
+        resonance: smallest resonance frequency ω_r [rad/s]; n_f ω0 has to stay below (the paper, section 4.3).
+        rate: the controller's [Hz]; a period has to hold a whole number of its samples.
+
+    Raises:
+        BadInput: for a period that is not positive, frequencies beyond the resonance, samples that do not fit.
+    """
+    counts = tuple(int(k) for k in (np.full(joints or 0, harmonics) if np.ndim(harmonics) == 0 else harmonics))  # type: ignore[arg-type]
+    if not counts or min(counts) < 0 or max(counts) < 1:
+        raise BadInput(f"harmonics {harmonics} for {joints} joints: expected whole numbers, one of them above 0")
+    if rest and 1 in counts:
+        raise BadInput("one harmonic cannot start at rest in velocity and acceleration: take 2 or more, or 0 to lock")
+    _check_frequencies(counts, period, resonance)
+    if rate is not None:
+        aligned_period(period, rate)
+    first = None if start is None else np.asarray(start, dtype=float)
+    if first is not None and (first.shape != (len(counts),) or not np.isfinite(first).all()):
+        raise BadInput(f"start: expected {len(counts)} finite joint values, found {start}")
+    freedoms = [_freedom(count, period, rest, None if first is None else first[j]) for j, count in enumerate(counts)]
+    return Fourier(float(period), counts, tuple(freedoms))
+
+
+def table(times: np.ndarray, period: float, count: int) -> np.ndarray:
+    """Return the slopes (4, N, 1 + 2 count) of q, v, a, jerk by q0, a, b."""
+    rates = 2 * np.pi / period * np.arange(1, count + 1)
+    angle = np.outer(times, rates)
+    sine, cosine = np.sin(angle), np.cos(angle)
+    result = np.zeros((4, len(times), 1 + 2 * count))
+    result[0, :, 0] = 1.0
+    for order, (by_a, by_b) in enumerate(((sine, cosine), (cosine, -sine), (-sine, -cosine), (-cosine, sine))):
+        result[order, :, 1 : 1 + count] = by_a * rates**order
+        result[order, :, 1 + count :] = by_b * rates**order
+    return result
+
+
+def evaluate(coefficients: Sequence[np.ndarray], period: float, times: np.ndarray, order: int = 0) -> np.ndarray:
+    """Return d^r q / dt^r (N, n) straight from eq. 23, term by term: independent of tables and null spaces."""
+    result = np.zeros((len(times), len(coefficients)))
+    for j, c in enumerate(coefficients):
+        count = len(c) // 2
+        result[:, j] = c[0] if order == 0 else 0.0
+        for k in range(1, count + 1):
+            rate, turn = 2 * np.pi * k / period, order * np.pi / 2  # each derivative turns sine and cosine by π/2
+            result[:, j] += rate**order * (
+                c[k] * np.sin(rate * times + turn) + c[count + k] * np.cos(rate * times + turn)
+            )
+    return result
+
+
+def _freedom(count: int, period: float, rest: bool, start: float | None) -> Freedom:
+    k = np.arange(1, count + 1)
+    rows, values = list[np.ndarray](), list[float]()
+    if rest and count:
+        rows += [np.r_[0.0, k, np.zeros(count)], np.r_[0.0, np.zeros(count), k**2]]
+        values += [0.0, 0.0]
+    if start is not None:
+        rows.append(np.r_[1.0, np.zeros(count), np.ones(count)])
+        values.append(start)
+    return freedom(np.array(rows).reshape(len(rows), 1 + 2 * count), np.array(values))
+
+
+def _check_frequencies(counts: Sequence[int], period: float, resonance: float | None) -> None:
+    if not np.isfinite(period) or period <= 0:
+        raise BadInput(f"period {period} s: expected a positive number")
+    top = max(counts) * 2 * np.pi / period
+    if resonance is not None and not top < resonance:
+        least = 2 * np.pi * max(counts) / resonance
+        raise BadInput(
+            f"the highest frequency, {max(counts)} · 2π/{period:g} s = {top:.4g} rad/s, is not below the resonance at "
+            f"{resonance:.4g} rad/s: it would excite what the model does not hold; take fewer harmonics or a period "
+            f"above {least:.4g} s"
+        )

@@ -1,0 +1,250 @@
+"""What makes a motion good, each with its exact gradient.
+
+Of the observation matrix W (all samples' regressors, rows of joint j divided by sigma_j) with the information matrix
+M = Wᵀ W + M_existing, its eigenvalues λ = s², s the singular values of W:
+
+    cond       s_1 / s_b                       minimise (Gautier & Khalil 1992; Kolyubin et al. 2019, eq. 24)
+    logdet     -log det M                      minimise (D-optimality)
+    smallest   -s_b                            minimise (E-optimality)
+
+Swevers et al. (1997) weigh the rows with the covariance of the torques: logdet with `sigmas`. Column scaling: ``raw``
+takes the columns in SI units, ``normalised`` divides each by its norm over the motion (so that the unit of a parameter
+does not matter), or a vector of scales is given. logdet ranks motions alike for every fixed scaling.
+
+Gradients: ∂F/∂W = 2 W S with S = ∂F/∂M. cond and smallest have kinks where singular values meet, which is where their
+optima lie: `sharpness` p < ∞ replaces max λ by (Σ λ^p)^(1/p) and min λ by (Σ λ^-p)^(-1/p). The smoothed cond is at
+least cond and at most b^(1/p) cond; its gradient is exact, too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+
+from trajectories.basis import Motion
+from trajectories.errors import BadInput, NotExciting
+
+Index = Literal["cond", "logdet", "smallest"]
+Scaling = Literal["raw", "normalised"]
+FLOOR = 1e-15  # eigenvalues below this part of the largest are rounding
+
+
+class Value(NamedTuple):
+    """An objective and its slopes: by the regressor (N, n, b), by q, v, a, jerk (4, N, n), by the duration [1/s]."""
+
+    value: float
+    by_regressor: np.ndarray | None = None
+    by_motion: np.ndarray | None = None
+    by_duration: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Excitation:
+    """An index of the information matrix.
+
+    Attributes:
+        index: "cond", "logdet" or "smallest".
+        scaling: "raw", "normalised", or (b,) by which the columns are divided.
+        sharpness: p of the smoothing; infinite for the index itself.
+        sigmas: (n,) standard deviations of the torques [N m or N]; None: 1.
+        existing: (b, b) information of motions recorded before, in the same sigmas: the next motion complements them.
+            A triangle R of theirs gives it as Rᵀ R.
+    """
+
+    index: Index = "cond"
+    scaling: Scaling | np.ndarray = "raw"
+    sharpness: float = np.inf
+    sigmas: np.ndarray | None = None
+    existing: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        if self.index not in get_args(Index):
+            raise BadInput(f"index '{self.index}' is none of {', '.join(get_args(Index))}")
+        if isinstance(self.scaling, str) and self.scaling not in get_args(Scaling):
+            raise BadInput(f"scaling '{self.scaling}' is none of {', '.join(get_args(Scaling))}")
+
+    @property
+    def name(self) -> str:
+        return self.index + (f" {self.scaling}" if isinstance(self.scaling, str) else " scaled")
+
+    def evaluate(self, motion: Motion, regressor: np.ndarray) -> Value:
+        """Return the index and ∂F/∂regressor."""
+        weighted = regressor if self.sigmas is None else regressor / self.sigmas[:, None]
+        stacked = _stacked(weighted)
+        value, by_m = self.of_information(information(stacked, self.existing))
+        slope = (2 * stacked @ by_m).reshape(regressor.shape[1], regressor.shape[0], -1).transpose(1, 0, 2)
+        return Value(value, slope if self.sigmas is None else slope / self.sigmas[:, None])
+
+    def of_information(self, M: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the index of an information matrix M (b, b) and S = ∂F/∂M, symmetric.
+
+        With C = D M D, D = diag(M)^-1/2 (normalised): ∂F/∂M = D S_C D - diag((C S_C)_kk / M_kk).
+        """
+        diagonal = np.diag(M)
+        if not (diagonal > 0).all():
+            raise NotExciting(f"column {int(np.argmin(diagonal))} of the regressor is zero along the whole motion")
+        normalised = isinstance(self.scaling, str) and self.scaling == "normalised"
+        d = diagonal**-0.5 if normalised else (1.0 if isinstance(self.scaling, str) else 1.0 / self.scaling)
+        d = np.broadcast_to(d, diagonal.shape)
+        C = M * d * d[:, None]
+        eigenvalues, V = np.linalg.eigh(C)
+        value, slope = self._of_spectrum(np.maximum(eigenvalues, FLOOR * eigenvalues[-1]))
+        by_c = (V * slope) @ V.T
+        by_m = by_c * d * d[:, None]
+        if normalised:
+            by_m -= np.diag(np.einsum("ij,ji->i", C, by_c) / diagonal)
+        return value, by_m
+
+    def _of_spectrum(self, eigenvalues: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return F and ∂F/∂λ; λ rising."""
+        if self.index == "logdet":
+            return -float(np.log(eigenvalues).sum()), -1.0 / eigenvalues
+        low, by_low = _extreme(eigenvalues, -self.sharpness)
+        if self.index == "smallest":
+            return -np.exp(low / 2), -np.exp(low / 2) / 2 * by_low
+        high, by_high = _extreme(eigenvalues, self.sharpness)
+        value = float(np.exp((high - low) / 2))
+        return value, value / 2 * (by_high - by_low)
+
+
+@dataclass(frozen=True, eq=False)
+class TorqueSlack:
+    """The paper's slack of poorly loaded joints, by their limits: 1 - mean over joints and time of |τ_j| / τ_max.
+
+    Eq. 24 asks for F = mean(τ_max - |τ|) ≤ k τ_max: slacks are *minimised*, so a goal of k = 0.9 asks for a mean torque
+    of at least a tenth of the limit. The modulus is smoothed as √(τ² + (ε τ_max)²) - ε τ_max, ε = `smoothing`, which
+    never overstates the torque. τ = Y χ is the motor torque: link torques of a light wrist cannot reach such goals.
+
+    Attributes:
+        joints: which.
+        parameters: (b,) χ, of the regressor's columns.
+        limits: (n,) τ_max [N m or N].
+    """
+
+    joints: tuple[int, ...]
+    parameters: np.ndarray
+    limits: np.ndarray
+    smoothing: float = 1e-3
+
+    @property
+    def name(self) -> str:
+        return "torque slack of joints " + ", ".join(str(j + 1) for j in self.joints)
+
+    def evaluate(self, motion: Motion, regressor: np.ndarray) -> Value:
+        chosen = list(self.joints)
+        ratio = regressor[:, chosen] @ self.parameters / self.limits[chosen]
+        size = np.sqrt(ratio**2 + self.smoothing**2)
+        by_torque = np.zeros(regressor.shape[:2])
+        by_torque[:, chosen] = -ratio / size / self.limits[chosen] / ratio.size
+        return Value(1.0 - float((size - self.smoothing).mean()), by_torque[:, :, None] * self.parameters)
+
+
+@dataclass(frozen=True, eq=False)
+class FrictionCoverage:
+    """How much is missing of the wanted shares of time at low and at high speed, in both directions.
+
+        F = mean over joints and the four ranges of  (max(0, 1 - share / wanted))²
+
+    Shares are means of logistic memberships of v: high: σ((±v - high) / w), low: σ(±v / w) - σ((±v - low) / w), with
+    w = `width` · low.
+
+    Attributes:
+        low, high: (n,) speeds [rad/s or m/s], 0 < low < high.
+        wanted: share of the time in each of the four ranges.
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+    wanted: float = 0.1
+    width: float = 0.2
+    name: str = "friction coverage"
+
+    def evaluate(self, motion: Motion, regressor: np.ndarray) -> Value:
+        count, n = motion.v.shape
+        value, slope = 0.0, np.zeros((4, count, n))
+        w = self.width * self.low
+        for sign in (1.0, -1.0):
+            v = sign * motion.v
+            (zero, d_zero), (lo, d_lo), (hi, d_hi) = (_logistic((v - at) / w) for at in (0.0, self.low, self.high))
+            for member, by_v in ((hi, d_hi / w), (zero - lo, (d_zero - d_lo) / w)):
+                missing = np.maximum(0.0, 1.0 - member.mean(axis=0) / self.wanted)
+                value += float((missing**2).sum()) / (4 * n)
+                slope[1] -= sign * 2 * missing / self.wanted / count / (4 * n) * by_v
+        return Value(value, None, slope)
+
+    def shares(self, motion: Motion) -> np.ndarray:
+        """Return the exact shares of time (4, n): fast forward, slow forward, fast backward, slow backward."""
+        rows = []
+        for v in (motion.v, -motion.v):
+            rows += [(v > self.high).mean(axis=0), ((v > 0) & (v < self.low)).mean(axis=0)]
+        return np.array(rows)
+
+
+@dataclass(frozen=True)
+class Duration:
+    """The period [s]; worth an objective where the problem leaves it free."""
+
+    name: str = "duration"
+
+    def evaluate(self, motion: Motion, regressor: np.ndarray) -> Value:
+        return Value(float(len(motion) * (motion.times[1] - motion.times[0])), by_duration=1.0)
+
+
+Objective = Excitation | TorqueSlack | FrictionCoverage | Duration
+
+
+def information(stacked: np.ndarray, existing: np.ndarray | None = None) -> np.ndarray:
+    """Return M = Wᵀ W + M_existing of a stacked W (rows, b)."""
+    M = stacked.T @ stacked
+    return M if existing is None else M + existing
+
+
+def condition_numbers(
+    regressor: np.ndarray, sigmas: np.ndarray | None = None, existing: np.ndarray | None = None
+) -> dict[str, float]:
+    """Return cond of the observation matrix, columns raw and normalised, by SVD (not by way of M).
+
+    Args:
+        regressor: (N, n, b).
+        sigmas: (n,) row weights; None: 1.
+        existing: (b, b) information of motions recorded before.
+    """
+    W = _stacked(regressor if sigmas is None else regressor / sigmas[:, None])
+    triangle = np.linalg.qr(W, mode="r")
+    if existing is not None:
+        values, V = np.linalg.eigh(existing)
+        triangle = np.concatenate([triangle, np.sqrt(np.maximum(values, 0.0))[:, None] * V.T])
+    norms = np.linalg.norm(triangle, axis=0)
+    if not norms.all():
+        return {"raw": np.inf, "normalised": np.inf}
+    spectra = {"raw": triangle, "normalised": triangle / norms}
+    return {key: _cond(np.linalg.svd(matrix, compute_uv=False)) for key, matrix in spectra.items()}
+
+
+def _cond(s: np.ndarray) -> float:
+    return float(s[0] / s[-1]) if s[-1] > 0 else np.inf
+
+
+def _stacked(regressor: np.ndarray) -> np.ndarray:
+    """Return W (n N, b), joint after joint: no copy where the regressor's memory is ordered (b, n, N)."""
+    count, n, b = regressor.shape
+    return regressor.transpose(2, 1, 0).reshape(b, n * count).T
+
+
+def _extreme(eigenvalues: np.ndarray, p: float) -> tuple[float, np.ndarray]:
+    """Return log (Σ λ^p)^(1/p) and its slopes by λ; the log of the largest λ for p = ∞, of the smallest for -∞."""
+    logs = np.log(eigenvalues)
+    if np.isinf(p):
+        slope, k = np.zeros_like(logs), int(np.argmax(logs) if p > 0 else np.argmin(logs))
+        slope[k] = 1.0 / eigenvalues[k]
+        return float(logs[k]), slope
+    top = (p * logs).max()
+    shares = np.exp(p * logs - top)
+    return float((top + np.log(shares.sum())) / p), shares / shares.sum() / eigenvalues
+
+
+def _logistic(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    s = 0.5 * (1.0 + np.tanh(0.5 * x))
+    return s, s * (1.0 - s)
