@@ -75,8 +75,8 @@ def _error(reference: Reference, measured: np.ndarray, rate: float) -> np.ndarra
     aim = reference.q[::every] if every >= 1 else reference.q
     if every < 1 or abs(every * rate * reference.period - 1.0) > 1e-3 or len(aim) < len(measured):
         raise MeasurementError(
-            f"a log of {len(measured)} samples at {rate:g} Hz does not fit a reference of {len(reference.t)} instants at "
-            f"{1 / reference.period:g} Hz"
+            f"a log of {len(measured)} samples at {rate:g} Hz does not fit a reference of {len(reference.t)} instants "
+            f"at {1 / reference.period:g} Hz"
         )
     return aim[: len(measured)] - shaped(measured, (None, reference.q.shape[1]), "measured positions")
 
@@ -85,7 +85,7 @@ def _joint(error: np.ndarray, tau: np.ndarray, orders: tuple[int, int]) -> tuple
     """Return a, b, c of one joint by least squares."""
     if not np.ptp(error) > 0.0:
         raise MeasurementError(
-            "the position error is zero throughout: a log of the reference is not one of the encoder"
+            "the position error is zero throughout: is this a log of the reference, not of the encoder?"
         )
     na, nb = orders
     first, count = max(orders), len(error)

@@ -87,7 +87,7 @@ def identify(
     rows = with_blocks([observe(model, base.kept, case, decimator) for case in cases], settings.folds)
     _require_enough(rows, base)
     say("first fit")
-    std, tau, values = _first(rows)
+    std, tau, values = first_fit(rows)
     first = Dynamics(model, bases.to_standard(base, values))
     loads = [transmitted(first, case) for case in cases]
     n = chain.n
@@ -105,11 +105,24 @@ def identify(
     richer = with_terms(model, *climbed.terms)
     values = fitted.estimate.values
     standard = np.concatenate([bases.to_standard(base, values[: base.b]), values[base.b :]])
+    standard = _with_payloads(standard, richer, cases, settings)
     say("essential parameters")
     gone = _essential(fitted, settings)
     return Identification(
         Dynamics(richer, standard), base, fitted, gone, climbed, settings, tuple(full), condition
     )  # fmt: skip
+
+
+def _with_payloads(
+    standard: np.ndarray, model: IdentificationModel, cases: Sequence[Case], settings: Settings
+) -> np.ndarray:
+    """Return the standard parameters with those of payloads that no case carries, where they are known."""
+    result = np.array(standard)
+    for label, known in settings.payload_values.items():
+        if not any(label in case.carried for case in cases):
+            first = 10 * model.tree.labels.index(label)
+            result[first : first + 10] = known
+    return result
 
 
 def find_base(
@@ -137,7 +150,7 @@ def common_decimator(cases: Sequence[Case], settings: Settings) -> Decimator:
     return design_decimator(rates[0], min(factor, cases[0].motion.decimator.factor))
 
 
-def _first(rows: Sequence[Rows]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def first_fit(rows: Sequence[Rows]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the residuals' standard deviation and inflation (rows,), and values (b,), of a robustly solvable first fit."""
     count = rows[0].target.shape[1]
     data = pool(triangulate(rows), count)

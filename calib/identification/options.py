@@ -67,6 +67,7 @@ from calib.data import values
 from calib.data.clock import CLOCKS
 from calib.data.decimation import KINDS as DECIMATORS
 from calib.data.motion import FilterOptions
+from calib.data.recording import parse_cut
 from calib.data.recording_options import RecordingOptions
 from calib.dynamics.drives import Term, term
 from calib.dynamics.idim import KINDS
@@ -337,3 +338,8 @@ _OWN: dict[str, Callable[[Any, str], Any]] = {
 _FILE = ("recording", "filter", "gains")
 _TABLES = ("coupling", "term", "payload", "files", "gain_identification")
 assert {_FIELD.get(key, key) for key in _SETTINGS} <= {f.name for f in fields(Settings)}
+
+
+def file_settings(options: IdentifyOptions, path: str) -> FileSettings:
+    """Return the settings of a recording that may have a cut behind its name."""
+    return options.for_file(parse_cut(path)[0])

@@ -53,6 +53,8 @@ class Settings:
         keep, drop: parameters never, or first, left out.
         prior: draw what the motion cannot tell to the CAD's values: ``auto`` where it has to.
         payloads: label → what is known of it.
+        payload_values: label → its ten standard parameters in the tip's frame, where they are known from elsewhere; they
+            serve for predictions where no recording to learn from carries it.
         gravity: in the base frame [m/s²]; None: the robot's.
         samples: most rows (per torque) that are held at once; longer recordings are thinned further.
         folds: number of time blocks for cross-validation.
@@ -73,6 +75,7 @@ class Settings:
     drop: tuple[str, ...] = ()
     prior: str = "auto"
     payloads: Mapping[str, Payload] = field(default_factory=dict)
+    payload_values: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     gravity: tuple[float, float, float] | None = None
     samples: int = 20_000
     folds: int = 6

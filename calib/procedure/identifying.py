@@ -15,10 +15,11 @@ from calib.data.recording_files import read_recording
 from calib.errors import UsageError
 from calib.identification.cases import Case, case_names, make_case
 from calib.identification.identify import Identification, identify
-from calib.identification.options import FileSettings, IdentifyOptions
+from calib.identification.options import FileSettings, IdentifyOptions, file_settings
 from calib.identification.prediction import predict
 from calib.identification.scores import Score, score
 from calib.identification.settings import Settings
+from calib.procedure.identification_gains import FoundGains, find_gains
 from calib.procedure.identification_verdict import judge, warnings
 from calib.procedure.inputs import joint_kinds
 from calib.procedure.verdict import Verdict
@@ -43,6 +44,7 @@ class IdentificationInputs:
         unseen: recordings to be predicted.
         options: the options file's content, the command's choices put in.
         notes: what a user should know about how the files were understood.
+        unit: of the torques.
     """
 
     chain: Chain
@@ -52,6 +54,7 @@ class IdentificationInputs:
     unseen: tuple[Case, ...]
     options: IdentifyOptions
     notes: tuple[str, ...] = ()
+    unit: str = "N m"
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,17 +114,19 @@ def gather(
         raise UsageError("no recording given")
     check_files(options, [*recordings, *validate])
     chain, nominal, source = load_robot(robot, base, tip)
-    names = case_names([*map(str, recordings), *map(str, validate)])
-    cases: list[Case] = []
-    notes: list[str] = []
-    for name, path in zip(names, [*recordings, *validate]):
+    paths = [*map(str, recordings), *map(str, validate)]
+    names = case_names(paths)
+    motions = []
+    for name, path in zip(names, paths):
         say(f"reading {name}")
-        case = read_case(str(path), name, chain, options)
-        cases.append(case)
-        notes += [f"{name}: {note}" for note in case.motion.notes]
+        motions.append(read_motion(path, chain, file_settings(options, path)))
+    notes = [f"{name}: {note}" for name, motion in zip(names, motions) for note in motion.notes]
     count = len(recordings)
+    found = find_gains(chain, options, dict(zip(paths, motions)), paths[:count], say)
+    options = found.options
+    cases = [read_case(path, name, motion, options, found) for name, path, motion in zip(names, paths, motions)]
     return IdentificationInputs(
-        chain, nominal, source, tuple(cases[:count]), tuple(cases[count:]), options, tuple(notes)
+        chain, nominal, source, tuple(cases[:count]), tuple(cases[count:]), options, (*notes, *found.notes), found.unit
     )  # fmt: skip
 
 
@@ -175,13 +180,13 @@ def load_robot(robot: str | Path, base: str | None, tip: str | None) -> tuple[Ch
     return chain, chain.with_values(np.asarray(values, dtype=float)), source
 
 
-def read_case(path: str, name: str, chain: Chain, options: IdentifyOptions) -> Case:
-    """Return the case of one recording; filters and payload as the options say."""
+def read_case(path: str, name: str, motion: Motion, options: IdentifyOptions, found: FoundGains) -> Case:
+    """Return the case of one recording; payload and gains as the options, or the gain identification, say."""
     own = file_settings(options, path)
-    motion = read_motion(path, chain, own)
-    gains = drive_gains(motion, own, options)
     slow = (options.slow if options.slow is not None else 0.01) if options.cut_slow else None
-    return make_case(name, motion, options.settings.kind, gains=gains, carried=own.payload, slow=slow)
+    return make_case(
+        name, motion, options.settings.kind, gains=found.for_motion(motion, own), carried=own.payload, slow=slow
+    )  # fmt: skip
 
 
 def read_motion(path: str, chain: Chain, own: FileSettings) -> Motion:
@@ -191,23 +196,6 @@ def read_motion(path: str, chain: Chain, own: FileSettings) -> Motion:
         np.array([joint.velocity for joint in chain.joints]), np.array([joint.effort for joint in chain.joints]),
     )  # fmt: skip
     return make_motion(read_recording(path, joints, own.recording), own.filter)
-
-
-def drive_gains(motion: Motion, own: FileSettings, options: IdentifyOptions) -> np.ndarray | None:
-    """Return the torque per current (n,): stated for the file, for all, by the file itself; None where nobody says."""
-    del options
-    if own.gains is not None:
-        if len(own.gains) != motion.n:
-            raise UsageError(f"gains: {len(own.gains)} values for {motion.n} joints ({motion.file})")
-        return np.array(own.gains)
-    return motion.drive_gain if motion.kind == "current" else None
-
-
-def file_settings(options: IdentifyOptions, path: str) -> FileSettings:
-    """Return the settings of a recording that may have a cut behind its name."""
-    from calib.data.recording import parse_cut
-
-    return options.for_file(parse_cut(path)[0])
 
 
 def check_files(options: IdentifyOptions, paths: Sequence[str]) -> None:

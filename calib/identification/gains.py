@@ -1,0 +1,145 @@
+"""Drive gains from currents: torque = gain · current, told by runs without and with a payload of known mass.
+
+A model fitted to currents is known up to a scale per joint; what joints share (a link's mass is felt by all before it)
+ties the scales together, and a payload of known mass fixes them (Gautier & Briot 2011, 2014):
+
+    K_j i_j = W_j χ  (unloaded),    K_j i_j = W_j χ + P_j χ_L  (loaded),    one entry of χ_L known.
+
+Gautier & Briot solve the homogeneous system by total least squares, for the noise is in the currents. With the noise
+of joint j only in i_j, that is the weighted nonlinear problem
+
+    min Σ_j ‖i_j - [W_j P_j] x / K_j‖² / σ_j²,
+
+which is solved here by Gauss and Newton on triangles, with σ_j settled; total least squares gives the start (our
+choice: the unstructured TLS lets every joint's current be noisy in every row).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from calib.arrays import frozen
+from calib.errors import NotConverged, Unidentifiable
+from calib.estimation.triangles import Triangles, retriangulate
+
+ROUNDS = 60
+
+
+@dataclass(frozen=True, eq=False)
+class DriveGains:
+    """Gains and what came with them.
+
+    Attributes:
+        gains: (n,) torque per current [N m/A or N/A].
+        covariance: (n, n).
+        names, values: of all parameters in torque units, base ones and the payload's.
+        std: (n,) of the residual currents [A].
+        scale: what fixed the scale, in words.
+    """
+
+    gains: np.ndarray
+    covariance: np.ndarray
+    names: tuple[str, ...]
+    values: np.ndarray
+    std: np.ndarray
+    scale: str
+
+    @property
+    def sigma(self) -> np.ndarray:
+        return np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
+
+
+def identify_gains(
+    currents: Triangles,
+    known: Mapping[str, float],
+    inflation: np.ndarray | None = None,
+    start: Sequence[float] | None = None,
+    reference: int | None = None,
+) -> DriveGains:
+    """Estimate gains from triangles of [W P | i], one group per joint.
+
+    Args:
+        currents: columns of the model with the payload, target the currents.
+        known: parameters whose values are known (a payload's mass, its centre of mass), in SI.
+        inflation: (n,) how many rows count as one.
+        start: (n,) first guess of the gains; None: from least squares on the torques of the known ones.
+        reference: where nothing is known, the joint whose gain is set to 1: the others follow relative to it, and
+            torques come out in amperes of that joint.
+
+    Raises:
+        Unidentifiable: where nothing known is felt by a joint, directly or through others.
+    """
+    n, names = currents.groups, currents.names
+    fixed = np.array([names.index(name) for name in known], dtype=int)
+    free = np.setdiff1d(np.arange(len(names)), fixed)
+    given = np.array([known[names[k]] for k in fixed])
+    if reference is None and (not len(fixed) or not np.any(given)):
+        raise Unidentifiable(
+            "gains need a payload of known mass: without it, currents fix torques up to a scale", names
+        )
+    tau = np.ones(n) if inflation is None else inflation
+    factors = np.array(currents.factors)
+    norms = np.linalg.norm(factors[:, :, free], axis=(0, 1))
+    norms = np.where(norms > 0.0, norms, 1.0)
+    body, load, current = factors[:, :, free] / norms, factors[:, :, fixed] @ given, factors[:, :, -1]
+    if start is not None or reference is not None:
+        gain = np.ones(n) if start is None else np.array(start, dtype=float)
+    else:
+        gain = _start(body, load, current)
+    x = _parameters(body, load, current, gain, np.ones(n))
+    std = np.ones(n)
+    for _ in range(ROUNDS):
+        torque = body @ x + load
+        residual = torque / gain[:, None] - current
+        std = np.sqrt(np.sum(residual**2, axis=1) / currents.rows)
+        weight = 1.0 / (std * np.sqrt(tau))
+        jacobian = np.zeros((n, factors.shape[1], len(free) + n))
+        jacobian[:, :, : len(free)] = body / gain[:, None, None]
+        for j in range(n):
+            if j != reference:
+                jacobian[j, :, len(free) + j] = -torque[j] / gain[j]  # by log K_j
+        stacked = retriangulate(
+            np.hstack(
+                [
+                    (jacobian * weight[:, None, None]).reshape(-1, len(free) + n),
+                    (residual * weight[:, None]).reshape(-1, 1),
+                ]
+            )
+        )
+        upper = stacked[:-1, :-1]
+        step = -np.linalg.lstsq(upper, stacked[:-1, -1], rcond=1e-12)[0]
+        size = min(1.0, 0.7 / max(float(np.abs(step[len(free) :]).max()), 1e-12))
+        x, gain = x + size * step[: len(free)], gain * np.exp(size * step[len(free) :])
+        if np.abs(step[len(free) :]).max() < 1e-7:
+            inverse = np.linalg.pinv(upper, rcond=1e-12)
+            covariance = (inverse @ inverse.T)[len(free) :, len(free) :] * np.outer(gain, gain)
+            values = np.zeros(len(names))
+            values[free], values[fixed] = x / norms, given
+            told = ", ".join(f"{name} = {value:g}" for name, value in known.items())
+            told = told if reference is None else f"gain of joint {reference + 1} = 1"
+            return DriveGains(frozen(gain), frozen(covariance), names, frozen(values), frozen(std), told)
+    raise NotConverged("the drive gains do not settle; is the payload felt by every joint?", gain)
+
+
+def _start(body: np.ndarray, load: np.ndarray, current: np.ndarray) -> np.ndarray:
+    """Return gains from [i -W] [K; χ] = P m, least squares: drawn towards zero, but a start."""
+    n, size, p = body.shape
+    matrix = np.zeros((n, size, n + p))
+    for j in range(n):
+        matrix[j, :, j] = current[j]
+    matrix[:, :, n:] = -body
+    found = scipy.linalg.lstsq(matrix.reshape(-1, n + p), load.ravel(), cond=1e-12)[0][:n]
+    usual = float(np.median(np.abs(found)))
+    return np.where(np.abs(found) > 0.05 * usual, np.abs(found), max(usual, 1e-3))
+
+
+def _parameters(
+    body: np.ndarray, load: np.ndarray, current: np.ndarray, gain: np.ndarray, std: np.ndarray
+) -> np.ndarray:
+    scale = (gain * std)[:, None]
+    target = (gain[:, None] * current - load) / scale
+    return scipy.linalg.lstsq((body / scale[:, :, None]).reshape(-1, body.shape[2]), target.ravel(), cond=1e-12)[0]
