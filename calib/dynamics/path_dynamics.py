@@ -1,0 +1,157 @@
+"""The dynamics of a robot along a path q = Φ(s), straight from the regressor of its identification model.
+
+    tau = A(s) s̈ + B(s) ṡ² + Γ(s) + f(Φ, Φ' ṡ),    v = Φ' ṡ,    a = Φ' s̈ + Φ'' ṡ²
+    Γ = w(Φ, 0, 0) X,    B = w(Φ, Φ', Φ'') X - Γ,    A = w(Φ, Φ', Φ' + Φ'') X - B - Γ = w(Φ, 0, Φ') X - Γ
+
+(Kolyubin, Shiriaev, Jubien 2019, Proposition 1, eq. 29 to 32), so A = M Φ', B = M Φ'' + C(Φ, Φ') Φ' and Γ = G without
+any of M, C, G. X are the parameters without friction (Remark 2 there): motor inertia Ia belongs to M where tau is the
+motors' torque, and a torque offset or a spring to Γ. Every term that depends on speed is friction f: Coulomb's is a
+sign that the direction of Φ' decides, viscous friction goes with ṡ, which is not affine in ṡ².
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.arrays import frozen, shaped
+from calib.dynamics import drives, rigid_body
+from calib.dynamics.base import BaseModel, to_standard
+from calib.dynamics.drives import Term
+from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.tree import Tree
+from calib.errors import CalibError
+
+AFFINE = ("acceleration", "one", "position")  # shapes that Proposition 1 holds for; all others are friction
+SMOOTHED = {"sign": 0, "dead": 0, "stribeck": 2, "load": 0}  # which setting smooths or delays Coulomb's sign
+MIXED = 1e-6  # of a column, beyond which friction counts as regrouped with something else
+
+Regressor = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class PathDynamics:
+    """A model with numbers, its friction apart.
+
+    Attributes:
+        regressor: q, v, a (N, n) to (N, rows, b); the last n rows are the torques that are limited.
+        parameters: (b,) X, zero for friction.
+        terms, amounts: friction terms and their (k,) values; Coulomb's sign is the exact one.
+        tree, bodies: bodies and their (10 B,) parameters, whose torques load-dependent friction feels.
+    """
+
+    regressor: Regressor
+    parameters: np.ndarray
+    terms: tuple[Term, ...]
+    amounts: np.ndarray
+    tree: Tree
+    bodies: np.ndarray
+
+    def __post_init__(self) -> None:
+        for key in ("parameters", "amounts", "bodies"):
+            value = np.asarray(getattr(self, key), dtype=float)
+            object.__setattr__(self, key, frozen(shaped(value, (None,), f"path dynamics, {key}")))
+
+    @property
+    def n(self) -> int:
+        return self.tree.n
+
+    def along(
+        self, q: np.ndarray, slope: np.ndarray, curvature: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return A, B, Γ, each (N, n), at Φ, Φ', Φ'' (N, n)."""
+        still = np.zeros_like(q)
+        gravity = self.rigid(q, still, still)
+        return self.rigid(q, still, slope) - gravity, self.rigid(q, slope, curvature) - gravity, gravity
+
+    def rigid(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        """Return the torques (N, n) without friction."""
+        return self.regressor(q, v, a)[:, -self.n :] @ self.parameters
+
+    def friction(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        """Return the friction torques (N, n); friction with memory (stop operators) counts as fully stressed."""
+        if not self.terms:
+            return np.zeros_like(q)
+        motions = [np.ascontiguousarray(x.T) for x in (q, v, a)]
+        load = None
+        if any(one.form.loaded for one in self.terms):
+            load = rigid_body.inverse_dynamics(self.tree, np.array(self.bodies), q, v, a).T
+        out = np.zeros((len(self.terms), self.n, len(q)))
+        drives.fill(self.terms, out, [*motions, load], _stressed(self.terms, motions[1]))
+        return np.einsum("k,kjN->Nj", self.amounts, out)
+
+    def torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        """Return the torques (N, n) of a motion, friction included: the full inverse dynamics."""
+        return self.rigid(q, v, a) + self.friction(q, v, a)
+
+
+def of_standard(model: IdentificationModel, values: np.ndarray) -> PathDynamics:
+    """Return the path dynamics of a model with standard (or regrouped) parameters (p,), all payloads carried."""
+    values = shaped(values, (model.p,), "parameters of the model")
+    _require_torques(model)
+    rubbing = _is_friction(model)
+    first = 10 * model.tree.bodies
+    without = replace(model, terms=tuple(one for one in model.columns if one.shape in AFFINE))
+    return PathDynamics(
+        without.regressor, values[~rubbing], *_friction(model, values), model.tree, np.array(values[:first])
+    )
+
+
+def of_base(model: BaseModel, values: np.ndarray) -> PathDynamics:
+    """Return the path dynamics of base parameters (b,): the regressor is the base regressor.
+
+    Raises:
+        CalibError: where friction is regrouped with masses or offsets, so that it cannot be told apart.
+    """
+    values = shaped(values, (model.base.b,), "base parameters")
+    _require_torques(model.model)
+    rubbing = _is_friction(model.model)
+    kept, dropped = rubbing[model.base.kept], rubbing[model.base.split.dropped]
+    mixed = np.abs(model.base.split.coefficients) * (kept[:, None] != dropped)
+    if mixed.max(initial=0.0) > MIXED:
+        name = model.names[int(mixed.max(axis=1).argmax())]
+        raise CalibError(f"base parameter {name} holds friction and other effects: their torques cannot be told apart")
+    standard = to_standard(model.base, values)
+    bodies = standard[: 10 * model.model.tree.bodies]
+    terms, amounts = _friction(model.model, standard)
+    return PathDynamics(model.regressor, np.where(kept, 0.0, values), terms, amounts, model.model.tree, bodies)
+
+
+def _require_torques(model: IdentificationModel) -> None:
+    if model.kind == "drive":
+        raise CalibError("rows tau - tau_l hold no bodies: no motion to plan; use a model of the torques tau")
+
+
+def _is_friction(model: IdentificationModel) -> np.ndarray:
+    """Tell which of the p columns depend on speed."""
+    bodies = np.zeros(10 * model.tree.bodies, dtype=bool)
+    return np.concatenate([bodies, np.array([one.shape not in AFFINE for one in model.columns], dtype=bool)])
+
+
+def _friction(model: IdentificationModel, values: np.ndarray) -> tuple[tuple[Term, ...], np.ndarray]:
+    """Return the friction terms with a value and an exact sign, and the values."""
+    own = values[10 * model.tree.bodies :]
+    found = [(one, value) for one, value in zip(model.columns, own) if one.shape not in AFFINE and value]
+    return tuple(_sharp(one) for one, _ in found), np.array([value for _, value in found], dtype=float)
+
+
+def _sharp(one: Term) -> Term:
+    """Return the term with Coulomb's sign as it is, not smoothed: at low speed the larger torque."""
+    if one.shape not in SMOOTHED:
+        return one
+    settings = list(one.settings)
+    settings[SMOOTHED[one.shape]] = 0.0
+    return replace(one, settings=tuple(settings))
+
+
+def _stressed(terms: Sequence[Term], v: np.ndarray) -> np.ndarray:
+    """Return states (s, N) of stop operators that slide in the direction of their motion; v (n, N)."""
+    found = [
+        np.sign(sum((weight * v[j] for j, weight in motion), np.zeros(v.shape[1])))
+        for one in terms
+        if one.form.remembers
+        for _, motion in one.acts
+    ]
+    return np.array(found).reshape(len(found), v.shape[1])
