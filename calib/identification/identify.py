@@ -138,7 +138,10 @@ def find_base(
 
 
 def common_decimator(cases: Sequence[Case], settings: Settings) -> Decimator:
-    """Return the filter that thins all cases to at most ``settings.samples`` rows per torque, in one band."""
+    """Return the filter of all rows: the widest of the cases' bands, narrower where that makes too many rows.
+
+    Too many are more than ``settings.samples``.
+    """
     rates = [case.motion.rate for case in cases]
     if max(rates) > 1.02 * min(rates):
         slowest, fastest = min(rates), max(rates)
@@ -146,8 +149,9 @@ def common_decimator(cases: Sequence[Case], settings: Settings) -> Decimator:
             f"recordings of {slowest:.4g} Hz and {fastest:.4g} Hz do not go together; resample one of them"
         )
     total = sum(len(case.motion) for case in cases)
-    factor = max(1, int(np.ceil(total / settings.samples)))
-    return design_decimator(rates[0], min(factor, cases[0].motion.decimator.factor))
+    by_rule = min(case.motion.decimator.factor for case in cases)
+    least = int(np.ceil(total / settings.samples))  # what the memory asks for
+    return design_decimator(rates[0], max(least, by_rule))
 
 
 def first_fit(rows: Sequence[Rows]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.data.decimation import decimate, kept
-from calib.data.motion import moving
+from calib.data.motion import in_band, moving
 from calib.errors import MeasurementError
 from calib.estimation.whiteness import Whiteness, examine, r_squared
 from calib.identification.cases import Case
@@ -37,13 +36,14 @@ class Score:
 
     Attributes:
         raw: against the torque as recorded, at the full rate.
-        filtered: both sides through the parallel decimation's filter.
+        filtered: both sides low-passed to the identification band, at the full rate.
         moving, standing: rows of joints that move, or stand, against the torque as recorded.
         above: (rows,) share of the torque that lies above the identification band, 100 ‖τ - τ_f‖ / ‖τ‖ [%]: noise,
             ripple, elasticity; a floor for `raw` of any model whose prediction stays in the band.
         r_squared: (rows,) of the raw torque.
         whiteness: of the residuals below the band, per row; None for series too short to say.
-        rate: of the filtered series [Hz].
+        rate: of the series whose whiteness was looked at: thinned to its band [Hz].
+        motion_share: part of the rows that move; where it is small, little but friction at rest was tested.
     """
 
     raw: Part
@@ -54,6 +54,7 @@ class Score:
     r_squared: np.ndarray
     whiteness: tuple[Whiteness | None, ...]
     rate: float
+    motion_share: float
 
 
 def score(case: Case, predicted: np.ndarray, slow: float | tuple[float, ...] | None = None) -> Score:
@@ -63,18 +64,19 @@ def score(case: Case, predicted: np.ndarray, slow: float | tuple[float, ...] | N
     target, predicted = np.asarray(case.target), np.asarray(predicted)
     moves = moving(motion) if slow is None else moving(motion, slow)
     moves = np.hstack([moves] * (target.shape[1] // motion.n))
-    low = [decimate(values, motion.decimator, motion.segment) for values in (target, predicted)]
-    index = kept(motion.segment, motion.decimator)
+    low = [in_band(motion, values) for values in (target, predicted)]
+    factor = motion.decimator.factor
     seen = np.repeat(known[:, None], target.shape[1], axis=1)
     return Score(
         part(target, predicted, seen),
-        part(low[0], low[1], np.ones(low[0].shape, dtype=bool)),
+        part(low[0], low[1], seen),
         part(target, predicted, seen & moves),
         part(target, predicted, seen & ~moves),
-        above_band(case),
+        _above(target, low[0]),
         np.array([r_squared(target[known, j], (target - predicted)[known, j]) for j in range(target.shape[1])]),
-        _whiteness(low[0] - low[1], motion.segment[index]),
-        motion.rate / motion.decimator.factor,
+        _whiteness((low[0] - low[1])[::factor], motion.segment[::factor]),
+        motion.rate / factor,
+        float(moves.mean()),
     )
 
 
@@ -89,16 +91,10 @@ def part(target: np.ndarray, predicted: np.ndarray, used: np.ndarray) -> Part:
     return Part(total, np.where(size > 0.0, joints, np.nan), np.where(count > 0, rms, np.nan), int(count.sum()))
 
 
-def above_band(case: Case) -> np.ndarray:
-    """Return the share of the recorded torque above the identification band (rows,) [%]."""
-    motion = case.motion
-    if motion.decimator.factor == 1:
-        return np.zeros(case.target.shape[1])
-    index = kept(motion.segment, motion.decimator)
-    low = decimate(case.target, motion.decimator, motion.segment)
-    raw = np.asarray(case.target)[index]
+def _above(target: np.ndarray, low: np.ndarray) -> np.ndarray:
+    """Return the share of the torque above the band (rows,) [%]."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        share = 100.0 * np.linalg.norm(raw - low, axis=0) / np.linalg.norm(raw, axis=0)
+        share = 100.0 * np.linalg.norm(target - low, axis=0) / np.linalg.norm(target, axis=0)
     return np.where(np.isfinite(share), share, 0.0)
 
 

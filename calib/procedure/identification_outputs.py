@@ -181,7 +181,7 @@ def score_table(found: Score) -> dict[str, Any]:
             else {"outside": w.outside, "ljung_box_p": w.ljung_box_p, "normal_p": w.normal_p, "kurtosis": w.kurtosis}
             for w in found.whiteness
         ],
-        "filtered_rate": found.rate,
+        "motion_share": found.motion_share,
     }
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from calib.data.decimation import SHARE
 from calib.data.excitation import ExcitationReport, repeats, report_excitation
 from calib.data.motion import Motion, make_motion
 from calib.data.recording import Joints
@@ -27,6 +28,8 @@ from calib.robot import description
 from calib.robot.chain import Chain
 from calib.robot.load import load, resolve
 
+LOST = 0.05  # of a recording may fall to the windows of the parallel decimation (our choice)
+WINDOW = 18  # samples per decimation factor that one window needs
 REPEAT = 0.5  # share of states met in training from which on a validation file proves nothing (our choice)
 
 Progress = Callable[[str], None]
@@ -116,10 +119,11 @@ def gather(
     chain, nominal, source = load_robot(robot, base, tip)
     paths = [*map(str, recordings), *map(str, validate)]
     names = case_names(paths)
-    motions = []
+    motions: list[Motion] = []
     for name, path in zip(names, paths):
         say(f"reading {name}")
-        motions.append(read_motion(path, chain, file_settings(options, path)))
+        like = motions[0] if len(motions) >= len(recordings) else None
+        motions.append(read_motion(path, chain, file_settings(options, path), like))
     notes = [f"{name}: {note}" for name, motion in zip(names, motions) for note in motion.notes]
     count = len(recordings)
     found = find_gains(chain, options, dict(zip(paths, motions)), paths[:count], say)
@@ -189,13 +193,28 @@ def read_case(path: str, name: str, motion: Motion, options: IdentifyOptions, fo
     )  # fmt: skip
 
 
-def read_motion(path: str, chain: Chain, own: FileSettings) -> Motion:
-    """Return the motion of a recording, held against the robot's joints and limits."""
+def read_motion(path: str, chain: Chain, own: FileSettings, like: Motion | None = None) -> Motion:
+    """Return the motion of a recording, held against the robot's joints and limits.
+
+    Args:
+        like: a motion whose identification band it is judged in, where the options state none; how far its own
+            positions need filtering, it says itself.
+    """
     joints = Joints(
         chain.joint_names, tuple(joint_kinds(chain)), chain.lower, chain.upper,
         np.array([joint.velocity for joint in chain.joints]), np.array([joint.effort for joint in chain.joints]),
     )  # fmt: skip
-    return make_motion(read_recording(path, joints, own.recording), own.filter)
+    recording = read_recording(path, joints, own.recording)
+    if like is not None and own.filter.band is None and like.band * np.median(np.diff(recording.t)) < 0.4:
+        return make_motion(recording, replace(own.filter, band=like.band * (1.0 - 1e-9)))
+    motion = make_motion(recording, own.filter)
+    widest = LOST * len(motion) / WINDOW  # decimation factor
+    if own.filter.band is not None or motion.decimator.factor <= max(widest, 1.0):
+        return motion
+    band = SHARE * motion.rate / (2 * max(1, int(widest)))
+    wider = make_motion(recording, replace(own.filter, band=min(band, 0.45 * motion.rate)))
+    note = f"f_p = {wider.band:.3g} Hz instead: a short recording must not lose its ends to the decimation's window"
+    return replace(wider, notes=(*motion.notes, note))
 
 
 def check_files(options: IdentifyOptions, paths: Sequence[str]) -> None:
