@@ -66,8 +66,8 @@ def random_fourier(
 ) -> Reference:  # fmt: skip
     """Return a random Fourier motion of one period inside the limits, at rest at both ends.
 
-    Coefficients fall with the harmonic's number; each joint is scaled until its first limit is met, then centred. Rest
-    (v = a = 0) fixes the first sine and cosine. A stand-in for designed excitation, not a replacement.
+    Coefficients fall with the harmonic's number and are projected to rest (Σ k a_k = Σ k² b_k = 0); each joint is scaled
+    until its first limit is met, then centred. A stand-in for designed excitation, not a replacement.
 
     Args:
         lower, upper, velocity: (n,) limits, kept everywhere on the grid of `rate`.
@@ -77,8 +77,8 @@ def random_fourier(
     rng, n = np.random.default_rng(seed), len(lower)
     order = np.arange(1, harmonics + 1)
     sines, cosines = rng.normal(size=(2, n, harmonics)) / order
-    sines[:, 0] = -(sines[:, 1:] * order[1:]).sum(axis=1)
-    cosines[:, 0] = -(cosines[:, 1:] * order[1:] ** 2).sum(axis=1)
+    for rows, across in ((sines, order), (cosines, order**2)):
+        rows -= np.outer(rows @ across, across) / (across @ across)
     base = 2 * np.pi / duration
     raw = fourier(np.zeros(n), sines, cosines, base, duration, rate)
     low, high = raw.q.min(axis=0), raw.q.max(axis=0)
