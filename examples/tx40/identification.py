@@ -13,8 +13,8 @@ set shows it. DIDIM, which uses no measured position at all, is not.
 
 A direct error of least squares is |y - W x| with the noisy W, one of IV is |y - Z x| with the simulated Z: no other
 reading lets IV come out below least squares on its own rows, and the slides' do. It judges robot and controller at
-once: with a wrong controller it grows although the parameters stay right. `torque_error` compares fairly: the noise-free
-torque of another motion, against the truth.
+once: with a wrong controller it grows although the parameters stay right. `torque_error` compares fairly: the torque of
+another motion, noise-free, against the truth. A dash: that estimate could not be simulated along that motion.
 
     python examples/tx40/identification.py --out tx40-study [--quick] [--seed 0]
 """
@@ -94,7 +94,7 @@ def references(quick: bool, seed: int) -> tuple[Reference, list[Reference]]:
     """Return the training motion, the best of a few random ones by condition number, and three others."""
     model = robots.model(robots.plant("tx40", coupled=True, offset=OFFSETS))
     kept = bases.find(model).kept
-    duration = 5.0 if quick else 10.0
+    duration = 8.0 if quick else 10.0
 
     def draw(number: int) -> Reference:
         return random_fourier(-REACH, REACH, SPEED, duration, RATE, 20, acceleration=40.0, seed=[seed, number])
@@ -171,7 +171,7 @@ def judge(
 
     return {
         "direct": {name: relative(*predicted(name, training))[1] for name in values},
-        "cross": {name: [relative(*predicted(name, log))[0] for log in others] for name in values},
+        "cross": {name: [cross(name, log) for log in others] for name in values},
         "torque_error": {name: torque_error(study, others[0].reference, own) for name, own in values.items()},
         "estimated": len(first.columns),
         "rounds": {name: [vars(one) for one in finite(result)] for name, result in results.items()},
@@ -298,7 +298,7 @@ def table(title: str, found: dict[str, Any], slides: dict[str, Any]) -> None:
         for method, errors in found[part].items():
             known = slides.get(part, {}).get(method)
             beside = "" if known is None else "   slides " + " ".join(f"{x:5.1f}" for x in known)
-            print(f"  {part:12} {method:6}" + " ".join(f"{x:6.2f}" for x in errors) + beside)
+            print(f"  {part:12} {method:6}" + " ".join("     -" if x is None else f"{x:6.2f}" for x in errors) + beside)
 
 
 def main() -> None:
