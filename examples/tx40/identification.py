@@ -34,6 +34,7 @@ from calib.data.recording import Recording
 from calib.dynamics import base as bases
 from calib.dynamics.base import Base
 from calib.dynamics.idim import IdentificationModel
+from calib.errors import CalibError
 from calib.estimation.essential import Rule, eliminate
 from calib.estimation.linear import LinearFit, subsystem_std
 from calib.estimation.triangles import collect
@@ -168,6 +169,12 @@ def judge(
             if measured
             else with_simulated(study, log, values[name], controller)
         )
+
+    def cross(name: str, log: Log) -> float | None:
+        try:
+            return relative(*predicted(name, log))[0]
+        except CalibError:  # a poor estimate need not be a possible robot everywhere
+            return None
 
     return {
         "direct": {name: relative(*predicted(name, training))[1] for name in values},
