@@ -12,9 +12,10 @@ from calib.estimation.estimate import Estimate
 from calib.estimation.linear import LinearFit, ols, settled_std, wls
 from calib.estimation.samples import irls, stack
 from calib.estimation.total import tls
-from calib.estimation.triangles import Triangles
+from calib.estimation.triangles import Triangles, residual_squares
 from calib.estimation.whiteness import inflation
-from calib.identification.rows import Rows, pool, segments
+from calib.identification.rows import Rows, pool
+from calib.identification.unseen import estimate
 
 METHODS = ("ols", "wls", "irls", "tls", "iv")
 
@@ -42,12 +43,13 @@ class Fitted:
         return self.fit.estimate
 
 
-def fit_rows(all_rows: Sequence[Rows], data: Triangles, method: str = "wls") -> Fitted:
+def fit_rows(all_rows: Sequence[Rows], data: Triangles, method: str = "wls", exact: bool = True) -> Fitted:
     """Estimate the columns' parameters, with a covariance that knows that residuals are correlated in time.
 
     Args:
         all_rows: of all cases.
         data: their triangles (`rows.triangulate`).
+        exact: False where a prior will decide on what the data leave open.
         method: ``ols``, ``wls``, ``irls`` (across joints, with a gate) or ``tls`` (noise in the columns of accelerations
             in proportion to their size).
     """
@@ -55,6 +57,8 @@ def fit_rows(all_rows: Sequence[Rows], data: Triangles, method: str = "wls") -> 
         raise UsageError(f"method '{method}' is none of {', '.join(METHODS)}")
     rows = all_rows[0].target.shape[1]
     pooled = pool(data, rows)
+    if not exact:
+        return _least_norm(all_rows, pooled, method)
     std = settled_std(pooled)
     first = wls(pooled, std)
     tau = residual_inflation(all_rows, first.estimate.values)
@@ -67,6 +71,20 @@ def fit_rows(all_rows: Sequence[Rows], data: Triangles, method: str = "wls") -> 
     else:
         fit = wls(pooled, std, tau)
     return Fitted(fit, pooled, std, tau, method)
+
+
+def _least_norm(all_rows: Sequence[Rows], pooled: Triangles, method: str) -> Fitted:
+    """Return a fit whose values serve for its residuals alone: a prior will decide what the data leave open."""
+    std, tau = np.ones(pooled.groups), np.ones(pooled.groups)
+    values = np.zeros(pooled.parameters)
+    for _ in range(4):
+        values = estimate(pooled, std, tau, np.full(pooled.parameters, -1))[0]
+        std = np.sqrt(residual_squares(pooled, values) / np.maximum(pooled.rows, 1))
+        std = np.maximum(std, 1e-9 * max(float(std.max()), 1e-300))
+    covariance = np.zeros((pooled.parameters, pooled.parameters))
+    holder = Estimate(pooled.names, pooled.units, values, covariance, 1.0, int(pooled.rows.sum()))
+    tau = residual_inflation(all_rows, values)
+    return Fitted(LinearFit(holder, std, np.inf, np.inf), pooled, std, tau, method)
 
 
 def residual_inflation(all_rows: Sequence[Rows], values: np.ndarray) -> np.ndarray:
@@ -101,8 +119,3 @@ def _tls(pooled: Triangles, std: np.ndarray) -> LinearFit:
     small = 0.01  # of a column's rms: what filtered derivatives miss (our choice)
     noise = np.append(np.where(exact, 0.0, small * size[:p]), 1.0)
     return tls(pooled, noise, std)
-
-
-def spans(part: Rows) -> list[tuple[int, int]]:
-    """Return the runs of one block."""
-    return segments(part.block)

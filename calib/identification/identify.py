@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.data.decimation import Decimator, design_decimator
+from calib.data.excitation import report_excitation
 from calib.dynamics import base as bases
 from calib.dynamics.base import Base
 from calib.dynamics.idim import IdentificationModel, with_terms
@@ -19,10 +20,13 @@ from calib.identification.cases import Case
 from calib.identification.estimators import Fitted, fit_rows, residual_inflation
 from calib.identification.ladder import Climb, Ground, Rung, climb
 from calib.identification.prediction import Dynamics, transmitted
+from calib.identification.prior import Prior, find_prior
 from calib.identification.rows import Rows, extend, observe, observe_terms, pool, triangulate, with_blocks
 from calib.identification.settings import Settings, make_model, per_joint
 from calib.identification.unseen import estimate
 from calib.robot.chain import Chain, sampling_limits
+
+CONDITION = 150.0  # of the observation matrix, unit columns, from which on the prior is used
 
 Progress = Callable[[str], None]
 
@@ -39,7 +43,8 @@ class Identification:
         climb: the friction ladder.
         settings: how.
         rows: what was learnt from.
-        condition: of the observation matrix, in its units and with columns of unit norm.
+        condition: of the observation matrix of the base parameters, in its units and with columns of unit norm.
+        prior: what was known of the base parameters beforehand, where it was used.
     """
 
     dynamics: Dynamics
@@ -50,6 +55,7 @@ class Identification:
     settings: Settings
     rows: tuple[Rows, ...]
     condition: tuple[float, float]
+    prior: Prior | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -90,10 +96,12 @@ def identify(
     std, tau, values = first_fit(rows)
     first = Dynamics(model, bases.to_standard(base, values))
     loads = [transmitted(first, case) for case in cases]
+    prior = _prior(chain, model, base, rows, cases, std, tau, settings)
+    known = None if prior is None else prior.rows
     n = chain.n
     ground = Ground(
         cases, rows, loads, decimator, std, tau, np.array(per_joint(settings.v0, n, "v0")),
-        np.array([joint.kind == "prismatic" for joint in chain.joints]),
+        np.array([joint.kind == "prismatic" for joint in chain.joints]), known,
     )  # fmt: skip
     climbed = climb(ground, settings.friction, progress) if settings.kind == "motor" else Climb((), (), ())
     say("estimate")
@@ -101,15 +109,15 @@ def identify(
         extend(part, climbed.terms, observe_terms(climbed.terms, case, decimator, load))
         for part, case, load in zip(rows, cases, loads)
     ]
-    fitted, condition = _estimate(full, climbed, settings)
+    fitted, condition = _estimate(full, climbed, settings, prior)
     richer = with_terms(model, *climbed.terms)
     values = fitted.estimate.values
     standard = np.concatenate([bases.to_standard(base, values[: base.b]), values[base.b :]])
     standard = _with_payloads(standard, richer, cases, settings)
     say("essential parameters")
-    gone = _essential(fitted, settings)
+    gone = _essential(fitted, settings, prior)
     return Identification(
-        Dynamics(richer, standard), base, fitted, gone, climbed, settings, tuple(full), condition
+        Dynamics(richer, standard), base, fitted, gone, climbed, settings, tuple(full), condition, prior
     )  # fmt: skip
 
 
@@ -169,24 +177,46 @@ def first_fit(rows: Sequence[Rows]) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return std, residual_inflation(rows, values), values
 
 
-def _estimate(rows: Sequence[Rows], climbed: Climb, settings: Settings) -> tuple[Fitted, tuple[float, float]]:
+def _prior(
+    chain: Chain, model: IdentificationModel, base: Base, rows: Sequence[Rows], cases: Sequence[Case],
+    std: np.ndarray, tau: np.ndarray, settings: Settings,
+) -> Prior | None:  # fmt: skip
+    """Return the prior, where it is asked for or the motion is too poor to do without."""
+    if settings.prior == "none" or settings.method not in ("wls", "iv") or settings.kind == "drive":
+        return None
+    data = pool(triangulate(rows), rows[0].target.shape[1])
+    normalised = condition_numbers(data.factors.reshape(-1, data.parameters + 1)[:, :-1])[1]
+    poor = all(report_excitation(case.motion).poor for case in cases)
+    if settings.prior == "auto" and not poor and normalised < CONDITION:
+        return None
+    return find_prior(chain, model, base, data, std, tau, settings.prior)
+
+
+def _estimate(
+    rows: Sequence[Rows], climbed: Climb, settings: Settings, prior: Prior | None
+) -> tuple[Fitted, tuple[float, float]]:
     """Return the final fit; richer friction keeps the ridge that the evidence chose."""
     data = triangulate(rows)
-    fitted = fit_rows(rows, data, settings.method)
-    condition = condition_numbers(fitted.pooled.factors.reshape(-1, data.parameters + 1)[:, :-1])
-    if not climbed.terms or settings.method not in ("wls", "iv"):
+    fitted = fit_rows(rows, data, settings.method, exact=prior is None)
+    more = len(climbed.terms)
+    own = data.parameters - more
+    condition = condition_numbers(fitted.pooled.factors.reshape(-1, data.parameters + 1)[:, :own])
+    if settings.method not in ("wls", "iv") or (not climbed.terms and prior is None):
         return fitted, condition
-    group = np.concatenate([np.full(data.parameters - len(climbed.terms), -1), climbed.groups]).astype(int)
-    _, prior = estimate(fitted.pooled, fitted.std, fitted.inflation, group)
-    prior = np.where(prior > 0.0, prior, 1e-12)
-    drawn: LinearFit = ridge(
-        fitted.pooled, np.zeros(len(prior)), np.diag(prior**2), fitted.std * np.sqrt(fitted.inflation)
-    )  # fmt: skip
+    group = np.concatenate([np.full(own, -1), climbed.groups]).astype(int)
+    known = None if prior is None else np.hstack([prior.rows[:, :-1], np.zeros((own, more)), prior.rows[:, -1:]])
+    _, ridges = estimate(fitted.pooled, fitted.std, fitted.inflation, group, known)
+    covariance = np.diag(np.where(group < 0, np.inf, np.maximum(ridges, 1e-12) ** 2))
+    mean = np.zeros(len(ridges))
+    if prior is not None:
+        covariance[:own, :own], mean[:own] = prior.covariance, prior.mean
+    drawn: LinearFit = ridge(fitted.pooled, mean, covariance, fitted.std * np.sqrt(fitted.inflation))
     return replace(fitted, fit=drawn), condition
 
 
-def _essential(fitted: Fitted, settings: Settings) -> Elimination | None:
-    if settings.essential == "none":
+def _essential(fitted: Fitted, settings: Settings, prior: Prior | None) -> Elimination | None:
+    """Return the elimination; none where the data alone do not determine the base parameters."""
+    if settings.essential == "none" or prior is not None:
         return None
     return eliminate(
         fitted.pooled, Rule(settings.essential), ratio=settings.ratio, level=settings.level, keep=settings.keep,

@@ -23,6 +23,7 @@ from calib.identification.rows import Rows, extend, observe_terms, triangulate
 from calib.identification.unseen import Bench
 
 GAIN = 0.02  # a rung has to lower a joint's rms error on unseen time by this share (our choice)
+WIDTHS = (0.0005, 0.002, 0.008, 0.03)  # of presliding, shares of a joint's travel (our choice)
 WINS = 0.6  # and on this share of the blocks
 RUNGS = ("load", "presliding", "stribeck", "asymmetric", "root", "cubic")
 NAMES = ("auto", "standard", *RUNGS)
@@ -80,6 +81,7 @@ class Ground:
         std, inflation: (rows,) of the first fit's residuals.
         v0: (n,) smoothing of the Coulomb sign.
         linear: (n,) prismatic joints.
+        prior: (k, b + 1) what is known of the base parameters (`calib.identification.prior`); None for nothing.
     """
 
     cases: Sequence[Case]
@@ -90,6 +92,7 @@ class Ground:
     inflation: np.ndarray
     v0: np.ndarray
     linear: np.ndarray
+    prior: np.ndarray | None = None
 
     @property
     def n(self) -> int:
@@ -151,8 +154,6 @@ def _try(
     new = bench.errors(np.array([*base, *taken, *columns]))
     if forced:
         return columns, new, everyone
-    n = bench.rows if bench.rows == len(everyone) else max(everyone, default=0) + 1
-    del n
     at = tuple(j for j in everyone if _pays(error[:, j], new[:, j]))
     if not at:
         return [], error, ()
@@ -186,7 +187,7 @@ def _terms(ground: Ground, name: str) -> list[Term]:
         v0 = float(ground.v0[j])
         terms = {
             "load": lambda: friction.load_dependent(j, v0, viscous=True),  # noqa: B023
-            "presliding": lambda: friction.presliding(j, travel * np.array([0.0005, 0.002, 0.008, 0.03])),  # noqa: B023
+            "presliding": lambda: friction.presliding(j, [travel * x for x in WIDTHS]),  # noqa: B023
             "stribeck": lambda: (
                 *friction.stribeck(j, 0.05 * peak, v0=v0),  # noqa: B023
                 replace(friction.stribeck(j, 0.2 * peak, v0=v0)[0], name=f"Fs{j + 1}.2"),  # noqa: B023
@@ -217,7 +218,16 @@ def _bench(ground: Ground, offered: dict[str, list[Term]], every: list[Term]) ->
         start += len(terms)
         number += 1
     blocks = 1 + max(int(part.block.max(initial=-1)) for part in rows)
-    return Bench(data, rows[0].target.shape[1], blocks, ground.std, ground.inflation, group), place
+    return Bench(
+        data, rows[0].target.shape[1], blocks, ground.std, ground.inflation, group, _padded(ground.prior, len(every))
+    ), place
+
+
+def _padded(prior: np.ndarray | None, more: int) -> np.ndarray | None:
+    """Return the prior's rows with zeros for `more` columns behind the base's."""
+    if prior is None:
+        return None
+    return np.hstack([prior[:, :-1], np.zeros((len(prior), more)), prior[:, -1:]])
 
 
 def _sizes(ground: Ground, bench: Bench) -> np.ndarray:

@@ -24,6 +24,7 @@ class Bench:
         std: (rows,) standard deviation of the residuals.
         inflation: (rows,) how many rows count as one.
         group: (p,) ridge group of each column, -1 for none.
+        prior: (k, p + 1) rows of [W y] that say what is known beforehand, whitened; None for nothing.
     """
 
     data: Triangles
@@ -32,6 +33,7 @@ class Bench:
     std: np.ndarray
     inflation: np.ndarray
     group: np.ndarray
+    prior: np.ndarray | None = None
 
     def errors(self, columns: np.ndarray) -> np.ndarray:
         """Return the squared errors (blocks, rows) on each block of the model with these columns, fitted to the others.
@@ -41,9 +43,10 @@ class Bench:
         chosen = select(self.data, columns)
         group = self.group[columns]
         result = np.zeros((self.blocks, self.rows))
-        every = np.arange(self.blocks)
-        for block in every:
-            values = estimate(pool(chosen, self.rows, every[every != block]), self.std, self.inflation, group)[0]
+        prior = None if self.prior is None else self.prior[:, np.append(columns, -1)]
+        for block in range(self.blocks):
+            others = [other for other in range(self.blocks) if other != block]
+            values = estimate(pool(chosen, self.rows, others), self.std, self.inflation, group, prior)[0]
             squares = residual_squares(chosen, values).reshape(-1, self.rows)
             result[block] = squares[block]
         return result
@@ -54,7 +57,7 @@ class Bench:
 
 
 def estimate(
-    data: Triangles, std: np.ndarray, inflation: np.ndarray, group: np.ndarray
+    data: Triangles, std: np.ndarray, inflation: np.ndarray, group: np.ndarray, prior: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return values (p,) and prior standard deviations (p,; infinite where there is no ridge, 0 where switched off).
 
@@ -63,6 +66,8 @@ def estimate(
     """
     weight = 1.0 / (std * np.sqrt(inflation))
     stacked = (data.factors * weight[:, None, None]).reshape(-1, data.parameters + 1)
+    if prior is not None:
+        stacked = np.vstack([stacked, prior])
     size = np.sqrt(np.sum(stacked[:, :-1] ** 2, axis=0))
     scale = np.where(size > 0.0, size, 1.0)
     scaled = stacked[:, :-1] / scale

@@ -10,6 +10,7 @@ from calib.data.excitation import ExcitationReport
 from calib.data.motion import moving
 from calib.identification.cases import Case
 from calib.identification.identify import Identification
+from calib.identification.prior import resting
 from calib.identification.scores import Score
 from calib.procedure.verdict import Verdict
 
@@ -90,8 +91,20 @@ def warnings(
             f"condition number {normalised:.0f} (columns of unit norm): the motion tells some parameters apart badly; "
             "design an excitation"
         )
+    told += _rests(found)
     told += _slow_bias(cases, found)
     return tuple(dict.fromkeys(told))
+
+
+def _rests(found: Identification) -> list[str]:
+    """Say which parameters the motion does not tell."""
+    if found.prior is None:
+        return []
+    on = resting(found.prior, found.fitted.estimate.covariance)
+    names = [name for name, rests in zip(found.base.names, on) if rests]
+    source = "the robot's own inertias" if found.prior.source == "cad" else "nothing but the order of their sizes"
+    told = f"not identifiable from this motion, drawn to {source} (f = {found.prior.scale:.2g}; {len(names)} of {found.base.b}): {', '.join(names)}"
+    return [told] if names else []
 
 
 def _slow_bias(cases: Sequence[Case], found: Identification) -> list[str]:
