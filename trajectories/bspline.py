@@ -47,6 +47,18 @@ class BSpline:
         """Return the variables nearest to given control points."""
         return projected(self.freedoms, coefficients)
 
+    def evaluate(self, x: np.ndarray, times: np.ndarray, order: int) -> np.ndarray:
+        """Return d^r q / dt^r (N, n) from the control points by de Boor's recursion, without the tables."""
+        result = np.zeros((len(times), self.n))
+        for j, (count, points) in enumerate(zip(self.counts, self.coefficients(x))):
+            if count == 1:
+                result[:, j] = points[0] if order == 0 else 0.0
+                continue
+            knots = self.period / count * np.arange(-self.degree, count + self.degree + 1)
+            whole = ScipyBSpline(knots, np.concatenate([points, points[: self.degree]]), self.degree)
+            result[:, j] = whole(np.mod(times, self.period), nu=order)
+        return result
+
     def largest(self, x: np.ndarray, order: int) -> np.ndarray:
         """Return a bound (n,) on abs(d^r q / dt^r): the largest control point of the r-th derivative.
 
@@ -78,14 +90,14 @@ def bspline(
     """Return the family of periodic splines with `points` control points (one number, or (n,); 1 locks a joint).
 
     Args:
-        degree: 4 or more, so that the jerk is continuous at 5.
+        degree: 5 or more, so that the jerk has no kinks.
         period, joints, rest, start, rate: as of `trajectories.fourier.fourier`.
     """
     counts = tuple(int(k) for k in (np.full(joints or 0, points) if np.ndim(points) == 0 else points))  # type: ignore[arg-type]
     if not counts or any(c != 1 and c <= degree for c in counts) or max(counts) == 1:
         raise BadInput(f"control points {points} for {joints} joints: expected more than the degree {degree} (or 1)")
-    if degree < 4:
-        raise BadInput(f"degree {degree}: 4 at least, or the jerk is no function of time")
+    if degree < 5:
+        raise BadInput(f"degree {degree}: 5 at least, or the jerk has kinks and nothing bounds it between samples")
     if not np.isfinite(period) or period <= 0:
         raise BadInput(f"period {period} s: expected a positive number")
     if rate is not None:

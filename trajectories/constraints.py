@@ -310,17 +310,19 @@ def gathered(
         tightening: added to every value, as a share of its scale.
     """
     scaled = constraint.values(motion) / constraint.scale + tightening
-    groups = constraint.groups
-    count = int(groups.max()) + 1
-    c, slopes = np.empty(count), np.zeros((count, 4, *motion.q.shape))
+    groups, count = constraint.groups, int(constraint.groups.max()) + 1
+    c, rows, weights = np.empty(count), list[np.ndarray](), list[np.ndarray]()
     for r in range(count):
         columns = np.flatnonzero(groups == r)
         top = scaled[:, columns].max()
         shares = np.exp(sharpness * (scaled[:, columns] - top))
         total = shares.sum()
         c[r] = top + np.log(total) / sharpness
-        rows = np.flatnonzero(shares.max(axis=1) > 1e-12 * total)
-        weights = np.zeros((len(rows), len(groups)))
-        weights[:, columns] = shares[rows] / total / constraint.scale[columns]
-        slopes[r][:, rows] = constraint.slopes(motion.part(rows), weights)
+        rows.append(np.flatnonzero(shares.max(axis=1) > 1e-12 * total))  # the others do not count to twelve digits
+        weights.append(np.zeros((len(rows[-1]), len(groups))))
+        weights[-1][:, columns] = shares[rows[-1]] / total / constraint.scale[columns]
+    found = constraint.slopes(motion.part(np.concatenate(rows)), np.concatenate(weights))
+    slopes = np.zeros((count, 4, *motion.q.shape))
+    for r, part in enumerate(np.split(found, np.cumsum([len(row) for row in rows])[:-1], axis=1)):
+        slopes[r][:, rows[r]] = part
     return c, slopes, float(scaled.max())

@@ -46,6 +46,10 @@ class Fourier:
         """Return the variables nearest to given coefficients."""
         return projected(self.freedoms, coefficients)
 
+    def evaluate(self, x: np.ndarray, times: np.ndarray, order: int) -> np.ndarray:
+        """Return d^r q / dt^r (N, n) from eq. 23 term by term, without the tables."""
+        return evaluate(self.coefficients(x), self.period, times, order)
+
     def largest(self, x: np.ndarray, order: int) -> np.ndarray:
         """Return a bound (n,) on abs(d^r q / dt^r) over all times, r ≥ 1: Σ_k (k ω0)^r √(a_k² + b_k²)."""
         bounds = []

@@ -27,7 +27,7 @@ from trajectories.problem import (
     is_condition,
     merit,
     stretched,
-    terms,
+    unmet,
 )  # fmt: skip
 
 Method = Literal["slsqp", "auglag", "mma"]
@@ -64,11 +64,17 @@ class Found:
 
 @dataclass(frozen=True, eq=False)
 class Stuck:
-    """A start that never became feasible: the largest excess over its constraint's scale, and what a search cost."""
+    """A start that never became feasible.
+
+    Attributes:
+        x, factor: of the motion that broke the constraints least.
+        excess: of its constraints over their scales, and of its hard goals over theirs.
+        evaluations: what the search cost; `reason`: why NLopt ended, where it says so.
+    """
 
     x: np.ndarray
     factor: float
-    excess: float
+    excess: tuple[float, float]
     evaluations: int
     reason: str = ""
 
@@ -143,11 +149,13 @@ def one_start(problem: Problem, evaluations: int, method: Method, seed: int, sta
     else:
         y = np.asarray(start, dtype=float)
         y = np.append(y, np.clip(1.0, *problem.stretch)) if problem.free_period and len(y) == run.basis.p else y
+    stages = STAGES if isinstance(start, int | np.integer) else STAGES[1:]  # a guess is not to be led far away
+    run.sharpness = stages[0]
     try:
         y = run.repaired(y)
-        for stage, sharpness in enumerate(STAGES):
+        for stage, sharpness in enumerate(stages):
             run.sharpness = sharpness
-            run.solve(run.best if run.best is not None and stage else y, evaluations // len(STAGES), method)
+            y = run.solve(run.best if run.best is not None and stage else y, evaluations // len(stages), method)
     except KeyboardInterrupt:
         if run.best is None:
             raise
@@ -156,6 +164,7 @@ def one_start(problem: Problem, evaluations: int, method: Method, seed: int, sta
     p = run.basis.p
     if run.best is None:
         nearest = run.nearest if run.nearest is not None else y
+        factor = float(nearest[p]) if problem.free_period else factor
         return Stuck(nearest[:p], factor, run.least, run.count, run.reason)
     seconds, share = time.perf_counter() - began, run.kept / run.count
     label = int(start) if isinstance(start, int | np.integer) else -1
@@ -211,7 +220,7 @@ class _Run:
         self.sharpness = STAGES[0]
         self.best: np.ndarray | None = None
         self.nearest: np.ndarray | None = None
-        self.merit, self.least = np.inf, np.inf
+        self.merit, self.least = np.inf, (np.inf, np.inf)
         self.values = np.zeros(0)
         self.history: list[float] = []
         self.count = self.kept = 0
@@ -229,8 +238,9 @@ class _Run:
         return self._evaluation
 
     def _remember(self, y: np.ndarray, found: Evaluation) -> None:
-        if found.excess < self.least:
-            self.least, self.nearest = found.excess, y
+        lacking = (max(found.excess, 0.0), unmet(self.problem, found.values)[0])
+        if lacking < self.least:
+            self.least, self.nearest = lacking, y
         if found.excess > 1e-7:
             return
         self.kept += 1
@@ -277,7 +287,7 @@ class _Run:
         self._bound(solver, len(start))
         solver.set_ftol_rel(1e-5)
         solver.set_maxeval(evaluations)
-        return self._optimised(solver, start)
+        return self._optimised(solver, start)[: len(y)]
 
     def _bound(self, solver: nlopt.opt, size: int) -> None:
         if self.problem.free_period:
@@ -342,15 +352,23 @@ def _nothing(problem: Problem, stuck: list[Stuck]) -> NothingFeasible:
     """Return the error that names the constraint which was in the way."""
     best = min(stuck, key=lambda one: one.excess)
     motion = stretched(problem.basis().motion(best.x), best.factor)
+    if best.excess[0] <= 0.0 and problem.goals:
+        values = exact_values(problem, motion, problem.regressor(motion.q, motion.v, motion.a))
+        lacking, goal, value = unmet(problem, values)
+        assert goal is not None  # the search kept every limit, so a hard goal stood in its way
+        return NothingFeasible(
+            f"the hard goal {goal.objective.name} ≤ {goal.goal:g} was not reached in {len(stuck)} starts, though all "
+            f"limits were kept: the nearest motion has {value:.4g}; ease it, give it a weight, or take a longer period",
+            goal.objective.name, lacking, "of the goal",
+        )  # fmt: skip
     worst = max(problem.constraints, key=lambda c: float((c.values(motion) / c.scale).max()), default=None)
     if worst is None:
         raise NotExciting(f"no motion could be evaluated: {best.reason}")
     values = worst.values(motion)
     row, column = np.unravel_index(np.argmax(values / worst.scale), values.shape)
     excess = float(values[row, column])
-    words = ", ".join(one.name for one in terms(problem))
     return NothingFeasible(
-        f"no feasible motion in {len(stuck)} starts ({words}): the nearest one breaks the {worst.name} limit "
+        f"no feasible motion in {len(stuck)} starts: the nearest one breaks the {worst.name} limit "
         f"({worst.labels[column]}) by {max(excess, 0.0):.3g} {worst.unit} at t = {motion.times[row]:.3g} s; widen that "
         "limit, take a longer period, or allow more starts",
         worst.name, excess, worst.unit,

@@ -36,7 +36,7 @@ class Goal:
     def attainment(self, value: float) -> float:
         """Return the γ at which F = value just meets the goal; 0 or infinite where the goal is hard."""
         if self.share == 0:
-            return -np.inf if value <= self.goal * (1 + 1e-9 * np.sign(self.goal)) else np.inf
+            return -np.inf if value <= self.goal + 1e-6 * max(abs(self.goal), 1e-3) else np.inf
         return (value - self.goal) / self.share
 
 
@@ -157,6 +157,16 @@ def merit(problem: Problem, values: np.ndarray) -> float:
     for (objective, weight), value in zip(problem.objectives, values):
         total += weight * (np.log(value) if is_condition(objective) else value)
     return float(total)
+
+
+def unmet(problem: Problem, values: np.ndarray) -> tuple[float, Goal | None, float]:
+    """Return by how much the worst hard goal is missed, as a share of it, that goal, and its value; or zeros."""
+    worst: tuple[float, Goal | None, float] = (0.0, None, 0.0)
+    for goal, value in zip(problem.goals, values):
+        lacking = (value - goal.goal) / max(abs(goal.goal), 1e-3)
+        if goal.share == 0 and lacking > worst[0]:
+            worst = (float(lacking), goal, float(value))
+    return worst
 
 
 def stretched(motion: Motion, factor: float) -> Motion:

@@ -1,0 +1,247 @@
+"""The search: feasible means feasible, exact gradients pay, goals are attained, and failure is named."""
+
+from __future__ import annotations
+
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache, partial
+
+import excited_arm as arm
+import numpy as np
+import pytest
+
+from calib.dynamics import model
+from calib.dynamics.tree import standard_parameters
+from trajectories import optimise
+from trajectories.bspline import bspline
+from trajectories.constraints import BoxLimit, TorqueLimit, Workspace, box_limits
+from trajectories.errors import BadInput, NotExciting, NothingFeasible
+from trajectories.fourier import fourier
+from trajectories.objectives import Duration, Excitation, FrictionCoverage, TorqueSlack, condition_numbers
+from trajectories.optimise import Found, Stuck, design, one_start
+from trajectories.pareto import non_dominated, proposed_goals, sweep
+from trajectories.problem import Goal, Problem
+from trajectories.verify import dense_motion, ensured, verify
+
+BASE, CHI, CHAIN = arm.lwr()
+EFFORT = np.array([joint.effort for joint in CHAIN.joints])
+VELOCITY = np.array([joint.velocity for joint in CHAIN.joints])
+SLACK = TorqueSlack((5, 6), CHI, EFFORT)
+
+
+def limits(radius: float = 0.3, lowest: float = -0.2) -> tuple:
+    points, product = arm.tool(CHAIN)
+    return (
+        *box_limits(CHAIN.lower, CHAIN.upper, VELOCITY),
+        TorqueLimit(BASE.regressor, BASE.regressor_gradient, CHI, EFFORT),
+        Workspace(points, product, radius=radius, lowest=lowest),
+    )
+
+
+def problem(**options) -> Problem:
+    given = {"family": fourier(4, 15.0, 7), "constraints": limits(), "samples": 90} | options
+    return Problem(regressor=BASE.regressor, product=BASE.regressor_gradient, **given)
+
+
+@cache
+def designed() -> tuple[Problem, Found]:
+    spot = problem()
+    return spot, design(spot, starts=1, evaluations=150, seed=1)
+
+
+def test_the_motion_found_keeps_every_limit_everywhere_by_pinocchio_too():
+    spot, found = designed()
+    found, proof = ensured(spot, found)
+    assert proof.feasible and found.merit < np.log(60.0)
+    assert max(proof.rest) < 1e-9
+    assert {one.name for one in proof.margins} == {"position", "velocity", "torque", "workspace"}
+    motion = dense_motion(spot.family, found.x, np.linspace(0, 15, 1501))
+    assert (motion.q <= CHAIN.upper).all() and (motion.q >= CHAIN.lower).all()
+    assert (np.abs(motion.v) <= VELOCITY).all()
+    friction = np.array(arm.FV) * motion.v + np.array(arm.FC) * np.tanh(motion.v / 0.05)
+    torque = model.inverse_dynamics(CHAIN, standard_parameters(CHAIN), *motion.orders[:3]) + friction
+    assert (np.abs(torque) <= EFFORT).all()
+    tool = arm.tool_points(CHAIN, motion.q)[:, 0]
+    assert np.hypot(tool[:, 0], tool[:, 1]).min() >= 0.3 and tool[:, 2].min() >= -0.2
+    least = proof.worst["torque"]
+    assert least.margin == pytest.approx((EFFORT - np.abs(torque))[:, int(least.label[6]) - 1].min(), abs=0.5)
+
+
+def test_the_same_seed_gives_the_same_motion_also_through_a_map():
+    spot, found = designed()
+    with ThreadPoolExecutor(2) as pool:
+        again = design(spot, starts=1, evaluations=150, seed=1, map=pool.map)
+    assert np.array_equal(found.x, again.x) and found.evaluations == again.evaluations
+    pickle.loads(pickle.dumps(partial(one_start, spot, 100, "slsqp", 0)))
+
+
+def test_history_falls_and_ends_at_the_merit():
+    _, found = designed()
+    assert all(one > two for one, two in zip(found.history, found.history[1:]))
+    assert found.history[-1] == found.merit and 0 < found.feasible <= 1
+
+
+def test_the_search_beats_random_motions():
+    spot, found = designed()
+    basis, rng = spot.basis(), np.random.default_rng(0)
+    values = []
+    for _ in range(60):
+        motion = basis.motion(optimise.random_start(spot, basis, rng))
+        values.append(condition_numbers(BASE.regressor(motion.q, motion.v, motion.a))["raw"])
+    assert found.values[0] < 0.5 * min(values)
+
+
+@pytest.mark.parametrize("method", ["auglag", "mma"])
+def test_the_other_methods_improve_their_start_too(method):
+    spot = problem()
+    run = one_start(spot, 120, method, 1, 0)
+    assert isinstance(run, Found) and run.merit < run.history[0] - 1.0
+    assert ensured(spot, run)[1].feasible
+
+
+def test_splines_are_a_family_like_any_other():
+    spot = problem(family=bspline(12, 15.0, 7))
+    run = one_start(spot, 120, "slsqp", 1, 0)
+    assert isinstance(run, Found) and run.merit < run.history[0] - 1.0
+    _, proof = ensured(spot, run)
+    assert proof.feasible and max(proof.rest) < 1e-6
+
+
+def test_goals_are_attained_within_gamma():
+    spot = problem(goals=(Goal(Excitation("cond", "normalised"), 20.0), Goal(SLACK, 0.85, 0.0)))
+    run = design(spot, starts=1, evaluations=150, seed=1, guesses=(designed()[1].x,))
+    assert run.values[1] <= 0.85 + 1e-6
+    assert run.merit == pytest.approx(run.values[0] / 20.0 - 1.0)
+    assert run.merit < 0.0
+
+
+def test_a_hard_goal_out_of_reach_is_named():
+    spot = problem(goals=(Goal(Excitation(), 30.0), Goal(SLACK, 0.1, 0.0)))
+    with pytest.raises(NothingFeasible, match=r"torque slack of joints 6, 7.*0\.1"):
+        design(spot, starts=1, evaluations=60)
+
+
+def test_a_free_period_is_shortened_down_to_a_limit():
+    spot = problem(
+        goals=(Goal(Duration(), 10.0), Goal(Excitation("cond", "normalised"), 15.0, 0.0)), stretch=(0.4, 2.0)
+    )
+    run = design(spot, starts=1, evaluations=150, seed=1, guesses=(designed()[1].x,))
+    assert run.factor < 0.95 and run.values[0] == pytest.approx(15.0 * run.factor)
+    assert run.values[1] <= 15.0 * (1 + 1e-5)
+    proof = verify(spot.family, run.x, spot.constraints, factor=run.factor)
+    assert proof.feasible
+    assert min(one.share for one in proof.margins) < 0.1
+
+
+def test_the_next_motion_complements_what_was_recorded():
+    spot, first = designed()
+    motion = spot.basis().motion(first.x)
+    W = BASE.regressor(motion.q, motion.v, motion.a).transpose(1, 0, 2).reshape(-1, 64)
+    known = Excitation("cond", existing=W.T @ W)
+    second = design(problem(objectives=((known, 1.0),)), starts=1, evaluations=120, seed=2)
+    alone = condition_numbers(BASE.regressor(motion.q, motion.v, motion.a))["raw"]
+    assert second.values[0] < 0.9 * alone
+
+
+def test_single_objectives_propose_goals_and_a_front_trades_them():
+    spot, first = designed()
+    motion = spot.basis().motion(first.x)
+    begin = SLACK.evaluate(motion, BASE.regressor(motion.q, motion.v, motion.a)).value
+    (least, run), *_ = proposed_goals(problem(samples=40), [SLACK], starts=1, evaluations=90, seed=1)
+    assert least < begin - 0.003 and run.values[0] == least
+    levels = [begin, (begin + least) / 2, 0.5 * least]  # the last is out of reach
+    front = sweep(spot, Excitation("cond", "normalised"), SLACK, levels, first.x, evaluations=80)
+    assert front.values.shape == (2, 2) and (front.values[:, 1] <= np.array(levels[:2]) + 1e-5).all()
+    assert front.best.any()
+
+
+def test_coverage_alone_reaches_its_shares():
+    coverage = FrictionCoverage(0.05 * VELOCITY, 0.4 * VELOCITY, wanted=0.05)
+    run = design(problem(samples=60, objectives=((coverage, 1.0),)), starts=1, evaluations=60, seed=1)
+    assert run.merit < 0.05 < run.history[0]
+
+
+def test_domination():
+    assert non_dominated(np.array([[1.0, 3.0], [2.0, 2.0], [2.0, 3.0], [1.0, 3.0]])).tolist() == [
+        True,
+        True,
+        False,
+        True,
+    ]
+
+
+def test_nothing_feasible_names_the_constraint_and_the_excess():
+    with pytest.raises(NothingFeasible, match=r"workspace limit \(tool lowest\) by 0\.\d+ m") as caught:
+        design(problem(constraints=limits(lowest=1.5)), starts=2, evaluations=30)
+    assert caught.value.constraint == "workspace" and 0.6 < caught.value.excess < 1.0
+    pickle.loads(pickle.dumps(caught.value))
+
+
+def test_a_start_outside_the_limits_is_infeasible_by_what_it_lacks():
+    start = np.array([0.0, 0.8, 0.0, -1.0, 0.0, 2.3, 0.0])  # joint 6 may go to 2.094
+    spot = problem(family=fourier(4, 15.0, 7, start=start))
+    with pytest.raises(NothingFeasible, match=r"position limit \(joint 6 upper\) by 0\.2\d* rad at t = 0 s"):
+        design(spot, starts=1, evaluations=30)
+
+
+def test_a_locked_joint_leaves_columns_without_information():
+    with pytest.raises(NotExciting, match="zero along the whole motion"):
+        design(problem(family=fourier((4, 4, 0, 4, 4, 4, 4), 15.0)), starts=1, evaluations=30)
+
+
+def test_interrupting_keeps_the_best_so_far():
+    calls = []
+
+    def regressor(q, v, a):
+        calls.append(1)
+        if len(calls) == 150:
+            raise KeyboardInterrupt
+        return BASE.regressor(q, v, a)
+
+    spot = Problem(fourier(4, 15.0, 7), regressor, BASE.regressor_gradient, constraints=limits(), samples=60)
+    found = design(spot, starts=5, evaluations=600, seed=1)
+    assert found.interrupted and len(calls) == 150 and found.merit < found.history[0]
+
+
+def test_verification_finds_what_happens_between_samples():
+    family = fourier(8, 8.0, 1)
+    x = family.random(np.random.default_rng(0), np.zeros(1), np.ones(1))
+    peak = np.abs(family.evaluate(x, np.linspace(0, 8, 100_001), 1)).max()
+    box = BoxLimit(1, np.array([-peak]), np.array([peak]))
+    for instants in (50, 500):
+        report = verify(family, x, [box], instants=instants)
+        assert not report.feasible or min(one.margin for one in report.margins) < 1e-9
+        assert min(one.margin for one in report.margins) > -0.2 * peak * (50 / instants) ** 2
+    coarse = np.abs(family.evaluate(x, np.linspace(0, 8, 51), 1)).max()
+    assert coarse < peak  # the samples alone would have called it feasible
+
+
+def test_a_motion_infeasible_between_coarse_samples_is_searched_again():
+    spot = problem(samples=24, tightening=0.0)
+    run = one_start(spot, 120, "slsqp", 1, 0)
+    assert isinstance(run, Found)
+    assert not verify(spot.family, run.x, spot.constraints).feasible
+    again, proof = ensured(spot, run)
+    assert proof.feasible and again.evaluations > run.evaluations
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: box_limits(CHAIN.lower, CHAIN.upper, 0 * VELOCITY), "velocity limit of joint 1 is 0"),
+        (lambda: design(problem(), method="newton"), "none of slsqp"),  # type: ignore[arg-type]
+        (lambda: design(problem(), starts=0), "no starts"),
+        (lambda: problem(samples=3), "8 or more"),
+        (lambda: problem(objectives=()), "nothing to design"),
+        (lambda: problem(stretch=(2.0, 1.0)), "smaller first"),
+        (lambda: Goal(SLACK, np.nan), "expected a number"),
+    ],
+)
+def test_refusals(make, words):
+    with pytest.raises(BadInput, match=words):
+        make()
+
+
+def test_stuck_is_not_found():
+    run = one_start(problem(constraints=limits(lowest=1.5)), 10, "slsqp", 0, 0)
+    assert isinstance(run, Stuck) and run.excess[0] > 0
