@@ -15,12 +15,12 @@ from calib.dynamics.idim import IdentificationModel, with_terms
 from calib.errors import MeasurementError, UsageError
 from calib.estimation.essential import Elimination, Rule, eliminate
 from calib.estimation.linear import LinearFit, ridge
-from calib.estimation.triangles import condition_numbers
+from calib.estimation.triangles import Triangles, combine, condition_numbers, retriangulate
 from calib.identification.cases import Case
 from calib.identification.estimators import Fitted, fit_rows, residual_inflation
 from calib.identification.ladder import Climb, Ground, Rung, climb
 from calib.identification.prediction import Dynamics, transmitted
-from calib.identification.prior import Prior, find_prior
+from calib.identification.prior import Prior, bounded, find_prior
 from calib.identification.rows import Rows, extend, observe, observe_terms, pool, triangulate, with_blocks
 from calib.identification.settings import Settings, make_model, per_joint
 from calib.identification.unseen import estimate
@@ -85,6 +85,11 @@ def identify(
     settings, say = settings or Settings(), progress or (lambda words: None)
     if not cases:
         raise UsageError("no recording to identify from")
+    if settings.method == "iv":
+        raise UsageError(
+            "method 'iv' simulates the closed loop and needs its controller and reference, which a recording does not "
+            "hold: see calib.identification.instrumental for scripts; from a recording alone use wls or irls"
+        )
     model = make_model(chain, settings)
     say("base parameters")
     base = find_base(chain, model, settings, nominal, cases)
@@ -103,7 +108,8 @@ def identify(
         cases, rows, loads, decimator, std, tau, np.array(per_joint(settings.v0, n, "v0")),
         np.array([joint.kind == "prismatic" for joint in chain.joints]), known,
     )  # fmt: skip
-    climbed = climb(ground, settings.friction, progress) if settings.kind == "motor" else Climb((), (), ())
+    friction = "standard" if settings.friction == "auto" and _all_poor(cases) else settings.friction
+    climbed = climb(ground, friction, progress) if settings.kind == "motor" else Climb((), (), ())
     say("estimate")
     full = [
         extend(part, climbed.terms, observe_terms(climbed.terms, case, decimator, load))
@@ -182,12 +188,11 @@ def _prior(
     std: np.ndarray, tau: np.ndarray, settings: Settings,
 ) -> Prior | None:  # fmt: skip
     """Return the prior, where it is asked for or the motion is too poor to do without."""
-    if settings.prior == "none" or settings.method not in ("wls", "iv") or settings.kind == "drive":
+    if settings.prior == "none" or settings.method != "wls" or settings.kind == "drive":
         return None
     data = pool(triangulate(rows), rows[0].target.shape[1])
     normalised = condition_numbers(data.factors.reshape(-1, data.parameters + 1)[:, :-1])[1]
-    poor = all(report_excitation(case.motion).poor for case in cases)
-    if settings.prior == "auto" and not poor and normalised < CONDITION:
+    if settings.prior == "auto" and not _all_poor(cases) and normalised < CONDITION:
         return None
     return find_prior(chain, model, base, data, std, tau, settings.prior)
 
@@ -201,7 +206,7 @@ def _estimate(
     more = len(climbed.terms)
     own = data.parameters - more
     condition = condition_numbers(fitted.pooled.factors.reshape(-1, data.parameters + 1)[:, :own])
-    if settings.method not in ("wls", "iv") or (not climbed.terms and prior is None):
+    if settings.method != "wls" or (not climbed.terms and prior is None):
         return fitted, condition
     group = np.concatenate([np.full(own, -1), climbed.groups]).astype(int)
     known = None if prior is None else np.hstack([prior.rows[:, :-1], np.zeros((own, more)), prior.rows[:, -1:]])
@@ -210,8 +215,28 @@ def _estimate(
     mean = np.zeros(len(ridges))
     if prior is not None:
         covariance[:own, :own], mean[:own] = prior.covariance, prior.mean
-    drawn: LinearFit = ridge(fitted.pooled, mean, covariance, fitted.std * np.sqrt(fitted.inflation))
+    std = fitted.std * np.sqrt(fitted.inflation)
+    drawn: LinearFit = ridge(fitted.pooled, mean, covariance, std)
+    if prior is not None:
+        drawn = _bounded(drawn, fitted.pooled, std, mean, covariance)
     return replace(fitted, fit=drawn), condition
+
+
+def _all_poor(cases: Sequence[Case]) -> bool:
+    """Say whether no case can tell parameters apart: then blocks of time repeat each other, and judge nothing."""
+    return all(report_excitation(case.motion).poor for case in cases)
+
+
+def _bounded(drawn: LinearFit, data: Triangles, std: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> LinearFit:
+    """Return the fit with drive parameters that are not negative; the covariance is that without the bounds."""
+    known = np.isfinite(np.diag(covariance))
+    unit = np.sqrt(np.diag(covariance)[known])
+    lower = np.linalg.cholesky(covariance[np.ix_(known, known)] / np.outer(unit, unit) + 1e-9 * np.eye(len(unit)))
+    rows = np.zeros((len(unit), data.parameters + 1))
+    rows[:, np.flatnonzero(known)] = np.linalg.solve(lower, np.diag(1.0 / unit))
+    rows[:, -1] = rows[:, :-1] @ mean
+    values = bounded(retriangulate(np.vstack([combine(data, std), rows])), data.names)
+    return replace(drawn, estimate=replace(drawn.estimate, values=values))
 
 
 def _essential(fitted: Fitted, settings: Settings, prior: Prior | None) -> Elimination | None:

@@ -7,15 +7,19 @@ where the marginal likelihood of the data is largest,
 
 with [R z] the triangle of the whitened [W y], μ and P the prior's mean and covariance (MacKay 1992). Directions that the
 motion tells well do not feel the prior; those that it does not tell stay at the CAD's values. It does not make the
-parameters those of possible bodies: that is the semidefinite fit of another module.
+parameters those of possible bodies: that is the semidefinite fit of another module; but with a prior, `bounded` keeps inertia and
+friction of the drives from being negative.
 """
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
+import scipy.optimize
 
 from calib.arrays import frozen
 from calib.dynamics.base import Base
@@ -25,12 +29,14 @@ from calib.errors import UsageError
 from calib.estimation.triangles import Triangles, retriangulate
 from calib.robot.chain import Chain
 
+POSITIVE = re.compile(r"(Ia|Fv|Fc|Fvm|Fcm|Fvl|Fcl)\d+")
 SCALES = tuple(float(10.0 ** (k / 4)) for k in range(-6, 7))  # f from 0.03 to 30
 MOST = 1.0  # largest f of a CAD prior: what no model explains must not pass for a wrong CAD (our choice)
 SPREAD = 0.3  # of a CAD value: standard deviation at f = 1 (our choice)
 LEVER = 0.03  # of a centre of mass [m]
 RADIUS = 0.08  # of gyration [m]
 DRIVES = 3.0  # terms without CAD: standard deviation in units of what would explain all of the torque
+ROTOR = 0.15  # [m]: motor inertias are of the order of the robot's mass times its square, seen from the joint
 TOLD = 0.5  # a parameter whose variance the data lower by less than this share rests on the prior
 
 
@@ -116,6 +122,8 @@ def _shape(
         if k >= len(own):  # drives, payloads
             covariance[row, :] = covariance[:, row] = 0.0
             covariance[row, row] = (DRIVES * size[row]) ** 2
+            if base.standard[k].startswith("Ia"):
+                covariance[row, row] = min(covariance[row, row], (float(own[9::10].sum()) * ROTOR**2) ** 2)
     return mean, covariance, "cad"
 
 
@@ -128,3 +136,17 @@ def _evidence(factor: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> f
     lower = np.linalg.cholesky(c)
     white = scipy.linalg.solve_triangular(lower, rest, lower=True)
     return float(-np.log(np.diag(lower)).sum() - 0.5 * white @ white)
+
+
+def bounded(factor: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """Return argmin ‖R x - z‖² with motor inertias, viscous and Coulomb friction not negative.
+
+    Args:
+        factor: (p + 1, p + 1) triangle of data and prior, whitened.
+        names: (p,).
+    """
+    p = len(names)
+    lower = np.array([0.0 if POSITIVE.fullmatch(name) else -np.inf for name in names])
+    norms = np.linalg.norm(factor[:p, :p], axis=0)
+    found = scipy.optimize.lsq_linear(factor[:p, :p] / norms, factor[:p, p], (lower, np.inf), method="bvls")
+    return found.x / norms

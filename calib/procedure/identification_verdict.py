@@ -91,6 +91,8 @@ def warnings(
             f"condition number {normalised:.0f} (columns of unit norm): the motion tells some parameters apart badly; "
             "design an excitation"
         )
+    if excitation and all(report.poor for report in excitation.values()) and found.settings.friction == "auto":
+        told.append("friction: standard only, since on so poor a motion no block of time judges another")
     told += _rests(found)
     told += _slow_bias(cases, found)
     return tuple(dict.fromkeys(told))
