@@ -91,6 +91,7 @@ def identify(
             "hold: see calib.identification.instrumental for scripts; from a recording alone use wls or irls"
         )
     model = make_model(chain, settings)
+    _require_motion(cases)
     say("base parameters")
     base = find_base(chain, model, settings, nominal, cases)
     decimator = common_decimator(cases, settings)
@@ -247,6 +248,14 @@ def _essential(fitted: Fitted, settings: Settings, prior: Prior | None) -> Elimi
         fitted.pooled, Rule(settings.essential), ratio=settings.ratio, level=settings.level, keep=settings.keep,
         drop=settings.drop, std=fitted.std, inflation=fitted.inflation,
     )  # fmt: skip
+
+
+def _require_motion(cases: Sequence[Case]) -> None:
+    """Refuse cases to learn from in which the robot stands (our choice: less than a milliradian or millimetre)."""
+    if all((np.ptp(case.motion.q, axis=0) < 1e-3).all() for case in cases):
+        raise MeasurementError(
+            "no joint moves: that tells of gravity in one pose, and nothing else", cases[0].motion.file
+        )
 
 
 def _require_enough(rows: Sequence[Rows], base: Base) -> None:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.data.motion import in_band, moving
-from calib.errors import MeasurementError
 from calib.estimation.whiteness import Whiteness, examine, r_squared
 from calib.identification.cases import Case
 from calib.identification.rows import segments
@@ -107,9 +106,3 @@ def _whiteness(residual: np.ndarray, segment: np.ndarray) -> tuple[Whiteness | N
         enough = len(column) > 40 and np.ptp(column) > 0.0
         found.append(examine(column, min(30, len(column) // 2)) if enough else None)
     return tuple(found)
-
-
-def require_moving(case: Case) -> None:
-    """Refuse a case without any motion."""
-    if not (np.ptp(case.motion.q, axis=0) > 0.0).any():
-        raise MeasurementError("no joint moves in this recording", case.motion.file)

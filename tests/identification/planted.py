@@ -1,0 +1,108 @@
+"""An arm of three joints with known dynamics, moved along Fourier series, and its recordings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from calib.data.motion import FilterOptions, make_motion
+from calib.data.recording import Recording
+from calib.dynamics import drives
+from calib.dynamics.drives import Term
+from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.tree import tree, with_payload
+from calib.identification.cases import Case, make_case
+from calib.robot.chain import Chain, Element, Joint
+
+N = 3
+RATE = 200.0
+INERTIAS = np.array(
+    [
+        [0.05, 0.001, 0.002, 0.06, 0.003, 0.08, 0.10, -0.05, 0.20, 4.0],
+        [0.04, 0.002, -0.01, 0.30, 0.002, 0.31, 0.90, 0.05, 0.10, 3.0],
+        [0.02, 0.001, 0.004, 0.09, 0.001, 0.10, 0.30, 0.04, -0.05, 1.5],
+    ]
+)
+DRIVES = {"Ia": (0.5, 0.4, 0.1), "Fv": (2.0, 1.5, 0.6), "Fc": (3.0, 2.5, 0.8), "off": (0.3, -0.2, 0.1)}
+PAYLOAD = (0.02, 0.0, 0.001, 0.02, 0.0, 0.01, 0.1, 0.05, 0.2, 2.0)
+
+
+def arm() -> Chain:
+    """Return a shoulder that turns about the vertical and two joints that lift."""
+    elements = (
+        Element("turn", "rz", 0.0, 0, 0),
+        Element("up", "rx", np.pi / 2, 1),
+        Element("shoulder", "rz", 0.0, 1, 1),
+        Element("upper", "tx", 0.5, 2),
+        Element("elbow", "rz", 0.0, 2, 2),
+        Element("fore", "tx", 0.4, 3),
+    )
+    joints = tuple(Joint(f"joint{j + 1}", "revolute", -3.0, 3.0, 5.0, 300.0) for j in range(N))
+    return Chain("planted", joints, elements, inertias=INERTIAS)
+
+
+def model(terms: tuple[Term, ...] = (), payload: bool = False) -> IdentificationModel:
+    """Return the truth's model; v0 of the sign is the default."""
+    bodies = tree(arm())
+    if payload:
+        bodies = with_payload(bodies, np.asarray(arm().tail), "load", on=N - 1)
+    return IdentificationModel(bodies, (*drives.standard(["Ia Fv Fc off"] * N), *terms))
+
+
+def truth(extra: dict[str, float] | None = None, payload: bool = False) -> np.ndarray:
+    """Return the true values in the model's order."""
+    standard = [DRIVES[name][joint] for joint in range(N) for name in ("Ia", "Fv", "Fc", "off")]
+    load = PAYLOAD if payload else ()
+    return np.array([*INERTIAS.ravel(), *load, *standard, *(extra or {}).values()])
+
+
+def motion(seed: int, duration: float = 20.0, harmonics: int = 6) -> tuple[np.ndarray, ...]:
+    """Return t (N,), q, v, a (N, 3) of a Fourier series with a period of ten seconds."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(int(duration * RATE)) / RATE
+    omega = 2 * np.pi / 10.0 * np.arange(1, harmonics + 1)
+    size = rng.normal(size=(2, N, harmonics)) * 0.5 / np.sqrt(np.arange(1, harmonics + 1))
+    s, c = np.sin(np.outer(t, omega)), np.cos(np.outer(t, omega))
+    q = s @ size[0].T + c @ size[1].T
+    v = (c * omega) @ size[0].T - (s * omega) @ size[1].T
+    a = -(s * omega**2) @ size[0].T - (c * omega**2) @ size[1].T
+    return t, q, v, a
+
+
+def torques(
+    q: np.ndarray, v: np.ndarray, a: np.ndarray, terms: tuple[Term, ...] = (), values: dict[str, float] | None = None,
+    payload: bool = False,
+) -> np.ndarray:  # fmt: skip
+    """Return the true torques (N, 3); load-dependent friction feels the bodies' torque."""
+    plain = model(payload=payload)
+    bodies = 10 * plain.tree.bodies
+    load = plain.regressor(q, v, a)[:, :, :bodies] @ truth(payload=payload)[:bodies]
+    full = model(terms, payload)
+    return full.regressor(q, v, a, load) @ truth(values, payload)
+
+
+def series(
+    seed: int, noise: float = 0.2, terms: tuple[Term, ...] = (), values: dict[str, float] | None = None,
+    payload: bool = False, **how,
+) -> dict[str, np.ndarray]:  # fmt: skip
+    """Return t, q and tau as a controller would log them, torque noise white."""
+    t, q, v, a = motion(seed, **how)
+    tau = torques(q, v, a, terms, values, payload)
+    rng = np.random.default_rng(1000 + seed)
+    return {"t": t, "q": q, "tau": tau + noise * rng.normal(size=tau.shape)}
+
+
+def case(name: str, seed: int, carried: tuple[str, ...] = (), band: float = 10.0, gains=None, **how) -> Case:
+    """Return a recorded case."""
+    log = series(seed, payload=bool(carried), **how)
+    effort = log["tau"] if gains is None else log["tau"] / np.asarray(gains)
+    recording = Recording(log["t"], log["q"], effort, "torque", ("joint1", "joint2", "joint3"), file=name)
+    return make_case(name, make_motion(recording, FilterOptions(cutoff=30.0, band=band)), carried=carried)
+
+
+def write(folder: Path, name: str, seed: int, **how) -> Path:
+    """Write a recording as a NumPy archive."""
+    path = folder / name
+    np.savez(path, **{**series(seed), **how})
+    return path

@@ -1,0 +1,134 @@
+"""Claims on a planted robot: parameters come back within their covariance; the ladder takes what is there, no more."""
+
+from __future__ import annotations
+
+import numpy as np
+import planted
+import pytest
+
+from calib.dynamics import friction
+from calib.dynamics.drives import term
+from calib.errors import CalibError, MeasurementError, UsageError
+from calib.identification.gains import identify_gains
+from calib.identification.identify import common_decimator, find_base, first_fit, identify
+from calib.identification.ladder import Ground, climb
+from calib.identification.prediction import predict
+from calib.identification.rows import observe, pool, triangulate, with_blocks
+from calib.identification.scores import score
+from calib.identification.settings import Payload, Settings, make_model
+
+PLAIN = Settings(friction="standard")
+
+
+def errors(found) -> np.ndarray:
+    """Return (value - truth) in the metric of the covariance, squared per degree of freedom."""
+    true = found.base.transform @ planted.truth()
+    off = found.fitted.estimate.values - true
+    return off @ np.linalg.solve(found.fitted.estimate.covariance, off) / len(off)
+
+
+@pytest.mark.parametrize("method", ["ols", "wls", "irls"])
+def test_base_parameters_come_back_within_their_covariance(method):
+    settings = Settings(friction="standard", method=method, essential="none")
+    size = [errors(identify(planted.arm(), [planted.case("a", seed)], settings)) for seed in range(5)]
+    assert 0.5 < np.mean(size) < 2.0
+
+
+def test_prediction_of_other_motion_is_as_good_as_the_noise():
+    found = identify(planted.arm(), [planted.case("a", 0)], PLAIN)
+    other = planted.case("b", 1)
+    scored = score(other, predict(found.dynamics, other))
+    np.testing.assert_allclose(scored.raw.rms, 0.2, rtol=0.1)
+    assert scored.filtered.total < 0.4 * scored.raw.total
+
+
+def test_nothing_is_added_to_a_plain_robot():
+    found = identify(planted.arm(), [planted.case("a", 0)])
+    assert found.climb.terms == () and found.climb.chosen == "standard"
+    assert len(found.rungs) > 5 and all(rung.note for rung in found.rungs[1:])
+
+
+@pytest.mark.parametrize(
+    ("name", "terms", "size"),
+    [
+        ("load", friction.load_dependent(1), 0.1),
+        ("presliding", friction.presliding(1, [0.02]), 2.0),
+        ("asymmetric", friction.asymmetric(1), 0.5),
+    ],
+)
+def test_the_ladder_takes_what_is_planted_and_only_there(name, terms, size):
+    values = {one.name: size for one in terms}
+    found = identify(planted.arm(), [planted.case("a", 0, terms=terms, values=values)])
+    rungs = {rung.model: rung for rung in found.rungs if rung.kept}
+    assert f"+ {name}" in rungs and rungs[f"+ {name}"].kept_at == (1,)
+    other = planted.case("b", 1, terms=terms, values=values)
+    plain = identify(planted.arm(), [planted.case("a", 0, terms=terms, values=values)], PLAIN)
+    one, two = (score(other, predict(model.dynamics, other)).filtered.total for model in (plain, found))
+    assert two < 0.8 * one
+
+
+def test_a_named_rung_is_taken_at_all_joints_whatever_it_brings():
+    found = identify(planted.arm(), [planted.case("a", 0)], Settings(friction="asymmetric"))
+    assert [one.name for one in found.climb.terms] == ["Fva1", "Fva2", "Fva3"]
+    with pytest.raises(UsageError, match="friction 'stribek' is none of"):
+        climb(Ground([], [], [], None, *[np.zeros(0)] * 4), "stribek")  # type: ignore[arg-type]
+
+
+def test_gains_come_from_a_payload_of_known_mass():
+    gains, arm = np.array([8.0, 12.0, 5.0]), planted.arm()
+    settings = Settings(payloads={"load": Payload(2.0)})
+    cases = [planted.case("u", 0, gains=gains, noise=0.1), planted.case("l", 0, ("load",), gains=gains, noise=0.1)]
+    model = make_model(arm, settings)
+    base = find_base(arm, model, settings, None, cases)
+    rows = with_blocks([observe(model, base.kept, one, common_decimator(cases, settings)) for one in cases], 6)
+    data = pool(triangulate(rows), 3)
+    found = identify_gains(data, {"Mload": 2.0}, first_fit(rows)[1])
+    assert (np.abs(found.gains - gains) < 4 * found.sigma).all()
+    assert (found.sigma[1:] < 0.03 * gains[1:]).all()
+    values = dict(zip(found.names, found.values))
+    assert values["MZload"] == pytest.approx(0.2, abs=0.05)
+    relative = identify_gains(data, {}, reference=1).gains
+    np.testing.assert_allclose(relative / relative[1], found.gains / found.gains[1], rtol=0.05)
+    with pytest.raises(CalibError, match="payload of known mass"):
+        identify_gains(data, {})
+
+
+def one_sine(name: str = "s"):
+    """Return the case of a robot whose joints share one sine."""
+    from calib.data.motion import FilterOptions, make_motion
+    from calib.data.recording import Recording
+    from calib.identification.cases import make_case
+
+    t = np.arange(0, 30, 1 / planted.RATE)
+    w, amplitude, phase = 2 * np.pi * 0.2, np.array([0.8, 0.6, 0.7]), np.array([0.0, 0.3, 1.6])
+    q = amplitude * np.sin(w * t[:, None] + phase)
+    v, a = amplitude * w * np.cos(w * t[:, None] + phase), -amplitude * w**2 * np.sin(w * t[:, None] + phase)
+    tau = planted.torques(q, v, a) + 0.2 * np.random.default_rng(0).normal(size=q.shape)
+    recording = Recording(t, q, tau, "torque", ("joint1", "joint2", "joint3"), file=name)
+    return make_case(name, make_motion(recording, FilterOptions(cutoff=20.0, band=5.0)))
+
+
+def test_one_sine_is_drawn_to_cad_and_says_so():
+    found = identify(planted.arm(), [one_sine()])
+    assert found.prior is not None and found.prior.source == "cad" and found.climb.terms == ()
+    values = dict(zip(found.names, found.fitted.estimate.values))
+    assert all(values[name] >= 0.0 for name in values if name[:2] in ("Ia", "Fv", "Fc"))
+    other = planted.case("b", 1)
+    with_cad = score(other, predict(found.dynamics, other)).raw.total
+    without = identify(planted.arm(), [one_sine()], Settings(friction="standard", prior="none", essential="none"))
+    assert with_cad < 0.5 * score(other, predict(without.dynamics, other)).raw.total
+
+
+def test_a_record_too_short_is_refused():
+    with pytest.raises(MeasurementError, match="rows are left for"):
+        identify(planted.arm(), [planted.case("a", 0, duration=1.3, band=10.0)])
+
+
+def test_a_term_from_the_options_is_found():
+    spring = term("Ks2", "position", 1)
+    values = {"Ks2": 15.0}
+    data = planted.case("a", 0, terms=(spring,), values=values)
+    found = identify(planted.arm(), [data], Settings(friction="standard", terms=(spring,)))
+    k = found.names.index("Ks2")
+    estimate = found.fitted.estimate
+    assert estimate.values[k] == pytest.approx(15.0, abs=4 * estimate.sigma[k])

@@ -1,0 +1,176 @@
+"""``calib identify``: the contract of its metrics, and what happens to input that cannot be."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import planted
+import pytest
+
+from calib import cli
+
+
+def run(*arguments: object) -> int:
+    return cli.run(["identify", *map(str, arguments)])
+
+
+def test_the_folder_keeps_its_contract(robot, tmp_path, capsys):
+    train, other = planted.write(tmp_path, "train.npz", 0), planted.write(tmp_path, "other.npz", 1)
+    out = tmp_path / "out"
+    assert (
+        run(robot, f"{train}@0:18", "--validate", other, f"{train}@18.5:", "--out", out, "--friction", "standard") == 0
+    )
+    found = json.loads((out / "metrics.json").read_text())
+    assert list(found["identification"]) == ["train.npz@0:18"]
+    assert list(found["validation"]) == ["other.npz", "train.npz@18.5:"]
+    for group in (found["identification"], found["validation"]):
+        for scored in group.values():
+            for name in ("raw", "filtered", "moving"):
+                relative = scored[name]["relative_error_percent"]
+                assert len(relative["joints"]) == 3 == len(scored[name]["rms"]) and relative["total"] > 0.0
+    assert found["parameters"] == {"standard": 42, "base": 25, "essential": found["parameters"]["essential"]}
+    assert 10 < found["parameters"]["essential"] <= 25
+    assert found["condition_number"]["raw"] > found["condition_number"]["normalised"] > 1.0
+    assert found["verdict"] == "pass" and found["ladder"][0]["model"] == "standard"
+    rows = list(csv.DictReader((out / "estimate.csv").open()))
+    assert list(rows[0]) == ["name", "expression", "unit", "value", "sigma", "rsd", "essential"]
+    assert any("YY2" in row["expression"] for row in rows if row["name"] == "ZZ1R")
+    assert {"dynamics.json", "covariance.csv", "robot.toml", "plot_torque_1.png", "plot_friction.png"} <= {
+        path.name for path in out.iterdir()
+    }
+    assert "verdict: pass" in capsys.readouterr().out
+    assert run(robot, train, "--out", out, "--friction", "standard") == 0, "an own folder may be written again"
+    assert not (out / "plot_torque_3.png").exists(), "plots of the earlier run are gone"
+
+
+def test_a_repeat_is_no_evidence(robot, tmp_path, capsys):
+    train = planted.write(
+        tmp_path,
+        "train.npz",
+        0,
+    )
+    out = tmp_path / "out"
+    assert run(robot, f"{train}@0:10", "--validate", f"{train}@10:", "--out", out, "--friction", "standard") == 0
+    found = json.loads((out / "metrics.json").read_text())
+    assert found["validation"]["train.npz@10:"]["evidence"] is False
+    assert found["verdict"] == "marginal" and "repeats" in found["reason"]
+    assert "it is no evidence" in capsys.readouterr().out
+
+
+def test_the_calibrated_robots_folder_serves_and_the_nominal_chooses_columns(tmp_path):
+    from calib.robot import description
+
+    nominal = planted.arm()
+    calibrated = nominal.with_values({"up": np.pi / 2 + 0.004, "upper": 0.502})
+    folder = tmp_path / "fit"
+    description.write(folder / "robot.toml", calibrated, {"provenance": {"nominal": nominal.values.tolist()}})
+    train = planted.write(tmp_path, "train.npz", 0)
+    assert run(folder, train, "--out", tmp_path / "out", "--friction", "standard") == 0
+    found = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert found["parameters"]["base"] == 25, "the tilt's weak columns stay out"
+    assert run(folder, train, "--out", folder) == 2, "the robot's own folder is not for --out"
+
+
+def spoil(name: str) -> dict[str, np.ndarray]:
+    """Return what is wrong in a recording."""
+    good = planted.series(0)
+    t, q, tau = good["t"].copy(), good["q"].copy(), good["tau"].copy()
+    if name == "backwards":
+        t[500:] -= 1.0
+    elif name == "stamps":
+        t[700] = t[699]
+    elif name == "nan":
+        tau[321, 1] = np.nan
+    elif name == "degrees":
+        q = np.degrees(q)
+    elif name == "columns":
+        q, tau = np.hstack([q, q]), np.hstack([tau, tau])
+    elif name == "short":
+        t, q, tau = t[:50], q[:50], tau[:50]
+    elif name == "constant":
+        tau[:, 2] = 1.0
+    elif name == "still":
+        q[:] = q[0]
+    return {"t": t, "q": q, "tau": tau}
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("backwards", "time goes back"),
+        ("stamps", "two samples have the stamp"),
+        ("nan", "row 322"),
+        ("degrees", "looks like deg"),
+        ("columns", "has 6 joints"),
+        ("short", "50 samples are too few"),
+        ("constant", "was it logged"),
+        ("still", "no joint moves"),
+    ],
+)
+def test_input_that_cannot_be_is_refused_and_nothing_written(robot, tmp_path, capsys, name, said):
+    path = tmp_path / "bad.npz"
+    np.savez(path, **spoil(name))
+    assert run(robot, path, "--out", tmp_path / "out") == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists() and not list(tmp_path.glob(".out*"))
+
+
+def test_a_reversed_torque_is_no_quiet_success(robot, tmp_path, capsys):
+    good = planted.series(0)
+    path = tmp_path / "reversed.npz"
+    np.savez(path, t=good["t"], q=good["q"], tau=-good["tau"])
+    code = run(robot, path, "--out", tmp_path / "out", "--friction", "standard")
+    told = capsys.readouterr()
+    assert code == 2 or "sign" in told.out + told.err
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("frition = 'auto'", "frition"),
+        ("friction = 'heavy'", "friction: expected one of"),
+        ("[filter]\ncutof = 3.0", "filter: there is no key 'cutof'"),
+        ("[filter]\ncutoff = 120.0", "Nyquist"),
+        ("[[coupling]]\njoints = [1]", "coupling"),
+        ("[[term]]\nname = 'K'\nshape = 'sine'\njoint = 2", "needs (order, speed)"),
+        ('[files."other.npz"]\npayload = []', "is none of the recordings"),
+        ("drives = ['Ia', 'Fv']", "drives: 2 values for 3 joints"),
+        ("drives = 'Ia Fx'", "drive term 'Fx'"),
+        ("prior = 'cad'\nmethod = 'iv'", "controller"),
+        ("keep = ['ZZ9']", "ZZ9"),
+        ("gains = [1.0, 2.0]", "gains: 2 values for 3 joints"),
+        ("[gain_identification]\nunloaded = 'train.npz'\nloaded = 'train.npz'", "payload"),
+        ("not toml", "is no TOML"),
+    ],
+)
+def test_options_are_held_against_what_exists(robot, tmp_path, capsys, text, said):
+    train, options = planted.write(tmp_path, "train.npz", 0), tmp_path / "options.toml"
+    options.write_text(text)
+    code = run(robot, train, "--options", options, "--out", tmp_path / "out")
+    assert code == 2 and said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_other_folders_are_not_overwritten(robot, tmp_path, capsys):
+    train, out = planted.write(tmp_path, "train.npz", 0), tmp_path / "out"
+    out.mkdir()
+    (out / "estimate.csv").write_text("mine")
+    assert run(robot, train, "--out", out) == 2
+    assert (out / "estimate.csv").read_text() == "mine"
+    assert run(robot, train, train, "--out", tmp_path / "b") == 2
+    assert "is given twice" in capsys.readouterr().err
+
+
+def test_every_key_of_the_documented_options_is_read(tmp_path):
+    from calib.identification import options
+
+    text = options.__doc__.split("from 1::\n\n", 1)[1]
+    path = Path(tmp_path / "documented.toml")
+    path.write_text("\n".join(line[4:] for line in text.splitlines()))
+    found = options.read_options(path)
+    assert found.settings.ratio == 20.0 and found.gain_pair is not None
+    assert found.for_file("x/run_load.npz").payload == ("tool",)
+    assert found.settings.couplings[0].joints == (4, 5)
