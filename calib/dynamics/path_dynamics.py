@@ -38,8 +38,8 @@ class PathDynamics:
     Attributes:
         regressor: q, v, a (N, n) to (N, rows, b); the last n rows are the torques that are limited.
         parameters: (b,) X, zero for friction.
-        terms, amounts: friction terms and their (k,) values; Coulomb's sign is the exact one.
-        tree, bodies: bodies and their (10 B,) parameters, whose torques load-dependent friction feels.
+        terms, amounts: all drive terms and their (k,) values; Coulomb's sign is the exact one.
+        tree, bodies: bodies and their (10 B,) parameters.
     """
 
     regressor: Regressor
@@ -72,19 +72,23 @@ class PathDynamics:
 
     def friction(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the friction torques (N, n); friction with memory (stop operators) counts as fully stressed."""
-        if not self.terms:
-            return np.zeros_like(q)
-        motions = [np.ascontiguousarray(x.T) for x in (q, v, a)]
-        load = None
-        if any(one.form.loaded for one in self.terms):
-            load = rigid_body.inverse_dynamics(self.tree, np.array(self.bodies), q, v, a).T
-        out = np.zeros((len(self.terms), self.n, len(q)))
-        drives.fill(self.terms, out, [*motions, load], _stressed(self.terms, motions[1]))
-        return np.einsum("k,kjN->Nj", self.amounts, out)
+        rubbing = [k for k, one in enumerate(self.terms) if one.shape not in AFFINE]
+        loaded = any(self.terms[k].form.loaded for k in rubbing)
+        load = rigid_body.inverse_dynamics(self.tree, np.array(self.bodies), q, v, a) if loaded else None
+        return self._drives(rubbing, q, v, a, load)
 
     def torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the torques (N, n) of a motion, friction included: the full inverse dynamics."""
-        return self.rigid(q, v, a) + self.friction(q, v, a)
+        """Return the torques (N, n) of a motion, friction included: recursive Newton-Euler, not the regressor."""
+        load = rigid_body.inverse_dynamics(self.tree, np.array(self.bodies), q, v, a)
+        return load + self._drives(range(len(self.terms)), q, v, a, load)
+
+    def _drives(self, chosen: Sequence[int], q, v, a, load: np.ndarray | None) -> np.ndarray:
+        """Return the torques (N, n) of chosen terms."""
+        terms = [self.terms[k] for k in chosen]
+        motions = [np.ascontiguousarray(x.T) for x in (q, v, a)]
+        out = np.zeros((len(terms), self.n, len(q)))
+        drives.fill(terms, out, [*motions, None if load is None else load.T], _stressed(terms, motions[1]))
+        return np.einsum("k,kjN->Nj", self.amounts[list(chosen)], out)
 
 
 def of_standard(model: IdentificationModel, values: np.ndarray) -> PathDynamics:
@@ -95,7 +99,7 @@ def of_standard(model: IdentificationModel, values: np.ndarray) -> PathDynamics:
     first = 10 * model.tree.bodies
     without = replace(model, terms=tuple(one for one in model.columns if one.shape in AFFINE))
     return PathDynamics(
-        without.regressor, values[~rubbing], *_friction(model, values), model.tree, np.array(values[:first])
+        without.regressor, values[~rubbing], *_valued(model, values), model.tree, np.array(values[:first])
     )
 
 
@@ -115,7 +119,7 @@ def of_base(model: BaseModel, values: np.ndarray) -> PathDynamics:
         raise CalibError(f"base parameter {name} holds friction and other effects: their torques cannot be told apart")
     standard = to_standard(model.base, values)
     bodies = standard[: 10 * model.model.tree.bodies]
-    terms, amounts = _friction(model.model, standard)
+    terms, amounts = _valued(model.model, standard)
     return PathDynamics(model.regressor, np.where(kept, 0.0, values), terms, amounts, model.model.tree, bodies)
 
 
@@ -130,11 +134,10 @@ def _is_friction(model: IdentificationModel) -> np.ndarray:
     return np.concatenate([bodies, np.array([one.shape not in AFFINE for one in model.columns], dtype=bool)])
 
 
-def _friction(model: IdentificationModel, values: np.ndarray) -> tuple[tuple[Term, ...], np.ndarray]:
-    """Return the friction terms with a value and an exact sign, and the values."""
-    own = values[10 * model.tree.bodies :]
-    found = [(one, value) for one, value in zip(model.columns, own) if one.shape not in AFFINE and value]
-    return tuple(_sharp(one) for one, _ in found), np.array([value for _, value in found], dtype=float)
+def _valued(model: IdentificationModel, values: np.ndarray) -> tuple[tuple[Term, ...], np.ndarray]:
+    """Return the drive terms with a value and an exact sign, and the values."""
+    found = [(one, x) for one, x in zip(model.columns, values[10 * model.tree.bodies :]) if x]
+    return tuple(_sharp(one) for one, _ in found), np.array([x for _, x in found], dtype=float)
 
 
 def _sharp(one: Term) -> Term:

@@ -65,6 +65,7 @@ def test_the_torque_along_a_path_is_the_full_inverse_dynamics():
     full = rnea + np.resize(IA, 7) * a + np.resize(OFF, 7) + np.resize(FV, 7) * v + np.resize(FC, 7) * np.sign(v)
     np.testing.assert_allclose(A * pull + B * speed**2 + G + dynamics.friction(q, v, a), full, atol=1e-10)
     np.testing.assert_allclose(dynamics.torque(q, v, a), full, atol=1e-10)
+    np.testing.assert_allclose(dynamics.rigid(q, v, a) + dynamics.friction(q, v, a), full, atol=1e-10)
 
 
 def test_richer_friction_depends_on_load_and_past_as_far_as_a_path_can_tell():

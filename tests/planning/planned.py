@@ -1,0 +1,78 @@
+"""Robots for the planning tests: the LWR4+ with its drives, and a cart whose fastest motion is known in closed form."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from scipy.optimize import brentq
+
+from calib.dynamics import drives
+from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.path_dynamics import PathDynamics, of_standard
+from calib.dynamics.tree import standard_parameters, tree
+from calib.robot.load import load
+from calib.simulation.robots import truth
+from trajectories.timing import Limits
+
+CHAIN = load("lwr4plus")
+WAYPOINTS = np.array(
+    [[0, 0.5, 0, -1, 0, 0.5, 0], [0.8, 1.0, 0.3, -1.4, 0.5, 0.2, 0.7], [1.5, 0.3, -0.4, -0.6, 1, -0.8, 0]]
+)
+
+
+@cache
+def lwr(viscous: float = 1.0) -> PathDynamics:
+    """Return the arm with Ia, Fv, Fc of the truth, viscous friction times a factor."""
+    known = truth("lwr4plus")["drives"]
+    amounts = np.column_stack([known["Ia"], viscous * np.array(known["Fv"]), known["Fc"]]).ravel()
+    model = IdentificationModel(tree(CHAIN), drives.standard(["Ia Fv Fc"] * 7))
+    return of_standard(model, np.concatenate([standard_parameters(CHAIN), amounts]))
+
+
+def limits(**changed) -> Limits:
+    kept = {
+        "velocity": np.array([joint.velocity for joint in CHAIN.joints]),
+        "acceleration": np.full(7, np.inf),
+        "torque": np.array([joint.effort for joint in CHAIN.joints]),
+    }
+    return Limits(**kept | changed)
+
+
+@dataclass(frozen=True)
+class Cart:
+    """tau = m a + F v + c sign(v) on one axis."""
+
+    mass: float = 2.0
+    viscous: float = 0.0
+    coulomb: float = 0.0
+
+    def along(self, q, slope, curvature):
+        return self.mass * slope, self.mass * curvature, np.zeros_like(q)
+
+    def friction(self, q, v, a):
+        return self.viscous * v + self.coulomb * np.sign(v)
+
+    def torque(self, q, v, a):
+        return self.mass * a + self.friction(q, v, a)
+
+    def fastest(self, force: float, way: float) -> float:
+        """Return the shortest time from rest to rest: all force forwards, then all backwards, integrated by hand."""
+        rate = self.viscous / self.mass
+        ahead, back = (force - self.coulomb) / self.mass, (force + self.coulomb) / self.mass
+
+        def phases(first: float) -> tuple[float, float]:
+            """Return when it rests and where, pushed for `first` seconds."""
+            if not rate:
+                speed = ahead * first
+                return first + speed / back, speed * first / 2 + speed**2 / back / 2
+            speed = ahead / rate * -np.expm1(-rate * first)
+            second = np.log1p(rate * speed / back) / rate
+            return first + second, (ahead * first - speed) / rate + (speed - back * second) / rate
+
+        return phases(brentq(lambda t: phases(t)[1] - way, 1e-9, 1e3, xtol=1e-14))[0]
+
+
+def cart_limits(force: float = np.inf, velocity: float = np.inf, acceleration: float = np.inf) -> Limits:
+    return Limits(np.array([velocity]), np.array([acceleration]), np.array([force]))

@@ -1,0 +1,145 @@
+"""Paths q = Φ(s): where a motion goes, before anything says when. At least twice continuously differentiable.
+
+Splines through joint waypoints are parametrised by chord length (knots s_k apart by |q_k - q_{k-1}|), so that Φ' has a
+norm near one and the spline does not swing out where waypoints lie unevenly (de Boor 1978; Lee 1989 compares).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline, make_interp_spline
+
+from trajectories.errors import BadInput
+
+SAME = 1e-9  # waypoints nearer than this [rad or m] are one
+DENSE = 40  # samples per knot interval where extremes are looked for
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """A path of n joints.
+
+    Attributes:
+        derivative: (s (N,), order) to (N, n), d^order Φ / ds^order [rad or m per s^order], order 0 to 2.
+        knots: (K,) from 0 to the length, between which Φ is smooth.
+    """
+
+    derivative: Callable[[np.ndarray, int], np.ndarray]
+    knots: np.ndarray
+
+    def __call__(self, s: np.ndarray, order: int = 0) -> np.ndarray:
+        return self.derivative(np.asarray(s, dtype=float), order)
+
+    @property
+    def length(self) -> float:
+        return float(self.knots[-1])
+
+    @property
+    def n(self) -> int:
+        return self(self.knots[:1]).shape[1]
+
+    # what toppra asks of a path
+    @property
+    def dof(self) -> int:
+        return self.n
+
+    @property
+    def path_interval(self) -> np.ndarray:
+        return np.array([0.0, self.length])
+
+
+def spline(waypoints: np.ndarray, spacing: np.ndarray | None = None, scale: np.ndarray | None = None) -> Path:
+    """Return the natural cubic spline (C²) through waypoints; through two, the straight line.
+
+    Args:
+        waypoints: (m, n) joint values [rad or m], two or more.
+        spacing: (m - 1,) factors on the chord lengths between knots: the shape's own parameters; None: ones.
+        scale: (n,) what counts as one unit of each joint in the chord length; None: ones.
+
+    Raises:
+        BadInput: for fewer than two waypoints, equal neighbours, or values that are no numbers.
+    """
+    points = checked(waypoints)
+    chords = np.linalg.norm(np.diff(points, axis=0) / (1.0 if scale is None else scale), axis=1)
+    factors = np.ones(len(chords)) if spacing is None else np.asarray(spacing, dtype=float)
+    if factors.shape != chords.shape or not (np.isfinite(factors) & (factors > 0)).all():
+        raise BadInput(f"spacing of the knots: expected {len(chords)} numbers above zero, found {spacing}")
+    knots = np.append(0.0, np.cumsum(chords * factors))
+    return Path(CubicSpline(knots, points, bc_type="natural"), knots)
+
+
+def through(samples: np.ndarray, s: np.ndarray) -> Path:
+    """Return the quintic spline (C⁴) through dense samples (N, n) of a curve at parameters s (N,), rising from 0."""
+    points = checked(samples)
+    curve = make_interp_spline(s, points, k=min(5, len(points) - 1 - len(points) % 2))
+    return Path(curve, np.asarray(s, dtype=float))
+
+
+def checked(waypoints: np.ndarray) -> np.ndarray:
+    """Return the waypoints (m, n) as floats, after the checks of `spline`."""
+    points = np.asarray(waypoints, dtype=float)
+    if points.ndim != 2 or not points.shape[1]:
+        raise BadInput(f"waypoints: expected an (m, n) array of joint values, found shape {points.shape}")
+    if not np.isfinite(points).all():
+        row, joint = (int(k) for k in np.argwhere(~np.isfinite(points))[0])
+        raise BadInput(f"waypoint {row + 1}, joint {joint + 1} is not a number ({points[row, joint]})")
+    if len(points) < 2:
+        raise BadInput(f"{len(points)} waypoint: a path needs two or more (the first is where the motion starts)")
+    steps = np.abs(np.diff(points, axis=0)).max(axis=1)
+    if (steps <= SAME).any():
+        k = int(np.argmax(steps <= SAME))
+        raise BadInput(f"waypoints {k + 1} and {k + 2} are the same; take one away (a stop is the end of a motion)")
+    return points
+
+
+def check_within(path: Path, lower: np.ndarray, upper: np.ndarray, waypoints: np.ndarray | None = None) -> np.ndarray:
+    """Return the margin (n,) that a path keeps to the nearer joint limit [rad or m].
+
+    Raises:
+        BadInput: naming the waypoint or the place of the path beyond a limit, the joint, and by how much.
+    """
+    for k, point in enumerate(() if waypoints is None else waypoints):
+        excess = np.maximum(point - upper, lower - point)
+        if (excess > 0).any():
+            j = int(np.argmax(excess))
+            raise BadInput(
+                f"waypoint {k + 1}: joint {j + 1} at {point[j]:.4g} is {excess[j]:.3g} beyond its limits "
+                f"{lower[j]:.4g} to {upper[j]:.4g}"
+            )
+    places, values = extremes(path)
+    excess = np.maximum(values - upper, lower - values)
+    if (excess > 0).any():
+        k, j = np.unravel_index(np.argmax(excess), excess.shape)
+        before = max(int(np.searchsorted(path.knots, places[k, j])), 1)
+        hint = f" between waypoints {before} and {before + 1}" if waypoints is not None else ""
+        raise BadInput(
+            f"the path swings{hint} to {values[k, j]:.4g} at joint {j + 1}, {excess[k, j]:.3g} beyond its limits "
+            f"{lower[j]:.4g} to {upper[j]:.4g}: put a waypoint there, or move the waypoints away from the limit"
+        )
+    return -excess.max(axis=0)
+
+
+def extremes(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return where each joint is lowest and highest, and its values there, two arrays (2, n)."""
+    spans = len(path.knots) - 1
+    s = np.interp(np.linspace(0, spans, DENSE * spans + 1), np.arange(spans + 1), path.knots)
+    s = np.concatenate([s, reversals(path, s)])
+    q = path(s)
+    peaks = np.array([q.argmin(axis=0), q.argmax(axis=0)])
+    return s[peaks], q[peaks, np.arange(path.n)]
+
+
+def reversals(path: Path, s: np.ndarray) -> np.ndarray:
+    """Return where joints turn between samples s (N,): zeros of Φ'_j, by bisection."""
+    slope = path(s, 1)
+    k, j = np.nonzero(slope[:-1] * slope[1:] < 0)
+    low, high, rising = s[k], s[k + 1], slope[k + 1, j] > 0
+    rows = np.arange(len(k))
+    for _ in range(50 if len(k) else 0):
+        middle = (low + high) / 2
+        beyond = (path(middle, 1)[rows, j] > 0) == rising
+        low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
+    return (low + high) / 2
