@@ -52,26 +52,10 @@ RATIO, POOR = 30.0, 10.0  # r_σ of the paper's rule; RSD [%] above which a para
 FILTERS = FilterOptions(cutoff=10.0, band=2.0, clock="stamps")
 COUNTS = {"Model 1": 74, "Model 2": 102, "Model 3": 28, "one load case": 92, "motor torque only": 79, "tilted": 104}
 TABLE_4 = (
-    *("Ia1", "Fvm1", "Fcm1", "Ia2", "Fvm2", "Fcm2", "Ia3", "Fvm3", "Fcm3", "Fvm4", "Ia5", "Fvm5", "Fcm5", "Ia6"),
-    *(
-        "Fvm6",
-        "Fcm6",
-        "Ia7",
-        "Fvm7",
-        "Fcm7",
-        "offm7",
-        "Fcl1",
-        "Fcl2",
-        "offl2",
-        "Fcl3",
-        "Fcl4",
-        "offl4",
-        "Fcl5",
-        "offl5",
-    ),
-    *("Fcl7", "offl7", "XX2R", "ZZ2R", "MY2R", "XX4R", "ZZ4R", "MY4R", "MY5R", "MY6R", "XX8", "YY8", "YZ8", "MY8"),
-    *("MZ8", "M8"),
-)
+    "Ia1", "Fvm1", "Fcm1", "Ia2", "Fvm2", "Fcm2", "Ia3", "Fvm3", "Fcm3", "Fvm4", "Ia5", "Fvm5", "Fcm5", "Ia6", "Fvm6",
+    "Fcm6", "Ia7", "Fvm7", "Fcm7", "offm7", "Fcl1", "Fcl2", "offl2", "Fcl3", "Fcl4", "offl4", "Fcl5", "offl5", "Fcl7",
+    "offl7", "XX2R", "ZZ2R", "MY2R", "XX4R", "ZZ4R", "MY4R", "MY5R", "MY6R", "XX8", "YY8", "YZ8", "MY8", "MZ8", "M8",
+)  # fmt: skip
 # Jubien, Gautier & Janot (2014), another unit, by way of kukaKDL's kukakdl_const.hpp; ZZ2R there holds Ia2. Its motor
 # inertias and friction are the truth here (by construction), so only the links' parameters are compared.
 PUBLISHED = {"XX2R": 1.31, "ZZ2R + Ia2": 4.46, "MY2R": 3.37, "XX4R": 0.368, "MY4R": -1.37, "MY5R": 0.049, "MY6R": 0.042}
