@@ -1,0 +1,57 @@
+"""The dynamic studies of TX40 and LWR4+ run, and say what they claim to say."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    """Run an example in quick mode once, and return its metrics."""
+    done: dict[str, dict] = {}
+
+    def run(name: str) -> dict:
+        if name not in done:
+            out = tmp_path_factory.mktemp("study")
+            command = [sys.executable, str(EXAMPLES / name), "--quick", "--out", str(out)]
+            subprocess.run(command, check=True, capture_output=True, text=True)
+            done[name] = json.loads((out / "metrics.json").read_text())
+        return done[name]
+
+    return run
+
+
+@pytest.mark.slow
+def test_tx40_least_squares_fails_on_degraded_data_and_instruments_do_not(study):
+    metrics = study("tx40/identification.py")
+    assert metrics["parameters"]["base"] == 60
+    clean, degraded = metrics["clean"], metrics["degraded"]
+    assert max(clean["direct"]["LS"] + clean["direct"]["IV"]) < 8.0  # the slides: 5 to 7 %
+    assert min(degraded["cross"]["LS"]) > 20.0 and max(degraded["cross"]["IV"]) < 9.0  # 25 to 28 %, 6 to 8 %
+    assert degraded["verdict"]["least_squares_biased"] and degraded["verdict"]["largest_shift_in_sigma"] > 4.0
+    assert clean["verdict"]["largest_shift_in_sigma"] < 1.0
+    wrong = metrics["wrong controllers"]["bandwidth / 3"]
+    assert max(wrong["torque_error"]["IV"]) < max(degraded["torque_error"]["LS"])
+    assert sum(wrong["torque_error"]["IV"]) < 1.2 * sum(degraded["torque_error"]["IV"])
+
+
+@pytest.mark.slow
+def test_lwr4plus_counts_essential_set_and_torques(study):
+    metrics = study("lwr4plus/dynamics.py")
+    assert {name: metrics["counts"][name] for name in metrics["counts_asked"]} == metrics["counts_asked"]
+    assert (metrics["counts"]["standard"], metrics["counts"]["without effect"]) == (136, 18)
+    essential = metrics["essential"]
+    assert len(essential["both"]) >= 40
+    assert {"XX2R", "ZZ2R", "MY2R", "XX4R", "ZZ4R", "MY4R", "MY5R", "MY6R"} <= set(essential["both"])
+    best, cad = metrics["computed_torque"]["calibrated"], metrics["computed_torque"]["cad"]
+    for part, errors in best.items():
+        assert errors["largest"][5] < 0.5, part  # joint 6 of the study's Fig. 8
+    for part in ("empty sensor", "loaded sensor"):
+        assert sum(best[part]["rms"]) < 0.8 * sum(cad[part]["rms"])
