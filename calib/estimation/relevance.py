@@ -8,6 +8,7 @@ import numpy as np
 import scipy.linalg
 from scipy.linalg.lapack import dpotri  # type: ignore[attr-defined]
 
+EXACT = 1e-7  # ‖y - W x‖ relative to ‖y‖ below which a fit counts as perfect: WᵀW knows no better
 OUTWEIGHED = 2.0  # a group is out once its prior is this many times as precise as the data on its columns (our choice)
 
 
@@ -81,7 +82,8 @@ def relevance(data: Gram, groups: np.ndarray, start: np.ndarray, iterations: int
         effective = float(gamma.sum())
         misfit = data.total - 2.0 * solution @ data.cross[index]
         misfit += solution @ data.square[np.ix_(index, index)] @ solution
-        beta = max(data.rows - effective - int((~ridged).sum()), 1.0) / max(float(misfit), 1e-300)
+        least = EXACT**2 * max(data.total, 1e-300)  # what rounding leaves of a perfect fit
+        beta = max(data.rows - effective - int((~ridged).sum()), 1.0) / max(float(misfit), least)
     values, ridge = np.zeros(len(groups)), np.where(ridged, 0.0, np.inf)
     values[index] = solution
     kept = index[ridged[index]]

@@ -26,6 +26,16 @@ from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from calib.transforms import invert, orthonormal, pose
 
+WRONG_UNIT = 15.0  # measured over predicted spread of the positions (our choice)
+UNITS = {
+    1e3: "are they mm under a header that says m",
+    1e-3: "are they m under a header that says mm",
+    39.37: "are they in under a header that says m",
+    0.0254: "are they m under a header that says in",
+    1e2: "are they cm under a header that says m",
+    25.4: "are they mm under a header that says in",
+    0.03937: "are they in under a header that says mm",
+}
 ENOUGH = 300  # rows of a block that a guess is made from (our choice)
 
 
@@ -44,6 +54,7 @@ def install(chain: Chain, measured: Sequence[PoseMeasurements], known: Deflectio
     for block in sorted(measured, key=lambda b: (rank.get(b.kind, 3), -len(b))):
         block = take(block, np.unique(np.linspace(0, len(block) - 1, ENOUGH).astype(int)))
         arm = forward(chain, block.q)
+        check_scale(block, arm)
         for number in np.unique(block.tool):
             name, rows = block.tool_names[number], block.tool == number
             station, tool = _guess(block, arm, rows, stations.get(block.station), tools.get(name))
@@ -59,6 +70,34 @@ def install(chain: Chain, measured: Sequence[PoseMeasurements], known: Deflectio
         station_names,
         tool_names,
         known=known or Deflection(),
+    )
+
+
+def check_scale(block: PoseMeasurements, arm: np.ndarray) -> None:
+    """Refuse measurements whose size cannot be the robot's: the ratio of measured to predicted spread of positions.
+
+    Args:
+        block: measurements; those without positions pass.
+        arm: (m, 4, 4) poses of the tip that the joints predict.
+
+    Raises:
+        MeasurementError: for a ratio beyond `WRONG_UNIT`, with the unit that would explain it.
+    """
+    if block.position is None or len(block) < 3:
+        return
+    measured, predicted = (np.linalg.norm(x.std(axis=0)) for x in (block.position, arm[:, :3, 3]))
+    if predicted < 1e-3:
+        return
+    ratio = float(measured / predicted)
+    if 1.0 / WRONG_UNIT < ratio < WRONG_UNIT:
+        return
+    factor = min(UNITS, key=lambda each: abs(np.log(ratio / each)))
+    likely = f": {UNITS[factor]}?" if abs(np.log(ratio / factor)) < np.log(2.0) else ""
+    raise MeasurementError(
+        f"the measured positions spread over {measured:.4g} m where the robot's joints make it move over "
+        f"{predicted:.4g} m, {ratio:.3g} times as much{likely} State the unit in the header, as in 'x [mm]', or look "
+        "whether this is the right robot",
+        block.file,
     )
 
 

@@ -8,17 +8,21 @@ from dataclasses import replace
 import numpy as np
 
 from calib.data.measurements import PoseMeasurements
+from calib.errors import MeasurementError
+from calib.estimation.columns import ColumnSplit
 from calib.estimation.nonlinear import covariance, solve
 from calib.estimation.relevance import gram, relevance
 from calib.geometry.identifiability import base_columns
 from calib.geometry.installation import Installation
-from calib.geometry.observation import Block, prepare, stack
+from calib.geometry.observation import Block, observe, prepare, stack
 from calib.geometry.parameters import layout, parameter_values, step
 from calib.geometry.result import GeometricFit
 from calib.geometry.weighing import Settings, Weigher
+from calib.robot.chain import element_length
 
 PLAUSIBLE = {"m": 0.01, "rad": 0.05}  # how far a real arm may be from its nominal (our choice)
 RETRIES = 4
+SPARE = 1.5  # measured numbers per unknown at least (our choice)
 WIDTHS = 3  # updates of a drawn fit's widths
 NARROWEST = 1e-6  # [m, rad]
 
@@ -59,8 +63,10 @@ def fit(
     blocks = prepare(cell, measured, torques)
     split = base_columns(cell, blocks, candidates, settings.tolerance)
     free = candidates[split.kept]
+    _enough(cell, blocks, len(free))
     stated = np.full(len(table.names), np.inf) if prior is None else prior
     if drawn:
+        free = np.setdiff1d(free, yardstick(cell, split, candidates))
         return replace(drawn_fit(cell, blocks, free, settings, stated[free]), split=split, candidates=candidates)
     start, found = cell, None
     for attempt in range(1 + RETRIES):
@@ -77,6 +83,35 @@ def fit(
         start, free = _back_to_nominal(found.cell, cell, candidates, free[told]), free[told]
     assert found is not None
     return replace(found, start=cell, split=split, candidates=candidates)
+
+
+def _enough(cell: Installation, blocks: list[Block], unknowns: int) -> None:
+    """Refuse measurements with less than `SPARE` numbers for each unknown: only what is left over can be judged."""
+    parts = [part for block in blocks for part in observe(cell, block, np.array([], dtype=int))]
+    numbers = sum(part.value.size - part.nuisances for part in parts)
+    if numbers < SPARE * unknowns:
+        poses = sum(len(block.measured) for block in blocks)
+        raise MeasurementError(
+            f"{poses} poses give {numbers} numbers, too few for {unknowns} unknowns; measure more poses (some 20 to 40 "
+            "for a full geometry), or ask for a smaller model (--model offsets, --model frames)",
+            blocks[0].measured.file,
+        )
+
+
+def yardstick(cell: Installation, split: ColumnSplit, candidates: np.ndarray) -> np.ndarray:
+    """Return the position of the arm's longest length among the base columns, as an array of one (or none).
+
+    Sockets and planes are as well explained by a smaller arm, in the limit by none at all, so that the scale has to
+    come from the nominal: this length stays. What others merge with a column counts with it.
+    """
+    lengths = np.zeros(len(candidates))
+    for place, k in enumerate(candidates):
+        if k < len(cell.chain.elements):
+            lengths[place] = element_length(cell.chain, int(k))
+    total = lengths[split.kept] + split.coefficients @ lengths[split.dropped]
+    own = np.array([k < len(cell.chain.elements) and cell.chain.elements[k].axis[0] == "t" for k in candidates])
+    total = np.where(own[split.kept], np.abs(total), 0.0)
+    return candidates[split.kept[[int(np.argmax(total))]]] if total.max(initial=0.0) > 0.0 else candidates[:0]
 
 
 def drawn_fit(

@@ -125,13 +125,15 @@ def _plane(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list
     groups = np.unique(measured.group)
     for group in groups:
         rows = np.flatnonzero(measured.group == group)
+        if len(rows) < 4:  # three points lie on a plane whatever the arm
+            continue
         points = seen.point[:, rows] - seen.point[:, rows].mean(axis=1, keepdims=True)
         axes = np.linalg.svd(points, full_matrices=False)[0]
         value[rows] = -axes[:, 2] @ points
         nuisance = np.column_stack([np.ones(len(rows)), points.T @ axes[:, :2]])
         slope[:, rows] = _project(np.einsum("i,fim->fm", axes[:, 2], jacobian[:, :3, rows]), nuisance)
     sigma = None if measured.sigma is None else measured.sigma[:, :1].T
-    return [Part("plane", value[None], slope[:, None], sigma, 3 * len(groups), np.arange(len(measured)))]
+    return [Part("plane", value[None], slope[:, None], sigma, _unknowns(measured), np.arange(len(measured)))]
 
 
 def _bar(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[Part]:
@@ -141,13 +143,21 @@ def _bar(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[P
     groups = np.unique(measured.group)
     for group in groups:
         rows = np.flatnonzero(measured.group == group)
+        if len(rows) < 4:  # three lengths always meet in a centre
+            continue
         points, lengths = seen.point[:, rows], measured.distance[rows]
         away = points - sphere_centre(points, lengths)[:, None]
         unit = away / np.linalg.norm(away, axis=0)
         value[rows] = lengths - np.linalg.norm(away, axis=0)
         slope[:, rows] = _project(np.einsum("im,fim->fm", unit, jacobian[:, :3, rows]), unit.T)
     sigma = None if measured.sigma is None else measured.sigma[:, :1].T
-    return [Part("distance", value[None], slope[:, None], sigma, 3 * len(groups), np.arange(len(measured)))]
+    return [Part("distance", value[None], slope[:, None], sigma, _unknowns(measured), np.arange(len(measured)))]
+
+
+def _unknowns(measured: PoseMeasurements) -> int:
+    """Return how many numbers of planes or centres were eliminated: three each, or all a small group has."""
+    _, counts = np.unique(measured.group, return_counts=True)
+    return int(np.minimum(counts, 3).sum())
 
 
 def sphere_centre(points: np.ndarray, lengths: np.ndarray, iterations: int = 20) -> np.ndarray:

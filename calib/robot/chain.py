@@ -181,6 +181,25 @@ def random_joints(chain: Chain, count: int, seed: int | np.random.Generator = 0)
     return np.random.default_rng(seed).uniform(lower, upper, (count, chain.n))
 
 
+def element_length(chain: Chain, k: int) -> float:
+    """Return the constant displacement along translation k [m], with what its joint's placement holds along it.
+
+    A URDF's joint origin is a placement followed by zero-valued elements, so that its lengths stand in the placement.
+    Zero for rotations and for what a joint moves.
+    """
+    element = chain.elements[k]
+    if element.axis[0] != "t" or element.joint is not None:
+        return 0.0
+    first = k
+    while first > 0 and chain.elements[first].placement is None and chain.elements[first - 1].owner == element.owner:
+        first -= 1
+    placement = chain.elements[first].placement
+    if placement is None or any(each.axis[0] == "r" for each in chain.elements[first:k]):
+        return element.value
+    along = placement[:3, AXES.index(element.axis) % 3]
+    return element.value + float(along @ placement[:3, 3])
+
+
 def element_index(chain: Chain, names: Iterable[str]) -> np.ndarray:
     """Return the indices of elements by name.
 
