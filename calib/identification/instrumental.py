@@ -31,13 +31,14 @@ from calib.estimation.linear import LinearFit, settled_std, wls
 from calib.estimation.triangles import absorb, empty, select
 from calib.estimation.whiteness import inflation
 from calib.identification.cases import Case
-from calib.identification.rows import Rows, observe
+from calib.identification.rows import Rows, observe, segments
 from calib.simulation.closed_loop import Plant, Run, Sensing, inertia_diagonal, simulate, with_parameters
 from calib.simulation.controllers import Controller, scaled
 from calib.simulation.references import Reference
 
 METHODS = ("iv", "didim")
 LIMIT = 10  # iterations; 3 to 6 are usual
+CHUNK = 400  # thinned samples at a time: bounds the memory
 RETREATS = 6  # halvings of a step to parameters that cannot be simulated
 
 
@@ -157,7 +158,10 @@ def identify_instrumental(
     runs = _runs(plant, cases)
     retreats = 0
     for _ in range(limit):
-        simulated = [_observe_run(model, base.kept[kept], case, run, loop, decimator) for (case, loop), run in runs]
+        simulated = [
+            _observe_run(model, base.kept[kept], simulated_case(case, run, loop), rows, decimator)
+            for rows, ((case, loop), run) in zip(observed, runs)
+        ]
         problem = _stack(observed, simulated)
         now = _estimate(problem, method, std, tau)
         tau = _inflation(observed, now, std)
@@ -199,8 +203,9 @@ def simulated_case(case: Case, run: Run, loop: Loop) -> Case:
             f"to {run.t[-1]:.6g} s in steps of {step:.6g} s: give the whole reference, and `every`"
         )
     motion, q = case.motion, np.empty_like(run.q)
-    for j, cutoff in enumerate(motion.cutoff):
-        q[:, j] = low_pass(run.q[:, j], motion.rate, float(cutoff))
+    for cutoff in np.unique(motion.cutoff):
+        own = motion.cutoff == cutoff
+        q[:, own] = low_pass(run.q[:, own], motion.rate, float(cutoff))
     v, a = slope(q, motion.rate), curvature(q, motion.rate)
     return replace(case, motion=replace(motion, q=q[index], v=v[index], a=a[index]))
 
@@ -248,9 +253,39 @@ def _simulate_new(old: Plant, new: Plant, cases: Sequence[tuple[Case, Loop]]) ->
 
 
 def _observe_run(
-    model: IdentificationModel, columns: np.ndarray, case: Case, run: Run, loop: Loop, decimator: Decimator
+    model: IdentificationModel, columns: np.ndarray, case: Case, rows: Rows, decimator: Decimator
 ) -> np.ndarray:
-    return observe(model, columns, simulated_case(case, run, loop), decimator).matrix
+    """Return what `observe` returns as matrix, (M, rows, p), from the entries alone that are not zero in W.
+
+    A joint does not feel the links before it: half of the entries of an arm's W are zero.
+    """
+    row, place = np.nonzero(rows.matrix.any(axis=0))
+    out, done = np.zeros(rows.matrix.shape), 0
+    step, reach = decimator.factor, len(decimator.taps)
+    for start, stop in segments(case.motion.segment):
+        count = max(0, (stop - start - reach) // step + 1)
+        for first in range(0, count, CHUNK):
+            last = min(first + CHUNK, count)
+            part = slice(start + first * step, start + (last - 1) * step + reach)
+            states = (case.motion.q[part], case.motion.v[part], case.motion.a[part])
+            full = model.regressor(*states, carried=case.carried).transpose(2, 1, 0)
+            out[done + first : done + last, row, place] = _thin(full[columns[place], row], decimator, last - first).T
+        done += count
+    return out
+
+
+def _thin(series: np.ndarray, decimator: Decimator, count: int) -> np.ndarray:
+    """Return the first `count` samples that `calib.data.decimation.decimate` keeps of series (k, N), as (k, count)."""
+    step = decimator.factor
+    phases = -(-len(decimator.taps) // step)
+    weights = np.zeros(phases * step)
+    weights[: len(decimator.taps)] = decimator.taps
+    padded = np.zeros((len(series), (count + phases - 1) * step))
+    size = min(padded.shape[1], series.shape[1])
+    padded[:, :size] = series[:, :size]
+    sums = padded.reshape(-1, step) @ weights.reshape(phases, step).T
+    sums = sums.reshape(len(series), -1, phases)
+    return np.asarray(sum(sums[:, k : k + count, k] for k in range(phases)))
 
 
 def _stack(observed: Sequence[Rows], simulated: Sequence[np.ndarray]) -> Instruments:
