@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from trajectories.errors import NothingFeasible
+from trajectories.errors import BadInput, NothingFeasible
 from trajectories.path import Path
 from trajectories.profile import Profile
 
@@ -171,8 +171,12 @@ def controllable(rows: Bounded, s: np.ndarray) -> np.ndarray:
 
     u and x are handed over in units of a typical x, without which the linear programs fail where speeds are large.
     """
-    from toppra.algorithm import TOPPRA
-
+    try:
+        from toppra.algorithm import TOPPRA
+    except ImportError as error:
+        raise BadInput(
+            "timing needs toppra: pip install toppra (on macOS and Windows it builds from source)"
+        ) from error
     size = np.abs(rows.b).max(axis=(0, 2), initial=1e-12)
     unit = float(np.median(np.minimum(rows.top[1:], 2.0 / size)))
     scaled = Bounded(unit * rows.a, unit * rows.b, rows.c, rows.top / unit)

@@ -62,8 +62,8 @@ def joined(tracks: Sequence[Track]) -> Track:
             if jump.max() > JUMP * (1 if what == "position" else rate):
                 j = int(jump.argmax())
                 raise BadInput(
-                    f"motion {k + 2} begins {jump[j]:.3g} away from where motion {k + 1} ends ({what} of joint {j + 1}):"
-                    " put an approach between them"
+                    f"motion {k + 2} begins {jump[j]:.3g} away from motion {k + 1}'s end ({what} of joint {j + 1}): "
+                    "put an approach between them"
                 )
     rows = [slice(None)] + [slice(1, None)] * (len(tracks) - 1)
     parts = {key: np.vstack([getattr(t, key)[r] for t, r in zip(tracks, rows)]) for key in ("q", "v", "a")}

@@ -1,0 +1,76 @@
+"""A smooth approach from any pose to the start of a motion, within velocity, acceleration and jerk limits.
+
+Ruckig (Berscheid & Kröger 2021, an open relative of the Reflexxes library that the 2019 study used) finds the fastest
+jerk-limited motion; all joints move in proportion, so the approach is a straight line in joint space and stays between
+its ends. Imported at the first call.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from trajectories.errors import BadInput
+from trajectories.track import Track
+
+KINDS: tuple[str, ...] = ("velocity", "acceleration", "jerk")
+
+
+def approach(
+    start: np.ndarray, goal: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray, jerk: np.ndarray, rate: float
+) -> Track:
+    """Return the fastest approach from rest to rest, its duration rounded up to whole samples.
+
+    Args:
+        start, goal: (n,) [rad or m].
+        velocity, acceleration, jerk: (n,) largest moduli [per s, s², s³], finite and above zero.
+        rate: of the controller [Hz].
+
+    Raises:
+        BadInput: naming the joint and what is wrong with it.
+    """
+    start, goal = np.asarray(start, dtype=float), np.asarray(goal, dtype=float)
+    limits = (np.asarray(x, dtype=float) for x in (velocity, acceleration, jerk))
+    bounds: dict[str, np.ndarray] = dict(zip(KINDS, limits))
+    _check(start, goal, bounds, rate)
+    if np.array_equal(start, goal):
+        still = np.zeros((1, len(start)))
+        return Track(rate, start[None, :].copy(), still, still.copy())
+    found = _trajectory(start, goal, bounds)
+    count = max(math.ceil(found.duration * rate - 1e-9), 1)
+    stretch = count / rate / found.duration
+    rows = [found.at_time(min(t, found.duration)) for t in np.arange(count + 1) / rate / stretch]
+    q, v, a = (np.array([row[order] for row in rows]) for order in range(3))
+    q[[0, -1]], v[[0, -1]] = (start, goal), 0.0
+    return Track(rate, q, v / stretch, a / stretch**2)
+
+
+def _trajectory(start: np.ndarray, goal: np.ndarray, bounds: dict[str, np.ndarray]) -> Any:
+    import ruckig
+
+    given = ruckig.InputParameter(len(start))
+    given.current_position, given.target_position = start.tolist(), goal.tolist()
+    given.max_velocity, given.max_acceleration, given.max_jerk = (bounds[kind].tolist() for kind in KINDS)
+    given.synchronization = ruckig.Synchronization.Phase
+    result = ruckig.Trajectory(len(start))
+    said = ruckig.Ruckig(len(start)).calculate(given, result)
+    if said not in (ruckig.Result.Working, ruckig.Result.Finished):
+        raise BadInput(f"no approach was found ({said}): check that limits are neither tiny nor huge")
+    return result
+
+
+def _check(start: np.ndarray, goal: np.ndarray, bounds: dict[str, np.ndarray], rate: float) -> None:
+    if start.ndim != 1 or start.shape != goal.shape:
+        raise BadInput(
+            f"approach: start and goal need one value per joint, found shapes {start.shape} and {goal.shape}"
+        )
+    for name, values in (("start", start), ("goal", goal)):
+        if not np.isfinite(values).all():
+            raise BadInput(f"approach: joint {int(np.argmin(np.isfinite(values))) + 1} of the {name} is not a number")
+    for kind, values in bounds.items():
+        if values.shape != start.shape or not (np.isfinite(values) & (values > 0)).all():
+            raise BadInput(f"approach: {kind} limits have to be finite and above zero, one per joint; found {values}")
+    if not (np.isfinite(rate) and rate > 0):
+        raise BadInput(f"rate {rate:g} Hz: expected a number above zero")

@@ -1,0 +1,73 @@
+"""A track as a ROS 2 message trajectory_msgs/msg/JointTrajectory, in JSON or in YAML (``ros2 topic pub`` reads it)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from trajectories.errors import BadInput
+from trajectories.track import Track
+
+DIGITS = 9  # after the point: 1e-9 rad, and whole nanoseconds
+
+
+def joint_trajectory(track: Track, joint_names: Sequence[str], every: int = 1, frame: str = "") -> dict[str, Any]:
+    """Return the message as plain dictionaries; joints in rad or m, effort in N m or N where torques are known.
+
+    Args:
+        every: take one sample out of so many (and the last), for controllers that interpolate.
+        frame: header.frame_id.
+    """
+    if len(joint_names) != track.n or len(set(joint_names)) != track.n:
+        raise BadInput(f"the motion has {track.n} joints, the message would name {', '.join(joint_names) or 'none'}")
+    if every < 1:
+        raise BadInput(f"every {every}: expected 1 or more")
+    rows = np.unique(np.append(np.arange(0, len(track), every), len(track) - 1))
+    points = [_point(track, int(k)) for k in rows]
+    return {
+        "header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": frame},
+        "joint_names": list(joint_names),
+        "points": points,
+    }
+
+
+def to_json(message: dict[str, Any]) -> str:
+    """Return the message as JSON, a point per line."""
+    points = ",\n".join("    " + json.dumps(point, allow_nan=False) for point in message["points"])
+    head = json.dumps({key: message[key] for key in ("header", "joint_names")}, indent=2)[:-2]
+    return f'{head},\n  "points": [\n{points}\n  ]\n}}\n'
+
+
+def to_yaml(message: dict[str, Any]) -> str:
+    """Return the message as YAML; numbers always with a point, since YAML 1.1 takes 1e-05 for text."""
+    stamp = message["header"]["stamp"]
+    lines = [
+        "header:",
+        f"  stamp: {{sec: {stamp['sec']}, nanosec: {stamp['nanosec']}}}",
+        f"  frame_id: {json.dumps(message['header']['frame_id'])}",
+        f"joint_names: [{', '.join(json.dumps(name) for name in message['joint_names'])}]",
+        "points:",
+    ]
+    for point in message["points"]:
+        for key, values in point.items():
+            lead = "- " if key == "positions" else "  "
+            if key == "time_from_start":
+                lines.append(f"{lead}{key}: {{sec: {values['sec']}, nanosec: {values['nanosec']}}}")
+            else:
+                lines.append(f"{lead}{key}: [{', '.join(f'{x:.{DIGITS}f}' for x in values)}]")
+    return "\n".join(lines) + "\n"
+
+
+def _point(track: Track, k: int) -> dict[str, Any]:
+    nanoseconds = round(k / track.rate * 1e9)
+    efforts = track.tau[k] if track.tau is not None else []
+    return {
+        "positions": [round(float(x), DIGITS) for x in track.q[k]],
+        "velocities": [round(float(x), DIGITS) for x in track.v[k]],
+        "accelerations": [round(float(x), DIGITS) for x in track.a[k]],
+        "effort": [round(float(x), DIGITS) for x in efforts],
+        "time_from_start": {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9},
+    }

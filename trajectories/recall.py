@@ -1,0 +1,133 @@
+"""A motion found again in a recording, cut to whole periods, and averaged with its variance.
+
+The place is where the sum of squared differences between recording and reference is least,
+
+    D(k) = Σ_i |q(k + i) - r(i)|² = Σ |q|² + Σ |r|² - 2 (q ⋆ r)(k),
+
+one cross-correlation by FFT. Unlike the peak of q ⋆ r alone it is not drawn to where the recording is large.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import fftconvolve
+
+from trajectories.errors import BadInput
+
+LIKENESS = 0.9  # share of the reference's variance that a found period explains at least (our choice)
+
+
+@dataclass(frozen=True)
+class Recalled:
+    """Whole periods of a motion in a recording.
+
+    Attributes:
+        start: first sample of the first period.
+        period: samples per period.
+        periods: how many follow one another.
+        likeness: (periods,) 1 - D / Σ |r - mean|².
+        lag: of the best match behind whole samples, in samples, from -1/2 to 1/2.
+    """
+
+    start: int
+    period: int
+    periods: int
+    likeness: tuple[float, ...]
+    lag: float
+
+    @property
+    def rows(self) -> slice:
+        return slice(self.start, self.start + self.period * self.periods)
+
+
+@dataclass(frozen=True, eq=False)
+class Averaged:
+    """Mean over periods.
+
+    Attributes:
+        mean: (period, k).
+        variance: (period, k) of a single sample, unbiased over the periods.
+        periods: that were averaged: the mean's variance is variance / periods.
+    """
+
+    mean: np.ndarray
+    variance: np.ndarray
+    periods: int
+
+    @property
+    def pooled(self) -> np.ndarray:
+        """(k,) variance of a single sample over the whole period: what weights are made of."""
+        return self.variance.mean(axis=0)
+
+
+def recall(recorded: np.ndarray, reference: np.ndarray, skip: int = 0, likeness: float = LIKENESS) -> Recalled:
+    """Find a periodic motion in a recording.
+
+    Args:
+        recorded: (N, n) measured joint positions, at the reference's rate.
+        reference: (P, n) one period of the motion as it was commanded, without the closing sample.
+        skip: whole periods to leave out at the beginning (transients).
+        likeness: share of the reference's variance that a period has to explain.
+
+    Raises:
+        BadInput: where it is not there, with the nearest thing that is.
+    """
+    q, r = np.asarray(recorded, dtype=float), np.asarray(reference, dtype=float)
+    if q.ndim != 2 or r.ndim != 2 or q.shape[1] != r.shape[1]:
+        raise BadInput(f"recording {q.shape} and reference {r.shape} need one column per joint, the same ones")
+    if not (np.isfinite(q).all() and np.isfinite(r).all()):
+        raise BadInput("recording or reference hold values that are no numbers: cut them out before")
+    if len(q) < len(r):
+        raise BadInput(f"the recording has {len(q)} samples, one period of the motion {len(r)}: it is not all there")
+    alike = _likeness(q, r)
+    best = int(alike.argmax())
+    if alike[best] < likeness:
+        raise BadInput(
+            f"the motion is not in the recording: the nearest {len(r)} samples begin at {best} and explain "
+            f"{max(alike[best], 0.0):.0%} of its variance; check the rate, the order of the joints and their units"
+        )
+    chain = [k for k in range(best % len(r), len(alike), len(r)) if alike[k] >= likeness]
+    run = _run_with(chain, best, len(r))[skip:]
+    if not run:
+        raise BadInput(f"fewer than {skip + 1} whole periods of the motion are in the recording")
+    return Recalled(run[0], len(r), len(run), tuple(float(alike[k]) for k in run), _lag(alike, best))
+
+
+def average(values: np.ndarray, found: Recalled) -> Averaged:
+    """Average signals (N, k) of the recording over the whole periods found; two or more."""
+    if found.periods < 2:
+        raise BadInput("one period has no variance: record two or more")
+    parts = np.asarray(values, dtype=float)[found.rows].reshape(found.periods, found.period, -1)
+    return Averaged(parts.mean(axis=0), parts.var(axis=0, ddof=1), found.periods)
+
+
+def _likeness(q: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """Return 1 - D(k) / Σ |r - mean|² for every place (N - P + 1,)."""
+    centre = r.mean(axis=0)
+    q, r = q - centre, r - centre
+    energy = np.concatenate([[0.0], np.cumsum((q**2).sum(axis=1))])
+    inside = energy[len(r) :] - energy[: -len(r)]
+    crossed = sum(fftconvolve(q[:, j], r[::-1, j], mode="valid") for j in range(q.shape[1]))
+    return 1.0 - (inside + (r**2).sum() - 2 * crossed) / max((r**2).sum(), 1e-300)
+
+
+def _run_with(places: list[int], best: int, period: int) -> list[int]:
+    """Return the unbroken run of places, one period apart, that holds the best one."""
+    k = places.index(best)
+    first = last = k
+    while first and places[first - 1] == places[first] - period:
+        first -= 1
+    while last + 1 < len(places) and places[last + 1] == places[last] + period:
+        last += 1
+    return places[first : last + 1]
+
+
+def _lag(alike: np.ndarray, best: int) -> float:
+    """Return where the parabola through the best match and its neighbours peaks, relative to it."""
+    if not 0 < best < len(alike) - 1:
+        return 0.0
+    before, here, after = alike[best - 1 : best + 2]
+    bend = before - 2 * here + after
+    return 0.0 if bend >= 0 else float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5))
