@@ -66,8 +66,8 @@ def random_fourier(
 ) -> Reference:  # fmt: skip
     """Return a random Fourier motion of one period inside the limits, at rest at both ends.
 
-    Coefficients fall with the harmonic's number and are projected to rest (Σ k a_k = Σ k² b_k = 0); each joint is scaled
-    until its first limit is met, then centred. A stand-in for designed excitation, not a replacement.
+    Coefficients fall with the harmonic's number and are projected to rest (Σ k a_k = Σ k² b_k = 0); each joint is
+    scaled until its first limit is met, then centred. A stand-in for designed excitation, not a replacement.
 
     Args:
         lower, upper, velocity: (n,) limits, kept everywhere on the grid of `rate`.

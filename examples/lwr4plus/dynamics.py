@@ -41,6 +41,7 @@ from calib.simulation import lwr4plus, robots
 from calib.simulation.closed_loop import Plant, Sensing, inertia_diagonal, simulate
 from calib.simulation.controllers import Controller, pd, with_feedforward
 from calib.simulation.references import Reference, random_fourier
+from calib.simulation.tracking import feed_forward, tracking_error
 from calib.transforms import pose
 
 PAYLOAD = "8"
@@ -154,15 +155,8 @@ def _record(chain: Chain, reference: Reference, loaded: bool, seed: list[int]) -
 def controller(plant: Plant, reference: Reference) -> Controller:
     """Return PD gains for 8 Hz, damped by 0.8, on the mean inertia, with gravity and friction fed forward (chosen)."""
     omega, inertia = 2 * np.pi * 8.0, inertia_diagonal(plant, reference.q[::500])
-    part = IdentificationModel(plant.tree, plant.terms, "motor")
-    ahead = np.concatenate(
-        [
-            part.regressor(reference.q[k : k + 5000], reference.v[k : k + 5000], 0 * reference.a[k : k + 5000])
-            @ plant.parameters
-            for k in range(0, len(reference.t), 5000)
-        ]
-    )
-    return with_feedforward(pd(omega**2 * inertia, 2 * 0.8 * omega * inertia), ahead)
+    slow = replace(reference, a=0.0 * reference.a)
+    return with_feedforward(pd(omega**2 * inertia, 2 * 0.8 * omega * inertia), feed_forward(plant, slow))
 
 
 @dataclass(frozen=True)
@@ -228,6 +222,18 @@ def computed_torque(found: Fit, data: Data) -> dict[str, Any]:
     return result
 
 
+def tracking(chain: Chain, fits: dict[str, Fit], reference: Reference) -> dict[str, list[float]]:
+    """Return rms tracking errors [mrad] of the true loaded arm, fed forward by nothing and by each estimate."""
+    whole = model(chain, "motor")
+    robot = Plant(whole.tree, whole.terms, true_parameters(chain))
+    bare = replace(controller(robot, reference), ahead=None)
+    result = {"feedback alone": tracking_error(robot, None, bare, reference)}
+    for name, found in fits.items():
+        believed = Plant(found.model.tree, whole.terms, bases.to_standard(found.base, values_of(found)))
+        result[name] = tracking_error(robot, believed, bare, reference)
+    return {name: (1e3 * error).tolist() for name, error in result.items()}
+
+
 def essential(found: Fit) -> dict[str, Any]:
     """Return the essential set beside Table 4, with RSDs [%]."""
     estimate = found.elimination.essential.estimate
@@ -288,6 +294,7 @@ def run(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
     metrics |= {
         "essential": essential(best),
         "computed_torque": {name: computed_torque(found, unseen) for name, found in fits.items()},
+        "tracking_mrad": tracking(calibrated, fits, other),
         "cad_against_calibrated_percent": side_by_side(fits["cad"], best),
         "published": published(best),
         "regrouping_left": float(best.base.lost.max(initial=0.0)),
@@ -322,6 +329,8 @@ def show(metrics: dict[str, Any]) -> None:
         for part, errors in parts.items():
             print(f"{geometry:11} {part:14} largest [N m] " + " ".join(f"{x:6.3f}" for x in errors["largest"])
                   + "   rms " + " ".join(f"{x:6.3f}" for x in errors["rms"]))  # fmt: skip
+    for name, errors in metrics["tracking_mrad"].items():
+        print(f"tracking [mrad rms], {name:14} " + " ".join(f"{x:6.3f}" for x in errors))
     apart = sorted(metrics["cad_against_calibrated_percent"].items(), key=lambda item: -item[1])
     print("CAD against calibrated [%]: " + ", ".join(f"{name} {x:.2g}" for name, x in apart[:12]))
     for name, one in metrics["published"].items():

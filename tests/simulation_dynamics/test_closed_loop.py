@@ -230,3 +230,12 @@ def test_the_truths_are_those_of_the_library():
         chain, plant = description.read(library.path(name)), robots.plant(name)
         assert np.array_equal(plant.parameters[: 10 * chain.n], standard_parameters(chain))
         assert robots.controller(name).kp.shape == (chain.n,)
+
+
+def test_the_better_model_tracks_better():
+    from calib.simulation.tracking import tracking_error
+
+    plant, controller, reference = robots.plant("tx40"), robots.controller("tx40"), motion()
+    rough = replace(plant, parameters=1.2 * plant.parameters)
+    none, poor, good = (tracking_error(plant, one, controller, reference) for one in (None, rough, plant))
+    assert np.all(good < poor) and np.all(poor < none)
