@@ -215,6 +215,51 @@ def identify_dynamics(
         raise typer.Exit(1)
 
 
+# Excitation: excite
+
+
+@app.command()
+def excite(
+    robot: Robot,
+    out: Annotated[Path, typer.Option(help="folder for the motion, its figures and metrics.json")],
+    model: Annotated[Path | None, typer.Option(help="folder of an identification: predicts the torques")] = None,
+    limits: Annotated[Path | None, typer.Option(help="TOML: speeds, torques, workspace, collision, friction")] = None,
+    goal: Annotated[
+        list[str] | None, typer.Option(help="raw=35, normalised=6, wrist=0.1, joint6=0.1, coverage=0.1; repeatable")
+    ] = None,
+    hard: Annotated[list[str] | None, typer.Option(help="a goal that must be met; repeatable")] = None,
+    period: Annotated[float, typer.Option(help="of the motion [s]")] = 20.0,
+    harmonics: Annotated[int, typer.Option(help="frequencies per joint; control points for splines")] = 5,
+    family: Annotated[str, typer.Option(help="fourier or bspline")] = "fourier",
+    drives: Annotated[str, typer.Option(help="terms of each drive to identify, without --model")] = "Fv Fc off",
+    rate: Annotated[float, typer.Option(help="of the controller [Hz]")] = 1000.0,
+    starts: Annotated[int, typer.Option(help="random starts of the search")] = 6,
+    evaluations: Annotated[int, typer.Option(help="most evaluations per start")] = 600,
+    front: Annotated[int, typer.Option(help="motions on the front of condition number and torque; 0 for none")] = 0,
+    workers: Annotated[str, typer.Option(help="local processes, or the address of a Dask scheduler")] = "1",
+    base: Base = None,
+    tip: Tip = None,
+    seed: Seed = 0,
+) -> None:
+    """Design a motion that excites the dynamics of ROBOT within its limits."""
+    from calib import workers as work
+    from calib.procedure import excitation_outputs, exciting
+
+    excitation_outputs.check_target(out)
+    with work.workers(workers) as mapped, _progress() as say:
+        designed = exciting.excite(
+            robot, model=model, limits=limits, goals=goal or [], hard=hard or [], period=period, harmonics=harmonics,
+            family=family, drives_=drives, rate=rate, starts=starts, evaluations=evaluations, front=front, base=base, tip=tip, seed=seed,
+            map=mapped, progress=say,
+        )  # fmt: skip
+        say("writing")
+        excitation_outputs.write_folder(designed, out)
+    console = _console()
+    for line in excitation_outputs.lines(designed):
+        console.print(line, soft_wrap=True, markup=False)
+    console.print(f"written to {out}", soft_wrap=True, markup=False)
+
+
 # The guided session: new, next, status, redo, demo
 
 Folder = Annotated[Path, typer.Argument(help="the session's folder")]

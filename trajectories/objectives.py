@@ -147,8 +147,8 @@ class FrictionCoverage:
 
         F = mean over joints and the four ranges of  (max(0, 1 - share / wanted))²
 
-    Shares are means of logistic memberships of v: high: σ((±v - high) / w), low: σ(±v / w) - σ((±v - low) / w), with
-    w = `width` · low.
+    Shares are means of logistic memberships of v: high: σ((±v - high) / (`width` high)), low: σ(±v / w) -
+    σ((±v - low) / w) with w = `width` low.
 
     Attributes:
         low, high: (n,) speeds [rad/s or m/s], 0 < low < high.
@@ -164,11 +164,12 @@ class FrictionCoverage:
     def evaluate(self, motion: Motion, regressor: np.ndarray) -> Value:
         count, n = motion.v.shape
         value, slope = 0.0, np.zeros((4, count, n))
-        w = self.width * self.low
+        slow, fast = self.width * self.low, self.width * self.high
         for sign in (1.0, -1.0):
             v = sign * motion.v
-            (zero, d_zero), (lo, d_lo), (hi, d_hi) = (_logistic((v - at) / w) for at in (0.0, self.low, self.high))
-            for member, by_v in ((hi, d_hi / w), (zero - lo, (d_zero - d_lo) / w)):
+            (zero, d_zero), (lo, d_lo) = _logistic(v / slow), _logistic((v - self.low) / slow)
+            hi, d_hi = _logistic((v - self.high) / fast)
+            for member, by_v in ((hi, d_hi / fast), (zero - lo, (d_zero - d_lo) / slow)):
                 missing = np.maximum(0.0, 1.0 - member.mean(axis=0) / self.wanted)
                 value += float((missing**2).sum()) / (4 * n)
                 slope[1] -= sign * 2 * missing / self.wanted / count / (4 * n) * by_v

@@ -35,13 +35,14 @@ def proposed_goals(
     starts: int = 2,
     evaluations: int = 300,
     seed: int = 0,
+    guesses: tuple[np.ndarray, ...] = (),
     map: Callable = map,
 ) -> list[tuple[float, Found]]:
     """Return what each objective reaches alone, with its motion: where goals start from (the study's advice)."""
     result = []
     for objective in objectives:
         alone = replace(problem, objectives=((objective, 1.0),), goals=())
-        run = design(alone, starts=starts, evaluations=evaluations, seed=seed, map=map)
+        run = design(alone, starts=starts, evaluations=evaluations, seed=seed, guesses=guesses, map=map)
         result.append((float(run.values[0]), run))
     return result
 
@@ -52,6 +53,7 @@ def sweep(
     second: Objective,
     levels: Sequence[float],
     guess: np.ndarray,
+    other: np.ndarray | None = None,
     *,
     evaluations: int = 240,
     report: Callable[[int, int, str], None] | None = None,
@@ -61,11 +63,14 @@ def sweep(
     Args:
         levels: of the second objective, in the order they are tried (best from easy to hard).
         guess: variables to start from (p,).
+        other: to try where the last motion does not lead to a level, best what the second objective alone reached.
     """
     runs, values = list[Found](), list[np.ndarray]()
     for number, level in enumerate(levels, 1):
         goals = (Goal(first, _level(problem, first, guess)), Goal(second, float(level), 0.0))
         run = one_start(replace(problem, goals=goals), evaluations, "slsqp", 0, guess)
+        if isinstance(run, Stuck) and other is not None:
+            run = one_start(replace(problem, goals=goals), evaluations, "slsqp", 0, other)
         if not isinstance(run, Stuck) and np.isfinite(run.merit):
             guess = np.append(run.x, run.factor) if problem.free_period else run.x
             runs.append(run)

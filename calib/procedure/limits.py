@@ -50,22 +50,32 @@ MARGIN, RADIUS = 0.01, 0.05  # [m], where the file does not tell (our choice)
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """Where poses may lie: joint limits (n,), smooth constraints, and what has no gradient."""
+    """Where poses may lie: joint limits (n,), smooth constraints, and what has no gradient.
+
+    Attributes:
+        collision: the `calib.robot.collision.Collision` behind `feasible`; None without one.
+        clearance: the least distance it asks for [m].
+    """
 
     lower: np.ndarray
     upper: np.ndarray
     constraints: tuple[Constraint, ...] = ()
     feasible: Callable[[np.ndarray], np.ndarray] | None = None
     notes: tuple[str, ...] = field(default=())
+    collision: Any = None
+    clearance: float = MARGIN
 
 
-def read_limits(path: Path | None, cell: Installation, source: Path | None = None) -> Limits:
+def read_limits(
+    path: Path | None, cell: Installation, source: Path | None = None, beside: tuple[str, ...] = ()
+) -> Limits:
     """Read the constraints for an arm with its targets.
 
     Args:
         path: the file; None for the joint limits alone.
         cell: the arm, see `calib.procedure.observing.targets_of`.
         source: the robot's file, whose collision shapes are used where it is a URDF.
+        beside: tables of the file that somebody else reads.
 
     Raises:
         UsageError: for an unknown key or a value that a key cannot have.
@@ -75,13 +85,15 @@ def read_limits(path: Path | None, cell: Installation, source: Path | None = Non
         return Limits(lower, upper)
     try:
         table, where = load(path), str(path)
-        check_keys(table, ("joints", "target", "instrument", "collision", "obstacle"), where)
+        check_keys(table, ("joints", "target", "instrument", "collision", "obstacle", *beside), where)
         lower, upper = _joints(table.get("joints", {}), cell, where)
         found = (*_target(table.get("target", {}), cell, where), *_instrument(table, cell, where))
-        free, notes = _collision(table, cell, source, where) if {"collision", "obstacle"} & set(table) else (None, ())
+        if not {"collision", "obstacle"} & set(table):
+            return Limits(lower, upper, found)
+        model, margin, notes = _collision(table, cell, source, where)
     except RobotError as error:
         raise UsageError(str(error)) from error
-    return Limits(lower, upper, found, free, notes)
+    return Limits(lower, upper, found, partial(model.free, margin=margin), notes, model, margin)
 
 
 def _joints(table: Mapping[str, Any], cell: Installation, where: str) -> tuple[np.ndarray, np.ndarray]:
@@ -143,7 +155,7 @@ def _instrument(tables: Mapping[str, Any], cell: Installation, where: str) -> li
 
 def _collision(
     tables: Mapping[str, Any], cell: Installation, source: Path | None, where: str
-) -> tuple[Callable[[np.ndarray], np.ndarray], tuple[str, ...]]:
+) -> tuple[Any, float, tuple[str, ...]]:
     from calib.robot import collision
 
     table = tables.get("collision", {})
@@ -161,7 +173,7 @@ def _collision(
     else:
         model = collision.from_chain(chain, radius, floor, obstacles)
         notes = (f"no collision shapes in the robot's file: capsules of radius {radius:g} m stand for its links",)
-    return partial(model.free, margin=margin), notes
+    return model, margin, notes
 
 
 def _obstacle(entry: Mapping[str, Any], where: str) -> Any:

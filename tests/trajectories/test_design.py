@@ -147,10 +147,10 @@ def test_single_objectives_propose_goals_and_a_front_trades_them():
     spot, first = designed()
     motion = spot.basis().motion(first.x)
     begin = SLACK.evaluate(motion, BASE.regressor(motion.q, motion.v, motion.a)).value
-    (least, run), *_ = proposed_goals(problem(samples=40), [SLACK], starts=1, evaluations=90, seed=1)
+    (least, run), *_ = proposed_goals(spot, [SLACK], starts=0, evaluations=90, guesses=(first.x,))
     assert least < begin - 0.003 and run.values[0] == least
     levels = [begin, (begin + least) / 2, 0.5 * least]  # the last is out of reach
-    front = sweep(spot, Excitation("cond", "normalised"), SLACK, levels, first.x, evaluations=80)
+    front = sweep(spot, Excitation("cond", "normalised"), SLACK, levels, first.x, run.x, evaluations=80)
     assert front.values.shape == (2, 2) and (front.values[:, 1] <= np.array(levels[:2]) + 1e-5).all()
     assert front.best.any()
 

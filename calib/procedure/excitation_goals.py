@@ -1,0 +1,67 @@
+"""The goals of an excitation, as said on the command line.
+
+``raw=35``, ``normalised=6``: condition numbers; ``wrist=0.1``, ``joint6=0.1``: mean torque; ``coverage=0.1``: speeds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from calib.errors import UsageError
+from calib.procedure.excitable import Dynamics
+from calib.procedure.motion_limits import MotionLimits
+from calib.robot.chain import Chain
+from trajectories.objectives import Excitation, FrictionCoverage, Objective, TorqueSlack
+from trajectories.optimise import Found
+from trajectories.problem import Goal
+
+
+def read_goals(
+    texts: Sequence[str], dynamics: Dynamics, chain: Chain, limits: MotionLimits, soft: int
+) -> list[tuple[str, Goal]]:
+    """Return the goals said on the command line, by name; those from `soft` on are hard."""
+    result = []
+    for number, text in enumerate(texts):
+        name, _, amount = text.partition("=")
+        try:
+            value = float(amount)
+        except ValueError:
+            raise UsageError(f"goal '{text}': expected NAME=NUMBER, e.g. wrist=0.1") from None
+        objective, goal = objective_of(name, value, dynamics, chain, limits, text)
+        result.append((name, Goal(objective, goal, None if number < soft else 0.0)))
+    return result
+
+
+def objective_of(
+    name: str, value: float, dynamics: Dynamics, chain: Chain, limits: MotionLimits, text: str
+) -> tuple[Objective, float]:
+    if name in ("raw", "normalised"):
+        if not value > 1:
+            raise UsageError(f"goal '{text}': a condition number is above 1")
+        return Excitation("cond", name), value
+    if name == "coverage":
+        speeds = np.array([joint.velocity for joint in chain.joints])
+        if not np.isfinite(speeds).all() or not 0 < value < 0.25:
+            raise UsageError(f"goal '{text}': needs velocity limits, and a share of time above 0 and below 0.25")
+        return FrictionCoverage(0.1 * speeds, 0.5 * speeds, value), 0.01
+    numbered = {f"joint{j + 1}": (j,) for j in range(chain.n)} | {"wrist": tuple(range(max(0, chain.n - 2), chain.n))}
+    if name not in numbered:
+        raise UsageError(f"goal '{text}': '{name}' is none of raw, normalised, coverage, wrist, joint1 …")
+    if not 0 < value < 1:
+        raise UsageError(f"goal '{text}': the mean torque is a share of its limit, above 0 and below 1")
+    if dynamics.values is None or not np.isfinite(limits.torque[list(numbered[name])]).all():
+        raise UsageError(f"goal '{text}': needs torque limits and a model or masses to predict torques with")
+    return TorqueSlack(numbered[name], dynamics.values, limits.torque), 1.0 - value
+
+
+def with_conditions(wanted: list[tuple[str, Goal]], found: Found) -> tuple[Goal, ...]:
+    """Add the condition numbers with what the first run reached, where no goal was said for either."""
+    goals = [goal for _, goal in wanted]
+    if not {"raw", "normalised"} & {name for name, _ in wanted}:
+        goals += [
+            Goal(Excitation("cond", scaling), float(value))
+            for scaling, value in zip(("raw", "normalised"), found.values)
+        ]
+    return tuple(goals)

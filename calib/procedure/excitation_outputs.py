@@ -1,0 +1,90 @@
+"""The folder of an excitation: metrics, the motion at the controller's rate, its coefficients, and pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib import files
+from calib.errors import UsageError
+from calib.procedure import excitation_plots, exciting
+from calib.procedure.drawing import save
+from calib.procedure.exciting import Designed
+from calib.robot.tables import dumps
+from trajectories.basis import Motion
+from trajectories.verify import dense_motion
+
+OURS = ("metrics.json", "trajectory.csv", "trajectory.toml")
+
+
+def check_target(out: Path) -> None:
+    """Refuse, before any work is done, a file, or a folder whose files of these names are not ours to replace."""
+    if out.exists() and not out.is_dir():
+        raise UsageError(f"{out} is a file; --out needs a folder")
+    present = [name for name in OURS if (out / name).exists()]
+    if present and not all((out / name).exists() for name in OURS):
+        raise UsageError(f"{out} holds {', '.join(present)} which no earlier excitation left there; choose another")
+
+
+def write_folder(designed: Designed, out: Path) -> Path:
+    """Write the folder; each file whole or not at all, ``metrics.json`` last."""
+    motion = sampled(designed)
+    header = ["t", *(f"{letter}{j + 1}" for letter in "qva" for j in range(designed.chain.n))]
+    table = np.concatenate([motion.times[:, None], motion.q, motion.v, motion.a], axis=1)
+    files.write_table(out / "trajectory.csv", header, table.tolist())
+    files.write(out / "trajectory.toml", dumps(coefficients(designed)))
+    save(excitation_plots.motion_figure(designed), out / "plot_motion.png")
+    save(excitation_plots.path_figure(designed), out / "plot_path.png")
+    save(excitation_plots.history_figure(designed), out / "plot_history.png")
+    if designed.front is not None and len(designed.front.values):
+        save(excitation_plots.front_figure(designed.front), out / "plot_front.png")
+        rows = [[*map(float, row), bool(best)] for row, best in zip(designed.front.values, designed.front.best)]
+        files.write_table(out / "front.csv", [*designed.front.names, "not dominated"], rows)
+    files.write_json(out / "metrics.json", exciting.metrics(designed))
+    return out
+
+
+def sampled(designed: Designed) -> Motion:
+    """Return one period at the controller's rate, both ends included."""
+    count = round(designed.period * designed.rate)
+    times = np.arange(count + 1) * (designed.period / count)
+    return dense_motion(designed.family, designed.found.x, times, designed.found.factor)
+
+
+def coefficients(designed: Designed) -> dict[str, Any]:
+    """Return the content of ``trajectory.toml``: eq. 23 of Kolyubin et al. 2019, or control points."""
+    head: dict[str, Any] = {
+        "robot": designed.chain.name, "family": designed.kind, "period": designed.period, "rate": designed.rate,
+        "note": "q(t) = q0 + sum_k a_k sin(k w t) + b_k cos(k w t), w = 2 pi / period; rad, m, s"
+        if designed.kind == "fourier" else "periodic spline, uniform knots over the period; rad, m, s",
+    }  # fmt: skip
+    joints = []
+    for name, c in zip(designed.chain.joint_names, designed.family.coefficients(designed.found.x)):
+        if designed.kind == "fourier":
+            half = len(c) // 2
+            joints.append({"name": name, "q0": c[0], "a": c[1 : 1 + half], "b": c[1 + half :]})
+        else:
+            joints.append({"name": name, "points": c})
+    degree = getattr(designed.family, "degree", None)
+    return head | ({"degree": degree} if degree else {}) | {"joint": joints}
+
+
+def lines(designed: Designed) -> list[str]:
+    """Return what a person wants to read at the end."""
+    found, cond = designed.found, designed.condition
+    columns = len(designed.dynamics.exact.names)
+    result = [
+        f"condition number of {columns} columns: {cond['raw']:.4g} raw, {cond['normalised']:.4g} normalised "
+        f"({designed.kind}, period {designed.period:g} s)",
+        *(f"goal {name}: {value:.4g} (asked: {goal:.4g})" for name, goal, _, value in designed.goals),
+        f"{found.evaluations} evaluations, {found.feasible:.0%} of them feasible, {found.seconds:.1f} s",
+        f"every limit is kept, at {designed.proof.instants} instants and between them; smallest margins:",
+    ]
+    for name, one in designed.proof.worst.items():
+        how = "bound" if one.proved else "estimate"
+        result.append(
+            f"  {name:12} {one.margin:.4g} {one.unit} ({one.label}, t = {one.time:.2f} s; between instants: {how})"
+        )
+    return result + [f"note: {note}" for note in designed.notes]

@@ -1,0 +1,238 @@
+"""Designing exciting motions: a robot's regressor and limits handed to the package `trajectories`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.data.options import FitOptions
+from calib.errors import UsageError
+from calib.procedure.excitable import Dynamics, read_dynamics
+from calib.procedure.excitation_goals import objective_of, read_goals, with_conditions
+from calib.procedure.inputs import load_robot
+from calib.procedure.motion_limits import MotionLimits, read_motion_limits
+from calib.robot.chain import Chain
+from trajectories.basis import Family, aligned_period
+from trajectories.bspline import bspline
+from trajectories.constraints import Constraint, TorqueLimit
+from trajectories.fourier import fourier
+from trajectories.objectives import Excitation, TorqueSlack, condition_numbers
+from trajectories.optimise import Found, design
+from trajectories.pareto import Front, proposed_goals, sweep
+from trajectories.problem import Goal, Problem
+from trajectories.verify import Verification, dense_motion, ensured
+
+GUARD = 0.2  # share of the torque limits kept free where no friction is known (our choice)
+INSTANTS = 1000  # over the period, at which condition numbers are reported
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Designed:
+    """An exciting motion with its proof.
+
+    Attributes:
+        chain, dynamics, limits, family: what it was made for.
+        problem: that was solved last.
+        found: the motion; `proof`: its margins, checked independently.
+        condition: raw and normalised, of `INSTANTS` samples over the period with the model's own Coulomb sign.
+        goals: name, goal, weight and what was reached.
+        front: trade-offs, where asked for.
+        rate: of the controller [Hz].
+        notes: what a user should know.
+    """
+
+    chain: Chain
+    dynamics: Dynamics
+    limits: MotionLimits
+    family: Family
+    problem: Problem
+    found: Found
+    proof: Verification
+    condition: dict[str, float]
+    goals: tuple[tuple[str, float, float, float], ...]
+    front: Front | None
+    rate: float
+    kind: str
+    notes: tuple[str, ...]
+
+    @property
+    def period(self) -> float:
+        return self.family.period * self.found.factor
+
+
+def excite(
+    robot: str | Path,
+    *,
+    model: Path | None = None,
+    limits: Path | None = None,
+    goals: Sequence[str] = (),
+    hard: Sequence[str] = (),
+    period: float = 20.0,
+    harmonics: int = 5,
+    family: str = "fourier",
+    drives_: str = "Fv Fc off",
+    rate: float = 1000.0,
+    samples: int = 200,
+    starts: int = 6,
+    evaluations: int = 600,
+    front: int = 0,
+    base: str | None = None,
+    tip: str | None = None,
+    seed: int = 0,
+    map: Callable = map,
+    progress: Progress | None = None,
+) -> Designed:
+    """Design a motion that excites the dynamics of a robot within its limits.
+
+    Without goals the logarithms of both condition numbers, raw and normalised, are minimised in equal parts. With goals
+    (``wrist=0.1``) both take part with what a single-objective run reached as their goal (the study's advice), unless
+    they are given themselves.
+
+    Args:
+        robot: see `calib.robot.load`.
+        model: folder of an identification: torques, friction and their uncertainty.
+        limits: see `calib.procedure.motion_limits`.
+        goals, hard: ``raw=35``, ``normalised=6`` (condition numbers), ``wrist=0.1`` or ``joint6=0.1`` (mean torque as a
+            share of the limit, at least), ``coverage=0.1`` (share of time at low and at high speed, either way).
+        period: T0 [s], of the first motion.
+        harmonics: n_f, or control points beside the rest conditions for splines.
+        family: "fourier" or "bspline".
+        drives_: terms of each joint's drive, without a model.
+        rate: the controller's [Hz].
+        samples, starts, evaluations, seed, map: of the search.
+        front: motions on the front between the normalised condition number and the first torque goal.
+    """
+    say = progress or (lambda words: None)
+    chain, source = load_robot(robot, None, FitOptions(), base, tip)
+    found_limits = read_motion_limits(limits, chain, source)
+    dynamics = read_dynamics(chain, model, drives_, found_limits)
+    motions = _family(family, harmonics, period, chain, found_limits, rate)
+    search, check, notes = _constraints(dynamics, found_limits)
+    problem = Problem(
+        motions, dynamics.smooth.regressor, dynamics.smooth.regressor_gradient,
+        ((Excitation("cond", "raw"), 0.5), (Excitation("cond", "normalised"), 0.5)), search, samples=samples,
+    )  # fmt: skip
+    words = lambda done, total, what: say(f"{what} ({done} of {total} starts)")  # noqa: E731
+    found = design(problem, starts=starts, evaluations=evaluations, seed=seed, map=map, report=words)
+    wanted = read_goals([*goals, *hard], dynamics, chain, found_limits, len(goals))
+    spent, seconds, history = found.evaluations, found.seconds, found.history
+    if wanted:
+        problem = replace(problem, goals=with_conditions(wanted, found))
+        say("goal attainment")
+        found = design(
+            problem, starts=max(1, starts // 3), evaluations=evaluations, seed=seed, guesses=(found.x,), map=map,
+            report=words,
+        )  # fmt: skip
+        spent, seconds, history = spent + found.evaluations, seconds + found.seconds, found.history
+    say("verifying")
+    found, proof = ensured(problem, replace(found, evaluations=spent, seconds=seconds, history=history), check)
+    trade = _front(problem, dynamics, chain, found_limits, found, wanted, front, words) if front else None
+    condition = condition_of(dynamics, motions, found)
+    return Designed(
+        chain, dynamics, found_limits, motions, problem, found, proof, condition, _reached(problem, found), trade,
+        rate, family, (*found_limits.notes, *dynamics.notes, *notes),
+    )  # fmt: skip
+
+
+def condition_of(dynamics: Dynamics, family: Family, found: Found) -> dict[str, float]:
+    """Return the condition numbers of `INSTANTS` samples over the period, with the model's own Coulomb sign."""
+    times = family.period * found.factor / INSTANTS * np.arange(INSTANTS)
+    motion = dense_motion(family, found.x, times, found.factor)
+    return condition_numbers(dynamics.exact.regressor(motion.q, motion.v, motion.a))
+
+
+def metrics(designed: Designed) -> dict[str, Any]:
+    """Return the content of ``metrics.json``."""
+    found = designed.found
+    return {
+        "condition_number": designed.condition,
+        "objective": found.merit,
+        "feasible": designed.proof.feasible,
+        "margins": {
+            name: {
+                "margin": one.margin, "unit": one.unit, "at": one.label, "time": one.time, "share": one.share,
+                "allowance": one.allowance, "proved": one.proved,
+            }
+            for name, one in designed.proof.worst.items()
+        },
+        "seconds": found.seconds,
+        "evaluations": found.evaluations,
+        "feasible_evaluations": found.feasible,
+        "history": list(found.history),
+        "goals": {name: {"goal": goal, "weight": w, "reached": value} for name, goal, w, value in designed.goals},
+        "setting": {
+            "robot": designed.chain.name, "family": designed.kind, "period": designed.period,
+            "harmonics": list(getattr(designed.family, "harmonics", getattr(designed.family, "counts", ()))),
+            "columns": list(designed.dynamics.exact.names), "samples": designed.problem.samples,
+            "samples_reported": INSTANTS, "instants_verified": designed.proof.instants, "rate": designed.rate,
+            "interrupted": found.interrupted,
+        },
+        "notes": list(designed.notes),
+    }  # fmt: skip
+
+
+def _family(kind: str, harmonics: int, period: float, chain: Chain, limits: MotionLimits, rate: float) -> Family:
+    if kind == "fourier":
+        return fourier(harmonics, period, chain.n, resonance=limits.resonance, rate=rate)
+    if kind == "bspline":
+        return bspline(harmonics, period, chain.n, rate=rate)
+    raise UsageError(f"family '{kind}' is none of fourier, bspline")
+
+
+def _constraints(
+    dynamics: Dynamics, limits: MotionLimits
+) -> tuple[tuple[Constraint, ...], tuple[Constraint, ...], tuple[str, ...]]:
+    """Return what the search keeps, and what is verified: the torque with the model's own Coulomb sign."""
+    if dynamics.values is None or not np.isfinite(limits.torque).any():
+        return limits.constraints, limits.constraints, ("no torque limit is checked",)
+    margin, notes = limits.margin, ()
+    if margin is None:
+        margin = 0.0 if dynamics.friction else GUARD
+        notes = () if dynamics.friction else (f"{GUARD:.0%} of the torque limits stay free for friction",)
+    torque = [
+        TorqueLimit(
+            one.regressor, one.regressor_gradient, dynamics.values, limits.torque, dynamics.covariance,
+            limits.deviations, margin,
+        )
+        for one in (dynamics.smooth, dynamics.exact)
+    ]  # fmt: skip
+    return (*limits.constraints, torque[0]), (*limits.constraints, torque[1]), notes
+
+
+def _reached(problem: Problem, found: Found) -> tuple[tuple[str, float, float, float], ...]:
+    return tuple(
+        (goal.objective.name, goal.goal, goal.share, float(value)) for goal, value in zip(problem.goals, found.values)
+    )
+
+
+def _front(
+    problem: Problem,
+    dynamics: Dynamics,
+    chain: Chain,
+    limits: MotionLimits,
+    found: Found,
+    wanted: list[tuple[str, Goal]],
+    count: int,
+    report: Callable[[int, int, str], None],
+) -> Front:
+    """Sweep the first torque goal (default: the wrist) between what this motion has and what it can reach alone."""
+    slack = next((goal.objective for _, goal in wanted if isinstance(goal.objective, TorqueSlack)), None)
+    if slack is None:
+        slack = objective_of("wrist", 0.5, dynamics, chain, limits, "wrist")[0]
+    motion = problem.basis().motion(found.x)
+    begin = slack.evaluate(motion, problem.regressor(motion.q, motion.v, motion.a)).value
+    (end, alone), *_ = proposed_goals(
+        replace(problem, goals=()), [slack], starts=1, evaluations=150, guesses=(found.x,)
+    )
+    levels = np.linspace(begin, end, count + 1)[:-1].tolist() if end < begin else [begin]
+    return sweep(problem, Excitation("cond", "normalised"), slack, levels, found.x, alone.x, report=report)
+
+
+def periods(designed: Designed) -> int:
+    """Return how many samples of the controller one period holds."""
+    return aligned_period(designed.period, designed.rate)
