@@ -63,6 +63,8 @@ class Climb:
     Attributes:
         fit: the chosen model, fitted to all rows.
         nominal: the nominal arm with its frames fitted to all rows.
+        rigid: the best fit without effects, to all rows. The geometry inside ``fit`` is good only together with its
+            effects, which trade with it; what has to do without them (a URDF) takes this one.
         rungs: all models tried, in order.
         chosen: name of the chosen model, e.g. ``geometry + harmonics``.
         folds: how the unseen rows were set aside.
@@ -71,6 +73,7 @@ class Climb:
 
     fit: GeometricFit
     nominal: GeometricFit
+    rigid: GeometricFit
     rungs: tuple[Rung, ...]
     chosen: str
     folds: Folds
@@ -139,6 +142,7 @@ class _Climber:
         tell(0, len(MODELS), "frames")
         self.nominal = polish_frames(cell, measured, settings)
         self.best, self.rungs, self.chosen = self.nominal, [], "frames"
+        self.stiff = self.nominal
         self.steps = 0
         self.drawn = not all(has_instrument(block) for block in measured)
 
@@ -170,6 +174,7 @@ class _Climber:
                 error = min(error, unseen)
             if name == last:
                 break
+        self.stiff = self.best
 
     def effects(self, model: str) -> None:
         """Try the effects one by one on top of the geometry; by name, take all up to it."""
@@ -260,7 +265,7 @@ class _Climber:
 
     def result(self) -> Climb:
         loss = "none" if self.settings.loss == "auto" else self.settings.loss
-        return Climb(self.best, self.nominal, tuple(self.rungs), self.chosen, self.folds, loss)
+        return Climb(self.best, self.nominal, self.stiff, tuple(self.rungs), self.chosen, self.folds, loss)
 
 
 def _places(offered: dict[str, list[Term]]) -> dict[str, np.ndarray]:
