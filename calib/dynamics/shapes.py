@@ -81,6 +81,22 @@ def _ripple_slopes(wave: np.ndarray, by_x: np.ndarray, m: Joined, s: tuple[float
     return s[0] * by_x * gain, -2.0 * m.v / s[1] ** 2 * gain**2 * wave, 0.0
 
 
+def _banded(m: Joined, s: tuple[float, ...]) -> np.ndarray:
+    """Return the gain of ripple in one band and one direction: a hat over the frequency order · |v| / 2π [Hz].
+
+    It fades over 0.1 rad beyond the positions it was learnt at, lower … upper: its phase does not carry further.
+    """
+    order, left, middle, right, way, lower, upper = s
+    frequency = np.abs(m.v) * order / (2.0 * np.pi)
+    falls = np.ones_like(m.v) if np.isinf(right) else (right - frequency) / (right - middle)
+    gain = np.clip(np.minimum((frequency - left) / (middle - left), falls), 0.0, 1.0) * (way * m.v > 0.0)
+    beyond = np.maximum(np.maximum(lower - m.x, m.x - upper), 0.0)
+    return gain * np.clip(1.0 - beyond / 0.1, 0.0, 1.0)
+
+
+BANDED = ("order", "left", "middle", "right", "way", "lower", "upper")
+
+
 def _given(array: np.ndarray | None) -> np.ndarray:
     assert array is not None  # the caller checks `Shape.loaded` and `Shape.remembers`
     return array
@@ -123,4 +139,6 @@ SHAPES: dict[str, Shape] = {
         lambda m, s: _ripple_slopes(np.cos(s[0] * m.x), -np.sin(s[0] * m.x), m, s),
         "N m", "N", ("order", "speed"),
     ),
+    "sine_band": Shape(lambda m, s: np.sin(s[0] * m.x) * _banded(m, s), None, "N m", "N", BANDED),
+    "cosine_band": Shape(lambda m, s: np.cos(s[0] * m.x) * _banded(m, s), None, "N m", "N", BANDED),
 }  # fmt: skip
