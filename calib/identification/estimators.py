@@ -50,7 +50,7 @@ def fit_rows(all_rows: Sequence[Rows], data: Triangles, method: str = "wls", exa
         all_rows: of all cases.
         data: their triangles (`rows.triangulate`).
         exact: False where a prior will decide on what the data leave open.
-        method: ``ols``, ``wls``, ``irls`` (across joints, with a gate) or ``tls`` (noise in the columns of accelerations
+        method: ``ols``, ``wls``, ``irls`` (across joints, with a gate) or ``tls`` (noise in the columns
             in proportion to their size).
     """
     if method not in METHODS:

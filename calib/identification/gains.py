@@ -20,7 +20,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
 
 from calib.arrays import frozen
 from calib.errors import NotConverged, Unidentifiable
@@ -132,7 +131,7 @@ def _start(body: np.ndarray, load: np.ndarray, current: np.ndarray) -> np.ndarra
     for j in range(n):
         matrix[j, :, j] = current[j]
     matrix[:, :, n:] = -body
-    found = scipy.linalg.lstsq(matrix.reshape(-1, n + p), load.ravel(), cond=1e-12)[0][:n]
+    found = np.linalg.lstsq(matrix.reshape(-1, n + p), load.ravel(), rcond=1e-12)[0][:n]
     usual = float(np.median(np.abs(found)))
     return np.where(np.abs(found) > 0.05 * usual, np.abs(found), max(usual, 1e-3))
 
@@ -142,4 +141,4 @@ def _parameters(
 ) -> np.ndarray:
     scale = (gain * std)[:, None]
     target = (gain[:, None] * current - load) / scale
-    return scipy.linalg.lstsq((body / scale[:, :, None]).reshape(-1, body.shape[2]), target.ravel(), cond=1e-12)[0]
+    return np.linalg.lstsq((body / scale[:, :, None]).reshape(-1, body.shape[2]), target.ravel(), rcond=1e-12)[0]

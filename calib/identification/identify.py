@@ -19,8 +19,9 @@ from calib.estimation.triangles import Triangles, combine, condition_numbers, re
 from calib.identification.cases import Case
 from calib.identification.estimators import Fitted, fit_rows, residual_inflation
 from calib.identification.ladder import Climb, Ground, Rung, climb
-from calib.identification.prediction import Dynamics, transmitted
+from calib.identification.prediction import Dynamics, predict, transmitted
 from calib.identification.prior import Prior, bounded, find_prior
+from calib.identification.ripple import Ripple, find_all
 from calib.identification.rows import Rows, extend, observe, observe_terms, pool, triangulate, with_blocks
 from calib.identification.settings import Settings, make_model, per_joint
 from calib.identification.unseen import estimate
@@ -45,6 +46,7 @@ class Identification:
         rows: what was learnt from.
         condition: of the observation matrix of the base parameters, in its units and with columns of unit norm.
         prior: what was known of the base parameters beforehand, where it was used.
+        ripples: gear ripple found above the identification band, by joint; not part of the estimate's covariance.
     """
 
     dynamics: Dynamics
@@ -56,6 +58,7 @@ class Identification:
     rows: tuple[Rows, ...]
     condition: tuple[float, float]
     prior: Prior | None = None
+    ripples: tuple[Ripple, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -120,11 +123,18 @@ def identify(
     richer = with_terms(model, *climbed.terms)
     values = fitted.estimate.values
     standard = np.concatenate([bases.to_standard(base, values[: base.b]), values[base.b :]])
+    ripples: list[Ripple] = []
+    if settings.kind == "motor" and friction in ("auto", "ripple"):
+        say("ripple")
+        so_far = Dynamics(richer, standard)
+        ripples = find_all(cases, [case.target - predict(so_far, case) for case in cases])
+        richer = with_terms(richer, *(one for ripple in ripples for one in ripple.terms))
+        standard = np.concatenate([standard, *(ripple.values for ripple in ripples)])
     standard = _with_payloads(standard, richer, cases, settings)
     say("essential parameters")
     gone = _essential(fitted, settings, prior)
     return Identification(
-        Dynamics(richer, standard), base, fitted, gone, climbed, settings, tuple(full), condition, prior
+        Dynamics(richer, standard), base, fitted, gone, climbed, settings, tuple(full), condition, prior, tuple(ripples)
     )  # fmt: skip
 
 
@@ -170,7 +180,7 @@ def common_decimator(cases: Sequence[Case], settings: Settings) -> Decimator:
 
 
 def first_fit(rows: Sequence[Rows]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the residuals' standard deviation and inflation (rows,), and values (b,), of a robustly solvable first fit."""
+    """Return standard deviation and inflation of the residuals (rows,), and values (b,), of a fit that always exists."""
     count = rows[0].target.shape[1]
     data = pool(triangulate(rows), count)
     std, tau = np.ones(count), np.ones(count)

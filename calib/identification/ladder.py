@@ -26,7 +26,7 @@ GAIN = 0.02  # a rung has to lower a joint's rms error on unseen time by this sh
 WIDTHS = (0.0005, 0.002, 0.008, 0.03)  # of presliding, shares of a joint's travel (our choice)
 WINS = 0.6  # and on this share of the blocks
 RUNGS = ("load", "presliding", "stribeck", "asymmetric", "root", "cubic")
-NAMES = ("auto", "standard", *RUNGS)
+NAMES = ("auto", "standard", *RUNGS, "ripple")
 
 Progress = Callable[[str], None]
 
@@ -103,7 +103,7 @@ def climb(ground: Ground, wanted: str = "auto", progress: Progress | None = None
     """Return the friction terms that unseen time rewards, or those of a rung by name.
 
     Args:
-        wanted: ``auto``; ``standard``: none; a rung's name: that rung at all joints, nothing else.
+        wanted: ``auto``; ``standard`` (or ``ripple``, which `calib.identification.ripple` finds later): none; a rung's name: that rung at all joints, nothing else.
     """
     say = progress or (lambda words: None)
     if wanted not in NAMES:

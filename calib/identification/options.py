@@ -2,7 +2,8 @@
 
 TOML; every key is optional, and a key that is none of these is refused. SI units; joints are counted from 1::
 
-    friction = "auto"                # auto, standard, or a rung: load, presliding, stribeck, asymmetric, root, cubic, ripple
+    friction = "auto"                # auto, standard, or a rung: load, presliding, stribeck, asymmetric, root, cubic,
+                                     # ripple
     method = "wls"                   # ols, wls, irls, tls, iv
     drives = "Ia Fv Fc off"          # a text for all joints, or one per joint; with torque sensors Fvl Fcl offl, Fvm …
     v0 = 0.01                        # smoothing of the Coulomb sign [rad/s or m/s], or one per joint

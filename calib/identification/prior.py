@@ -5,10 +5,10 @@ where the marginal likelihood of the data is largest,
 
     log p(y | f) = -½ [log det C + eᵀ C⁻¹ e] + const,   C = I + R P Rᵀ,   e = z - R μ,
 
-with [R z] the triangle of the whitened [W y], μ and P the prior's mean and covariance (MacKay 1992). Directions that the
-motion tells well do not feel the prior; those that it does not tell stay at the CAD's values. It does not make the
-parameters those of possible bodies: that is the semidefinite fit of another module; but with a prior, `bounded` keeps inertia and
-friction of the drives from being negative.
+with [R z] the triangle of the whitened [W y], μ and P the prior's mean and covariance (MacKay 1992). Directions that
+the motion tells well do not feel the prior; those that it does not tell stay at the CAD's values. It does not make the
+parameters those of possible bodies: that is the semidefinite fit of another module; but with a prior, `bounded` keeps
+inertia and friction of the drives from being negative.
 """
 
 from __future__ import annotations

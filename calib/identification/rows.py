@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -95,7 +96,7 @@ def segmented_states(terms: Sequence[Term], case: Case) -> np.ndarray:
 def segments(segment: np.ndarray) -> list[tuple[int, int]]:
     """Return (start, stop) of each run of equal numbers."""
     edges = np.concatenate([[0], np.flatnonzero(np.diff(segment)) + 1, [len(segment)]])
-    return [(int(a), int(b)) for a, b in zip(edges, edges[1:])]
+    return [(int(a), int(b)) for a, b in pairwise(edges)]
 
 
 def extend(rows: Rows, terms: Sequence[Term], columns: np.ndarray) -> Rows:

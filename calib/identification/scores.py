@@ -1,4 +1,4 @@
-"""How good a prediction of torques is: relative errors, moving and standing apart, and what no rigid model can reach."""
+"""How good a prediction of torques is: relative errors, moving and standing apart, and the share no model reaches."""
 
 from __future__ import annotations
 

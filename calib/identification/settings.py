@@ -53,8 +53,8 @@ class Settings:
         keep, drop: parameters never, or first, left out.
         prior: draw what the motion cannot tell to the CAD's values: ``auto`` where it has to.
         payloads: label → what is known of it.
-        payload_values: label → its ten standard parameters in the tip's frame, where they are known from elsewhere; they
-            serve for predictions where no recording to learn from carries it.
+        payload_values: label → its ten standard parameters in the tip's frame, where they are known from elsewhere;
+            they serve for predictions where no recording to learn from carries it.
         gravity: in the base frame [m/s²]; None: the robot's.
         samples: most rows (per torque) that are held at once; longer recordings are thinned further.
         folds: number of time blocks for cross-validation.

@@ -15,6 +15,7 @@ from calib import files
 from calib.dynamics.base import expressions
 from calib.errors import UsageError
 from calib.identification.scores import Part, Score
+from calib.identification.storage import to_table
 from calib.procedure.identifying import IdentificationOutcome
 from calib.robot import description
 
@@ -73,7 +74,7 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     estimate = found.fitted.estimate
     rows = ([name, *map(float, row)] for name, row in zip(found.names, estimate.covariance))
     files.write_table(folder / "covariance.csv", ("name", *found.names), rows)
-    files.write_json(folder / "dynamics.json", dynamics_table(outcome))
+    files.write_json(folder / "dynamics.json", to_table(found.dynamics, found.base))
     files.write_json(folder / "metrics.json", metrics(outcome))
 
 
@@ -93,35 +94,6 @@ def estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:
             found.names, estimate.names, words, estimate.units, estimate.values, estimate.sigma, estimate.rsd
         )
     ]
-
-
-def dynamics_table(outcome: IdentificationOutcome) -> dict[str, Any]:
-    """Return the model with numbers, enough to predict torques: `robot.toml` holds the geometry."""
-    found = outcome.found
-    model = found.dynamics.model
-    return {
-        "robot": "robot.toml",
-        "kind": model.kind,
-        "gravity": model.tree.gravity.tolist(),
-        "payloads": sorted(found.settings.payloads),
-        "bodies": dict(zip(model.tree.names, found.dynamics.values[: 10 * model.tree.bodies].tolist())),
-        "terms": [
-            {
-                "name": one.name,
-                "shape": one.shape,
-                "acts": [[row, [list(pair) for pair in motion]] for row, motion in one.acts],
-                "settings": [_json_number(x) for x in one.settings],
-                "side": one.side,
-                "linear": one.linear,
-                "value": float(value),
-                "unit": one.unit,
-            }
-            for one, value in zip(model.columns, found.dynamics.values[10 * model.tree.bodies :])
-        ],
-        "base": {name: line for name, line in zip(found.base.names, expressions(found.base))},
-        "covariance": "covariance.csv",
-        "note": "regrouped parameters hold base values, the others are zero: torques are right, single ones need not be",
-    }
 
 
 def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
@@ -155,6 +127,10 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
                 "note": rung.note,
             }
             for rung in found.rungs
+        ],
+        "ripple": [
+            {"joint": one.joint + 1, "orders_per_turn": list(one.orders), "explained_share_on_unseen_blocks": one.share}
+            for one in found.ripples
         ],
         "elimination": elimination_table(outcome),
         "filters": {case.name: filter_table(case.motion) for case in (*outcome.inputs.cases, *outcome.inputs.unseen)},
@@ -228,7 +204,3 @@ def _finite(value: float) -> float | None:
 
 def _number(value: float | None) -> float | None:
     return None if value is None else float(value)
-
-
-def _json_number(value: float) -> float | str:
-    return float(value) if np.isfinite(value) else "inf"

@@ -32,6 +32,10 @@ def outcome_lines(outcome: IdentificationOutcome) -> Iterator[RenderableType]:
     found = outcome.found
     if found.rungs:
         yield ladder_table(outcome)
+    for one in found.ripples:
+        orders = ", ".join(f"{order:g}" for order in one.orders)
+        words = f"ripple at joint {one.joint + 1}, orders {orders} per turn: explains {100 * one.share:.0f} % of the"
+        yield f"{words} fast residual's power on unseen time, at positions it has been to"
     raw, normalised = found.condition
     words = f"{found.dynamics.model.p} standard parameters, {found.base.b} base"
     words += f", {len(found.climb.terms)} of richer friction; condition {raw:.0f}, with unit columns {normalised:.0f}"
@@ -83,7 +87,8 @@ def error_table(outcome: IdentificationOutcome) -> Table:
 
 def _score_rows(found: Score) -> Iterator[list[str]]:
     for words, part in (
-        ("all, raw", found.raw), ("all, in band", found.filtered), ("moving", found.moving), ("standing", found.standing),
+        ("all, raw", found.raw), ("all, in band", found.filtered),
+        ("moving", found.moving), ("standing", found.standing),
     ):  # fmt: skip
         yield [words, _percent(part.total), *(_percent(x) for x in part.joints)]
     yield ["torque above band", "", *(_percent(x) for x in found.above)]

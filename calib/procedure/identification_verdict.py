@@ -105,8 +105,8 @@ def _rests(found: Identification) -> list[str]:
     on = resting(found.prior, found.fitted.estimate.covariance)
     names = [name for name, rests in zip(found.base.names, on) if rests]
     source = "the robot's own inertias" if found.prior.source == "cad" else "nothing but the order of their sizes"
-    told = f"not identifiable from this motion, drawn to {source} (f = {found.prior.scale:.2g}; {len(names)} of {found.base.b}): {', '.join(names)}"
-    return [told] if names else []
+    how = f"drawn to {source} (f = {found.prior.scale:.2g}; {len(names)} of {found.base.b})"
+    return [f"not identifiable from this motion, {how}: {', '.join(names)}"] if names else []
 
 
 def _slow_bias(cases: Sequence[Case], found: Identification) -> list[str]:

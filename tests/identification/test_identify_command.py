@@ -11,6 +11,7 @@ import planted
 import pytest
 
 from calib import cli
+from calib.errors import CalibError
 
 
 def run(*arguments: object) -> int:
@@ -174,3 +175,20 @@ def test_every_key_of_the_documented_options_is_read(tmp_path):
     assert found.settings.ratio == 20.0 and found.gain_pair is not None
     assert found.for_file("x/run_load.npz").payload == ("tool",)
     assert found.settings.couplings[0].joints == (4, 5)
+
+
+def test_the_model_comes_back_from_its_folder_and_predicts_the_same(robot, tmp_path):
+    from calib.identification.prediction import predict
+    from calib.identification.storage import read_dynamics
+
+    train, out = planted.write(tmp_path, "train.npz", 0), tmp_path / "out"
+    assert run(robot, train, "--out", out, "--friction", "presliding") == 0
+    _, dynamics = read_dynamics(out)
+    case = planted.case("train.npz", 0)
+    residual = case.target - predict(dynamics, case)
+    metrics = json.loads((out / "metrics.json").read_text())
+    rms = metrics["identification"]["train.npz"]["raw"]["rms"]
+    np.testing.assert_allclose(np.sqrt(np.mean(residual**2, axis=0)), rms, rtol=0.02)
+    (out / "dynamics.json").write_text("{}")
+    with pytest.raises(CalibError, match="damaged or of another version"):
+        read_dynamics(out)

@@ -1,0 +1,90 @@
+"""An identified model in a folder: ``robot.toml`` holds the geometry, ``dynamics.json`` the numbers."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.dynamics.base import Base, expressions
+from calib.dynamics.drives import Term
+from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.tree import tree, with_gravity, with_payload
+from calib.errors import RobotError
+from calib.identification.prediction import Dynamics
+from calib.robot import description
+from calib.robot.chain import Chain
+
+NOTE = "regrouped parameters hold base values, the others are zero: torques are right, single ones need not be"
+
+
+def read_dynamics(folder: str | Path) -> tuple[Chain, Dynamics]:
+    """Return the robot and the model that an identification left in `folder`.
+
+    Raises:
+        RobotError: where the folder holds none, or the two files do not belong together.
+    """
+    folder = Path(folder)
+    try:
+        table = json.loads((folder / "dynamics.json").read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise RobotError(f"{folder} holds no identified model (dynamics.json): {error}") from error
+    chain = description.read(folder / "robot.toml")
+    try:
+        return chain, from_table(chain, table)
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise RobotError(f"{folder}/dynamics.json is damaged or of another version: {error!r}") from error
+
+
+def to_table(dynamics: Dynamics, base: Base) -> dict[str, Any]:
+    """Return the model as what JSON can hold."""
+    model = dynamics.model
+    bodies = 10 * model.tree.bodies if model.kind != "drive" else 0
+    payloads = [label for label, coordinate in zip(model.tree.labels, model.tree.coordinates) if coordinate < 0]
+    return {
+        "robot": "robot.toml",
+        "kind": model.kind,
+        "gravity": model.tree.gravity.tolist(),
+        "payloads": payloads,
+        "bodies": dict(zip(model.names[:bodies], dynamics.values[:bodies].tolist())),
+        "terms": [
+            {
+                "name": one.name,
+                "shape": one.shape,
+                "acts": [[row, [list(pair) for pair in motion]] for row, motion in one.acts],
+                "settings": [float(x) if np.isfinite(x) else "inf" for x in one.settings],
+                "side": one.side,
+                "linear": one.linear,
+                "value": float(value),
+                "unit": one.unit,
+            }
+            for one, value in zip(model.columns, dynamics.values[bodies:])
+        ],
+        "base": dict(zip(base.names, expressions(base))),
+        "covariance": "covariance.csv",
+        "note": NOTE,
+    }
+
+
+def from_table(chain: Chain, table: Mapping[str, Any]) -> Dynamics:
+    """Return the model of a table that `to_table` made, on the chain it was made for."""
+    bodies = with_gravity(tree(chain), np.array(table["gravity"], dtype=float))
+    for label in table["payloads"]:
+        bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1)
+    terms = tuple(_term(entry) for entry in table["terms"])
+    model = IdentificationModel(bodies, terms, table["kind"])
+    own = table["bodies"]
+    standard = [] if model.kind == "drive" else [float(own[name]) for name in bodies.names]
+    values = np.array([*standard, *(float(entry["value"]) for entry in table["terms"])])
+    if len(values) != model.p or (model.kind != "drive" and len(own) != len(standard)):
+        raise ValueError(f"{len(values)} values for {model.p} parameters")
+    return Dynamics(model, values)
+
+
+def _term(entry: Mapping[str, Any]) -> Term:
+    acts = tuple((int(row), tuple((int(j), float(w)) for j, w in motion)) for row, motion in entry["acts"])
+    settings = tuple(float(x) for x in entry["settings"])
+    return Term(entry["name"], entry["shape"], acts, settings, entry["side"], bool(entry["linear"]))
