@@ -3,7 +3,9 @@
     tau_k = Σ a_i tau_{k-i} + Σ b_i e_{k-i} + c,    C(ω) = B(e^{jωT}) / A(e^{jωT}) ≈ kp + kd jω + ki / (jω)
 
 ("An ARMA model is generally enough", Janot's slides on the TX40.) Both series are low-passed alike first: what is above
-the band is noise, and the controller's own rate, often a multiple of the log's, does not matter below it.
+the band is noise, and the controller's own rate, often a multiple of the log's, does not matter below it. Noise that is
+in the logged positions but was not in the controller's would shrink the gains; the error is therefore replaced by its
+projection on functions of the reference, which knows nothing of noise (two-stage least squares; our choice).
 """
 
 from __future__ import annotations
@@ -58,11 +60,10 @@ def identify_controller(
         MeasurementError: where reference and log do not fit together, or the error is zero.
     """
     error, tau = _error(reference, measured, rate), shaped(tau, np.shape(measured), "torques")
+    error, tau = low_pass(error, rate, band), low_pass(tau, rate, band)
     edge = border(rate, band)
-    found = [
-        _joint(low_pass(error[:, j], rate, band)[edge:-edge], low_pass(tau[:, j], rate, band)[edge:-edge], orders)
-        for j in range(error.shape[1])
-    ]
+    basis = np.linalg.qr(_instruments(reference, len(error), rate, band)[edge:-edge])[0]
+    found = [_joint(error[edge:-edge, j], tau[edge:-edge, j], basis, orders) for j in range(error.shape[1])]
     gains = np.array([_read(past, errors, rate, band, integral) for past, errors, _ in found])
     controller = pd(gains[:, 0], gains[:, 1], ki=gains[:, 2])
     past, errors, offset = (np.array(part) for part in zip(*found))
@@ -81,19 +82,31 @@ def _error(reference: Reference, measured: np.ndarray, rate: float) -> np.ndarra
     return aim[: len(measured)] - shaped(measured, (None, reference.q.shape[1]), "measured positions")
 
 
-def _joint(error: np.ndarray, tau: np.ndarray, orders: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return a, b, c of one joint by least squares."""
+def _instruments(reference: Reference, count: int, rate: float, band: float) -> np.ndarray:
+    """Return functions of the reference that errors depend on (count, k): friction, inertia, gravity, low-passed."""
+    every = round(1.0 / (rate * reference.period))
+    q, v, a = (x[::every][:count] for x in (reference.q, reference.v, reference.a))
+    jerk = np.gradient(a, 1.0 / rate, axis=0)
+    slow = np.tanh(v / (0.01 * np.abs(v).max(axis=0, initial=1e-9)))
+    parts = [v, a, jerk, slow, np.gradient(slow, 1.0 / rate, axis=0), np.sin(q), np.cos(q)]
+    series = low_pass(np.hstack(parts), rate, band)
+    return np.column_stack([series / np.maximum(np.linalg.norm(series, axis=0), 1e-12), np.ones(count)])
+
+
+def _joint(
+    error: np.ndarray, tau: np.ndarray, basis: np.ndarray, orders: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return a, b, c of one joint by two-stage least squares with an orthonormal basis of instruments."""
     if not np.ptp(error) > 0.0:
-        raise MeasurementError(
-            "the position error is zero throughout: is this a log of the reference, not of the encoder?"
-        )
+        raise MeasurementError("the position error is zero throughout: a log of the reference, not of the encoder?")
     na, nb = orders
     first, count = max(orders), len(error)
+    own = basis[first:]
     columns = [tau[first - i : count - i] for i in range(1, na + 1)]
-    columns += [error[first - i : count - i] for i in range(nb + 1)] + [np.ones(count - first)]
-    matrix = np.column_stack(columns)
+    columns += [error[first - i : count - i] for i in range(nb + 1)]
+    matrix = np.column_stack([own @ (own.T @ np.column_stack(columns)), np.ones(count - first)])
     size = np.linalg.norm(matrix, axis=0)
-    values = np.linalg.lstsq(matrix / size, tau[first:], rcond=None)[0] / size
+    values = np.linalg.lstsq(matrix / size, own @ (own.T @ tau[first:]), rcond=None)[0] / size
     return values[:na], values[na:-1], float(values[-1])
 
 
@@ -111,7 +124,7 @@ def _read(past: np.ndarray, errors: np.ndarray, rate: float, band: float, integr
 
 
 def _explained(error: np.ndarray, tau: np.ndarray, gains: np.ndarray, rate: float, band: float) -> float:
-    error, tau = low_pass(error, rate, band), low_pass(tau, rate, band)
+    """Return the share of the low-passed torque that the gains explain [%]."""
     own = gains[0] * error + gains[1] * np.gradient(error, 1.0 / rate) + gains[2] * np.cumsum(error) / rate
     edge = border(rate, band)
     rest, whole = (x[edge:-edge] - x[edge:-edge].mean() for x in (tau - own, tau))

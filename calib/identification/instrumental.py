@@ -107,6 +107,15 @@ class Instrumental:
     constrained: Constrained | None
 
     @property
+    def shift(self) -> np.ndarray:
+        """(p,) distance of least squares from this estimate, in standard deviations.
+
+        The test finds any bias that the data can tell; this says whether it matters.
+        """
+        estimate = self.fit.estimate
+        return np.abs(self.ordinary.estimate.values - estimate.values) / np.where(estimate.sigma > 0, estimate.sigma, 1)
+
+    @property
     def valid(self) -> bool:
         """Whether the instruments may be trusted: full rank, not weak, and the simulated robot follows the real one."""
         return not self.strength.weak and bool(np.all(self.distance < 10.0))

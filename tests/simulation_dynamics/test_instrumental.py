@@ -13,7 +13,7 @@ from calib.dynamics import base as bases
 from calib.dynamics import drives
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.tree import tree
-from calib.errors import MeasurementError, NotConverged, UsageError
+from calib.errors import MeasurementError, NotConverged, Unidentifiable, UsageError
 from calib.estimation import instruments
 from calib.identification.cases import make_case
 from calib.identification.controller import identify_controller
@@ -155,6 +155,10 @@ def test_the_controller_is_read_from_its_log():
     assert np.allclose(result.controller.kp, PD.kp, rtol=0.03)
     assert np.allclose(result.controller.kd, PD.kd, rtol=0.15)
     assert np.all(result.explained > 90.0)
+    noisy = run.measured + 2e-3 * np.random.default_rng(0).normal(size=run.q.shape)
+    assert np.std(noisy - run.q) > 0.1 * np.std(run.measured - motion().q[::EVERY])
+    result = identify_controller(motion(), noisy, run.tau, RATE / EVERY)
+    assert np.allclose(result.controller.kp, PD.kp, rtol=0.05)
     cascade = controllers.cascade(np.array([40.0, 40.0]), PD.kd, np.array([0.05, 0.05]))
     run = simulate(arm()[0], cascade, motion(), Sensing(1e-6, every=EVERY), 1)
     result = identify_controller(motion(), run.measured, run.tau, RATE / EVERY, orders=(1, 2), integral=True)
@@ -190,3 +194,13 @@ def test_instruments_are_filtered_as_the_rows_are():
     quick = instrumental._observe_run(model, base.kept, own, rows, decimator)
     expected = observe(model, base.kept, own, decimator).matrix
     assert np.abs(quick - expected).max() < 1e-12 * np.abs(expected).max()
+
+
+def test_instruments_that_do_not_excite_a_parameter_are_named():
+    still = references.Reference(motion().t, motion().q * [1.0, 0.0], motion().v * [1.0, 0.0], motion().a * [1.0, 0.0])
+    run = simulate(arm()[0], PD, still, Sensing(1e-5, every=EVERY))
+    recording = Recording(run.t, run.measured, run.tau, "torque", ("joint1", "joint2"))
+    case = make_case("half", make_motion(recording, FilterOptions(cutoff=50.0, band=20.0, clock="stamps")))
+    with pytest.raises(Unidentifiable, match="does not excite") as caught:
+        found(case, Loop(PD, still, EVERY))
+    assert "instrument of Fv2" in str(caught.value) and "Fv1" not in str(caught.value)
