@@ -25,7 +25,7 @@ app = typer.Typer(
     help="Calibrate a robot: choose poses, fit the geometry, validate on unseen poses, export.",
 )
 
-_FLAGS = ("--debug", "--help", "--refit-frames", "--no-refit-frames")
+_FLAGS = ("--debug", "--help", "--line", "--refit-frames", "--no-refit-frames")
 _USAGE: Any = typer.BadParameter.__mro__[2]  # ClickException, of the click that this typer uses (or brings)
 
 Robot = Annotated[str, typer.Argument(help="a .urdf, an MDH .toml, a library name, or the folder of an earlier fit")]
@@ -257,6 +257,48 @@ def excite(
     console = _console()
     for line in excitation_outputs.lines(designed):
         console.print(line, soft_wrap=True, markup=False)
+    console.print(f"written to {out}", soft_wrap=True, markup=False)
+
+
+# Motion planning: plan
+
+
+@app.command()
+def plan(
+    robot: Robot,
+    waypoints: Annotated[Path, typer.Option(help="CSV of joint values, a row per waypoint, in order")],
+    out: Annotated[Path, typer.Option(help="folder for the motion, its figures and metrics.json")],
+    model: Annotated[Path | None, typer.Option(help="folder of an identification: the dynamics to plan with")] = None,
+    payload: Annotated[list[str] | None, typer.Option(help="an identified payload on board; may be repeated")] = None,
+    limits: Annotated[Path | None, typer.Option(help="TOML: speeds, torques, workspace, collision, friction")] = None,
+    drives: Annotated[Path | None, typer.Option(help="TOML: [drives] Ia, Fv, Fc, off, without --model")] = None,
+    line: Annotated[
+        bool, typer.Option("--line", help="the tool runs straight between waypoints, resting there")
+    ] = False,
+    rate: Annotated[float, typer.Option(help="of the controller [Hz]")] = 1000.0,
+    shorten: Annotated[int, typer.Option(help="timings to spend on a faster shape between waypoints")] = 0,
+    stray: Annotated[float, typer.Option(help="how far that may leave the spline, per joint [rad or m]")] = 0.0,
+    start: Annotated[str | None, typer.Option(help="joint values with commas: an approach from there")] = None,
+    slower: Annotated[float, typer.Option(help="factor of a slow rehearsal, written beside the motion")] = 1.0,
+    base: Base = None,
+    tip: Tip = None,
+) -> None:
+    """Plan the fastest motion of ROBOT through waypoints, within its speeds and torques."""
+    from calib.procedure import motion_outputs, motion_planning
+
+    motion_outputs.check_target(out)
+    stands = None if start is None else _numbers(start, start.count(",") + 1, "--start")
+    with _progress() as say:
+        planned = motion_planning.plan(
+            robot, waypoints, model=model, payloads=payload or [], limits=limits, drives_file=drives, lines=line,
+            rate=rate, evaluations=shorten, stray=stray, start=stands, slower=slower, base=base, tip=tip,
+            progress=say,
+        )  # fmt: skip
+        say("writing")
+        motion_outputs.write_folder(planned, out)
+    console = _console()
+    for words in motion_outputs.lines(planned):
+        console.print(words, soft_wrap=True, markup=False)
     console.print(f"written to {out}", soft_wrap=True, markup=False)
 
 

@@ -80,7 +80,7 @@ def _follow(forward: Forward, jacobian: Forward, start: np.ndarray, targets: np.
             short, turn = float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))
             raise NothingFeasible(
                 f"no tool line: at {k / (len(targets) - 1):.0%} of it the arm stays {1e3 * short:.3g} mm and "
-                f"{np.degrees(turn):.3g} deg short (out of reach, or the elbow would have to flip); take waypoints nearer "
+                f"{np.degrees(turn):.3g} deg short (out of reach, or the elbow has to flip); take waypoints nearer "
                 "to each other, another posture at the start, or joint motion",
                 "reach", short, "m",
             )  # fmt: skip

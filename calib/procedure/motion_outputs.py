@@ -1,0 +1,171 @@
+"""The folder of a planned motion: samples at the controller's rate, ROS messages, metrics, and pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from calib import files
+from calib.errors import UsageError
+from calib.procedure.drawing import AFTER, BEFORE, MARK, QUIET, WIDE, save, sheet, styled
+from calib.procedure.motion_planning import Planned
+from trajectories.messages import joint_trajectory, to_json, to_yaml
+from trajectories.timing import ACTIVE
+from trajectories.track import Track
+
+OURS = ("metrics.json", "motion.csv", "trajectory.yaml", "trajectory.json")
+UNITS = {"velocity": "rad/s", "acceleration": "rad/s²", "torque": "N m"}
+
+
+def check_target(out: Path) -> None:
+    """Refuse, before any work is done, a file, or a folder whose files of these names are not ours to replace."""
+    if out.exists() and not out.is_dir():
+        raise UsageError(f"{out} is a file; --out needs a folder")
+    present = [name for name in OURS if (out / name).exists()]
+    if present and not all((out / name).exists() for name in OURS):
+        raise UsageError(f"{out} holds {', '.join(present)} which no earlier plan left there; choose another")
+
+
+def write_folder(planned: Planned, out: Path) -> Path:
+    """Write the folder; each file whole or not at all, ``metrics.json`` last."""
+    write_track(planned.track, out / "motion.csv")
+    message = joint_trajectory(planned.track, planned.chain.joint_names)
+    files.write(out / "trajectory.json", to_json(message))
+    files.write(out / "trajectory.yaml", to_yaml(message))
+    for name, track in (("approach", planned.approach), ("rehearsal", planned.rehearsal)):
+        if track is not None:
+            write_track(track, out / f"{name}.csv")
+        else:
+            (out / f"{name}.csv").unlink(missing_ok=True)
+    save(motion_figure(planned), out / "plot_motion.png")
+    save(profile_figure(planned), out / "plot_profile.png")
+    files.write_json(out / "metrics.json", metrics(planned))
+    return out
+
+
+def write_track(track: Track, path: Path) -> Path:
+    """Write t, q, v, a and, where known, tau; SI, a row per sample of the controller."""
+    parts = {"q": track.q, "v": track.v, "a": track.a} | ({} if track.tau is None else {"tau": track.tau})
+    header = ["t", *(f"{letter}{j + 1}" for letter in parts for j in range(track.n))]
+    return files.write_table(path, header, np.column_stack([track.times, *parts.values()]).tolist())
+
+
+def metrics(planned: Planned) -> dict[str, Any]:
+    """Return the content of ``metrics.json``."""
+    used = {name: np.concatenate([one.used[name] for one in planned.timings]) for name in planned.timings[0].used}
+    seconds = np.array([one.duration for one in planned.timings])
+    shaped = planned.shaped
+    return {
+        "feasible": True,
+        "duration": planned.track.duration,
+        "margins": {"position": _nearest(planned)} | {name: _margin(planned, name, x) for name, x in used.items()},
+        "active_share": float(seconds @ [one.active_share for one in planned.timings] / seconds.sum()),
+        "active_within": ACTIVE,
+        "iterations": sum(one.iterations for one in planned.timings),
+        "tightened": max(one.tightened for one in planned.timings),
+        "history": [list(one.history) for one in planned.timings],
+        "segments": seconds.tolist(),
+        "rate": planned.track.rate,
+        "samples": len(planned.track),
+        "samples_verified": sum(len(one.sampled.s) for one in planned.timings),
+        "line_deviation": None
+        if planned.deviation is None
+        else {"position": float(planned.deviation[0]), "orientation": float(planned.deviation[1])},
+        "shortened": None
+        if shaped is None
+        else {
+            "before": shaped.before, "after": shaped.after, "evaluations": shaped.evaluations,
+            "refused": shaped.refused, "parameters": shaped.phi.tolist(),
+        },
+        "approach": None if planned.approach is None else planned.approach.duration,
+        "notes": list(planned.notes),
+    }  # fmt: skip
+
+
+def lines(planned: Planned) -> list[str]:
+    """Return what a person wants to read at the end."""
+    found = metrics(planned)
+    words = [
+        f"{found['duration']:.3f} s at {found['rate']:g} Hz; some limit is within {ACTIVE:.0%} of being reached for "
+        f"{found['active_share']:.1%} of the time, none is crossed at {found['samples_verified']} instants",
+        "smallest margins:",
+    ]
+    for name, one in found["margins"].items():
+        words.append(f"  {name:12} {one['margin']:.4g} {one['unit']} ({one['at']})")
+    if planned.shaped is not None:
+        words.append(f"the path's own shape: {planned.shaped.before:.3f} s before, {planned.shaped.after:.3f} s after")
+    if planned.deviation is not None:
+        words.append(f"the tool keeps its lines to {1e6 * planned.deviation[0]:.2g} µm")
+    return words + [f"note: {note}" for note in planned.notes]
+
+
+def motion_figure(planned: Planned) -> Figure:
+    """Draw q, v, a and τ of every joint with their limits dashed."""
+    track, limits, n = planned.track, planned.limits, planned.chain.n
+    rows = [
+        (track.q, planned.lower, planned.upper, "position"),
+        (track.v, -limits.velocity, limits.velocity, "velocity"),
+    ]
+    rows.append((track.a, -limits.acceleration, limits.acceleration, "acceleration"))
+    if track.tau is not None:
+        rows.append((track.tau, -limits.torque, limits.torque, "torque"))
+    with styled():
+        figure, axes = sheet(n, len(rows), WIDE, 0.85 * n + 0.5)
+        for j, k in np.ndindex(n, len(rows)):
+            x, lower, upper, title = rows[k]
+            axis = axes[j * len(rows) + k]
+            axis.plot(track.times, x[:, j], color=AFTER, linewidth=0.8)
+            for bound in (lower[j], upper[j]):
+                if np.isfinite(bound):
+                    axis.axhline(bound, color=MARK, linewidth=0.6, linestyle="--")
+            if j == 0:
+                axis.set_title(title)
+            if k == 0:
+                axis.set_ylabel(planned.chain.joint_names[j], fontsize=7)
+        for axis in axes[-len(rows) :]:
+            axis.set_xlabel("time [s]")
+    return figure
+
+
+def profile_figure(planned: Planned) -> Figure:
+    """Draw the speed along the path, and which limit is nearest to being reached."""
+    with styled():
+        figure, (above, below) = sheet(2, 1, WIDE, 3.6)
+        start = 0.0
+        for one in planned.timings:
+            times = start + one.profile.times
+            above.plot(times, np.sqrt(one.profile.x), color=AFTER, linewidth=0.9)
+            instants = np.repeat(times[:-1], len(one.sampled.s) // (len(times) - 1))
+            for (name, used), color in zip(one.used.items(), (BEFORE, AFTER, QUIET)):
+                label = name if start == 0.0 else None
+                below.plot(instants, used.max(axis=1), color=color, linewidth=0.8, label=label)
+            start = float(times[-1])
+        below.axhline(1.0, color=MARK, linewidth=0.6, linestyle="--")
+        above.set(ylabel="speed along the path")
+        below.set(xlabel="time [s]", ylabel="share of the limit", ylim=(0, 1.05))
+        below.legend(loc="lower center", ncols=3, fontsize=7)
+    return figure
+
+
+def _margin(planned: Planned, name: str, used: np.ndarray) -> dict[str, Any]:
+    size = getattr(planned.limits, name)
+    share = 1.0 - used.max(axis=0)
+    j = int(np.argmin(share))
+    joint = planned.chain.joints[j]
+    unit = UNITS[name] if joint.kind == "revolute" else UNITS[name].replace("rad", "m").replace("N m", "N")
+    return {
+        "margin": float(share[j] * size[j]), "unit": unit, "at": joint.name, "share": float(share[j]),
+        "joints": share.tolist(),
+    }  # fmt: skip
+
+
+def _nearest(planned: Planned) -> dict[str, Any]:
+    j = int(np.argmin(planned.margins))
+    joint = planned.chain.joints[j]
+    return {
+        "margin": float(planned.margins[j]), "unit": joint.unit, "at": joint.name,
+        "share": float(planned.margins[j] / (planned.upper[j] - planned.lower[j])), "joints": planned.margins.tolist(),
+    }  # fmt: skip

@@ -1,0 +1,175 @@
+"""`calib plan`: files, figures and exit codes; bad input gets one clear message."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from planned import CHAIN, WAYPOINTS, lwr
+
+from calib import cli, files
+from calib.dynamics import drives
+from calib.procedure import motion_outputs, motion_planning
+from calib.robot import description
+from calib.robot.kinematics import forward
+from calib.simulation.robots import truth
+
+
+@pytest.fixture
+def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a working folder with waypoints, drives, and an identified model in the form of `calib identify`."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("CALIB_DEBUG", raising=False)
+    write_waypoints(WAYPOINTS)
+    known = truth("lwr4plus")["drives"]
+    amounts = {key: known[key] for key in ("Ia", "Fv", "Fc")}
+    files.write(tmp_path / "drives.toml", "[drives]\n" + "".join(f"{key} = {amounts[key]}\n" for key in amounts))
+    folder = tmp_path / "model"
+    description.write(folder / "robot.toml", CHAIN)
+    law = lwr()
+    terms = [
+        {
+            "name": one.name, "shape": one.shape, "acts": one.acts, "settings": one.settings, "side": one.side,
+            "linear": one.linear, "value": amounts[one.name[:-1]][int(one.name[-1]) - 1],
+        }
+        for one in drives.standard(["Ia Fv Fc"] * 7)
+    ]  # fmt: skip
+    table = {
+        "kind": "motor", "gravity": list(CHAIN.gravity), "payloads": [],
+        "bodies": dict(zip(law.tree.names, law.bodies.tolist())), "terms": terms,
+    }  # fmt: skip
+    files.write_json(folder / "dynamics.json", table)
+    return tmp_path
+
+
+def write_waypoints(points, name: str = "way.csv", header: str = "q1,q2,q3,q4,q5,q6,q7") -> None:
+    Path(name).write_text(header + "\n" + "\n".join(",".join(map(str, row)) for row in points) + "\n")
+
+
+def plan(*more: str) -> int:
+    given = list(more) if "--waypoints" in more else ["--waypoints", "way.csv", *more]
+    return cli.run(["plan", "lwr4plus", *given, *(() if "--out" in more else ("--out", "out"))])
+
+
+def columns(path: Path) -> dict[str, np.ndarray]:
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    return {key: np.array([float(row[key]) for row in rows]) for key in rows[0]}
+
+
+def test_an_identified_model_is_planned_with(room, capsys):
+    assert plan("--model", "model", "--start", "0,0,0,0,0,0,0", "--slower", "4") == 0
+    table = json.loads((room / "out" / "metrics.json").read_text())
+    motion = columns(room / "out" / "motion.csv")
+    assert motion["t"][-1] == pytest.approx(table["duration"], abs=1e-9)
+    np.testing.assert_allclose(np.diff(motion["t"]), 1e-3, atol=1e-9)
+    q, v, a, tau = (np.column_stack([motion[f"{x}{j + 1}"] for j in range(7)]) for x in ("q", "v", "a", "tau"))
+    np.testing.assert_allclose(tau[1:-1], lwr().torque(q, v, a)[1:-1], atol=1e-7)
+    assert table["feasible"] and table["active_share"] > 0.97 and table["samples"] == len(q)
+    for name in ("position", "velocity", "torque"):
+        assert min(table["margins"][name]["joints"]) >= 0
+    assert (np.abs(tau) <= [joint.effort for joint in CHAIN.joints]).all()
+    message = yaml.safe_load((room / "out" / "trajectory.yaml").read_text())
+    assert message == json.loads((room / "out" / "trajectory.json").read_text())
+    assert message["joint_names"] == list(CHAIN.joint_names) and len(message["points"]) == len(q)
+    lead = columns(room / "out" / "approach.csv")
+    np.testing.assert_allclose([lead[f"q{j + 1}"][-1] for j in range(7)], WAYPOINTS[0], atol=1e-9)
+    slow = columns(room / "out" / "rehearsal.csv")
+    assert slow["t"][-1] == pytest.approx(4 * table["duration"], abs=1e-9)
+    assert {"plot_motion.png", "plot_profile.png"} <= {path.name for path in (room / "out").iterdir()}
+    assert "none is crossed" in capsys.readouterr().out
+    assert plan("--model", "model") == 0  # over the earlier plan, whose approach is no longer one's own
+    assert not (room / "out" / "approach.csv").exists()
+
+
+def test_model_and_stated_drives_plan_the_same_motion(room):
+    one = motion_planning.plan("lwr4plus", room / "way.csv", model=room / "model")
+    two = motion_planning.plan("lwr4plus", room / "way.csv", drives_file=room / "drives.toml")
+    assert one.track.duration == two.track.duration and not one.notes
+    bare = motion_planning.plan("lwr4plus", room / "way.csv")
+    assert bare.track.duration < one.track.duration and "friction not known" in bare.notes[0]
+
+
+def test_lines_and_shapes(room):
+    given = {"model": room / "model", "limits": None}
+    straight = motion_planning.plan("lwr4plus", room / "way.csv", lines=True, **given)
+    table = motion_outputs.metrics(straight)
+    assert len(table["segments"]) == 2 and table["line_deviation"]["position"] <= 1e-6
+    corner = forward(CHAIN, WAYPOINTS[1:2])[0, :3, 3]
+    tool = forward(CHAIN, straight.track.q)[:, :3, 3]
+    assert np.linalg.norm(tool - corner, axis=1).min() < 1e-4
+    shaped = motion_planning.plan("lwr4plus", room / "way.csv", evaluations=20, stray=0.1, **given)
+    found = motion_outputs.metrics(shaped)["shortened"]
+    assert found["after"] <= found["before"] and found["evaluations"] >= 20
+
+
+@pytest.mark.parametrize(
+    ("limits", "message"),
+    [
+        ("[joints]\nq2 = [1.0, -1.0]\n", "is not below"),
+        ("[joints]\nq2 = [0.4, 0.9]\n", "waypoint 2: joint 2 at 1 is 0.1 beyond"),
+        ("[velocity]\nq3 = 0.0\n", "velocity limit of joint 3"),
+        ("[velocity]\nq3 = nan\n", "is not a number"),
+        ("[torque]\nq2 = 30.0\n", "joint 2 needs"),
+        ("[torque]\nmargin = 1.5\n", "margin"),
+        ("[target]\nheight = 0.9\n", "is broken by"),
+        ("[speed]\nall = 1.0\n", "unknown key 'speed'"),
+    ],
+)
+def test_limits_that_leave_no_motion(room, capsys, limits, message):
+    Path("limits.toml").write_text(limits)
+    assert plan("--model", "model", "--limits", "limits.toml") == 2
+    said = capsys.readouterr().err
+    assert message in said and said.count("\n") == 1
+    assert not (room / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        (WAYPOINTS[:1], "1 waypoint"),
+        (WAYPOINTS[[0, 0, 1]], "waypoints 1 and 2 are the same"),
+        (np.where(WAYPOINTS == 1.0, np.nan, WAYPOINTS), "row 2, column 'q2': found an empty or NaN cell"),
+        (WAYPOINTS * 2, "beyond"),
+    ],
+)
+def test_bad_waypoints(room, capsys, points, message):
+    write_waypoints(points)
+    assert plan("--drives", "drives.toml") == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--model", "model", "--drives", "drives.toml"], "take one of them away"),
+        (["--model", "."], "holds no dynamics.json"),
+        (["--model", "model", "--payload", "tool"], "no payload 'tool'"),
+        (["--rate", "0"], "--rate 0"),
+        (["--line", "--shorten", "10"], "leaves nothing to change"),
+        (["--start", "0,0"], "expected 7 joint values"),
+        (["--start", "0,9,0,0,0,0,0"], "beyond its limits"),
+        (["--slower", "0.5"], "--slower 0.5"),
+        (["--waypoints", "none.csv"], "none.csv"),
+        (["--out", "way.csv"], "is a file"),
+    ],
+)
+def test_bad_options(room, capsys, words, message):
+    assert plan(*words) == 2
+    said = capsys.readouterr().err
+    assert message in said and "Traceback" not in said
+
+
+def test_a_damaged_model_is_refused(room, capsys):
+    place = room / "model" / "dynamics.json"
+    table = json.loads(place.read_text())
+    place.write_text(json.dumps(table | {"bodies": {}}))
+    assert plan("--model", "model") == 2
+    assert "the value of" in capsys.readouterr().err
+    place.write_text("{")
+    assert plan("--model", "model") == 2
+    assert "damaged" in capsys.readouterr().err
