@@ -16,7 +16,8 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.path_dynamics import PathDynamics, of_standard
 from calib.dynamics.tree import standard_parameters, tree
 from calib.errors import RobotError, UsageError
-from calib.procedure import identified
+from calib.identification.prediction import carried_columns
+from calib.identification.storage import read_dynamics
 from calib.procedure.inputs import joint_kinds, load_robot
 from calib.procedure.motion_limits import MotionLimits, read_motion_limits
 from calib.robot.chain import Chain
@@ -109,7 +110,7 @@ def plan(
     law, notes = _law(chain, model, payloads, drives_file, known)
     lower, upper, bounds = _bounds(chain, known, law)
     points = read_poses(waypoints, chain.joint_names, kinds=joint_kinds(chain))
-    arm = chain if model is None else identified.read(model)[0]
+    arm = chain if model is None else read_dynamics(model)[0]
     say("the path")
     paths, deviation = _paths(arm, points, lines)
     for path in paths:
@@ -181,10 +182,7 @@ def _law(
     if folder is not None:
         if drives_file is not None:
             raise UsageError("--model and --drives both say what the drives are; take one of them away")
-        arm, dynamics = identified.read(folder, payloads)
-        if arm.n != chain.n:
-            raise UsageError(f"{folder} is of a robot with {arm.n} joints, {chain.name} has {chain.n}")
-        return of_standard(dynamics.model, dynamics.values), ()
+        return _identified(chain, folder, payloads), ()
     try:
         stated = {} if drives_file is None else read_drives(drives_file, chain)
         if known.friction is not None and not stated:
@@ -201,6 +199,22 @@ def _law(
         f"{' and '.join(missing)} not known (no --model, no --drives): planned without, a real robot needs more torque"
     )
     return of_standard(model, np.concatenate([standard_parameters(chain), values.ravel()])), (note,) if missing else ()
+
+
+def _identified(chain: Chain, folder: Path, payloads: Sequence[str]) -> PathDynamics:
+    """Return an identified model with the payloads that are on board."""
+    arm, dynamics = read_dynamics(folder)
+    if arm.n != chain.n:
+        raise UsageError(f"{folder} is of a robot with {arm.n} joints, {chain.name} has {chain.n}")
+    model = dynamics.model
+    known = [label for label, coordinate in zip(model.tree.labels, model.tree.coordinates) if coordinate < 0]
+    if unknown := sorted(set(payloads) - set(known)):
+        raise UsageError(f"{folder}: no payload '{unknown[0]}' was identified; it knows {', '.join(known) or 'none'}")
+    if model.kind == "drive":
+        return of_standard(model, dynamics.values)  # which says why that cannot be
+    values = np.array(dynamics.values)
+    values[: 10 * model.tree.bodies] *= carried_columns(model, payloads)
+    return of_standard(model, values)
 
 
 def _bounds(chain: Chain, known: MotionLimits, law: PathDynamics | None) -> tuple[np.ndarray, np.ndarray, Limits]:

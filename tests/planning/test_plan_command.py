@@ -13,6 +13,7 @@ from planned import CHAIN, WAYPOINTS, lwr
 
 from calib import cli, files
 from calib.dynamics import drives
+from calib.dynamics.tree import STANDARD
 from calib.procedure import motion_outputs, motion_planning
 from calib.robot import description
 from calib.robot.kinematics import forward
@@ -147,7 +148,7 @@ def test_bad_waypoints(room, capsys, points, message):
     ("words", "message"),
     [
         (["--model", "model", "--drives", "drives.toml"], "take one of them away"),
-        (["--model", "."], "holds no dynamics.json"),
+        (["--model", "."], "holds no identified model"),
         (["--model", "model", "--payload", "tool"], "no payload 'tool'"),
         (["--rate", "0"], "--rate 0"),
         (["--line", "--shorten", "10"], "leaves nothing to change"),
@@ -169,7 +170,22 @@ def test_a_damaged_model_is_refused(room, capsys):
     table = json.loads(place.read_text())
     place.write_text(json.dumps(table | {"bodies": {}}))
     assert plan("--model", "model") == 2
-    assert "the value of" in capsys.readouterr().err
+    assert "damaged" in capsys.readouterr().err
+    place.write_text(json.dumps(table | {"bodies": table["bodies"] | {"ZZ3": float("nan")}}))
+    assert plan("--model", "model") == 2
+    assert "not finite" in capsys.readouterr().err
     place.write_text("{")
     assert plan("--model", "model") == 2
-    assert "damaged" in capsys.readouterr().err
+    assert "no identified model" in capsys.readouterr().err
+
+
+def test_a_payload_on_board_takes_longer(room):
+    place = room / "model" / "dynamics.json"
+    table = json.loads(place.read_text())
+    load = dict(zip([f"{name}tool" for name in STANDARD], truth("lwr4plus")["payload"]["inertia"]))
+    place.write_text(json.dumps(table | {"payloads": ["tool"], "bodies": table["bodies"] | load}))
+    free, loaded = (
+        motion_planning.plan("lwr4plus", room / "way.csv", model=room / "model", payloads=on).track.duration
+        for on in ((), ("tool",))
+    )
+    assert free < loaded
