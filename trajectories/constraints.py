@@ -318,7 +318,7 @@ def gathered(
         shares = np.exp(sharpness * (scaled[:, columns] - top))
         total = shares.sum()
         c[r] = top + np.log(total) / sharpness
-        rows.append(np.flatnonzero(shares.max(axis=1) > 1e-12 * total))  # the others do not count to twelve digits
+        rows.append(np.flatnonzero(shares.max(axis=1) > 1e-9 * total))  # the others do not count to nine digits
         weights.append(np.zeros((len(rows[-1]), len(groups))))
         weights[-1][:, columns] = shares[rows[-1]] / total / constraint.scale[columns]
     found = constraint.slopes(motion.part(np.concatenate(rows)), np.concatenate(weights))

@@ -31,8 +31,9 @@ from trajectories.problem import (
 )  # fmt: skip
 
 Method = Literal["slsqp", "auglag", "mma"]
-STAGES = ((4.0, 40.0), (10.0, 120.0), (30.0, 400.0))
+STAGES = ((4.0, 100.0), (10.0, 200.0), (30.0, 500.0))
 """Sharpness of the spectra and of the constraints, stage by stage (our choice)."""
+S_RANGE = (-4.0, 12.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,12 +291,15 @@ class _Run:
         return self._optimised(solver, start)[: len(y)]
 
     def _bound(self, solver: nlopt.opt, size: int) -> None:
+        """Bound the factor on the period, and s to γ from -0.98 to 10⁵: SLSQP may try any length of step."""
+        lower, upper = np.full(size, -np.inf), np.full(size, np.inf)
+        p = self.basis.p
         if self.problem.free_period:
-            place = self.basis.p
-            lower, upper = np.full(size, -np.inf), np.full(size, np.inf)
-            lower[place], upper[place] = self.problem.stretch
-            solver.set_lower_bounds(lower)
-            solver.set_upper_bounds(upper)
+            lower[p], upper[p] = self.problem.stretch
+        if size > p + self.problem.free_period:
+            lower[-1], upper[-1] = S_RANGE
+        solver.set_lower_bounds(lower)
+        solver.set_upper_bounds(upper)
 
     def _optimised(self, solver: nlopt.opt, start: np.ndarray) -> np.ndarray:
         try:
@@ -324,7 +328,7 @@ class _Run:
 
     def _attainment(self, y: np.ndarray) -> float:
         gammas = [goal.attainment(value) for goal, value in zip(self.problem.goals, self.at(y).values) if goal.share]
-        return float(np.log(max(1.0 + max(gammas, default=0.0), 0.05)))
+        return float(np.clip(np.log(max(1.0 + max(gammas, default=0.0), 1e-9)), *S_RANGE))
 
     def _rows(self, result: np.ndarray, y: np.ndarray, slope: np.ndarray) -> None:
         goals = self.problem.goals

@@ -57,11 +57,7 @@ def objective_of(
 
 
 def with_conditions(wanted: list[tuple[str, Goal]], found: Found) -> tuple[Goal, ...]:
-    """Add the condition numbers with what the first run reached, where no goal was said for either."""
-    goals = [goal for _, goal in wanted]
-    if not {"raw", "normalised"} & {name for name, _ in wanted}:
-        goals += [
-            Goal(Excitation("cond", scaling), float(value))
-            for scaling, value in zip(("raw", "normalised"), found.values)
-        ]
-    return tuple(goals)
+    """Add the condition numbers with what the first run reached as their goals."""
+    both = zip(("raw", "normalised"), found.values)
+    conditions = (Goal(Excitation("cond", scaling), float(value)) for scaling, value in both)
+    return (*(goal for _, goal in wanted), *conditions)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -117,26 +118,38 @@ def excite(
         motions, dynamics.smooth.regressor, dynamics.smooth.regressor_gradient,
         ((Excitation("cond", "raw"), 0.5), (Excitation("cond", "normalised"), 0.5)), search, samples=samples,
     )  # fmt: skip
-    words = lambda done, total, what: say(f"{what} ({done} of {total} starts)")  # noqa: E731
-    found = design(problem, starts=starts, evaluations=evaluations, seed=seed, map=map, report=words)
     wanted = read_goals([*goals, *hard], dynamics, chain, found_limits, len(goals))
-    spent, seconds, history = found.evaluations, found.seconds, found.history
-    if wanted:
-        problem = replace(problem, goals=with_conditions(wanted, found))
-        say("goal attainment")
-        found = design(
-            problem, starts=max(1, starts // 3), evaluations=evaluations, seed=seed, guesses=(found.x,), map=map,
-            report=words,
-        )  # fmt: skip
-        spent, seconds, history = spent + found.evaluations, seconds + found.seconds, found.history
+    run = partial(design, evaluations=evaluations, seed=seed, map=map, report=_reporter(say))
+    found, problem = _searched(problem, wanted, starts, run, say)
     say("verifying")
-    found, proof = ensured(problem, replace(found, evaluations=spent, seconds=seconds, history=history), check)
-    trade = _front(problem, dynamics, chain, found_limits, found, wanted, front, words) if front else None
+    found, proof = ensured(problem, found, check)
+    trade = _front(problem, dynamics, chain, found_limits, found, wanted, front, _reporter(say)) if front else None
     condition = condition_of(dynamics, motions, found)
     return Designed(
         chain, dynamics, found_limits, motions, problem, found, proof, condition, _reached(problem, found), trade,
         rate, family, (*found_limits.notes, *dynamics.notes, *notes),
     )  # fmt: skip
+
+
+def _searched(
+    problem: Problem, wanted: list[tuple[str, Goal]], starts: int, search: Callable[..., Found], say: Progress
+) -> tuple[Found, Problem]:
+    """Search without goals, or for the goals: with a first run that proposes some for the condition numbers."""
+    if not wanted:
+        return search(problem, starts=starts), problem
+    if {"raw", "normalised"} & {name for name, _ in wanted}:
+        problem = replace(problem, goals=tuple(goal for _, goal in wanted))
+        return search(problem, starts=starts), problem
+    first = search(problem, starts=starts)
+    problem = replace(problem, goals=with_conditions(wanted, first))
+    say("goal attainment")
+    found = search(problem, starts=max(1, starts // 3), guesses=(first.x,))
+    spent, seconds = first.evaluations + found.evaluations, first.seconds + found.seconds
+    return replace(found, evaluations=spent, seconds=seconds), problem
+
+
+def _reporter(say: Progress) -> Callable[[int, int, str], None]:
+    return lambda done, total, what: say(f"{what} ({done} of {total})")
 
 
 def condition_of(dynamics: Dynamics, family: Family, found: Found) -> dict[str, float]:

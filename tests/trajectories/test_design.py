@@ -94,7 +94,7 @@ def test_the_search_beats_random_motions():
 @pytest.mark.parametrize("method", ["auglag", "mma"])
 def test_the_other_methods_improve_their_start_too(method):
     spot = problem()
-    run = one_start(spot, 120, method, 1, 0)
+    run = one_start(spot, 240, method, 1, 0)
     assert isinstance(run, Found) and run.merit < run.history[0] - 1.0
     assert ensured(spot, run)[1].feasible
 
@@ -217,7 +217,7 @@ def test_verification_finds_what_happens_between_samples():
 
 
 def test_a_motion_infeasible_between_coarse_samples_is_searched_again():
-    spot = problem(samples=24, tightening=0.0)
+    spot = problem(samples=14, tightening=0.0)
     run = one_start(spot, 120, "slsqp", 1, 0)
     assert isinstance(run, Found)
     assert not verify(spot.family, run.x, spot.constraints).feasible

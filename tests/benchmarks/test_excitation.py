@@ -1,0 +1,140 @@
+"""Speed and quality of excitation: run with `pytest tests/benchmarks/test_excitation.py --benchmark-only -s`.
+
+Set OPENBLAS_NUM_THREADS=1 on a shared machine. LWR4+ of the library, 64 base columns (43 inertial, Fv Fc off of seven
+joints), limits of the URDF on position and velocity, torque from the library's inertias with published friction, tool
+at least 0.3 m from axis 1 and not below -0.2 m.
+"""
+
+from __future__ import annotations
+
+import time
+from functools import cache, partial
+
+import numpy as np
+import pytest
+
+from calib.dynamics import base, drives
+from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.tree import standard_parameters, tree
+from calib.procedure.motion_limits import Points
+from calib.robot.load import load
+from trajectories.constraints import TorqueLimit, Workspace, box_limits
+from trajectories.fourier import fourier
+from trajectories.objectives import Excitation, condition_numbers
+from trajectories.optimise import design, random_start
+from trajectories.problem import Goal, Problem, evaluate
+from trajectories.verify import dense_motion, ensured
+
+CHAIN = load("lwr4plus")
+FC = (11.9, 11.5, 8.98, 8.35, 8.31, 4.72, 6.04)
+FV = (14.4, 15.3, 6.55, 11.0, 4.29, 2.26, 1.6)
+
+
+@cache
+def model() -> tuple[base.BaseModel, np.ndarray]:
+    full = IdentificationModel(tree(CHAIN), drives.standard(["Fv Fc off"] * 7, 0.05))
+    found = base.find(full)
+    values = np.concatenate([standard_parameters(CHAIN), np.column_stack([FV, FC, np.zeros(7)]).ravel()])
+    return base.BaseModel(full, found), found.transform @ values
+
+
+def problem(period: float, harmonics: int, samples: int = 200, goals=(), constrained: bool = True) -> Problem:
+    columns, values = model()
+    velocity, effort = (np.array([getattr(j, key) for j in CHAIN.joints]) for key in ("velocity", "effort"))
+    points = Points(CHAIN, (0,), np.zeros((1, 3)))
+    limits = (
+        *box_limits(CHAIN.lower, CHAIN.upper, velocity),
+        TorqueLimit(columns.regressor, columns.regressor_gradient, values, effort),
+        Workspace(points, points.product, radius=0.3, lowest=-0.2),
+    )
+    chosen = tuple(Goal(Excitation("cond", name), goal) for name, goal in zip(("raw", "normalised"), goals))
+    return Problem(
+        fourier(harmonics, period, 7, rate=1000.0), columns.regressor, columns.regressor_gradient,
+        constraints=limits if constrained else (), goals=chosen, samples=samples,
+    )  # fmt: skip
+
+
+def value(spot: Problem, basis, x: np.ndarray) -> float:
+    motion = basis.motion(x)
+    Y = spot.regressor(motion.q, motion.v, motion.a)
+    return Excitation().evaluate(motion, Y).value
+
+
+@pytest.mark.parametrize("harmonics", [5, 10])
+@pytest.mark.parametrize("samples", [200, 1000])
+def test_value_and_gradient_of_cond_against_differences(benchmark, harmonics, samples):
+    spot = problem(20.0, harmonics, samples, constrained=False)
+    basis = spot.basis()
+    x = random_start(problem(20.0, harmonics), basis, np.random.default_rng(0))
+    found = benchmark.pedantic(evaluate, (spot, basis, x, (np.inf, 1.0)), rounds=5, warmup_rounds=1)
+    began, differences = time.perf_counter(), []
+    for k in range(len(x)):
+        h = 1e-6 * np.eye(len(x))[k]
+        differences.append((value(spot, basis, x + h) - value(spot, basis, x - h)) / 2e-6)
+    taken = time.perf_counter() - began
+    error = np.abs(np.array(differences) - found.slopes[0]).max() / np.abs(found.slopes[0]).max()
+    exact = benchmark.stats.stats.median
+    print(
+        f"\nn_f {harmonics}, {samples} samples, {len(x)} variables: {1e3 * exact:.1f} ms exact, {1e3 * taken:.0f} ms "
+        f"by central differences ({taken / exact:.0f} times), largest relative difference {error:.1e}"
+    )
+
+
+@pytest.mark.parametrize(("period", "goals"), [(20.0, (35.0, 6.0)), (10.0, (45.0, 7.5))])
+def test_condition_number_under_all_constraints(benchmark, period, goals):
+    spot = problem(period, 5, goals=goals)
+    found = benchmark.pedantic(design, (spot,), {"starts": 4, "seed": 0}, rounds=1)
+    found, proof = ensured(spot, found)
+    motion = dense_motion(spot.family, found.x, period / 1000 * np.arange(1000))
+    sharp = base.BaseModel(IdentificationModel(tree(CHAIN), drives.standard(["Fv Fc off"] * 7, 0.01)), model()[0].base)
+    reached = condition_numbers(sharp.regressor(motion.q, motion.v, motion.a))
+    print(
+        f"\nT0 = {period:g} s, n_f 5, 64 columns, 1000 samples, sign smoothed at 0.01 rad/s: {reached['raw']:.1f} raw, "
+        f"{reached['normalised']:.2f} normalised; {found.evaluations} evaluations ({found.feasible:.0%} feasible), "
+        f"{found.seconds:.0f} s on one core; feasible: {proof.feasible}"
+    )
+    for name, one in proof.worst.items():
+        print(f"  {name}: {one.margin:.4g} {one.unit} ({one.label})")
+
+
+def test_finite_differences_with_the_same_optimiser_and_the_same_time(benchmark):
+    """The same SLSQP on the same problem, its gradients of cond by forward differences, stopped after 30 s."""
+    spot = problem(20.0, 5, goals=(35.0, 6.0))
+    numeric = Problem(**(spot.__dict__ | {"product": partial(_differences, spot.regressor)}))
+    start = time.perf_counter()
+    found = benchmark.pedantic(design, (numeric,), {"starts": 1, "evaluations": 150, "seed": 0}, rounds=1)
+    print(f"\nregressor differentiated numerically: γ = {found.merit:.3f} in {time.perf_counter() - start:.0f} s")
+    exact = design(spot, starts=1, evaluations=150, seed=0)
+    print(f"exact: γ = {exact.merit:.3f} in {exact.seconds:.1f} s")
+
+
+def test_random_search(benchmark):
+    spot = problem(20.0, 5)
+    basis, rng = spot.basis(), np.random.default_rng(0)
+
+    def search(seconds: float = 20.0) -> tuple[float, int]:
+        best, count, began = np.inf, 0, time.perf_counter()
+        while time.perf_counter() - began < seconds:
+            x = random_start(spot, basis, rng)
+            motion = basis.motion(x)
+            count += 1
+            if all((c.values(motion) <= 0).all() for c in spot.constraints):
+                best = min(best, value(spot, basis, x))
+        return best, count
+
+    best, count = benchmark.pedantic(search, rounds=1)
+    print(f"\nrandom search, 20 s: {best:.0f} raw, best of {count} motions")
+
+
+def _differences(regressor, q, v, a, G):
+    """Return the derivative product by central differences of the regressor: what a robot without kernels offers."""
+    slopes = []
+    for k in range(3):
+        gradient = np.zeros(q.shape)
+        for j in range(q.shape[1]):
+            step = np.zeros(q.shape[1])
+            step[j] = 1e-6
+            one, two = ([x + s * step * (i == k) for i, x in enumerate((q, v, a))] for s in (1, -1))
+            gradient[:, j] = (G * (regressor(*one) - regressor(*two))).sum(axis=(1, 2)) / 2e-6
+        slopes.append(gradient)
+    return tuple(slopes)
