@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,8 +42,33 @@ def write(path: str | Path, content: str | bytes) -> Path:
 
 
 def write_json(path: str | Path, value: Any) -> Path:
-    """Write `value` as indented JSON; NaN is refused, since JSON has none."""
-    return write(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
+    """Write `value` as indented JSON.
+
+    Raises:
+        CalibError: for a number that is not finite, since JSON has none, with its place; nothing is written.
+    """
+    try:
+        content = json.dumps(value, indent=2, allow_nan=False)
+    except ValueError as error:
+        place = next(_not_finite(value, ""), "") or "somewhere"
+        raise CalibError(
+            f"{path} was not written: {place} is not a finite number, so that nothing can be said of this robot; the "
+            "measurements are too few or too much alike, or far from what the robot can do. Measure more poses, or ask "
+            "for a simpler model"
+        ) from error
+    return write(path, content + "\n")
+
+
+def _not_finite(value: Any, place: str) -> Iterator[str]:
+    """Yield where numbers are not finite, as ``fit.nominal.position_mm.rms``."""
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from _not_finite(item, f"{place}.{key}" if place else str(key))
+    elif isinstance(value, (list, tuple)):
+        for number, item in enumerate(value):
+            yield from _not_finite(item, f"{place}[{number}]")
+    elif isinstance(value, float) and not math.isfinite(value):
+        yield place
 
 
 def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> Path:

@@ -203,3 +203,12 @@ def test_debug_shows_the_traceback(cell):
         command, cwd=cell.folder, capture_output=True, text=True, check=False, env=os.environ | {"CALIB_DEBUG": "1"}
     )
     assert "Traceback" in loud.stderr
+
+
+def test_a_number_that_is_not_finite_is_never_written(tmp_path):
+    from calib import files
+    from calib.errors import CalibError
+
+    with pytest.raises(CalibError, match=r"fit\.rms\[1\] is not a finite number"):
+        files.write_json(tmp_path / "a.json", {"fit": {"rms": [1.0, float("nan")]}})
+    assert not list(tmp_path.iterdir())
