@@ -14,6 +14,7 @@ from calib.data.pose_files import joint_columns, read_measurements
 from calib.errors import MeasurementError, UsageError
 from calib.geometry.deflection import Deflection
 from calib.procedure import calibrated
+from calib.procedure.plausible_frames import check_orientations
 from calib.robot import description
 from calib.robot.chain import Chain, Joint
 from calib.robot.load import load, resolve
@@ -139,9 +140,12 @@ def load_robot(
 
 
 def read_file(path: Path, chain: Chain, options: FitOptions) -> list[PoseMeasurements]:
-    """Read one measurement file for a chain, held against its limits."""
-    limits = (chain.lower, chain.upper)
-    return read_measurements(path, chain.joint_names, options.for_file(path), kinds=joint_kinds(chain), limits=limits)
+    """Read one measurement file for a chain, held against its limits and its orientations."""
+    limits, kinds = (chain.lower, chain.upper), joint_kinds(chain)
+    blocks = read_measurements(path, chain.joint_names, options.for_file(path), kinds=kinds, limits=limits)
+    for block in blocks:
+        check_orientations(chain, block)
+    return blocks
 
 
 def joint_kinds(chain: Chain) -> list[str]:
