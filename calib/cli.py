@@ -52,11 +52,18 @@ def fit(
     refit_frames: Annotated[bool, typer.Option(help="validation files: base and tool placement of their own")] = False,
     options: Annotated[Path | None, typer.Option(help="TOML: column names, units, kinds, how to fit")] = None,
     model: Annotated[
-        str | None, typer.Option(help="auto, frames, offsets, geometry, stiffness, coupling or harmonics")
+        str | None,
+        typer.Option(
+            help="auto, frames, offsets, geometry, stiffness, bending, coupling, harmonics or wobble: that rung and "
+            "all below it"
+        ),
     ] = None,
     loss: Annotated[str | None, typer.Option(help="auto, none, huber or cauchy")] = None,
     stations: Annotated[str, typer.Option(help="base placement: each file its own, or one for all")] = "each",
     tools: Annotated[str, typer.Option(help="one tool for all files, or each its own")] = "one",
+    tolerance: Annotated[
+        float | None, typer.Option(metavar="MM", help="rms on unseen poses, in mm, above which the verdict is fail")
+    ] = None,
     base: Base = None,
     tip: Tip = None,
     seed: Seed = 0,
@@ -69,6 +76,8 @@ def fit(
 
     if model not in (None, "auto", *MODELS):
         raise UsageError(f"--model {model}: expected auto, {', '.join(MODELS)}")
+    if tolerance is not None and not 0.0 < tolerance < float("inf"):
+        raise UsageError(f"--tolerance {tolerance:g}: expected a length above 0, in mm")
     chosen = read_options(options)
     outputs.check_target(out)
     found = inputs.gather(
@@ -80,7 +89,10 @@ def fit(
     for line in show.read_lines(found):
         console.print(line, soft_wrap=True)
     with _progress() as say:
-        outcome = fitting.run(found, chosen, model=model, loss=loss, seed=seed, progress=say)
+        outcome = fitting.run(
+            found, chosen, model=model, loss=loss, tolerance=1e-3 * tolerance if tolerance else None, seed=seed,
+            progress=say,
+        )  # fmt: skip
         say("writing")
         outputs.write_folder(outcome, out, report.write)
     for line in show.outcome_lines(outcome):
@@ -142,6 +154,9 @@ def export(
     out: Annotated[Path | None, typer.Option(help="the URDF to write")] = None,
     ur_kinematics: Annotated[Path | None, typer.Option(help="write ur_description's kinematics YAML")] = None,
     offsets: Annotated[Path | None, typer.Option(help="write a CSV of joint offsets")] = None,
+    for_corrections: Annotated[
+        bool, typer.Option("--for-corrections", help="the URDF that joint_corrections.csv belongs to, worse without it")
+    ] = False,
 ) -> None:
     """Write the calibrated geometry for other programs."""
     from calib.errors import UsageError
@@ -150,9 +165,10 @@ def export(
     if (urdf is None) != (out is None) or not (urdf or ur_kinematics or offsets):
         raise UsageError("nothing to write: give --urdf SOURCE.urdf --out FILE.urdf, --ur-kinematics or --offsets")
     found = exporting.read(folder)
+    exporting.check_targets(urdf, [path for path in (out, ur_kinematics, offsets) if path])
     console = _console()
     if urdf and out:
-        exporting.export_urdf(found, urdf, out)
+        exporting.export_urdf(found, urdf, out, for_corrections)
         console.print(
             f"{out}: joint origins of {urdf} calibrated, all else kept; base link and flange stay where the source has "
             "them; Pinocchio reads the same poses to 1e-9", soft_wrap=True, markup=False,
@@ -160,6 +176,8 @@ def export(
     if ur_kinematics:
         exporting.export_ur_kinematics(found, ur_kinematics)
         console.print(f"{ur_kinematics}: for kinematics_params_file of ur_description", soft_wrap=True, markup=False)
+        if note := exporting.flange_note(found):
+            console.print(f"note: {note}", soft_wrap=True, markup=False)
     if offsets:
         exporting.export_offsets(found, offsets)
         console.print(
@@ -168,6 +186,7 @@ def export(
         )  # fmt: skip
     if found.corrected:
         note = f"note: the corrections in {folder}/joint_corrections.csv are in none of these files"
+        note += f": {found.alone}" if found.alone else ""
         console.print(note, soft_wrap=True, markup=False)
 
 

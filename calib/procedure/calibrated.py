@@ -81,6 +81,15 @@ def read(path: str | Path) -> Installation:
     return Installation(chain, **given)
 
 
+def rigid_chain(path: str | Path) -> Chain:
+    """Return the geometry of a fit that is best without its deflections: what a URDF of it holds."""
+    path = Path(path) / "robot.toml" if Path(path).is_dir() else Path(path)
+    chain, values = description.read(path), description.read_extra(path).get("provenance", {}).get("rigid")
+    if values is None:
+        return chain
+    return chain.with_values(vector(values, len(chain.elements), f"{path}, provenance.rigid"))
+
+
 def _frames(entries: Any, where: str) -> dict[str, np.ndarray]:
     if not isinstance(entries, list) or not all(isinstance(entry, Mapping) for entry in entries):
         raise RobotError(f"{where}: expected [[...]] tables, each with a name, xyz and rpy")

@@ -26,6 +26,7 @@ KINDS = {
     "distance_mm": ("distance", "mm"),
 }
 ARMS = {"nominal": "nominal", "calibrated": "calibrated", "urdf_alone": "its URDF alone"}
+EDITED = "edited by hand"
 MOST_ROWS = 60
 CONVENTIONS = (
     "Units: m, rad, s, kg, N·m in all files unless a header names another; this page prints mm, deg and mrad.",
@@ -122,10 +123,18 @@ def of_fit(report: Report, drawn: Mapping[str, Drawn], setup: Sequence[tuple[str
     """Return the certificate of a fit alone, without a session around it."""
     given = setup or (
         ("robot", f"{report.robot}, {report.base} to {report.tip}, {len(report.joints)} joints"),
+        ("tolerance", tolerance(report.metrics.get("tolerance_mm"))),
         ("seed", str(report.metrics["seed"])),
         ("toolkit", versions()),
     )
     return Page(f"Calibration of {report.robot}", "Geometry", given, [geometry_stage(report, drawn)])
+
+
+def tolerance(millimetres: float | None) -> str:
+    """Return what a verdict of pass means, in words."""
+    if not millimetres:
+        return "none was given: pass means better than the nominal robot on unseen poses, or nothing to gain"
+    return f"{millimetres:g} mm rms on unseen poses"
 
 
 def versions() -> str:
@@ -194,8 +203,9 @@ def error_table(metrics: Mapping[str, Any]) -> Table:
     note = "Distances of pairs do not depend on where instrument and tool are placed."
     if any("urdf_alone" in found for _, found in sets):
         note += (
-            " A URDF cannot hold the joint corrections of the chosen model: its errors alone stand beside; with "
-            "joint_corrections.csv they are those of the calibrated arm."
+            " A URDF cannot hold the joint corrections of the chosen model: robot.urdf is the best geometry without "
+            "them, and its errors stand beside; robot_for_corrections.urdf with joint_corrections.csv has those of the "
+            "calibrated arm."
         )
     return Table("Errors", header, rows, note, frozenset(strong), range(3, 7))
 

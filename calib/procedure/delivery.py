@@ -29,22 +29,33 @@ def deliver(fit: Path, source: Path, out: Path) -> list[str]:
         elif (out / name).exists():
             os.unlink(out / name)
     found = exporting.read(fit)
-    if source.suffix == ".urdf":
-        exporting.export_urdf(found, source, out / "robot.urdf")
-        notes = ["robot.urdf: the given URDF with calibrated joint origins, all else kept"]
-    else:
-        written = (fit / "robot.urdf").read_text(encoding="utf-8")
-        exporting.check_readback(written, "robot.urdf", found.chain)
-        files.write(out / "robot.urdf", written)
-        notes = ["robot.urdf: written from the calibrated table"]
-    notes[0] += "; Pinocchio reads the same poses to 1e-9"
+    given = source.suffix == ".urdf"
+    for name, chain in (("robot.urdf", found.chain), ("robot_for_corrections.urdf", found.complete)):
+        if chain is None:
+            (out / name).unlink(missing_ok=True)
+        elif given:
+            exporting.export_urdf(found, source, out / name, chain is found.complete)
+        else:
+            written = (fit / name).read_text(encoding="utf-8")
+            exporting.check_readback(written, name, chain)
+            files.write(out / name, written)
+    made = (
+        "the given URDF with calibrated joint origins, all else kept" if given else "written from the calibrated table"
+    )
+    notes = [f"robot.urdf: {made}; Pinocchio reads the same poses to 1e-9"]
     exporting.export_offsets(found, out / "joint_offsets.csv")
     notes.append("robot.toml, joint_offsets.csv")
     try:
         exporting.export_ur_kinematics(found, out / "ur_kinematics.yaml")
-        notes.append("ur_kinematics.yaml: for kinematics_params_file of ur_description")
+        flange = exporting.flange_note(found)
+        words = "ur_kinematics.yaml: for kinematics_params_file of ur_description"
+        notes.append(f"{words}; {flange}" if flange else words)
     except (RobotError, UsageError):  # no UR arm
         (out / "ur_kinematics.yaml").unlink(missing_ok=True)
     if found.corrected:
-        notes.append("joint_corrections.csv: what a URDF cannot hold; formula in joint_corrections.txt")
+        words = (
+            "joint_corrections.csv: what a URDF cannot hold, on top of robot_for_corrections.urdf; formula in "
+            "joint_corrections.txt"
+        )
+        notes.append(f"{words}; {found.alone}" if found.alone else words)
     return notes

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from calib.data.measurements import PoseMeasurements
 from calib.data.plans import read_poses
 from calib.dynamics.gravity import gravity_torques
 from calib.errors import SessionError
-from calib.geometry.deflection import Deflection, evaluate
+from calib.geometry.deflection import evaluate
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation, see
@@ -91,18 +91,18 @@ def bring(session: Session, cell: Cell, seed: int) -> None:
 
 
 def against_truth(session: Session, cell: Cell) -> tuple[float, float, float]:
-    """Return rms position errors against the noise-free truth [mm]: nominal, calibrated, and without corrections.
+    """Return rms position errors against the noise-free truth [mm]: nominal, calibrated, and its URDF alone.
 
-    The nominal arm gets its best station and tool for these very poses, so that arms are compared.
+    The nominal arm and the URDF get their best station and tool for these very poses, so that arms are compared.
     """
     q = random_joints(cell.nominal, TRUTH, 12345)
     true = true_poses(cell, q)
     points = true[:, :3, 3]
     block = PoseMeasurements("pose", q, cell.nominal.joint_names, position=points, quaternion=to_quaternion(true))
-    nominal = polish_frames(install(cell.nominal, [block]), [block]).cell
+    rigid = calibrated.rigid_chain(session.path("4-fit"))
+    nominal, alone = (polish_frames(install(chain, [block]), [block]).cell for chain in (cell.nominal, rigid))
     found = calibrated.read(session.path("4-fit"))
-    arms = (nominal, found, replace(found, deflection=Deflection()))
-    before, after, bare = (_rms(arm, q, points) for arm in arms)
+    before, after, bare = (_rms(arm, q, points) for arm in (nominal, found, alone))
     return before, after, bare
 
 

@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from calib.data.measurements import PoseMeasurements
 from calib.data.options import FitOptions
 from calib.errors import NotConverged
+from calib.geometry.deflection import Deflection
 from calib.geometry.diagnosis import diagnose
 from calib.geometry.explanation import explain
 from calib.geometry.first_guess import install
+from calib.geometry.fit import fit, polish_frames
 from calib.geometry.installation import Installation
 from calib.geometry.ladder import Climb, climb
+from calib.geometry.observation import has_instrument
 from calib.geometry.parameters import layout
 from calib.geometry.weighing import Settings, combine
-from calib.procedure.comparing import Comparison, compare, compare_unseen
+from calib.procedure.comparing import Comparison, compare, compare_unseen, urdf_alone, without_corrections
 from calib.procedure.diagnosis import Outlier, named_outliers, plateau, remains
 from calib.procedure.inputs import Inputs
-from calib.procedure.verdict import Verdict, judge
+from calib.procedure.verdict import OWN_FRAMES, Verdict, judge
 from calib.robot.chain import Chain
 
 Progress = Callable[[str], None]
@@ -34,6 +38,7 @@ class Outcome:
     Attributes:
         inputs: what it worked on.
         climb: the rungs, the chosen model, and the fits of the nominal and the calibrated arm.
+        rigid: the best geometry without joint corrections, which a URDF holds.
         fit: the two arms on the fit rows.
         validation: the two arms on unseen rows, by file name.
         outliers: rows of the fit that do not fit, worst first.
@@ -41,10 +46,12 @@ class Outcome:
         warnings: what a user should know.
         verdict: pass, marginal or fail, with its reason.
         seed: that reproduces it.
+        tolerance: largest rms on unseen poses that is good enough [m]; None where none was given.
     """
 
     inputs: Inputs
     climb: Climb
+    rigid: Chain
     fit: Comparison
     validation: Mapping[str, Comparison]
     outliers: Sequence[Outlier]
@@ -52,6 +59,7 @@ class Outcome:
     warnings: tuple[str, ...]
     verdict: Verdict
     seed: int = 0
+    tolerance: float | None = None
 
 
 def run(
@@ -60,6 +68,7 @@ def run(
     *,
     model: str | None = None,
     loss: str | None = None,
+    tolerance: float | None = None,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Outcome:
@@ -69,6 +78,7 @@ def run(
         inputs: see `calib.procedure.inputs.gather`.
         options: the fit options file's content.
         model, loss: in place of the options'.
+        tolerance: largest rms on unseen poses that is good enough [m].
         seed: for everything random.
         progress: called with a few words at each stage.
 
@@ -97,25 +107,48 @@ def run(
         raise NotConverged(f"the fit of model '{found.chosen}' did not converge: {status.value}", found.fit)
     say("comparing on unseen poses")
     nominal, calibrated = found.nominal.cell, found.fit.cell
-    fitted = compare(nominal, calibrated, inputs.fit, torques, "fitted on these rows", False, seed)
+    rigid = rigid_geometry(found, inputs.fit, settings)
+    alone = without_corrections(calibrated, rigid, inputs.fit, settings)
+    fitted = compare(nominal, calibrated, inputs.fit, torques, "fitted on these rows", False, seed, alone=alone)
     validation = {
-        name: compare_unseen(nominal, calibrated, unseen, lambda b: gravity_of(inputs.chain, b), settings, seed)
+        name: compare_unseen(nominal, calibrated, unseen, lambda b: gravity_of(inputs.chain, b), settings, seed, alone)
         for name, unseen in inputs.unseen.items()
     }
     named = named_outliers(found.fit)
     unexplained = plateau(found, reach(inputs.chain))
-    verdict = judge(
-        fitted,
-        validation,
-        model=found.chosen,
-        asked=asked,
-        cross_validated=cross_validated(found),
-        outlier_share=len({(each.file, each.row) for each in named}) / sum(len(block) for block in inputs.fit),
-        unexplained=unexplained if remains(found, reach(inputs.chain)) else "",
-    )
+    verdict = judge(fitted, validation, asked=asked, tolerance=tolerance, **judged(inputs, found, named))
+    clause, loud = urdf_alone(fitted, validation)
+    verdict = verdict if not clause else replace(verdict, reason=f"{verdict.reason}; {clause}")
     notes = (*inputs.notes, *(note for block in inputs.fit for note in block.notes), *elsewhere(fitted, validation))
-    warnings = (*notes, *((unexplained,) if unexplained else ()), *diagnose(found.fit))
-    return Outcome(inputs, found, fitted, validation, named, tuple(explain(found.fit)), warnings, verdict, seed)
+    warnings = (*loud, *notes, *((unexplained,) if unexplained else ()), *diagnose(found.fit))
+    return Outcome(
+        inputs, found, rigid, fitted, validation, named, tuple(explain(found.fit)), warnings, verdict, seed, tolerance
+    )
+
+
+def rigid_geometry(found: Climb, measured: Sequence[PoseMeasurements], settings: Settings) -> Chain:
+    """Return the best geometry without any corrections, those that came with the robot included: for a URDF."""
+    cell = found.rigid.cell
+    if not cell.known.terms:
+        return cell.chain
+    bare = polish_frames(replace(found.nominal.cell, known=Deflection()), measured, settings).cell
+    drawn = not all(has_instrument(block) for block in measured)
+    table = layout(bare)
+    every = np.concatenate([table.arm_index, table.frame_index])
+    return fit(bare, measured, every, settings=settings, drawn=drawn).cell.chain
+
+
+def judged(inputs: Inputs, found: Climb, named: Sequence[Outlier]) -> dict[str, Any]:
+    """Return what `calib.procedure.verdict.judge` needs besides errors, the model asked for and a tolerance."""
+    long = reach(inputs.chain)
+    return {
+        "model": found.chosen,
+        "cross_validated": cross_validated(found),
+        "nominal_cross_validated": next((r.cross_validated for r in found.rungs if r.model == "frames"), None),
+        "outlier_share": len({(each.file, each.row) for each in named}) / sum(len(block) for block in inputs.fit),
+        "unexplained": plateau(found, long) if remains(found, long) else "",
+        "reach": long,
+    }
 
 
 def fixed_parameters(start: Installation, options: FitOptions) -> np.ndarray:
@@ -166,7 +199,7 @@ def elsewhere(fit: Comparison, validation: Mapping[str, Comparison]) -> list[str
     usual = float(np.median(fit.errors[0].main)) if len(fit.errors[0].main) else np.inf
     return [
         f"{name}: nominal errors of {1e3 * np.median(found.errors[0].main):.3g} mm look like an instrument (or "
-        "tool) that stood elsewhere; give --refit-frames"
+        f"tool) that stood elsewhere; give {OWN_FRAMES}"
         for name, found in validation.items()
         if np.median(found.errors[0].main) > ELSEWHERE * usual
     ]

@@ -22,12 +22,16 @@ from calib.robot import description, urdf_write
 from calib.robot.chain import Chain
 
 OURS = (
-    "robot.toml", "robot.urdf", "estimate.csv", "covariance.csv", "residuals.csv", "joint_corrections.csv",
+    "robot.toml", "robot.urdf", "robot_for_corrections.urdf",
+    "estimate.csv", "covariance.csv", "residuals.csv", "joint_corrections.csv",
     "joint_corrections.txt", "report.json", "certificate.html", "metrics.json",
 )  # fmt: skip
 """Files of an earlier fit that a new one replaces; besides plots, ``plot_*.png``."""
 
 CORRECTIONS = """Joint corrections that a URDF cannot hold.
+
+robot.urdf               the best geometry for whoever does not apply them
+robot_for_corrections.urdf   the geometry they belong to, which is worse alone
 
 At joint values q, add to the joint (or element) of each row of joint_corrections.csv
 
@@ -40,9 +44,9 @@ At joint values q, add to the joint (or element) of each row of joint_correction
     cos     cos(order * q of `joint`)
     sin     sin(order * q of `joint`)
 
-To make the arm stand where the calibrated model says: predict with q + delta(q) in robot.urdf; to command a joint
-position for which robot.urdf wants q, send q - delta(q) (one step is enough; delta is small).
-robot.toml holds the same terms, and `calib.procedure.calibrated.read` reads them.
+To make the arm stand where the calibrated model says: predict with q + delta(q) in robot_for_corrections.urdf; to
+command a joint position for which that file wants q, send q - delta(q) (one step is enough; delta is small).
+robot.toml holds the same geometry and terms, and `calib.procedure.calibrated.read` reads them.
 """
 
 
@@ -93,18 +97,21 @@ def _write_all(outcome: Outcome, folder: Path) -> None:
     fit, chain = outcome.climb.fit, outcome.inputs.chain
     extra = calibrated.tables(fit.cell) | {"provenance": _provenance(outcome)}
     description.write(folder / "robot.toml", fit.cell.chain, extra, source=f"calibrated from {outcome.inputs.source}")
-    if outcome.inputs.source.suffix == ".urdf":
-        urdf_write.edit_file(outcome.inputs.source, folder / "robot.urdf", chain, fit.cell.chain)
-    else:
-        files.write(folder / "robot.urdf", urdf_write.write_new(fit.cell.chain))
+    whole = merged(fit.cell)
+    urdfs = {"robot.urdf": outcome.rigid if whole.deflection.terms else fit.cell.chain}
+    if whole.deflection.terms:
+        urdfs["robot_for_corrections.urdf"] = fit.cell.chain
+        write_corrections(whole.chain, whole.deflection, folder)
+    for name, geometry in urdfs.items():
+        if outcome.inputs.source.suffix == ".urdf":
+            urdf_write.edit_file(outcome.inputs.source, folder / name, chain, geometry)
+        else:
+            files.write(folder / name, urdf_write.write_new(geometry))
     table = estimate_table(fit, outcome.climb.nominal.cell)
     files.write_table(folder / "estimate.csv", HEADER, table.rows())
     rows = ([name, *map(float, row)] for name, row in zip(table.names, table.covariance))
     files.write_table(folder / "covariance.csv", ("name", *table.names), rows)
     write_residuals(outcome, folder / "residuals.csv")
-    whole = merged(fit.cell)
-    if whole.deflection.terms:
-        write_corrections(whole.chain, whole.deflection, folder)
     files.write_json(folder / "metrics.json", metrics(outcome))
 
 
@@ -128,6 +135,7 @@ def metrics(outcome: Outcome) -> dict[str, object]:
         "status": outcome.climb.fit.solution.status.name.lower(),
         "verdict": outcome.verdict.level,
         "reason": outcome.verdict.reason,
+        "tolerance_mm": None if outcome.tolerance is None else 1e3 * outcome.tolerance,
         "warnings": list(outcome.warnings),
         "not_identifiable": list(outcome.unclear),
         "outliers": [
@@ -147,7 +155,8 @@ def metrics(outcome: Outcome) -> dict[str, object]:
 def _provenance(outcome: Outcome) -> dict[str, object]:
     inputs = outcome.inputs
     earlier = description.read_extra(inputs.source) if inputs.source.suffix == ".toml" else {}
-    return {
+    rigid = {"rigid": outcome.rigid.values.tolist()} if merged(outcome.climb.fit.cell).deflection.terms else {}
+    return rigid | {
         "robot": str(inputs.source),
         "nominal": earlier.get("provenance", {}).get("nominal", inputs.chain.values.tolist()),
         "files": [block.file for block in inputs.fit],

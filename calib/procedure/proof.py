@@ -1,16 +1,13 @@
-"""What unseen rows say of both arms: doubtful rows, the URDF without its corrections, the table of errors."""
+"""What unseen rows say of both arms: doubtful rows, the table of errors."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from calib import files
 from calib.data.measurements import PoseMeasurements
-from calib.geometry.accuracy import errors, summary
-from calib.geometry.deflection import Deflection
 from calib.procedure.comparing import Comparison
 from calib.robot.chain import Chain
 
@@ -32,15 +29,6 @@ def doubtful(validation: dict[str, Comparison]) -> list[str]:
                 f"for the verdict too; without them the rms is {without:.3f} mm"
             )
     return result
-
-
-def without_corrections(found: Comparison) -> dict[str, object]:
-    """Return the errors of the calibrated geometry alone, as a URDF holds it; nothing where that is all there is."""
-    cell = found.cells[1]
-    if not cell.deflection.terms:
-        return {}
-    bare = replace(cell, deflection=Deflection())
-    return {"urdf_alone": summary(errors(bare, found.blocks))}
 
 
 def write_errors(path: Path, chain: Chain, validation: dict[str, Comparison]) -> None:

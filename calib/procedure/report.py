@@ -20,9 +20,8 @@ from calib.estimation.estimate import strong_correlations
 from calib.geometry.observation import has_instrument, predict, prepare
 from calib.geometry.parameters import layout
 from calib.procedure.comparing import Comparison
-from calib.procedure.diagnosis import plateau, remains
 from calib.procedure.estimates import estimate_table
-from calib.procedure.fitting import Outcome, cross_validated, reach
+from calib.procedure.fitting import Outcome, judged
 from calib.procedure.outputs import metrics
 from calib.transforms import invert
 
@@ -93,18 +92,8 @@ def collect(outcome: Outcome) -> Report:
         rank=len(values) if fit.split is None else fit.split.rank,
         sets=sets,
         noise=_noise(outcome.fit.blocks),
-        judged=_judged(outcome),
+        judged=judged(outcome.inputs, outcome.climb, outcome.outliers),
     )
-
-
-def _judged(outcome: Outcome) -> dict[str, Any]:
-    rows, long = sum(len(block) for block in outcome.inputs.fit), reach(outcome.inputs.chain)
-    return {
-        "model": outcome.climb.chosen,
-        "cross_validated": cross_validated(outcome.climb),
-        "outlier_share": len({(each.file, each.row) for each in outcome.outliers}) / rows,
-        "unexplained": plateau(outcome.climb, long) if remains(outcome.climb, long) else "",
-    }
 
 
 def rows_of(name: str, comparison: Comparison, unseen: bool) -> dict[str, Any]:

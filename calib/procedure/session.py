@@ -3,7 +3,8 @@
 session.toml     what is to be calibrated, with what, how; written by `calib new`, edited by people
 1-robot/         the robot's description, copied, so that the folder can move
 2-poses/         poses.csv to measure and fit, validation.csv to measure and never fit
-3-measured/      what people bring: measured.csv (any name), and files whose name starts with validation
+3-measured/      what people bring: measured.csv (any name), and files whose name starts with validation; their columns:
+                 `calib formats measurements`
 4-fit/  5-validation/  6-export/  certificate.html
 state.json       which step was made from which files (SHA-256), when, by which version; written whole or not at all
 session.lock     there while a command works on the session
@@ -55,15 +56,18 @@ validation = {validation}              # how many more to measure and never fit;
 plan = true                            # false: measured files hold other poses than those chosen here
 index = "O1"
 method = "detmax"
-constraints = ""                       # a TOML file beside this one, see `calib select --help`
+constraints = ""                       # a TOML file beside this one; see `calib formats constraints`
 
 [fit]
-model = "auto"                         # or frames, offsets, geometry, stiffness, ...
+model = "auto"                         # or frames, offsets, geometry, stiffness, bending, coupling, harmonics, wobble
 loss = "none"                          # or huber, cauchy
-options = ""                           # a TOML file beside this one: column names, units (see calib.data.options)
+options = ""                           # a TOML file beside this one: column names, units; see `calib formats options`
 stations = "each"                      # each measured file has its own base placement, or one for all
 validation_frames = "fit"              # own: base and tool placement are fitted anew on validation files
+tolerance_mm = 0.0                     # largest rms [mm] on unseen poses that is good enough: above it the verdict is
+                                       # fail; 0: none, and pass only means better than the nominal robot
 """
+_LATER = {("fit", "tolerance_mm")}  # keys that sessions made before do not have; the example's value stands for them
 
 
 @dataclass(frozen=True)
@@ -152,6 +156,8 @@ def open_session(folder: Path) -> Session:
     for section, values in tomllib.loads(_example()).items():
         if section not in table:
             raise SessionError(f"{path}: '{section}' is missing")
+        if isinstance(values, dict) and isinstance(table[section], dict):
+            table[section] = {k: v for k, v in values.items() if (section, k) in _LATER} | table[section]
         _check_section(path, section, values, table[section])
     unknown = sorted(set(table) - known)
     if unknown:
@@ -190,6 +196,8 @@ def _check_section(path: Path, section: str, expected: Any, found: Any) -> None:
         numeric = isinstance(value, float) and isinstance(found[key], int) and not isinstance(found[key], bool)
         if not numeric and type(found[key]) is not type(value):
             raise SessionError(f"{path}: [{section}] {key} = {found[key]!r}: expected {type(value).__name__}")
+    if found.get("tolerance_mm", 0.0) < 0.0:
+        raise SessionError(f"{path}: [{section}] tolerance_mm = {found['tolerance_mm']:g}: expected 0 or more")
     unknown = sorted(set(found) - set(expected))
     if unknown:
         raise SessionError(f"{path}: [{section}] has no key '{unknown[0]}'; it has {', '.join(expected)}")

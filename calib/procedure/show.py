@@ -21,6 +21,7 @@ KINDS = {
     "distance_mm": "distance [mm]",
     "pair": "pairs' distance [mm]",
 }
+ARMS = {"nominal": "nominal", "calibrated": "calibrated", "urdf_alone": "URDF alone"}
 MANY = 8  # how many outliers or merged parameters are listed
 
 
@@ -59,7 +60,7 @@ def ladder_table(outcome: Outcome) -> Table:
     """Return the rungs with their error on rows left out."""
     table = Table("model", title="ladder of models", title_justify="left")
     for name in ("parameters", "cross-validated rms [mm]"):
-        table.add_column(name, justify="right")
+        table.add_column(escape(name), justify="right")
     table.add_column("")
     for rung in outcome.climb.rungs:
         style = "bold" if rung.kept else "dim"
@@ -88,9 +89,9 @@ def _add(table: Table, label: str, comparison: Comparison) -> None:
     pairs = found.get("pair_distance_mm", {})
     table.add_row(f"[bold]{escape(label)}[/]")
     for kind, words in KINDS.items():
-        for arm in ("nominal", "calibrated"):
-            numbers = pairs.get(arm) if kind == "pair" else found[arm].get(kind)
+        for arm, words_of_arm in ARMS.items():
+            numbers = pairs.get(arm) if kind == "pair" else found.get(arm, {}).get(kind)
             if numbers is not None:
                 cells = [f"{numbers[key]:.4f}" for key in ("mean", "rms", "p95", "max")]
-                table.add_row(f"  {escape(words)}" if arm == "nominal" else "", arm, *cells)
+                table.add_row(f"  {escape(words)}" if arm == "nominal" else "", words_of_arm, *cells)
     table.add_section()

@@ -52,6 +52,11 @@ def options_of(session: Session) -> FitOptions:
     )
 
 
+def tolerance_of(session: Session) -> float | None:
+    """Return the largest rms on unseen poses that is good enough [m]; None where the session states none."""
+    return 1e-3 * session.settings.fit["tolerance_mm"] or None
+
+
 def measured_files(session: Session) -> tuple[list[Path], list[Path]]:
     """Return the CSV files people have brought: for the fit, and for validation (names starting with it)."""
     found = sorted(session.path("3-measured").glob("*.csv"))
@@ -148,7 +153,7 @@ def fit(session: Session, say: Say) -> list[str]:
     settings = session.settings
     outcome = fitting.run(
         gathered(session), options_of(session), model=settings.fit["model"], loss=settings.fit["loss"],
-        seed=settings.seed, progress=say,
+        tolerance=tolerance_of(session), seed=settings.seed, progress=say,
     )  # fmt: skip
     outputs.write_folder(outcome, session.path("4-fit"), report.write)
     count = len(outcome.climb.fit.free)
@@ -175,10 +180,11 @@ def validate(session: Session, say: Say) -> list[str]:
     given = gathered(session, unseen)
     fitted, validation = compared(session, given)
     asked = session.settings.fit["model"]
-    verdict = judge(fitted, validation, asked=asked, **found.judged)
-    warnings = [*fitting.elsewhere(fitted, validation), *proof.doubtful(validation)]
-    tables = {name: each.table() | proof.without_corrections(each) for name, each in validation.items()}
-    metrics: dict[str, object] = {"validation": tables}
+    verdict = judge(fitted, validation, asked=asked, tolerance=tolerance_of(session), **found.judged)
+    clause, loud = comparing.urdf_alone(fitted, validation)
+    verdict = verdict if not clause else replace(verdict, reason=f"{verdict.reason}; {clause}")
+    warnings = [*loud, *fitting.elsewhere(fitted, validation), *proof.doubtful(validation)]
+    metrics: dict[str, object] = {"validation": {name: each.table() for name, each in validation.items()}}
     metrics |= {"verdict": verdict.level, "reason": verdict.reason, "warnings": warnings}
     sets = [report.rows_of(name, each, each.proves) for name, each in validation.items()]
     proof.write_errors(folder / "errors.csv", given.chain, validation)
@@ -195,10 +201,12 @@ def compared(session: Session, given: inputs.Inputs) -> tuple[comparing.Comparis
     torques = [fitting.gravity_of(given.chain, block) for block in given.fit]
     nominal = polish_frames(fitting.install(given.chain, given.fit), given.fit, settings, torques).cell
     cell = calibrated.read(session.path("4-fit"))
-    fitted = comparing.compare(nominal, cell, given.fit, torques, "fitted on these rows", False, seed)
+    rigid = calibrated.rigid_chain(session.path("4-fit"))
+    alone = comparing.without_corrections(cell, rigid, given.fit, settings)
+    fitted = comparing.compare(nominal, cell, given.fit, torques, "fitted on these rows", False, seed, alone=alone)
     unseen = {
         name: comparing.compare_unseen(
-            nominal, cell, each, lambda block: fitting.gravity_of(given.chain, block), settings, seed
+            nominal, cell, each, lambda block: fitting.gravity_of(given.chain, block), settings, seed, alone
         )
         for name, each in given.unseen.items()
     }
@@ -261,6 +269,7 @@ def setup(session: Session, found: report.Report) -> list[tuple[str, str]]:
         ("measurements", f"{measured}; files of {day}"),
         ("pose plan", session_plan(session)),
         ("model", found.metrics["model"]),
+        ("tolerance", certificate.tolerance(settings.fit["tolerance_mm"])),
         ("seed", str(settings.seed)),
         ("command", f"calib next {session.folder.name}"),
         ("toolkit", certificate.versions()),

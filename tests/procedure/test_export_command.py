@@ -13,7 +13,7 @@ from calib.robot import urdf
 from calib.robot.kinematics import forward
 from calib.robot.load import load
 from calib.robot.urdf_write import write_new
-from calib.transforms import from_xyz_rpy
+from calib.transforms import from_xyz_rpy, to_xyz_rpy
 
 
 @pytest.fixture
@@ -94,6 +94,47 @@ def test_ur_kinematics_give_the_calibrated_poses_in_the_frames_of_ur_description
         poses = poses @ origin @ from_xyz_rpy(np.zeros((10, 3)), np.outer(q[:, j], [0, 0, 1]))
     # base_link_inertia is the controller's base, wrist_3's link the controller's flange
     assert np.abs(poses - forward(load(fitted), q)).max() < 1e-9
+
+
+def test_the_source_is_never_written_over(cell, calib, fitted):
+    before = Path("source.urdf").read_bytes()
+    Path("link.urdf").symlink_to("source.urdf")
+    for arguments in (
+        ("--out", "source.urdf"),
+        ("--out", "link.urdf"),
+        ("--out", "n.urdf", "--offsets", "source.urdf"),
+    ):
+        code, _, err = calib("export", fitted, "--urdf", "source.urdf", *arguments)
+        assert (code, "is the source URDF" in err) == (2, True)
+    assert calib("export", fitted, "--urdf", "source.urdf", "--out", "n.urdf", "--offsets", "n.urdf")[0] == 2
+    assert Path("source.urdf").read_bytes() == before and not Path("n.urdf").exists()
+
+
+@pytest.mark.parametrize("old", [False, True])
+def test_what_is_mounted_behind_wrist_3_is_not_in_its_kinematics(cell, calib, old):
+    """A flange 0.109 m behind the last joint, as in ur10_ipa; URDFs of old have UR's own d6 there instead."""
+    text, name = write_new(cell.nominal), "wrist_3_joint"
+    plain = re.search(rf'<joint name="{name}".*?<origin xyz="([^"]+)" rpy="([^"]+)"', text, re.DOTALL)
+    assert plain
+    at = from_xyz_rpy(*([float(number) for number in plain[k].split()] for k in (1, 2)))
+    behind = from_xyz_rpy([0, 0, 0.0823], [0, 0, 0])
+    if old:
+        xyz, rpy = to_xyz_rpy(at @ np.linalg.inv(behind))
+        numbers = [" ".join(repr(float(value)) for value in part) for part in (xyz, rpy)]
+        start, end = plain.span(1)[0], plain.span(2)[1]
+        text = f'{text[:start]}{numbers[0]}" rpy="{numbers[1]}{text[end:]}'
+    last = re.search(rf'<joint name="{name}".*?<child link="([^"]+)"', text, re.DOTALL)
+    assert last
+    mounted = f'<link name="plate"/><joint name="plate" type="fixed"><parent link="{last[1]}"/><child link="plate"/>'
+    text = text.replace("</robot>", f'{mounted}<origin xyz="0 0 {0.0823 if old else 0.109}"/></joint></robot>')
+    Path("plate.urdf").write_text(text)
+    file = cell.write("a.csv", cell.measure(60))
+    assert calib("fit", "plate.urdf", file, "--tip", "plate", "--model", "geometry", "--out", "done")[0] == 0
+    code, out, err = calib("export", "done", "--ur-kinematics", "k.yaml")
+    assert code == 0, err
+    assert ("wrist_3 reaches to plate" if old else "the fixed joint to plate, 109 mm") in out
+    wrist = re.findall(r"wrist_3:\n    x: (\S+)\n    y: (\S+)\n", Path("k.yaml").read_text())[0]
+    assert float(wrist[1]) == pytest.approx(0.0823, abs=2e-3)
 
 
 def test_an_arm_without_ur_axes_has_no_ur_kinematics(cell, calib):

@@ -7,11 +7,13 @@ import json
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from calib.procedure import calibrated
 from calib.robot import urdf
 from calib.robot.kinematics import forward
 from calib.robot.load import load
+from calib.robot.urdf_write import write_new
 from calib.transforms import from_xyz_rpy
 
 ERRORS = {"mean", "rms", "p95", "max"}
@@ -113,7 +115,8 @@ def test_a_pose_file_from_another_station_needs_refitted_frames(cell, calib):
     file = cell.write("a.csv", cell.measure(50), columns)
     other = cell.write("b.csv", cell.measure(40, 1, elsewhere), columns)
     code, out, _ = calib("fit", "ur5", file, "--validate", other, "--model", "geometry", "--out", "one")
-    assert "--refit-frames" in out
+    assert (code, "is not judged" in out, "--refit-frames" in out) == (1, True, True)
+    assert "calibrated already" not in out
     code, out, err = calib(
         "fit", "ur5", file, "--validate", other, "--refit-frames", "--model", "geometry", "--out", "two"
     )
@@ -187,9 +190,25 @@ def test_deflections_go_out_as_a_table_with_its_formula_and_come_back(cell, cali
     seen = np.array([[row[axis] for axis in "xyz"] for row in cell.measure(90)])
     size = np.linalg.norm(see(installation, q).point.T - seen, axis=1)
     assert np.isclose(1e3 * np.sqrt(np.mean(size**2)), metrics["fit"]["calibrated"]["position_mm"]["rms"], rtol=1e-6)
+    # a URDF alone is the best rigid geometry, beside the one that the corrections belong to
+    alone = metrics["fit"]["urdf_alone"]["position_mm"]["rms"]
+    assert metrics["fit"]["calibrated"]["position_mm"]["rms"] <= alone < metrics["fit"]["nominal"]["position_mm"]["rms"]
+    assert "without joint_corrections.csv, leaves" in metrics["reason"]
+    some = q[:20] / 2
+    with_corrections = forward(urdf.read("done/robot_for_corrections.urdf"), some)
+    assert np.abs(with_corrections - forward(load("done"), some)).max() < 1e-9
+    rigid = urdf.read("done/robot.urdf")
+    assert np.abs(forward(rigid, some) - forward(calibrated.rigid_chain("done"), some)).max() < 1e-9
+    Path("ur5.urdf").write_text(write_new(load("ur5")))
+    said = calib("export", "done", "--urdf", "ur5.urdf", "--out", "new.urdf")[1]
+    assert f"the URDF alone leaves {alone:.3f} mm rms" in said
+    assert np.abs(forward(urdf.read("new.urdf"), some) - forward(rigid, some)).max() < 1e-9
+    assert calib("export", "done", "--urdf", "ur5.urdf", "--out", "new.urdf", "--for-corrections")[0] == 0
+    assert np.abs(forward(urdf.read("new.urdf"), some) - with_corrections).max() < 1e-9
     # a simpler model afterwards leaves no correction table behind
     assert calib("fit", "ur5", file, "--model", "geometry", "--out", "done")[0] == 0
     assert not Path("done/joint_corrections.csv").exists()
+    assert not Path("done/robot_for_corrections.urdf").exists()
 
 
 def test_fixed_parameters_stay(cell, calib):
@@ -200,3 +219,59 @@ def test_fixed_parameters_stay(cell, calib):
     values, before = dict(zip(chain.names, chain.values)), dict(zip(nominal.names, nominal.values))
     assert values["theta2"] == before["theta2"]
     assert values["theta4"] != before["theta4"]
+
+
+def test_refitting_a_fits_own_folder_is_no_failure(cell, calib):
+    file = cell.write("a.csv", cell.measure(60))
+    assert calib("fit", "ur5", file, "--out", "arm")[0] == 0
+    code, out, _ = calib("fit", "arm", file, "--out", "again")
+    assert (code, "nothing to gain" in out) == (0, True)
+    code, out, _ = calib("fit", "arm", file, "--model", "geometry", "--out", "forced")
+    assert (code, "verdict: fail" in out) == (0, False)
+
+
+def test_a_tolerance_is_held_against_unseen_rows_and_named(cell, calib):
+    file = cell.write("a.csv", cell.measure(60))
+    start = ("fit", "ur5", file, "--model", "geometry", "--holdout", "0.25", "--out", "done")
+    for tolerance, code, word in (("0.5", 0, "within the tolerance of 0.5 mm"), ("0.001", 1, "above the tolerance")):
+        found, out, _ = calib(*start, "--tolerance", tolerance)
+        assert (found, word in out) == (code, True)
+        assert json.loads(Path("done/metrics.json").read_text())["tolerance_mm"] == float(tolerance)
+    assert calib(*start, "--tolerance", "-1")[0] == 2
+
+
+def test_orientations_are_held_against_the_arm(cell, calib):
+    rows = cell.measure(40)
+    names = ["qx", "qy", "qz", "qw"]
+    for words, reading in (
+        ("are these w first", ["qw", "qx", "qy", "qz"]),
+        ("target seen from the instrument", ["qx", "qy", "qz", "-qw"]),
+        ("", names),
+    ):
+        other = [
+            row | {n: row[r.removeprefix("-")] * (-1 if r[0] == "-" else 1) for n, r in zip(names, reading)}
+            for row in rows
+        ]
+        code, _, err = calib(
+            "fit", "ur5", cell.write("a.csv", other, list(rows[0])), "--model", "offsets", "--out", "done"
+        )
+        assert (code, words in err) == (2 if words else 0, True), err
+
+
+def test_turned_orientations_fail_on_unseen_rows(cell, calib):
+    """Ten degrees about changing axes: not another convention, and no orientation of an arm."""
+    rows, columns = cell.measure(60), list(cell.measure(1)[0])
+    turns = Rotation.from_rotvec(np.radians(10.0) * _directions(60))
+    for row, turn in zip(rows, turns):
+        turned = turn * Rotation.from_quat([row[name] for name in columns[-4:]])
+        row |= dict(zip(columns[-4:], map(float, turned.as_quat())))
+    Path("o.toml").write_text("[sigma]\nposition = 2e-5\norientation = 0.2\n")
+    file = cell.write("a.csv", rows, columns)
+    start = ("fit", "ur5", file, "--options", "o.toml", "--model", "geometry", "--out", "done")
+    code, out, _ = calib(*start, "--holdout", "0.25")
+    assert (code, "orientations are off by" in out) == (1, True)
+
+
+def _directions(count: int) -> np.ndarray:
+    axes = np.random.default_rng(5).standard_normal((count, 3))
+    return axes / np.linalg.norm(axes, axis=1)[:, None]

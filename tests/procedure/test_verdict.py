@@ -6,14 +6,26 @@ import numpy as np
 import pytest
 
 from calib.geometry.accuracy import Errors
-from calib.procedure.comparing import Comparison
+from calib.procedure.comparing import Comparison, urdf_alone
 from calib.procedure.verdict import judge
 
 
-def rows(nominal: float, calibrated: float, proves: bool = True) -> Comparison:
-    """Return a comparison with errors of these sizes [mm] on 50 poses."""
-    sizes = [Errors(np.full(50, 1e-3 * size), None, None) for size in (nominal, calibrated)]
-    return Comparison((), [], (None, None), (sizes[0], sizes[1]), (np.zeros(0), np.zeros(0)), 50, "", proves)  # type: ignore[arg-type]
+def rows(
+    nominal: float,
+    calibrated: float,
+    proves: bool = True,
+    turned: float | None = None,
+    alone: float | None = None,
+    shares_frames: bool = True,
+) -> Comparison:
+    """Return a comparison with errors of these sizes [mm] on 50 poses; orientations are off by `turned` [deg]."""
+    angles = None if turned is None else np.radians(np.full(50, turned))
+    sizes = [Errors(np.full(50, 1e-3 * size), angles, None) for size in (nominal, calibrated)]
+    bare = None if alone is None else Errors(np.full(50, 1e-3 * alone), None, None)
+    nothing = (np.zeros(0), np.zeros(0))
+    return Comparison(
+        (), [], (None, None), (sizes[0], sizes[1]), nothing, 50, "", proves, bare, shares_frames  # type: ignore[arg-type]
+    )  # fmt: skip
 
 
 DEFAULTS = {"model": "geometry", "asked": "auto", "cross_validated": 1e-4, "outlier_share": 0.0}
@@ -23,7 +35,7 @@ DEFAULTS = {"model": "geometry", "asked": "auto", "cross_validated": 1e-4, "outl
     ("unseen", "changes", "level", "words"),
     [
         ({"a": rows(1.0, 0.1)}, {}, "pass", "on a, unseen: rms 1.000 mm nominal, 0.100 mm calibrated"),
-        ({"a": rows(1.0, 0.1), "b": rows(1.0, 1.1)}, {}, "fail", "on b the calibrated arm is worse"),
+        ({"a": rows(1.0, 0.1), "b": rows(1.0, 1.1)}, {}, "fail", "on b, unseen, the calibrated arm is worse"),
         ({"a": rows(0.100, 0.1005)}, {}, "marginal", "gain is small"),
         ({"a": rows(1.0, 0.5)}, {}, "marginal", "5.0 times those on the fitted"),
         (
@@ -39,8 +51,41 @@ DEFAULTS = {"model": "geometry", "asked": "auto", "cross_validated": 1e-4, "outl
         ({"a": rows(1.0, 0.01, proves=False)}, {"cross_validated": None}, "marginal", "no unseen poses"),
         ({"a": rows(1.0, 1.0)}, {"model": "frames"}, "fail", "no model of the arm"),
         ({"a": rows(1.0, 1.0)}, {"model": "frames", "asked": "frames"}, "pass", "the arm is as it was"),
+        # orientations count
+        ({"a": rows(1.0, 0.1, turned=4.0)}, {}, "pass", "on a, unseen"),
+        ({"a": rows(1.0, 0.1, turned=6.0)}, {}, "fail", "off by 6° rms"),
+        # both arms far off say where the instrument stood, not what the arm is
+        ({"a": rows(150.0, 149.0)}, {"reach": 1.0}, "fail", "stood elsewhere; give --refit-frames"),
+        ({"a": rows(150.0, 149.0, shares_frames=False)}, {"reach": 1.0}, "fail", "is it this robot"),
+        ({"a": rows(150.0, 0.1)}, {"reach": 1.0}, "pass", "on a, unseen"),
+        # nothing to gain, like beside like
+        ({"a": rows(0.3, 0.3)}, {"model": "frames", "reach": 1.0}, "pass", "nothing to gain"),
+        ({"a": rows(0.5, 0.5)}, {"model": "frames", "reach": 1.0}, "fail", "no model of the arm"),
+        (
+            {},
+            {"model": "frames", "nominal_cross_validated": 3e-4, "cross_validated": 3e-4, "reach": 1.0},
+            "pass",
+            "nothing to gain",
+        ),
+        ({}, {"nominal_cross_validated": 5e-3, "cross_validated": 2e-3}, "marginal", "20.0 times"),
+        ({}, {"nominal_cross_validated": 1e-4, "cross_validated": 2e-4, "reach": 1.0}, "marginal", "nothing to gain"),
+        # a tolerance is held against unseen rows
+        ({"a": rows(1.0, 0.1)}, {"tolerance": 2e-4}, "pass", "within the tolerance of 0.2 mm"),
+        ({"a": rows(1.0, 0.1)}, {"tolerance": 5e-5}, "fail", "above the tolerance of 0.05 mm"),
+        ({}, {"tolerance": 5e-5}, "fail", "above the tolerance"),
+        ({"a": rows(0.3, 0.3)}, {"model": "frames", "reach": 1.0, "tolerance": 2e-4}, "fail", "above the tolerance"),
     ],
 )
 def test_rules(unseen, changes, level, words):
     found = judge(rows(1.0, 0.1, False), unseen, **(DEFAULTS | changes))
     assert (found.level, words in found.reason) == (level, True), found
+
+
+def test_what_a_urdf_alone_leaves_is_said_and_a_bad_one_loudly():
+    fit = rows(1.0, 0.1, False, alone=0.5)
+    assert urdf_alone(rows(1.0, 0.1, False), {"a": rows(1.0, 0.1)}) == ("", [])
+    words, warnings = urdf_alone(fit, {"a": rows(1.0, 0.1, alone=0.6)})
+    assert "without joint_corrections.csv, leaves 0.600 mm on a, unseen" in words and not warnings
+    words, warnings = urdf_alone(fit, {"a": rows(1.0, 0.1, alone=1.2)})
+    assert "WORSE THAN THE NOMINAL ARM on a, unseen" in warnings[0]
+    assert "0.500 mm on the fitted poses" in urdf_alone(fit, {})[0]

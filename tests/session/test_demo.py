@@ -33,7 +33,8 @@ def test_demo_of_the_lwr4plus(tmp_path: Path, capsys: pytest.CaptureFixture) -> 
     found = json.loads((out / "5-validation/metrics.json").read_text())["validation"]["validation.csv"]
     measured = [found[arm]["position_mm"]["rms"] for arm in ("calibrated", "urdf_alone")]
     assert stated and [float(number) for number in stated.groups()] == pytest.approx(measured, rel=0.1)
-    chain, read = load(out / "6-export"), urdf.read(out / "6-export/robot.urdf")
+    assert found["calibrated"]["position_mm"]["rms"] < found["urdf_alone"]["position_mm"]["rms"] < nominal
+    chain, read = load(out / "6-export"), urdf.read(out / "6-export/robot_for_corrections.urdf")
     q = np.random.default_rng(0).uniform(-1.5, 1.5, (5, 7))
     np.testing.assert_allclose(forward(read, q), forward(chain, q), atol=1e-9)
     assert cli.run(["demo", "--out", str(out)]) == 2
