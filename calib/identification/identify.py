@@ -180,7 +180,7 @@ def common_decimator(cases: Sequence[Case], settings: Settings) -> Decimator:
 
 
 def first_fit(rows: Sequence[Rows]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return standard deviation and inflation of the residuals (rows,), and values (b,), of a fit that always exists."""
+    """Return standard deviation and inflation of the residuals (rows,), and values (b,) of a fit that always exists."""
     count = rows[0].target.shape[1]
     data = pool(triangulate(rows), count)
     std, tau = np.ones(count), np.ones(count)

@@ -103,7 +103,8 @@ def climb(ground: Ground, wanted: str = "auto", progress: Progress | None = None
     """Return the friction terms that unseen time rewards, or those of a rung by name.
 
     Args:
-        wanted: ``auto``; ``standard`` (or ``ripple``, which `calib.identification.ripple` finds later): none; a rung's name: that rung at all joints, nothing else.
+        wanted: ``auto``; ``standard`` (or ``ripple``, found later by `calib.identification.ripple`): none;
+            a rung's name: that rung at all joints, nothing else.
     """
     say = progress or (lambda words: None)
     if wanted not in NAMES:

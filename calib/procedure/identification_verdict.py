@@ -19,6 +19,7 @@ GOOD = 10.0  # relative error of the torque on other motion below which the mode
 POOR = 30.0  # and above which it fails
 CONDITION = 200.0  # of the observation matrix with columns of unit norm
 MOVES = 0.1  # share of moving rows below which a recording is no motion
+BEND = 1e-4  # rms of link minus motor position that shows elasticity [rad or m]
 SLOW_SHARE = 0.1  # share of samples near standstill from which on Coulomb friction is drawn down
 
 
@@ -94,6 +95,7 @@ def warnings(
     if excitation and all(report.poor for report in excitation.values()) and found.settings.friction == "auto":
         told.append("friction: standard only, since on so poor a motion no block of time judges another")
     told += _rests(found)
+    told += _elastic(cases)
     told += _slow_bias(cases, found)
     return tuple(dict.fromkeys(told))
 
@@ -107,6 +109,23 @@ def _rests(found: Identification) -> list[str]:
     source = "the robot's own inertias" if found.prior.source == "cad" else "nothing but the order of their sizes"
     how = f"drawn to {source} (f = {found.prior.scale:.2g}; {len(names)} of {found.base.b})"
     return [f"not identifiable from this motion, {how}: {', '.join(names)}"] if names else []
+
+
+def _elastic(cases: Sequence[Case]) -> list[str]:
+    """Say where second encoders show that joints bend: a rigid model does not know."""
+    told = []
+    for case in cases:
+        if case.motion.q_link is None:
+            continue
+        apart = np.asarray(case.motion.q_link - case.motion.q)
+        bend = np.std(apart, axis=0)
+        joints = [f"{1e3 * bend[j]:.2g} mrad at joint {j + 1}" for j in np.flatnonzero(bend > BEND)]
+        if joints:
+            told.append(
+                f"{case.name}: motor and link encoders move apart ({', '.join(joints)}, rms): elastic joints, "
+                "and what they store and release is beyond a rigid model"
+            )
+    return told
 
 
 def _slow_bias(cases: Sequence[Case], found: Identification) -> list[str]:

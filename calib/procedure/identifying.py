@@ -10,8 +10,8 @@ import numpy as np
 
 from calib.data.decimation import SHARE
 from calib.data.excitation import ExcitationReport, repeats, report_excitation
-from calib.data.motion import Motion, make_motion
-from calib.data.recording import Joints
+from calib.data.motion import FilterOptions, Motion, make_motion
+from calib.data.recording import Joints, Recording
 from calib.data.recording_files import read_recording
 from calib.errors import UsageError
 from calib.identification.cases import Case, case_names, make_case
@@ -29,6 +29,7 @@ from calib.robot.chain import Chain
 from calib.robot.load import load, resolve
 
 LOST = 0.05  # of a recording may fall to the windows of the parallel decimation (our choice)
+QUIET = 0.02  # noise of the accelerations that is no matter, of their rms (our choice)
 WINDOW = 18  # samples per decimation factor that one window needs
 REPEAT = 0.5  # share of states met in training from which on a validation file proves nothing (our choice)
 
@@ -206,15 +207,39 @@ def read_motion(path: str, chain: Chain, own: FileSettings, like: Motion | None 
     )  # fmt: skip
     recording = read_recording(path, joints, own.recording)
     if like is not None and own.filter.band is None and like.band * np.median(np.diff(recording.t)) < 0.4:
-        return make_motion(recording, replace(own.filter, band=like.band * (1.0 - 1e-9)))
+        banded = replace(own.filter, band=like.band * (1.0 - 1e-9))
+        motion = make_motion(recording, banded)
+        return motion if own.filter.cutoff is not None else _sharper(recording, motion, banded)
     motion = make_motion(recording, own.filter)
+    if own.filter.cutoff is None:
+        motion = _sharper(recording, motion, own.filter)
     widest = LOST * len(motion) / WINDOW  # decimation factor
     if own.filter.band is not None or motion.decimator.factor <= max(widest, 1.0):
         return motion
     band = SHARE * motion.rate / (2 * max(1, int(widest)))
-    wider = make_motion(recording, replace(own.filter, band=min(band, 0.45 * motion.rate)))
+    cutoff = tuple(float(f) for f in motion.cutoff)
+    wider = make_motion(recording, replace(own.filter, band=min(band, 0.45 * motion.rate), cutoff=cutoff))
     note = f"f_p = {wider.band:.3g} Hz instead: a short recording must not lose its ends to the decimation's window"
     return replace(wider, notes=(*motion.notes, note))
+
+
+def _sharper(recording: Recording, motion: Motion, options: FilterOptions) -> Motion:
+    """Return the motion with a higher f_q, where the encoders are quiet enough: f_q ≥ 5 f_dyn is a least value.
+
+    White noise of the positions, σ_q, makes σ_a = σ_q (2π)² sqrt(2 f_q⁵ / (5 f_s)) in the accelerations; f_q is
+    doubled where that stays below `QUIET` of every moving joint's rms acceleration (our choice).
+    """
+    size = np.sqrt(np.mean(motion.a**2, axis=0))
+    moves = np.ptp(motion.q, axis=0) > 1e-3
+    cutoff = float(motion.cutoff.max())
+    f = 2.0 * cutoff
+    noise = motion.cutoffs.noise * (2 * np.pi) ** 2 * np.sqrt(2 * f**5 / (5 * motion.rate))
+    if f > 0.4 * motion.rate or not moves.any() or not (noise < QUIET * size)[moves].all():
+        return motion
+    borders = 2.0 / cutoff if options.borders is None else options.borders  # no samples that the wider band would add
+    sharper = make_motion(recording, replace(options, cutoff=f, borders=borders))
+    note = f"f_q = {f:.3g} Hz instead: the positions are quiet enough"
+    return replace(sharper, notes=(*motion.notes, note), cutoffs=motion.cutoffs)
 
 
 def check_files(options: IdentifyOptions, paths: Sequence[str]) -> None:

@@ -34,6 +34,7 @@ def values(out: Path) -> dict[str, float]:
         return {row["name"]: float(row["value"]) for row in csv.DictReader(file)}
 
 
+@pytest.mark.slow
 def test_panda_on_the_rest_of_its_record(data, tmp_path):
     folder = data / "franka_panda_inria"
     log = folder / "traj1_first60pct.npz"
@@ -53,6 +54,7 @@ payload = ["load"]
 """
 
 
+@pytest.mark.slow
 def test_ur10e_currents_become_torques_and_friction_pays(data, tmp_path):
     folder = data / "ur10e_innopolis"
     unseen = [folder / f"ur-20_02_19_14harm50sec{end}.npz" for end in ("", "Load")]
@@ -95,6 +97,7 @@ def test_tx40_its_coupled_wrist_and_coulomb_friction(data, tmp_path):
     assert total(found, log.name, "filtered") < 6.0
 
 
+@pytest.mark.slow
 def test_tx40_richer_friction_pays_on_other_motion(data, tmp_path):
     folder = data / "staubli_tx40"
     log = folder / "tx40_first_5p4s.npz"
@@ -118,6 +121,7 @@ def test_lwr_with_one_sine_says_what_it_cannot_tell(data, tmp_path):
     assert all(own[name] >= 0.0 for name in own if name[:2] in ("Ia", "Fv", "Fc"))
 
 
+@pytest.mark.slow
 def test_kr300_needs_the_prior_on_other_motion(data, tmp_path):
     folder = data / "kuka_kr300_tuk"
     robot, train, other = folder / "model.urdf", folder / "traj_A.npz", folder / "traj_B.npz"
@@ -126,6 +130,7 @@ def test_kr300_needs_the_prior_on_other_motion(data, tmp_path):
     assert total(drawn, "traj_B.npz") < 25.0 < total(bare, "traj_B.npz")
 
 
+@pytest.mark.slow
 def test_tiago_prismatic_torso_and_signed_gains(data, tmp_path):
     folder = data / "tiago_laas"
     log = folder / "dynamic.npz"
