@@ -4,8 +4,9 @@
 
 g_m hat functions of the ripple's frequency k v / 2π, one set per direction: the structure answers it as an oscillator,
 with a gain and a phase that depend on that frequency (our choice). A harmonic drive of ratio N shows at 2 N against the
-case and at 2 (N + 1) against the output, so orders come in pairs two apart; a motion of three radians hardly tells them, and a single order that fits one place does not carry over to another. Beyond the positions it was
-learnt at, the ripple fades.
+case and at 2 (N + 1) against the output, so orders come in pairs two apart; a motion of three radians hardly tells them
+apart, and a single order that fits one place does not carry over to another. Beyond the positions it was learnt at, the
+ripple fades.
 
 Orders are found one pair after the other as the pair that explains most of the residual. How strongly the columns are
 drawn to zero, and whether a joint gets them at all, time blocks that are left out decide.
