@@ -1,0 +1,165 @@
+"""Section 5 of the LWR4+ study: time-optimal motion on the identified model, against CAD and against the truth.
+
+Kolyubin, Shiriaev & Jubien (2019), Int. J. Adv. Manuf. Technol. 101, 243-259, eq. 29 to 32. The truth is the library's
+(lwr4plus_truth.toml: geometry, drives, noise). Base parameters are fitted by weighted least squares to a simulated
+motion; Proposition 1 turns them into A, B, Γ of each path. Every planned motion is then judged by the true robot: which
+share of its torque limits would it really need? "with margin" keeps three standard deviations of the predicted torque.
+
+    python examples/lwr4plus/planning.py --out lwr4plus-planning [--paths 12] [--seed 0]
+
+Some twenty seconds.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib import files
+from calib.dynamics import base, drives
+from calib.dynamics.base import BaseModel
+from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.path_dynamics import PathDynamics, of_base, of_standard
+from calib.dynamics.tree import standard_parameters, tree
+from calib.robot import description, library
+from calib.robot.chain import Chain, random_joints
+from calib.simulation.robots import truth
+from trajectories.errors import BadInput
+from trajectories.path import Path as JointPath
+from trajectories.path import check_within, spline
+from trajectories.profile import dense
+from trajectories.shape import shorten
+from trajectories.timing import Limits, Timing, time_optimal
+
+REACH = 0.7  # of the joint limits, for waypoints
+SIGMAS = 3.0  # of the predicted torque, kept free of its limit
+SECONDS, RATE, SINES = 10.0, 200.0, 20  # of the motion that is identified from
+
+
+def nominal() -> Chain:
+    return description.read(library.path("lwr4plus"))
+
+
+def true_chain() -> Chain:
+    """Return the library's arm on the calibrated geometry, which is taken as known here."""
+    columns = truth("lwr4plus")["dynamic_geometry"]
+    names = {f"{key}{row + 1}": value for key, values in columns.items() for row, value in enumerate(values)}
+    chain = nominal()
+    return chain.with_values({name: value for name, value in names.items() if name in chain.names})
+
+
+def true_robot(chain: Chain) -> tuple[IdentificationModel, np.ndarray]:
+    """Return the model with Ia, Fv, Fc, off of every joint and its true parameters."""
+    known = truth("lwr4plus")["drives"]
+    offsets = np.array(known["offl"]) + np.array(known["offm"])
+    amounts = np.column_stack([known["Ia"], known["Fv"], known["Fc"], offsets]).ravel()
+    model = IdentificationModel(tree(chain), drives.standard(["Ia Fv Fc off"] * chain.n))
+    return model, np.concatenate([standard_parameters(chain), amounts])
+
+
+def identified(model: IdentificationModel, values: np.ndarray, seed: int) -> tuple[PathDynamics, BaseModel, np.ndarray]:
+    """Return the path dynamics of base parameters fitted to a noisy simulated motion, its model and covariance."""
+    rng, n = np.random.default_rng(seed), model.tree.n
+    times = np.arange(0, SECONDS, 1 / RATE)[:, None, None]
+    pace = 2 * np.pi / SECONDS * np.arange(1, SINES + 1)
+    size, phase = rng.normal(size=(n, SINES)) / np.sqrt(np.arange(1, SINES + 1)), rng.uniform(0, 2 * np.pi, (n, SINES))
+    wave, slope = np.sin(pace * times + phase), np.cos(pace * times + phase)
+    q, v, a = (size * wave).sum(2), (size * pace * slope).sum(2), -(size * pace**2 * wave).sum(2)
+    scale = np.minimum(0.8 * nominal().upper / np.abs(q).max(0), 0.9 * limits(nominal()).velocity / np.abs(v).max(0))
+    q, v, a = scale * q, scale * v, scale * a
+    sigma = truth("lwr4plus")["noise"]["sigma_tau_m"] * limits(nominal()).torque
+    tau = model.regressor(q, v, a) @ values + sigma * rng.normal(size=q.shape)
+    found = BaseModel(model, base.find(model))
+    W = (found.regressor(q, v, a) / sigma[:, None]).reshape(-1, found.base.b)
+    factor = np.linalg.qr(W, mode="r")
+    fitted = np.linalg.lstsq(W, (tau / sigma).ravel(), rcond=None)[0]
+    spread = np.linalg.inv(factor)
+    return of_base(found, fitted), found, spread @ spread.T
+
+
+def guarded(path: JointPath, law: PathDynamics, model: BaseModel, covariance: np.ndarray, bounds: Limits) -> Timing:
+    """Return the timing that keeps `SIGMAS` of each joint's predicted torque free, its largest along the first one."""
+    sampled = time_optimal(path, bounds, law).sampled
+    W = model.regressor(sampled.q, sampled.v, sampled.a)
+    sigma = np.sqrt(np.einsum("Nib,bc,Nic->Ni", W, covariance, W, optimize=True)).max(axis=0)
+    return time_optimal(path, replace(bounds, torque=bounds.torque - SIGMAS * sigma), law)
+
+
+def limits(chain: Chain) -> Limits:
+    speeds, efforts = (np.array([getattr(j, key) for j in chain.joints]) for key in ("velocity", "effort"))
+    return Limits(speeds, np.full(chain.n, np.inf), efforts)
+
+
+def judged(timing: Timing, robot: PathDynamics, efforts: np.ndarray) -> dict[str, float]:
+    """Return what the true robot would need for a planned motion: peak share, and share of the time beyond a limit."""
+    sampled = dense(timing.path, timing.profile, robot.torque)
+    assert sampled.tau is not None
+    share = (np.abs(sampled.tau) / efforts).max(axis=1)
+    beyond = float(sampled.weights @ (share > 1.0) / sampled.weights.sum())
+    return {"seconds": timing.duration, "peak": float(share.max()), "beyond": beyond, "active": timing.active_share}
+
+
+def run(paths: int, seed: int) -> dict[str, Any]:
+    """Plan each path on every model and judge the plans by the truth."""
+    chain = true_chain()
+    model, values = true_robot(chain)
+    robot = of_standard(model, values)
+    bodies_alone = IdentificationModel(tree(nominal()))
+    cad = of_standard(bodies_alone, standard_parameters(nominal()))
+    fitted, seen, covariance = identified(model, values, seed)
+    models = {"CAD bodies": cad, "identified": fitted, "truth": robot}
+    rng, rows, shaped = np.random.default_rng(seed), [], []
+    while len(rows) < paths:
+        waypoints = REACH * random_joints(chain, 4, rng)
+        path = spline(waypoints)
+        try:
+            check_within(path, chain.lower, chain.upper)
+        except BadInput:
+            continue
+        timings = {name: time_optimal(path, limits(chain), law) for name, law in models.items()}
+        timings["with margin"] = guarded(path, fitted, seen, covariance, limits(chain))
+        rows.append({name: judged(one, robot, limits(chain).torque) for name, one in timings.items()})
+        if len(shaped) < 3:
+            timer = lambda path: time_optimal(path, limits(chain), robot, grid=150).duration  # noqa: E731
+            found = shorten(waypoints, timer, evaluations=60, stray=0.3)
+            shaped.append(found.after / found.before)
+    summary = {
+        name: {key: float(np.median([row[name][key] for row in rows])) for key in rows[0][name]}
+        | {"worst_peak": max(row[name]["peak"] for row in rows)}
+        for name in rows[0]
+    }
+    return {"summary": summary, "paths": rows, "shaped": shaped, "sigmas": SIGMAS, "seed": seed}
+
+
+def printed(found: dict[str, Any]) -> str:
+    """Return the study as text."""
+    lines = [f"{'planned on':12} {'median s':>9} {'true peak':>10} {'worst':>7} {'time beyond':>12} {'active':>8}"]
+    for name, one in found["summary"].items():
+        lines.append(
+            f"{name:12} {one['seconds']:9.3f} {one['peak']:10.1%} {one['worst_peak']:7.1%} {one['beyond']:12.1%} "
+            f"{one['active']:8.1%}"
+        )
+    lines.append("share of the torque limits that the true robot needs; a plan above 100 % cannot be followed")
+    lines.append(f"shape of the path, 60 timings: {', '.join(f'{ratio:.3f}' for ratio in found['shaped'])} of the time")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Run the study from the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--paths", type=int, default=12)
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    found = run(given.paths, given.seed)
+    files.write_json(given.out / "metrics.json", found)
+    print(printed(found))
+    print(f"\nwritten to {given.out / 'metrics.json'}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,22 @@
+"""The scripted planning study runs: a plan on the identified model can be followed, one on CAD bodies alone cannot."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+SCRIPT = Path(__file__).parents[2] / "examples/lwr4plus/planning.py"
+
+
+def test_the_identified_model_plans_what_the_robot_can_follow(tmp_path):
+    words = [sys.executable, SCRIPT, "--out", tmp_path, "--paths", "3"]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert "true peak" in done.stdout
+    found = json.loads((tmp_path / "metrics.json").read_text())["summary"]
+    assert found["CAD bodies"]["worst_peak"] > 1.1
+    assert 1.0 < found["identified"]["worst_peak"] < 1.2  # noise: its own limits are not quite the robot's
+    assert found["with margin"]["worst_peak"] <= 1.0
+    assert found["truth"]["worst_peak"] <= 1.0 + 1e-9
+    assert found["with margin"]["seconds"] < 1.05 * found["truth"]["seconds"]
