@@ -80,6 +80,8 @@ def metrics(planned: Planned) -> dict[str, Any]:
             "before": shaped.before, "after": shaped.after, "evaluations": shaped.evaluations,
             "refused": shaped.refused, "parameters": shaped.phi.tolist(),
         },
+        "torque_sigma": None if planned.sigma is None else planned.sigma.tolist(),
+        "torque_limits": [float(x) if np.isfinite(x) else None for x in planned.limits.torque],
         "approach": None if planned.approach is None else planned.approach.duration,
         "notes": list(planned.notes),
     }  # fmt: skip
@@ -95,6 +97,9 @@ def lines(planned: Planned) -> list[str]:
     ]
     for name, one in found["margins"].items():
         words.append(f"  {name:12} {one['margin']:.4g} {one['unit']} ({one['at']})")
+    if planned.sigma is not None:
+        free = ", ".join(f"{x:.3g}" for x in planned.sigma)
+        words.append(f"limits of torque narrowed for the model's uncertainty, one sigma of each joint: {free} N m")
     if planned.shaped is not None:
         words.append(f"the path's own shape: {planned.shaped.before:.3f} s before, {planned.shaped.after:.3f} s after")
     if planned.deviation is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -16,10 +16,11 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.path_dynamics import PathDynamics, of_standard
 from calib.dynamics.tree import standard_parameters, tree
 from calib.errors import RobotError, UsageError
-from calib.identification.prediction import carried_columns
+from calib.identification.prediction import Dynamics, carried_columns
 from calib.identification.storage import read_dynamics
 from calib.procedure.inputs import joint_kinds, load_robot
 from calib.procedure.motion_limits import MotionLimits, read_motion_limits
+from calib.procedure.torque_margin import Uncertainty, read_uncertainty
 from calib.robot.chain import Chain
 from calib.robot.kinematics import element_jacobian, forward, joint_jacobian, sweep
 from calib.robot.tables import check_keys, load, vector
@@ -54,6 +55,8 @@ class Planned:
         deviation: (2,) of the tool from its lines [m, rad]; None for joint paths.
         shaped: what the outer loop found; None without one.
         approach, rehearsal: tracks; None where not asked for.
+        sigma: (n,) largest standard deviation of each predicted torque; `limits.torque` leaves as many of them free as
+            the limits file says (default 2); None where the model states none.
         notes: what a user should know.
     """
 
@@ -69,6 +72,7 @@ class Planned:
     shaped: Shaped | None
     approach: Track | None
     rehearsal: Track | None
+    sigma: np.ndarray | None
     notes: tuple[str, ...]
 
 
@@ -107,7 +111,7 @@ def plan(
     _check(rate, evaluations, lines, slower)
     chain, source = load_robot(robot, waypoints, FitOptions(), base, tip)
     known = read_motion_limits(limits, chain, source)
-    law, notes = _law(chain, model, payloads, drives_file, known)
+    law, notes, unsure = _law(chain, model, payloads, drives_file, known)
     lower, upper, bounds = _bounds(chain, known, law)
     points = read_poses(waypoints, chain.joint_names, kinds=joint_kinds(chain))
     arm = chain if model is None else read_dynamics(model)[0]
@@ -126,12 +130,17 @@ def plan(
         check_places(path, known)
     say("timing")
     timings = tuple(time_optimal(path, bounds, law, rate=rate) for path in paths)
+    sigma = None
+    if unsure is not None and known.deviations > 0:
+        sigma = np.max([unsure.sigma(one.sampled) for one in timings], axis=0)
+        bounds = _guarded(bounds, known.deviations * sigma, chain)
+        timings = tuple(time_optimal(path, bounds, law, rate=rate) for path in paths)
     torque = None if law is None else law.torque
     motion = joined([track(one.path, one.profile, rate, torque) for one in timings])
     lead = None if start is None else _approach(np.asarray(start, dtype=float), motion, known, chain, lower, upper)
     return Planned(
         chain, law, bounds, lower, upper, timings, motion, margins, deviation, shaped, lead,
-        slowed(motion, slower) if slower != 1 else None, (*known.notes, *notes),
+        slowed(motion, slower) if slower != 1 else None, sigma, (*known.notes, *notes),
     )  # fmt: skip
 
 
@@ -177,18 +186,19 @@ def _check(rate: float, evaluations: int, lines: bool, slower: float) -> None:
 
 def _law(
     chain: Chain, folder: Path | None, payloads: Sequence[str], drives_file: Path | None, known: MotionLimits
-) -> tuple[PathDynamics | None, tuple[str, ...]]:
+) -> tuple[PathDynamics | None, tuple[str, ...], Uncertainty | None]:
     """Return the dynamics: identified, or the robot's inertias with stated drives; None without any."""
     if folder is not None:
         if drives_file is not None:
             raise UsageError("--model and --drives both say what the drives are; take one of them away")
-        return _identified(chain, folder, payloads), ()
+        law, unsure = _identified(chain, folder, payloads)
+        return law, () if unsure else ("the model states no covariance: torques have no margin for it",), unsure
     try:
         stated = {} if drives_file is None else read_drives(drives_file, chain)
         if known.friction is not None and not stated:
             stated = {"Fv": known.friction[0], "Fc": known.friction[1]}
         if chain.inertias is None:
-            return None, ("the robot's masses are not known: torques are not limited",)
+            return None, ("the robot's masses are not known: torques are not limited",), None
         values = np.column_stack([stated.get(key, np.zeros(chain.n)) for key in DRIVES])
     except RobotError as error:
         raise UsageError(str(error)) from error
@@ -198,11 +208,12 @@ def _law(
     note = (
         f"{' and '.join(missing)} not known (no --model, no --drives): planned without, a real robot needs more torque"
     )
-    return of_standard(model, np.concatenate([standard_parameters(chain), values.ravel()])), (note,) if missing else ()
+    law = of_standard(model, np.concatenate([standard_parameters(chain), values.ravel()]))
+    return law, (note,) if missing else (), None
 
 
-def _identified(chain: Chain, folder: Path, payloads: Sequence[str]) -> PathDynamics:
-    """Return an identified model with the payloads that are on board."""
+def _identified(chain: Chain, folder: Path, payloads: Sequence[str]) -> tuple[PathDynamics, Uncertainty | None]:
+    """Return an identified model with the payloads that are on board, and its uncertainty."""
     arm, dynamics = read_dynamics(folder)
     if arm.n != chain.n:
         raise UsageError(f"{folder} is of a robot with {arm.n} joints, {chain.name} has {chain.n}")
@@ -211,10 +222,21 @@ def _identified(chain: Chain, folder: Path, payloads: Sequence[str]) -> PathDyna
     if unknown := sorted(set(payloads) - set(known)):
         raise UsageError(f"{folder}: no payload '{unknown[0]}' was identified; it knows {', '.join(known) or 'none'}")
     if model.kind == "drive":
-        return of_standard(model, dynamics.values)  # which says why that cannot be
+        return of_standard(model, dynamics.values), None  # which says why that cannot be
     values = np.array(dynamics.values)
     values[: 10 * model.tree.bodies] *= carried_columns(model, payloads)
-    return of_standard(model, values)
+    return of_standard(model, values), read_uncertainty(folder, Dynamics(model, values), payloads)
+
+
+def _guarded(bounds: Limits, margin: np.ndarray, chain: Chain) -> Limits:
+    """Return the limits with a margin (n,) of torque left free."""
+    if (margin >= bounds.torque).any():
+        j = int(np.argmax(margin / bounds.torque))
+        raise UsageError(
+            f"{chain.joint_names[j]}: the model's torque is uncertain by {margin[j]:.3g} along this motion, its limit "
+            f"is {bounds.torque[j]:.3g}; identify with a richer motion, or lower torque.deviations in the limits file"
+        )
+    return replace(bounds, torque=bounds.torque - margin)
 
 
 def _bounds(chain: Chain, known: MotionLimits, law: PathDynamics | None) -> tuple[np.ndarray, np.ndarray, Limits]:

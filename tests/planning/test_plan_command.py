@@ -90,7 +90,7 @@ def test_an_identified_model_is_planned_with(room, capsys):
 def test_model_and_stated_drives_plan_the_same_motion(room):
     one = motion_planning.plan("lwr4plus", room / "way.csv", model=room / "model")
     two = motion_planning.plan("lwr4plus", room / "way.csv", drives_file=room / "drives.toml")
-    assert one.track.duration == two.track.duration and not one.notes
+    assert one.track.duration == two.track.duration and "no covariance" in one.notes[0]
     bare = motion_planning.plan("lwr4plus", room / "way.csv")
     assert bare.track.duration < one.track.duration and "friction not known" in bare.notes[0]
 
@@ -177,6 +177,23 @@ def test_a_damaged_model_is_refused(room, capsys):
     place.write_text("{")
     assert plan("--model", "model") == 2
     assert "no identified model" in capsys.readouterr().err
+
+
+def test_an_uncertain_model_keeps_torque_free(room, capsys):
+    """Only Ia2 is uncertain, so sigma is its own times the largest acceleration of joint 2."""
+    files.write_table(
+        room / "model" / "covariance.csv", ("name", "Ia2", "ZZ3R"), [("Ia2", 0.04, 0.0), ("ZZ3R", 0.0, 0.0)]
+    )
+    sharp = motion_planning.plan("lwr4plus", room / "way.csv", drives_file=room / "drives.toml")
+    careful = motion_planning.plan("lwr4plus", room / "way.csv", model=room / "model")
+    assert careful.sigma is not None
+    np.testing.assert_allclose(careful.sigma[1], 0.2 * np.abs(sharp.timings[0].sampled.a[:, 1]).max(), rtol=1e-6)
+    np.testing.assert_allclose(careful.limits.torque, sharp.limits.torque - 2 * careful.sigma, atol=1e-9)
+    assert careful.track.duration > sharp.track.duration
+    assert (np.abs(careful.track.tau) <= careful.limits.torque).all()
+    files.write_table(room / "model" / "covariance.csv", ("name", "Ia2"), [("Ia2", 1e4)])
+    assert plan("--model", "model") == 2
+    assert "is uncertain by" in capsys.readouterr().err
 
 
 def test_a_payload_on_board_takes_longer(room):
