@@ -4,7 +4,7 @@ Of the observation matrix W (all samples' regressors, rows of joint j divided by
 M = Wᵀ W + M_existing, its eigenvalues λ = s², s the singular values of W:
 
     cond       s_1 / s_b                       minimise (Gautier & Khalil 1992; Kolyubin et al. 2019, eq. 24)
-    logdet     -log det M                      minimise (D-optimality)
+    logdet     -(log det M) / b                minimise (D-optimality; per column, so that searches are well scaled)
     smallest   -s_b                            minimise (E-optimality)
 
 Swevers et al. (1997) weigh the rows with the covariance of the torques: logdet with `sigmas`. Column scaling: ``raw``
@@ -100,7 +100,7 @@ class Excitation:
     def _of_spectrum(self, eigenvalues: np.ndarray) -> tuple[float, np.ndarray]:
         """Return F and ∂F/∂λ; λ rising."""
         if self.index == "logdet":
-            return -float(np.log(eigenvalues).sum()), -1.0 / eigenvalues
+            return -float(np.log(eigenvalues).mean()), -1.0 / eigenvalues / len(eigenvalues)
         low, by_low = _extreme(eigenvalues, -self.sharpness)
         if self.index == "smallest":
             return -np.exp(low / 2), -np.exp(low / 2) / 2 * by_low
