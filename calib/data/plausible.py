@@ -51,9 +51,9 @@ def check_joints(
         span = (float(lower[j]), float(upper[j]))
         bounded = bool(np.isfinite(span).all())
         if options.check_limits and bounded:
-            _check_limits(q[:, j], table, column, joint, span, kind)
+            _check_limits(q[:, j], table, column, joint, span, kind, _stated(table, column, options))
         elif options.check_limits or kind == "prismatic":
-            _check_size(q[:, j], table, column, joint, kind)
+            _check_size(q[:, j], table, column, joint, kind, _stated(table, column, options))
         if bounded:
             notes += _beyond(q[:, j], table, joint, span, kind)
     return (*notes, *_few_degrees(q, table, columns, kinds, options))
@@ -115,7 +115,22 @@ def _units(kind: str) -> tuple[str, str, float]:
     return ("m", "mm", 1e-3) if kind == "prismatic" else ("rad", "deg", DEGREE)
 
 
-def _check_size(q: np.ndarray, table: Table, column: str, joint: str, kind: str) -> None:
+def _stated(table: Table, column: str, options: FileOptions) -> str:
+    """Return the unit that header or options state for a joint's column; "" for none."""
+    ours = {theirs: name for name, theirs in options.columns.items()}
+    units = options.units
+    own = table.units[table.index(column)]
+    return own or units.get(ours.get(column, column), units.get(column, units.get("joints", "")))
+
+
+def _advice(column: str, other: str, stated: str) -> str:
+    """Return what to do about values that would suit a joint in another unit."""
+    if stated in ("", "rad", "m"):
+        return f"looks like {other}; if so, name the column '{column} [{other}]'"
+    return f"the column is read as [{stated}]: does it hold another unit (counts, grad), or another joint?"
+
+
+def _check_size(q: np.ndarray, table: Table, column: str, joint: str, kind: str, stated: str) -> None:
     """Refuse values that no joint has, where there are no limits to hold against."""
     if kind == "continuous":
         return
@@ -123,13 +138,13 @@ def _check_size(q: np.ndarray, table: Table, column: str, joint: str, kind: str)
     if beyond.any():
         row, (unit, other, _) = int(np.argmax(beyond)), _units(kind)
         travel = "cannot be the travel" if kind == "prismatic" else "is more than a turn"
-        message = f"{q[row]:g} {unit} {travel} of {joint} ({_share(beyond)}): looks like {other}"
-        raise MeasurementError(
-            f"{message}; if so, name the column '{column} [{other}]'", table.file, int(table.rows[row]), column
-        )
+        message = f"{q[row]:g} {unit} {travel} of {joint} ({_share(beyond)}): {_advice(column, other, stated)}"
+        raise MeasurementError(message, table.file, int(table.rows[row]), column)
 
 
-def _check_limits(q: np.ndarray, table: Table, column: str, joint: str, span: tuple[float, float], kind: str) -> None:
+def _check_limits(
+    q: np.ndarray, table: Table, column: str, joint: str, span: tuple[float, float], kind: str, stated: str
+) -> None:
     outside = (q < span[0] - SLACK) | (q > span[1] + SLACK)
     if not outside.any():
         return
@@ -138,8 +153,9 @@ def _check_limits(q: np.ndarray, table: Table, column: str, joint: str, span: tu
         f"{q[row]:g} {unit} is outside the limits {span[0]:g} to {span[1]:g} {unit} of {joint} ({_share(outside)})"
     )
     small = q * factor
-    if np.abs(q).max() > TURN and ((small >= span[0] - SLACK) & (small <= span[1] + SLACK)).all():
-        message += f": looks like {other}; if so, name the column '{column} [{other}]'"
+    si = stated in ("", "rad", "m")
+    if si and np.abs(q).max() > TURN and ((small >= span[0] - SLACK) & (small <= span[1] + SLACK)).all():
+        message += f": {_advice(column, other, stated)}"
     else:
         message += ": are joint columns swapped? If the robot does go there, correct its limits or set"
         message += " check_limits = false in the options"

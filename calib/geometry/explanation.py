@@ -109,7 +109,8 @@ def _loose(found: GeometricFit) -> list[str]:
             text += f": the tool cannot be told from the base (the placement of '{partner}' trades with it)"
         spread = orientation_range(found)
         if spread is not None and spread < STILL:
-            text += f", because all poses hold the wrist nearly still (orientations within {spread:.0f}° of each other)"
+            range_ = "less than 1°" if spread < 1.0 else f"{spread:.0f}°"
+            text += f", because all poses hold the wrist nearly still (orientations within {range_} of each other)"
         lines.append(text + ". Predictions inside the measured region stand; the tool's own numbers do not.")
     return lines
 

@@ -11,6 +11,7 @@ import numpy as np
 from calib.data.measurements import PoseMeasurements
 from calib.data.options import FitOptions
 from calib.errors import NotConverged
+from calib.geometry.accuracy import errors
 from calib.geometry.deflection import Deflection
 from calib.geometry.diagnosis import diagnose
 from calib.geometry.explanation import explain
@@ -28,6 +29,7 @@ from calib.procedure.verdict import OWN_FRAMES, Verdict, judge
 from calib.robot.chain import Chain
 
 Progress = Callable[[str], None]
+MOVED = 3.0  # nominal errors fall by this factor when each file gets a station of its own: it was moved (our choice)
 ELSEWHERE = 20.0  # nominal errors this many times the fit's: the instrument must have stood elsewhere (our choice)
 
 
@@ -119,7 +121,10 @@ def run(
     verdict = judge(fitted, validation, asked=asked, tolerance=tolerance, **judged(inputs, found, named))
     clause, loud = urdf_alone(fitted, validation)
     verdict = verdict if not clause else replace(verdict, reason=f"{verdict.reason}; {clause}")
-    notes = (*inputs.notes, *(note for block in inputs.fit for note in block.notes), *elsewhere(fitted, validation))
+    notes = (
+        *inputs.notes, *(note for block in inputs.fit for note in block.notes), *elsewhere(fitted, validation),
+        *moved_between(nominal, inputs.fit, settings),
+    )  # fmt: skip
     warnings = (*loud, *notes, *((unexplained,) if unexplained else ()), *diagnose(found.fit))
     return Outcome(
         inputs, found, rigid, fitted, validation, named, tuple(explain(found.fit)), warnings, verdict, seed, tolerance
@@ -203,3 +208,24 @@ def elsewhere(fit: Comparison, validation: Mapping[str, Comparison]) -> list[str
         for name, found in validation.items()
         if np.median(found.errors[0].main) > ELSEWHERE * usual
     ]
+
+
+def moved_between(nominal: Installation, blocks: Sequence[PoseMeasurements], settings: Settings) -> list[str]:
+    """Say that several files share one station where stations of their own explain them far better."""
+    own = [block for block in blocks if has_instrument(block)]
+    if len({block.file for block in own}) < 2 or len({block.station for block in own}) > 1:
+        return []
+    apart = [replace(block, station=f"{number}") for number, block in enumerate(own)]
+    before = _rms(nominal, own)
+    after = _rms(polish_frames(install(nominal.chain, apart, nominal.known), apart, settings).cell, apart)
+    if before < MOVED * after:
+        return []
+    return [
+        f"with one station for all {len(own)} files the nominal arm is off by {1e3 * before:.3g} mm rms, with one for "
+        f"each by {1e3 * after:.3g} mm: the instrument seems to have been moved; give --stations each (in a "
+        'session: stations = "each" in session.toml)'
+    ]
+
+
+def _rms(cell: Installation, blocks: Sequence[PoseMeasurements]) -> float:
+    return float(np.sqrt(np.mean(errors(cell, blocks).main ** 2)))

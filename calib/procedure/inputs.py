@@ -15,6 +15,7 @@ from calib.errors import MeasurementError, UsageError
 from calib.geometry.deflection import Deflection
 from calib.procedure import calibrated
 from calib.procedure.plausible_frames import check_orientations
+from calib.procedure.repeats import repeated
 from calib.robot import description
 from calib.robot.chain import Chain, Joint
 from calib.robot.load import load, resolve
@@ -116,6 +117,9 @@ def gather(
             own = refit_frames
             shared = block if own else _shared(block, fit, notes)
             unseen[_free_name(unseen, block.file)] = Unseen(shared, own_frames=own, seen=again)
+    copied, told = repeated(fit, unseen)
+    notes += told
+    unseen = {name: replace(each, seen=each.seen or name in copied) for name, each in unseen.items()}
     known = calibrated.read(source).deflection if source.suffix == ".toml" else Deflection()
     if known.terms:
         notes.append(f"{robot} brings {len(known.terms)} deflection terms of an earlier fit; they stay as they are")

@@ -80,6 +80,14 @@ def test_a_column_twice(cell, calib):
     assert (code, "q1" in err, "twice" in err) == (2, True, True)
 
 
+def test_a_unit_that_is_stated_is_not_advised(cell, calib):
+    rows = [{(f"{k} [deg]" if k[0] == "q" else k): v for k, v in row.items()} for row in degrees(cell.measure(30))]
+    for row in rows:
+        row["q1 [deg]"] *= 60.0
+    code, _, err = calib("fit", "ur5", cell.write("bad.csv", rows, list(rows[0])[:9]), "--out", "done")
+    assert (code, "read as [deg]" in err or "columns swapped" in err, "looks like" in err) == (2, True, False)
+
+
 def test_swapped_joint_columns_cannot_pass_unnoticed(cell, calib):
     rows = [row | {"q2": row["q3"], "q3": row["q2"]} for row in cell.measure(60)]
     code, out, _ = calib("fit", "ur5", cell.write("swapped.csv", rows), "--holdout", "0.3", "--out", "done")

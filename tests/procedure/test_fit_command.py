@@ -136,6 +136,26 @@ def test_two_files_have_two_stations_unless_one_is_asked_for(cell, calib):
     assert calibrated.read("tools").tool_names == ("a tool", "b tool")
 
 
+def test_one_station_for_an_instrument_that_was_moved_is_said(cell, calib):
+    moved = from_xyz_rpy([1.8, -0.8, 0.5], [0.1, -0.2, 2.2])
+    file, other = cell.write("a.csv", cell.measure(40)), cell.write("b.csv", cell.measure(40, 1, moved))
+    start = ("fit", "ur5", file, other, "--model", "geometry", "--out", "done")
+    assert "give --stations each" in calib(*start, "--stations", "one")[1]
+    assert "give --stations each" not in calib(*start)[1]
+
+
+def test_rows_that_count_twice_are_said_and_copies_prove_nothing(cell, calib):
+    rows = cell.measure(40)
+    file, copy = cell.write("a.csv", [*rows, rows[2]]), cell.write("copy.csv", rows[:20])
+    start = ("fit", "ur5", file, "--model", "geometry", "--out", "done")
+    out = calib(*start, "--validate", copy)[1]
+    assert "a.csv: 1 row (41) with the numbers of another row" in out
+    assert "copy.csv: 20 rows (1, 2, 3, 4, 5, ...) with the numbers of a row of the fit" in out
+    assert "by cross-validation only" in out and "NOT unseen" in out
+    assert "is the file given twice" in calib(*start[:3], file, *start[3:])[1]
+    assert "with the numbers" not in calib("fit", "ur5", cell.write("b.csv", cell.measure(40, 5)), *start[3:])[1]
+
+
 def test_validation_files_may_follow_one_option_or_each_its_own(cell, calib):
     file = cell.write("a.csv", cell.measure(40))
     for name, seed in (("b.csv", 1), ("c.csv", 2)):
