@@ -1,5 +1,5 @@
-"""The command ``calib``: commands only, no mathematics. Exit codes: 0 done, 1 done but the verdict is fail, 2 input or
-usage, 3 not identifiable or not converged."""
+"""The command ``calib``: commands only, no mathematics. Exit codes: 0 done (the verdict is pass or marginal), 1 done but
+the verdict is fail, 2 input or usage, 3 not identifiable or not converged."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # a unit in brackets is a unit, not a style
     help="Calibrate a robot: choose poses, fit the geometry, validate on unseen poses, export.",
 )
 
@@ -45,12 +46,12 @@ def options(
 @app.command()
 def fit(
     robot: Robot,
-    measured: Annotated[list[Path], typer.Argument(help="CSV files of measured poses")],
+    measured: Annotated[list[Path], typer.Argument(help="CSV files of measured poses: calib formats measurements")],
     out: Annotated[Path, typer.Option(help="folder for the calibrated robot and its report")],
     validate: Annotated[list[Path] | None, typer.Option(help="CSV file of unseen poses; may be repeated")] = None,
     holdout: Annotated[float, typer.Option(help="share of each file's poses kept from the fit")] = 0.0,
     refit_frames: Annotated[bool, typer.Option(help="validation files: base and tool placement of their own")] = False,
-    options: Annotated[Path | None, typer.Option(help="TOML: column names, units, kinds, how to fit")] = None,
+    options: Annotated[Path | None, typer.Option(help="TOML, see calib formats options")] = None,
     model: Annotated[
         str | None,
         typer.Option(
@@ -68,7 +69,12 @@ def fit(
     tip: Tip = None,
     seed: Seed = 0,
 ) -> None:
-    """Fit the geometry of ROBOT to measured poses, and say how far to trust it."""
+    """Fit the geometry of ROBOT to measured poses, and say how far to trust it.
+
+    Exit codes: 0 the verdict is pass or marginal, 1 fail, 2 input or usage, 3 not identifiable or not converged.
+    Pass means that on poses it has not seen the calibrated arm is better than the nominal one, or that there is nothing
+    to gain; that it is good enough is said only with --tolerance.
+    """
     from calib.data.options import read_options
     from calib.errors import UsageError
     from calib.geometry.effects import MODELS
@@ -113,7 +119,7 @@ def select(
     ] = None,
     index: Annotated[str, typer.Option(help="O1 to O5, or cond")] = "O1",
     method: Annotated[str, typer.Option(help="detmax, multistart, tabu or local")] = "detmax",
-    constraints: Annotated[Path | None, typer.Option(help="TOML: limits, sight, height, collision")] = None,
+    constraints: Annotated[Path | None, typer.Option(help="TOML, see calib formats constraints")] = None,
     candidates: Annotated[int, typer.Option(help="poses to choose from")] = 2000,
     existing: Annotated[Path | None, typer.Option(help="CSV of poses measured before, which count")] = None,
     sigma: Annotated[
@@ -337,7 +343,11 @@ def new(
     tip: Tip = "",
     seed: Seed = 0,
 ) -> None:
-    """Make a session FOLDER: calibrate a robot step by step, with a certificate at the end."""
+    """Make a session FOLDER: calibrate a robot step by step, with a certificate at the end.
+
+    What is to be measured goes into FOLDER/3-measured as CSV (calib formats measurements); how the session goes on is
+    said in FOLDER/session.toml (calib formats session).
+    """
     from calib.procedure import guided
 
     made = guided.begin(
@@ -348,6 +358,19 @@ def new(
 
 @app.command("next")
 def next_step(folder: Folder) -> None:
+@app.command()
+def formats(
+    topic: Annotated[
+        str | None,
+        typer.Argument(help="measurements, options, constraints, mdh, robot, session or recordings"),
+    ] = None,
+) -> None:
+    """Print what the files of this toolkit hold: columns, keys, units."""
+    from calib.procedure import formats as documents
+
+    print(documents.describe(topic) if topic else "\n".join(documents.overview()))
+
+
     """Do what can be done in a session, then say what to do at the robot."""
     _go_on(folder, f"calib next {folder}")
 

@@ -153,7 +153,7 @@ def open_session(folder: Path) -> Session:
         raise SessionError(f"{path}: is no TOML: {error}; correct that line") from error
     _check_schema(path, table.get("schema"))
     known = {each.name for each in fields(Settings)}
-    for section, values in tomllib.loads(_example()).items():
+    for section, values in tomllib.loads(example()).items():
         if section not in table:
             raise SessionError(f"{path}: '{section}' is missing")
         if isinstance(values, dict) and isinstance(table[section], dict):
@@ -165,7 +165,8 @@ def open_session(folder: Path) -> Session:
     return Session(folder, Settings(**table))
 
 
-def _example() -> str:
+def example() -> str:
+    """Return a ``session.toml`` with every key."""
     return _HEAD.format(
         schema=SCHEMA, name="", created="", seed=0, robot="", given="", base="", tip="", instrument="",
         measures="pose", sigma_position=0.0, sigma_orientation=0.0, fit=30, validation=15,

@@ -17,7 +17,7 @@ from calib.geometry.fit import polish_frames
 from calib.geometry.weighing import Settings as FitSettings
 from calib.geometry.weighing import combine
 from calib.procedure import calibrated, certificate, comparing, fitting, inputs, outputs, proof, report
-from calib.procedure.session import Session, fingerprint
+from calib.procedure.session import Session, fingerprint, read_state
 from calib.procedure.verdict import judge
 from calib.robot.chain import Chain
 
@@ -290,10 +290,13 @@ def listed(session: Session) -> list[tuple[str, str, str, str]]:
     wanted = [robot_file(session), *measured_files(session)[0], *measured_files(session)[1]]
     wanted += [session.path("4-fit/estimate.csv"), session.path("4-fit/covariance.csv")]
     wanted += sorted(path for path in session.path("6-export").glob("*") if path.is_file())
+    made = {name: mark for step in read_state(session)["steps"].values() for name, mark in step["outputs"].items()}
     rows = []
     for path in wanted:
         name = path.relative_to(session.folder)
         role = "measured, unseen by the fit" if path.name.lower().startswith("validation") else roles[name.parts[0]]
+        if name.parts[0] in ("4-fit", "6-export") and made.get(str(name)) != fingerprint(path):
+            role = certificate.EDITED
         rows.append((str(name), role, f"{path.stat().st_size}", fingerprint(path)))
     return rows
 

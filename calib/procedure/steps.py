@@ -242,11 +242,12 @@ def asks(session: Session, state: State) -> tuple[str, str]:
     if state.kind == WAITING and state.step.name in ("measure", "validate"):
         name = "poses" if state.step.name == "measure" else "validation"
         target = "measured.csv" if name == "poses" else "validation.csv"
-        return _at_the_robot(session, name), _form(session, target)
+        both = name == "poses" and not stages.measured_files(session)[1]
+        return _at_the_robot(session, name, both), _form(session, target, both)
     return f"step {state.step.name} needs {state.words}", f"put it into {session.folder} and run calib next again"
 
 
-def _at_the_robot(session: Session, name: str) -> str:
+def _at_the_robot(session: Session, name: str, both: bool) -> str:
     path = session.path(f"2-poses/{name}.csv")
     what = "pose" if session.settings.instrument["measures"] == "pose" else "position"
     device = session.settings.instrument["name"]
@@ -254,12 +255,20 @@ def _at_the_robot(session: Session, name: str) -> str:
         return f"Measure the target's {what} with the {device} at poses all over the workspace."
     count = sum(1 for _ in path.open()) - 1
     return (
-        f"Drive the {count} poses of {path}, let the arm settle, measure the target's {what} with the {device} and log "
-        "the joint angles read back."
+        f"Drive the {count} poses of {path}{_and_validation(session) if both else ''}, let the arm settle, measure the "
+        f"target's {what} with the {device} and log the joint angles read back."
     )
 
 
-def _form(session: Session, target: str) -> str:
+def _and_validation(session: Session) -> str:
+    """Name the list of validation poses, so that the robot is visited once."""
+    path = session.path("2-poses/validation.csv")
+    if not session.settings.poses["validation"] or not path.exists():
+        return ""
+    return f" and, into a file of their own, the {sum(1 for _ in path.open()) - 1} of {path} (never fitted)"
+
+
+def _form(session: Session, target: str, both: bool) -> str:
     try:
         joints = stages.chain_of(session).joint_names
     except Exception as error:
@@ -267,5 +276,8 @@ def _form(session: Session, target: str) -> str:
     full = session.settings.instrument["measures"] == "pose"
     columns = ", ".join((*(f"{joint} [deg]" for joint in joints), *(f"{axis} [mm]" for axis in "xyz")))
     quaternion = ", qx, qy, qz, qw" if full else ""
-    file = session.path("3-measured") / target
-    return f"Bring {file}, one row per pose: {columns}{quaternion}; then: calib next {session.folder}"
+    files = [str(session.path("3-measured") / target)]
+    if both and session.settings.poses["validation"]:
+        files.append(str(session.path("3-measured/validation.csv")))
+    each = f"Bring {' and '.join(files)}, one row per pose: {columns}{quaternion} (calib formats measurements)"
+    return f"{each}; then: calib next {session.folder}"

@@ -14,7 +14,7 @@ import pytest
 
 from calib import cli
 from calib.errors import CalibError, MeasurementError, SessionError
-from calib.procedure import steps
+from calib.procedure import stages, steps
 from calib.procedure.session import Session, locked, open_session, read_state
 
 from .conftest import edit, go_on, quiet
@@ -43,6 +43,7 @@ def test_two_lines_say_what_to_do_and_what_to_bring(planned: Session) -> None:
     first, second = steps.asks(planned, waiting)
     assert "20 poses" in first and "optical CMM" in first and "poses.csv" in first
     assert "measured.csv" in second and "joint1 [deg]" in second and "qw" in second
+    assert "the 8 of" in first and "2-poses/validation.csv (never fitted)" in first and "validation.csv" in second
 
 
 def test_the_fit_waits_for_validation_but_not_the_other_way_round(measured: Session) -> None:
@@ -89,6 +90,8 @@ def test_what_a_person_replaced_is_kept_and_said(finished: Session) -> None:
     urdf.write_text(urdf.read_text() + "<!-- checked -->\n")
     assert kinds(finished)["export"] == steps.DONE
     assert "replaced by hand: 6-export/robot.urdf" in words(finished, "export")
+    roles = {name: role for name, role, _, _ in stages.listed(finished)}
+    assert roles["6-export/robot.urdf"] == "edited by hand" and roles["6-export/robot.toml"] == "calibrated robot"
     assert go_on(finished) is None
     assert "checked" in urdf.read_text()
 
@@ -204,6 +207,27 @@ def test_a_session_of_another_version_or_hand_is_recognised(planned: Session, ol
     path.write_text(path.read_text().replace('model = "geometry"', 'model = "auto"'))
     edit(path, old, new)
     with pytest.raises(SessionError, match=message):
+        open_session(planned.folder)
+
+
+def test_a_tolerance_of_the_session_decides_and_stands_on_the_certificate(finished: Session) -> None:
+    assert "tolerance" in finished.path("certificate.html").read_text()
+    assert "none was given" in finished.path("certificate.html").read_text()
+    edit(finished.path("session.toml"), "tolerance_mm = 0.0", "tolerance_mm = 0.01")
+    assert go_on(open_session(finished.folder)) is None
+    found = json.loads(finished.path("5-validation/metrics.json").read_text())
+    assert found["verdict"] == "fail" and "above the tolerance of 0.01 mm" in found["reason"]
+    assert "0.01 mm rms on unseen poses" in finished.path("certificate.html").read_text()
+
+
+def test_a_session_made_before_tolerances_is_read(planned: Session) -> None:
+    path = planned.path("session.toml")
+    lines = path.read_text().splitlines()
+    start = next(k for k, line in enumerate(lines) if line.startswith("tolerance_mm"))
+    path.write_text("\n".join(lines[:start] + lines[start + 2 :]) + "\n")
+    assert open_session(planned.folder).settings.fit["tolerance_mm"] == 0.0
+    path.write_text(path.read_text() + "tolerance_mm = -1.0\n")
+    with pytest.raises(SessionError, match="expected 0 or more"):
         open_session(planned.folder)
 
 

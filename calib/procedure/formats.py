@@ -1,0 +1,50 @@
+"""The file formats, as their own modules document them: `calib formats` prints those docstrings and nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+
+from calib.errors import UsageError
+
+TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
+    "measurements": (
+        "CSV files of measured poses, positions, distances",
+        ("calib.data.pose_files", "calib.data.robodk"),
+    ),
+    "options": ("the TOML file of calib fit --options", ("calib.data.options",)),
+    "constraints": ("the TOML file of calib select --constraints", ("calib.procedure.limits",)),
+    "mdh": ("a robot as a table of modified Denavit-Hartenberg rows", ("calib.robot.mdh", "calib.robot.tables")),
+    "robot": ("robot.toml as calib fit writes it", ("calib.robot.description", "calib.procedure.calibrated")),
+    "session": ("a session's folder and its session.toml", ("calib.procedure.session",)),
+    "recordings": (
+        "recordings of motion, for calib identify",
+        ("calib.data.recording_options", "calib.data.recording_tables", "calib.data.archives", "calib.data.bags"),
+    ),
+}
+
+
+def overview() -> list[str]:
+    """Return one line per topic."""
+    return [f"{name:14} {words}" for name, (words, _) in TOPICS.items()]
+
+
+def describe(topic: str) -> str:
+    """Return the documentation of a topic.
+
+    Raises:
+        UsageError: with the topics there are.
+    """
+    if topic not in TOPICS:
+        raise UsageError(f"no format '{topic}'; there are {', '.join(TOPICS)}")
+    parts = [_plain(import_module(name).__doc__ or "") for name in TOPICS[topic][1]]
+    if topic == "session":
+        from calib.procedure.session import example
+
+        parts.append(f"session.toml, as calib new writes it:\n\n{example()}")
+    return "\n\n".join(part.strip() for part in parts) + "\n"
+
+
+def _plain(text: str) -> str:
+    """Return a docstring without reStructuredText's marks for code."""
+    return text.replace("::\n", ":\n").replace("``", "")
