@@ -225,7 +225,7 @@ class _Run:
         self.values = np.zeros(0)
         self.history: list[float] = []
         self.count = self.kept = 0
-        self.interrupted, self.reason = False, ""
+        self.interrupted, self.reason, self.scale = False, "", 1.0
         self._at: tuple[bytes, tuple[float, float]] | None = None
         self._evaluation: Evaluation | None = None
 
@@ -274,6 +274,10 @@ class _Run:
         """Run NLopt on the smoothed problem from y (with s, of γ = e^s - 1, behind it where there are goals)."""
         goals = self.problem.goals
         start = np.append(y, self._attainment(y)) if goals else y
+        if not goals:  # a slope of at most 1 at the start: SLSQP's first step is as long as the slope
+            slope, self.scale = np.zeros(len(y)), 1.0
+            self._sum(np.ascontiguousarray(y), slope)
+            self.scale = 1.0 / max(1.0, float(np.linalg.norm(slope)))
         algorithm = {"slsqp": nlopt.LD_SLSQP, "auglag": nlopt.AUGLAG, "mma": nlopt.LD_MMA}[method]
         solver = nlopt.opt(algorithm, len(start))
         if method == "auglag":
@@ -317,8 +321,8 @@ class _Run:
             total += weight * float(np.log(value) if logarithm else value)
             gradient += weight * (row / value if logarithm else row)
         if slope.size:
-            slope[:] = gradient
-        return total
+            slope[:] = gradient * self.scale
+        return total * self.scale
 
     def _last(self, y: np.ndarray, slope: np.ndarray) -> float:
         if slope.size:
