@@ -209,7 +209,9 @@ def identify_dynamics(
     friction: Annotated[
         str | None, typer.Option(help="auto, standard, or one rung: load, presliding, stribeck, root, ...")
     ] = None,
-    options: Annotated[Path | None, typer.Option(help="TOML: drives, payloads, gains, filters, how to identify")] = None,
+    options: Annotated[
+        Path | None, typer.Option(help="TOML: drives, payloads, gains, filters, how to identify")
+    ] = None,
     base: Base = None,
     tip: Tip = None,
     seed: Seed = 0,
@@ -356,8 +358,6 @@ def new(
     _console().print(f"made {made.folder}; next: calib next {made.folder}", soft_wrap=True, markup=False)
 
 
-@app.command("next")
-def next_step(folder: Folder) -> None:
 @app.command()
 def formats(
     topic: Annotated[
@@ -371,6 +371,8 @@ def formats(
     print(documents.describe(topic) if topic else "\n".join(documents.overview()))
 
 
+@app.command("next")
+def next_step(folder: Folder) -> None:
     """Do what can be done in a session, then say what to do at the robot."""
     _go_on(folder, f"calib next {folder}")
 
