@@ -154,7 +154,8 @@ def urdf_alone(fit: Comparison, validation: Mapping[str, Comparison]) -> tuple[s
                 f"THE URDF ALONE IS WORSE THAN THE NOMINAL ARM {where}: rms {1e3 * bare:.3f} mm against "
                 f"{1e3 * before:.3f} mm; use robot_for_corrections.urdf with joint_corrections.csv, or the nominal one"
             )
-    return (f"its URDF alone, without joint_corrections.csv, leaves {', '.join(words)}" if words else ""), warnings
+    there = words[0].removesuffix(f" {next(iter(sets))}") if len(sets) == 1 and proofs and words else ", ".join(words)
+    return (f"its URDF alone, without joint_corrections.csv, leaves {there}" if words else ""), warnings
 
 
 def _rms(found: Errors) -> float:

@@ -85,7 +85,7 @@ def test_what_a_urdf_alone_leaves_is_said_and_a_bad_one_loudly():
     fit = rows(1.0, 0.1, False, alone=0.5)
     assert urdf_alone(rows(1.0, 0.1, False), {"a": rows(1.0, 0.1)}) == ("", [])
     words, warnings = urdf_alone(fit, {"a": rows(1.0, 0.1, alone=0.6)})
-    assert "without joint_corrections.csv, leaves 0.600 mm on a, unseen" in words and not warnings
+    assert "without joint_corrections.csv, leaves 0.600 mm" in words and not warnings
     words, warnings = urdf_alone(fit, {"a": rows(1.0, 0.1, alone=1.2)})
     assert "WORSE THAN THE NOMINAL ARM on a, unseen" in warnings[0]
     assert "0.500 mm on the fitted poses" in urdf_alone(fit, {})[0]
