@@ -1,5 +1,5 @@
-"""The command ``calib``: commands only, no mathematics. Exit codes: 0 done (the verdict is pass or marginal), 1 done but
-the verdict is fail, 2 input or usage, 3 not identifiable or not converged."""
+"""The command ``calib``: commands only, no mathematics. Exit codes: 0 done (the verdict is pass or marginal), 1 done
+but the verdict is fail, 2 input or usage, 3 not identifiable or not converged."""
 
 from __future__ import annotations
 
@@ -276,8 +276,8 @@ def excite(
     with work.workers(workers) as mapped, _progress() as say:
         designed = exciting.excite(
             robot, model=model, limits=limits, goals=goal or [], hard=hard or [], period=period, harmonics=harmonics,
-            family=family, drives_=drives, rate=rate, starts=starts, evaluations=evaluations, front=front, base=base, tip=tip, seed=seed,
-            map=mapped, progress=say,
+            family=family, drives_=drives, rate=rate, starts=starts, evaluations=evaluations, front=front, base=base,
+            tip=tip, seed=seed, map=mapped, progress=say,
         )  # fmt: skip
         say("writing")
         excitation_outputs.write_folder(designed, out)
@@ -474,7 +474,7 @@ def run(arguments: list[str] | None = None) -> int:
 
 
 def _spread(arguments: list[str]) -> list[str]:
-    """Return the arguments of ``fit`` and ``identify`` with ``--validate a b`` written as ``--validate a --validate b``.
+    """Return the arguments of ``fit`` and ``identify``, ``--validate a b`` written as ``--validate a --validate b``.
 
     Only where ROBOT and MEASURED have come before: what follows --validate then cannot be one of them.
     """

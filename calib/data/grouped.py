@@ -18,7 +18,7 @@ from calib.errors import MeasurementError
 def read_groups(table: Table, options: FileOptions, layout: Layout, q: np.ndarray) -> PoseMeasurements:
     """Return the rows of `table`, with joint values q (m, n), as groups."""
     names, group = labels(table, layout.group)
-    tool_names, tool = labels(table, (layout.tool,)) if layout.tool else ((options.tool,), None)
+    tool_names, tool = labels(table, (layout.tool,)) if layout.tool else ((options.tool,), np.zeros(len(q), dtype=int))
     distance, sigma = _read_distance(table, options, layout)
     if layout.kind == "distance" and distance is not None:
         _check_pairs(table, layout, group, names, distance)
