@@ -60,6 +60,10 @@ def fit(
         ),
     ] = None,
     loss: Annotated[str | None, typer.Option(help="auto, none, huber or cauchy")] = None,
+    folds: Annotated[
+        str,
+        typer.Option(help="rows the ladder sets aside: transfer (stations, files, regions), regions, random or poses"),
+    ] = "transfer",
     stations: Annotated[str, typer.Option(help="base placement: each file its own, or one for all")] = "each",
     tools: Annotated[str, typer.Option(help="one tool for all files, or each its own")] = "one",
     tolerance: Annotated[
@@ -96,8 +100,8 @@ def fit(
         console.print(line, soft_wrap=True)
     with _progress() as say:
         outcome = fitting.run(
-            found, chosen, model=model, loss=loss, tolerance=1e-3 * tolerance if tolerance else None, seed=seed,
-            progress=say,
+            found, chosen, model=model, loss=loss, tolerance=1e-3 * tolerance if tolerance else None, folds=folds,
+            seed=seed, progress=say,
         )  # fmt: skip
         say("writing")
         outputs.write_folder(outcome, out, report.write)

@@ -12,10 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.data.measurements import PoseMeasurements
+from calib.errors import UsageError
 from calib.geometry.observation import has_instrument
 
 REGIONS = 20
 FOLDS = 5
+MOST = 150
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +25,7 @@ class Folds:
     """A partition of the rows of all blocks.
 
     Attributes:
-        kind: ``stations``, ``files``, ``fixtures`` or ``regions``.
+        kind: ``stations``, ``files``, ``fixtures`` or ``regions``; ``random`` or ``poses`` (one left out) on request.
         count: number of folds.
         members: per block, (m,) fold of each row.
     """
@@ -70,6 +72,45 @@ def region_folds(
     fold = np.array([order[int(k)] for k in label]) % count
     members = np.split(fold, np.cumsum([len(block) for block in measured])[:-1])
     return Folds("regions", count, tuple(_whole(block, rows) for block, rows in zip(measured, members)))
+
+
+def folds_by_name(name: str, measured: Sequence[PoseMeasurements], seed: int = 0) -> Folds:
+    """Return `transfer_folds`, `region_folds`, ten `random_folds`, or one fold for each of the ``poses``.
+
+    Raises:
+        UsageError: for another name, or for leaving out each of more than `MOST` poses.
+    """
+    if name == "poses" and sum(len(block) for block in measured) > MOST:
+        raise UsageError(
+            f"--folds poses leaves out every pose once, which is for {MOST} rows at most; take --folds random"
+        )
+    ways = {
+        "transfer": lambda: transfer_folds(measured, seed),
+        "regions": lambda: region_folds(measured, seed=seed),
+        "random": lambda: random_folds(measured, 10, seed),
+        "poses": lambda: random_folds(measured, None, seed),
+    }
+    if name not in ways:
+        raise UsageError(f"--folds {name}: expected one of {', '.join(ways)}")
+    return ways[name]()
+
+
+def random_folds(measured: Sequence[PoseMeasurements], folds: int | None = 10, seed: int = 0) -> Folds:
+    """Return folds drawn at random: k-fold, or leave-one-out where `folds` is None.
+
+    They ask for interpolation only: on a grid every held-out pose has neighbours among the fitted ones, so that errors
+    come out smaller than elsewhere in the workspace. Reflectors of one pose and the two rows of a distance stay
+    together.
+    """
+    members = []
+    for number, block in enumerate(measured):
+        _, unit = np.unique(block.group if block.kind == "distance" else block.rows, return_inverse=True)
+        count = int(unit.max(initial=-1)) + 1
+        wanted = count if folds is None else min(folds, count)
+        order = np.random.default_rng([seed, number]).permutation(count)
+        members.append((order % wanted)[unit])
+    highest = max(int(fold.max(initial=0)) for fold in members) + 1
+    return Folds("poses" if folds is None else "random", highest, tuple(members))
 
 
 def _whole(block: PoseMeasurements, fold: np.ndarray) -> np.ndarray:

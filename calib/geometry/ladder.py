@@ -90,6 +90,7 @@ def climb(
     fixed: np.ndarray | None = None,
     prior: np.ndarray | None = None,
     seed: int = 0,
+    folds: Folds | None = None,
     progress: Progress | None = None,
 ) -> Climb:
     """Fit the model the data support, or the one asked for by name.
@@ -104,6 +105,7 @@ def climb(
         fixed: positions in the parameter vector that stay at their nominal.
         prior: standard deviations of the parameter vector about its nominal; infinite where nothing is known.
         seed: of the regions.
+        folds: how unseen rows are set aside; None for the most demanding way (`calib.geometry.folds`).
         progress: called with (done, total, what).
 
     Raises:
@@ -112,7 +114,7 @@ def climb(
     if model not in ("auto", *MODELS):
         raise UsageError(f"model '{model}' is none of auto, {', '.join(MODELS)}")
     tell = progress or (lambda done, total, what: None)
-    folds, settings = transfer_folds(measured, seed), settings or Settings()
+    folds, settings = folds or transfer_folds(measured, seed), settings or Settings()
     climber = _Climber(cell, measured, settings, torques, fixed, prior, folds, tell)
     climber.rigid(model)
     if settings.loss == "auto" and outliers(climber.best, GROSS):

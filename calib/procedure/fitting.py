@@ -17,6 +17,7 @@ from calib.geometry.diagnosis import diagnose
 from calib.geometry.explanation import explain
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit, polish_frames
+from calib.geometry.folds import folds_by_name
 from calib.geometry.installation import Installation
 from calib.geometry.ladder import Climb, climb
 from calib.geometry.observation import has_instrument
@@ -71,6 +72,7 @@ def run(
     model: str | None = None,
     loss: str | None = None,
     tolerance: float | None = None,
+    folds: str = "transfer",
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Outcome:
@@ -81,6 +83,7 @@ def run(
         options: the fit options file's content.
         model, loss: in place of the options'.
         tolerance: largest rms on unseen poses that is good enough [m].
+        folds: how the ladder sets rows aside, see `calib.geometry.folds.folds_by_name`.
         seed: for everything random.
         progress: called with a few words at each stage.
 
@@ -101,6 +104,7 @@ def run(
         torques=torques,
         fixed=fixed_parameters(start, options),
         prior=stated_prior(start, options),
+        folds=folds_by_name(folds, inputs.fit, seed),
         seed=seed,
         progress=lambda done, total, what: say(f"fitting: {what}"),
     )

@@ -9,7 +9,8 @@ import pytest
 from planted import cell, load, measure
 
 from calib.data.measurements import PoseMeasurements, take
-from calib.geometry.folds import Folds, region_folds, transfer_folds
+from calib.errors import UsageError
+from calib.geometry.folds import Folds, folds_by_name, random_folds, region_folds, transfer_folds
 
 
 @pytest.fixture(scope="module")
@@ -116,3 +117,26 @@ def test_files_without_an_instrument_are_left_out_one_by_one():
     assert folds.kind == "files" and folds.count == 3
     assert_partition(folds, measured)
     assert all(len(set(members)) == 1 for members in folds.members)
+
+
+@pytest.mark.parametrize("kind", ["position", "distance"])
+def test_random_folds_are_a_partition_that_the_seed_repeats(truth, kind):
+    measured = [measure(truth, kind, 60, 1)]
+    folds = random_folds(measured, 10, seed=3)
+    assert_partition(folds, measured)
+    assert folds.count == 10
+    assert np.array_equal(folds.members[0], random_folds(measured, 10, seed=3).members[0])
+    assert not np.array_equal(folds.members[0], random_folds(measured, 10, seed=4).members[0])
+    if kind == "distance":
+        for pair in np.unique(measured[0].group):
+            assert len(set(folds.members[0][measured[0].group == pair])) == 1
+
+
+def test_leaving_out_one_pose_leaves_out_each_once_and_only_of_few(truth):
+    measured = [measure(truth, "position", 40, 1)]
+    folds = folds_by_name("poses", measured)
+    assert folds.count == 40 and sorted(folds.members[0]) == list(range(40))
+    with pytest.raises(UsageError, match="--folds random"):
+        folds_by_name("poses", [measure(truth, "position", 200, 1)])
+    with pytest.raises(UsageError, match="transfer, regions, random, poses"):
+        folds_by_name("kfold", measured)
