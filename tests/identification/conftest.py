@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import planted
+import planted_motion as planted
 import pytest
 
 from calib.robot import description

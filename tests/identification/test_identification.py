@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import planted
+import planted_motion as planted
 import pytest
 
 from calib.dynamics import friction

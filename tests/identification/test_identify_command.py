@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 import numpy as np
-import planted
+import planted_motion as planted
 import pytest
 
 from calib import cli
