@@ -56,7 +56,7 @@ def _processes(count: int) -> Iterator[Map]:
 @contextmanager
 def _dask(address: str) -> Iterator[Map]:
     try:
-        from distributed import Client
+        from distributed import Client  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise UsageError("a Dask scheduler needs Dask: pip install 'armature-calib[cluster]'") from error
     try:
