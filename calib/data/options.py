@@ -37,7 +37,6 @@ TOML; every key is optional, and a key that is none of these is refused. Lengths
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -108,12 +107,7 @@ class FitOptions:
 
     def for_file(self, path: str | Path) -> FileOptions:
         """Return the options for the file at `path`: its own where there is a [files] table of that name."""
-        parts = Path(path).parts
-        for name, own in self.files.items():
-            wanted = Path(name).parts
-            if parts[-len(wanted) :] == wanted:
-                return own
-        return self.every
+        return values.own_table(self.files, path) or self.every
 
 
 def read_options(path: str | Path | None = None) -> FitOptions:
@@ -124,13 +118,7 @@ def read_options(path: str | Path | None = None) -> FitOptions:
     """
     if path is None:
         return FitOptions()
-    try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: is no TOML: {error}") from error
-    return parse_options(table, str(path))
+    return parse_options(values.read_toml(path), str(path))
 
 
 def parse_options(table: Mapping[str, Any], source: str = "options") -> FitOptions:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Callable, Mapping
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 
 from calib.data.tables import ANGLES, LENGTHS, nearest
 from calib.errors import UsageError
 
+Own = TypeVar("Own")
 Triple = tuple[float, float, float]
 
 
@@ -106,3 +109,27 @@ def pairs(value: Any, place: str) -> tuple[tuple[str, str], ...]:
     if not isinstance(value, list) or not all(isinstance(pair, list) and len(pair) == 2 for pair in value):
         raise refuse(value, place, 'pairs of socket labels, [["0", "1"]]')
     return tuple((label(first, place), label(second, place)) for first, second in value)
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """Return the tables of the TOML file at `path`.
+
+    Raises:
+        UsageError: for a file that is missing or no TOML.
+    """
+    try:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path}: is no TOML: {error}") from error
+
+
+def own_table(files: Mapping[str, Own], path: str | Path) -> Own | None:
+    """Return what `files` holds under the name of the file at `path`, or the end of its path; None for nothing."""
+    parts = Path(path).parts
+    for name, own in files.items():
+        wanted = Path(name).parts
+        if parts[-len(wanted) :] == wanted:
+            return own
+    return None

@@ -56,7 +56,6 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -120,12 +119,7 @@ class IdentifyOptions:
 
     def for_file(self, path: str | Path) -> FileSettings:
         """Return the settings of the recording at `path`."""
-        parts = Path(path).parts
-        for name, own in self.files.items():
-            wanted = Path(name).parts
-            if parts[-len(wanted) :] == wanted:
-                return own
-        return self.every
+        return values.own_table(self.files, path) or self.every
 
 
 def read_options(path: str | Path | None = None) -> IdentifyOptions:
@@ -136,13 +130,7 @@ def read_options(path: str | Path | None = None) -> IdentifyOptions:
     """
     if path is None:
         return IdentifyOptions()
-    try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: is no TOML: {error}") from error
-    return parse_options(table, str(path))
+    return parse_options(values.read_toml(path), str(path))
 
 
 def parse_options(table: Mapping[str, Any], source: str = "options") -> IdentifyOptions:

@@ -51,7 +51,9 @@ def outcome_lines(outcome: Outcome) -> Iterator[RenderableType]:
         count = len({(each.file, each.row) for each in outcome.outliers})
         worst = "; ".join(each.words for each in outcome.outliers[:MANY])
         more = "; ..." if len(outcome.outliers) > MANY else ""
-        yield f"[yellow]outliers[/]: {count} rows beyond 4 robust sigma, kept in the fit: {escape(worst)}{more}"
+        loss = outcome.climb.loss
+        how = "kept in the fit" if loss == "none" else f"weighed down by the {loss} loss"
+        yield f"[yellow]outliers[/]: {count} rows beyond 4 robust sigma, {how}: {escape(worst)}{more}"
     verdict = outcome.verdict
     yield f"verdict: [bold {COLOURS[verdict.level]}]{verdict.level}[/]: {escape(verdict.reason)}"
 
