@@ -247,9 +247,7 @@ def outlier_table(metrics: Mapping[str, Any], most: int = 20) -> Table:
     """Return the rows that do not fit, worst first."""
     found = metrics["outliers"]
     rows = [(o["file"], str(o["row"]), o["nature"], f"{o['sigmas']:.1f}") for o in found[:most]]
-    note = (
-        "Rows beyond 4 robust sigmas. They were kept in the fit; a robust loss, where used, weighed them down."
-    )
+    note = "Rows beyond 4 robust sigmas. They were kept in the fit; a robust loss, where used, weighed them down."
     if len(found) > most:
         note += f" {len(found) - most} more in metrics.json."
     return Table("Rows that do not fit", ("file", "row", "residual", "robust sigmas"), rows, note, numbers=(1, 3))
