@@ -1,0 +1,108 @@
+"""The command ``calib``: commands only, no mathematics. Exit codes: 0 done (the verdict is pass or marginal), 1 done
+but the verdict is fail, 2 input or usage, 3 not identifiable or not converged."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Annotated, Any
+
+import typer
+
+from calib.cli import dynamics, geometry, motion, session
+
+# many small matrices: BLAS threads only get in each other's way (a fit on two busy cores: 9 s against 19 s)
+for _pool in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_pool, "1")
+
+INTERRUPTED = "interrupted; nothing was left half-written, and the same command goes on from here"
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # a unit in brackets is a unit, not a style
+    help="Calibrate a robot: choose poses, fit the geometry, validate on unseen poses, export.",
+)
+
+_FLAGS = ("--debug", "--help", "--line", "--refit-frames", "--no-refit-frames")
+_USAGE: Any = typer.BadParameter.__mro__[2]  # ClickException, of the click that this typer uses (or brings)
+
+for _group in (geometry, dynamics, motion, session):
+    app.add_typer(_group.app)
+
+
+@app.callback()
+def options(
+    debug: Annotated[bool, typer.Option("--debug", help="show tracebacks (or set CALIB_DEBUG)")] = False,
+) -> None:
+    if debug:
+        os.environ["CALIB_DEBUG"] = "1"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line and exit with one of the codes above."""
+    sys.exit(run(arguments))
+
+
+def run(arguments: list[str] | None = None) -> int:
+    """Run the command line and return its exit code; errors become one message on stderr."""
+    try:
+        given = list(sys.argv[1:] if arguments is None else arguments)
+        code = int(app(args=_spread(given), standalone_mode=False) or 0)
+        return _complain(INTERRUPTED, 130) if code == 130 else code  # Typer turns Ctrl-C into this code
+    except typer.Exit as stop:
+        return stop.exit_code
+    except _USAGE as error:
+        error.show()
+        return 2
+    except (KeyboardInterrupt, typer.Abort):
+        return _complain(INTERRUPTED, 130)
+    except Exception as error:
+        code = _code(error)
+        if code is None or os.environ.get("CALIB_DEBUG"):
+            raise
+        return _complain(str(error), code)
+
+
+def _spread(arguments: list[str]) -> list[str]:
+    """Return the arguments of ``fit`` and ``identify``, ``--validate a b`` written as ``--validate a --validate b``.
+
+    Only where ROBOT and MEASURED have come before: what follows --validate then cannot be one of them.
+    """
+    result: list[str] = []
+    option, positionals, spreading = "", 0, False
+    for word in arguments:
+        if word.startswith("--"):
+            option = "" if word in _FLAGS or "=" in word else word
+            spreading = False
+        elif option:
+            spreading = option == "--validate" and positionals > 2  # the command itself, ROBOT, MEASURED
+            option = ""
+        elif spreading:
+            result.append("--validate")
+        else:
+            positionals += 1
+        result.append(word)
+    return result if {"fit", "identify"} & set(arguments[:2]) else arguments
+
+
+def _code(error: Exception) -> int | None:
+    """Return the exit code of an error raised on purpose; None for any other."""
+    from calib.errors import CalibError, NotConverged, Unidentifiable
+
+    if isinstance(error, (NotConverged, Unidentifiable)):
+        return 3
+    if isinstance(error, CalibError):
+        return 2
+    module = sys.modules.get("poses.errors")
+    if module is not None and isinstance(error, module.NotIdentifiable):
+        return 3
+    if type(error).__module__.split(".")[0] in ("poses", "trajectories"):
+        return 2
+    return None
+
+
+def _complain(message: str, code: int) -> int:
+    print(f"calib: {message}", file=sys.stderr)
+    return code

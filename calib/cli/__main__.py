@@ -1,0 +1,5 @@
+"""``python -m calib.cli``."""
+
+from calib.cli import main
+
+main()

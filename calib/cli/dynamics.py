@@ -1,0 +1,55 @@
+"""The dynamics: identify."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calib.cli.shared import Base, Robot, Seed, Tip, make_console, progress
+
+app = typer.Typer()
+
+
+@app.command("identify")
+def identify_dynamics(
+    robot: Robot,
+    recordings: Annotated[list[str], typer.Argument(help="recordings of q and torque or current; log.npz@0:9.4 cuts")],
+    out: Annotated[Path, typer.Option(help="folder for the identified model and its report")],
+    validate: Annotated[list[str] | None, typer.Option(help="recording of other motion; may be repeated")] = None,
+    method: Annotated[str | None, typer.Option(help="ols, wls, irls, tls or iv")] = None,
+    friction: Annotated[
+        str | None, typer.Option(help="auto, standard, or one rung: load, presliding, stribeck, root, ...")
+    ] = None,
+    options: Annotated[
+        Path | None, typer.Option(help="TOML: drives, payloads, gains, filters, how to identify")
+    ] = None,
+    base: Base = None,
+    tip: Tip = None,
+    seed: Seed = 0,
+) -> None:
+    """Identify the dynamics of ROBOT from recordings, and say how well it predicts other motion."""
+    from calib.identification.options import read_options
+    from calib.procedure import identification_outputs, identification_plots, identification_show, identifying
+
+    chosen = read_options(options)
+    identification_outputs.check_target(out)
+    console = make_console()
+    with progress() as say:
+        found = identifying.gather(
+            robot, recordings, validate or [], options=chosen, method=method, friction=friction, base=base, tip=tip,
+            seed=seed, progress=say,
+        )  # fmt: skip
+        identification_outputs.check_target(out, found.source)
+    for line in identification_show.read_lines(found):
+        console.print(line, soft_wrap=True)
+    with progress() as say:
+        outcome = identifying.run(found, progress=say)
+        say("writing")
+        identification_outputs.write_folder(outcome, out, identification_plots.write)
+    for line in identification_show.outcome_lines(outcome):
+        console.print(line, soft_wrap=True)
+    console.print(f"written to {out}", soft_wrap=True, markup=False)
+    if outcome.verdict.level == "fail":
+        raise typer.Exit(1)

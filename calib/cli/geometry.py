@@ -1,0 +1,169 @@
+"""The geometry: fit, select, export."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calib.cli.shared import Base, Robot, Seed, Tip, make_console, numbers, progress
+
+app = typer.Typer()
+
+
+@app.command()
+def fit(
+    robot: Robot,
+    measured: Annotated[list[Path], typer.Argument(help="CSV files of measured poses: calib formats measurements")],
+    out: Annotated[Path, typer.Option(help="folder for the calibrated robot and its report")],
+    validate: Annotated[list[Path] | None, typer.Option(help="CSV file of unseen poses; may be repeated")] = None,
+    holdout: Annotated[float, typer.Option(help="share of each file's poses kept from the fit")] = 0.0,
+    refit_frames: Annotated[bool, typer.Option(help="validation files: base and tool placement of their own")] = False,
+    options: Annotated[Path | None, typer.Option(help="TOML, see calib formats options")] = None,
+    model: Annotated[
+        str | None,
+        typer.Option(
+            help="auto, frames, offsets, geometry, stiffness, bending, coupling, harmonics or wobble: that rung and "
+            "all below it"
+        ),
+    ] = None,
+    loss: Annotated[str | None, typer.Option(help="auto, none, huber or cauchy")] = None,
+    folds: Annotated[
+        str,
+        typer.Option(help="rows the ladder sets aside: transfer (stations, files, regions), regions, random or poses"),
+    ] = "transfer",
+    stations: Annotated[str, typer.Option(help="base placement: each file its own, or one for all")] = "each",
+    tools: Annotated[str, typer.Option(help="one tool for all files, or each its own")] = "one",
+    tolerance: Annotated[
+        float | None, typer.Option(metavar="MM", help="rms on unseen poses, in mm, above which the verdict is fail")
+    ] = None,
+    base: Base = None,
+    tip: Tip = None,
+    seed: Seed = 0,
+) -> None:
+    """Fit the geometry of ROBOT to measured poses, and say how far to trust it.
+
+    Exit codes: 0 the verdict is pass or marginal, 1 fail, 2 input or usage, 3 not identifiable or not converged.
+    Pass means that on poses it has not seen the calibrated arm is better than the nominal one, or that there is nothing
+    to gain; that it is good enough is said only with --tolerance.
+    """
+    from calib.data.options import read_options
+    from calib.errors import UsageError
+    from calib.geometry.effects import MODELS
+    from calib.procedure import fitting, inputs, outputs, report, show
+
+    if model not in (None, "auto", *MODELS):
+        raise UsageError(f"--model {model}: expected auto, {', '.join(MODELS)}")
+    if tolerance is not None and not 0.0 < tolerance < float("inf"):
+        raise UsageError(f"--tolerance {tolerance:g}: expected a length above 0, in mm")
+    chosen = read_options(options)
+    outputs.check_target(out)
+    found = inputs.gather(
+        robot, measured, validate or [], options=chosen, holdout=holdout, stations=stations, tools=tools,
+        refit_frames=refit_frames, base=base, tip=tip, seed=seed,
+    )  # fmt: skip
+    outputs.check_target(out, found.source)
+    console = make_console()
+    for line in show.read_lines(found):
+        console.print(line, soft_wrap=True)
+    with progress() as say:
+        outcome = fitting.run(
+            found, chosen, model=model, loss=loss, tolerance=1e-3 * tolerance if tolerance else None, folds=folds,
+            seed=seed, progress=say,
+        )  # fmt: skip
+        say("writing")
+        outputs.write_folder(outcome, out, report.write)
+    for line in show.outcome_lines(outcome):
+        console.print(line, soft_wrap=True)
+    console.print(f"written to {out}", soft_wrap=True, markup=False)
+    if outcome.verdict.level == "fail":
+        raise typer.Exit(1)
+
+
+@app.command()
+def select(
+    robot: Robot,
+    out: Annotated[Path, typer.Option(help="CSV file of the chosen joint values, rad")],
+    m: Annotated[int, typer.Option("-m", help="how many poses")] = 30,
+    kind: Annotated[str, typer.Option(help="what will be measured: pose or position")] = "pose",
+    tool: Annotated[
+        list[str] | None, typer.Option(help="x,y,z of a target in the tip's frame [m]; may be repeated")
+    ] = None,
+    index: Annotated[str, typer.Option(help="O1 to O5, or cond")] = "O1",
+    method: Annotated[str, typer.Option(help="detmax, multistart, tabu or local")] = "detmax",
+    constraints: Annotated[Path | None, typer.Option(help="TOML, see calib formats constraints")] = None,
+    candidates: Annotated[int, typer.Option(help="poses to choose from")] = 2000,
+    existing: Annotated[Path | None, typer.Option(help="CSV of poses measured before, which count")] = None,
+    sigma: Annotated[
+        str | None, typer.Option(help="of a position [m] and an orientation [rad], e.g. 1e-4,1e-4")
+    ] = None,
+    workers: Annotated[str, typer.Option(help="local processes, or the address of a Dask scheduler")] = "1",
+    base: Base = None,
+    tip: Tip = None,
+    seed: Seed = 0,
+) -> None:
+    """Choose the poses at which the geometry of ROBOT shows best."""
+    from calib import workers as work
+    from calib.procedure import selecting
+
+    targets = [numbers(text, 3, "--tool") for text in tool or []]
+    sigmas = None if sigma is None else numbers(sigma, 2, "--sigma")
+    with work.workers(workers) as mapped, progress() as say:
+        chosen = selecting.choose(
+            robot, m, kind=kind, tools=targets, index=index, method=method, constraints=constraints, existing=existing,
+            candidates=candidates, sigmas=(sigmas[0], sigmas[1]) if sigmas else None, base=base, tip=tip, seed=seed,
+            map=mapped, progress=lambda done, total, what: say(f"{what} ({done} of {total})"),
+        )  # fmt: skip
+    selecting.write(chosen, out)
+    console = make_console()
+    for words, number in selecting.table(chosen):
+        console.print(f"{words:38} {number}", soft_wrap=True, markup=False)
+    for note in chosen.notes:
+        console.print(f"note: {note}", soft_wrap=True, markup=False)
+    console.print(f"{m} poses written to {out}", soft_wrap=True, markup=False)
+
+
+@app.command()
+def export(
+    folder: Annotated[Path, typer.Argument(help="the folder of a fit")],
+    urdf: Annotated[
+        Path | None, typer.Option(help="the URDF to put the calibrated geometry into (it stays as it is)")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="the URDF to write")] = None,
+    ur_kinematics: Annotated[Path | None, typer.Option(help="write ur_description's kinematics YAML")] = None,
+    offsets: Annotated[Path | None, typer.Option(help="write a CSV of joint offsets")] = None,
+    for_corrections: Annotated[
+        bool, typer.Option("--for-corrections", help="the URDF that joint_corrections.csv belongs to, worse without it")
+    ] = False,
+) -> None:
+    """Write the calibrated geometry for other programs."""
+    from calib.errors import UsageError
+    from calib.procedure import exporting
+
+    if (urdf is None) != (out is None) or not (urdf or ur_kinematics or offsets):
+        raise UsageError("nothing to write: give --urdf SOURCE.urdf --out FILE.urdf, --ur-kinematics or --offsets")
+    found = exporting.read(folder)
+    exporting.check_targets(urdf, [path for path in (out, ur_kinematics, offsets) if path])
+    console = make_console()
+    if urdf and out:
+        exporting.export_urdf(found, urdf, out, for_corrections)
+        console.print(
+            f"{out}: joint origins of {urdf} calibrated, all else kept; base link and flange stay where the source has "
+            "them; Pinocchio reads the same poses to 1e-9", soft_wrap=True, markup=False,
+        )  # fmt: skip
+    if ur_kinematics:
+        exporting.export_ur_kinematics(found, ur_kinematics)
+        console.print(f"{ur_kinematics}: for kinematics_params_file of ur_description", soft_wrap=True, markup=False)
+        if note := exporting.flange_note(found):
+            console.print(f"note: {note}", soft_wrap=True, markup=False)
+    if offsets:
+        exporting.export_offsets(found, offsets)
+        console.print(
+            f"{offsets}: offset of each joint, the rest of the geometry left out; --model offsets fits the best ones",
+            soft_wrap=True, markup=False,
+        )  # fmt: skip
+    if found.corrected:
+        note = f"note: the corrections in {folder}/joint_corrections.csv are in none of these files"
+        note += f": {found.alone}" if found.alone else ""
+        console.print(note, soft_wrap=True, markup=False)

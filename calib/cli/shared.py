@@ -1,0 +1,51 @@
+"""What several commands share: arguments, the console, progress, lists of numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Annotated, Any
+
+import typer
+
+Robot = Annotated[str, typer.Argument(help="a .urdf, an MDH .toml, a library name, or the folder of an earlier fit")]
+Base = Annotated[str | None, typer.Option(help="URDF: the link the arm starts at")]
+Tip = Annotated[str | None, typer.Option(help="URDF: the link the arm ends at")]
+Seed = Annotated[int, typer.Option(help="reproduces everything random")]
+
+
+def make_console(**options: Any) -> Any:
+    from rich.console import Console
+
+    return Console(highlight=False, **options)
+
+
+@contextmanager
+def progress() -> Iterator[Any]:
+    """Show on stderr what is being done, where stderr is a terminal."""
+    console = make_console(stderr=True)
+    with console.status("") as status:
+        yield lambda words: status.update(str(words))
+
+
+@contextmanager
+def told() -> Iterator[tuple[Any, Any, Any]]:
+    """Yield a console, and two functions on it: for lines that stay, and for words that show while work goes on."""
+    from rich.markup import escape
+
+    console = make_console()
+    with console.status("") as status:
+        say = lambda words: console.print(words, soft_wrap=True, markup=False)  # noqa: E731
+        yield console, say, lambda words: status.update(escape(words))
+
+
+def numbers(text: str, count: int, option: str) -> list[float]:
+    from calib.errors import UsageError
+
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count:
+        raise UsageError(f"{option} {text}: expected {count} numbers with commas between them")
+    return values
