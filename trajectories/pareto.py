@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from trajectories.objectives import Objective
-from trajectories.optimise import Found, Stuck, design, one_start
+from trajectories.optimise import design
 from trajectories.problem import Goal, Problem
+from trajectories.search import Found, Stuck, one_start
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,8 +16,8 @@ import numpy as np
 from trajectories.basis import Family, Motion
 from trajectories.constraints import BoxLimit, Constraint
 from trajectories.errors import NothingFeasible
-from trajectories.optimise import Found, one_start
 from trajectories.problem import Problem
+from trajectories.search import Found, one_start
 
 BLOCK = 2000
 

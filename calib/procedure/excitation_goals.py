@@ -14,8 +14,8 @@ from calib.procedure.excitable import Dynamics
 from calib.procedure.motion_limits import MotionLimits
 from calib.robot.chain import Chain
 from trajectories.objectives import Excitation, FrictionCoverage, Objective, TorqueSlack
-from trajectories.optimise import Found
 from trajectories.problem import Goal
+from trajectories.search import Found
 
 
 def read_goals(

@@ -22,9 +22,10 @@ from trajectories.bspline import bspline
 from trajectories.constraints import Constraint, TorqueLimit
 from trajectories.fourier import fourier
 from trajectories.objectives import Excitation, TorqueSlack, condition_numbers
-from trajectories.optimise import Found, design
+from trajectories.optimise import design
 from trajectories.pareto import Front, proposed_goals, sweep
 from trajectories.problem import Goal, Problem
+from trajectories.search import Found
 from trajectories.verify import Verification, dense_motion, ensured
 
 GUARD = 0.2  # share of the torque limits kept free where no friction is known (our choice)

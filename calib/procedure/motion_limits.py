@@ -42,7 +42,8 @@ from calib.robot.kinematics import element_jacobian, joint_frames, joint_jacobia
 from calib.robot.tables import check_keys, load, number, vector
 from poses.space import Constraint as PoseConstraint
 from trajectories.basis import Motion
-from trajectories.constraints import Clearance, Constraint, Workspace, box_limits
+from trajectories.constraints import Constraint, box_limits
+from trajectories.places import Clearance, Workspace
 
 TABLES = ("velocity", "acceleration", "jerk", "torque", "friction", "point", "frequency")
 STEP = 1e-6  # [rad or m] of the central differences of collision distances (our choice)

@@ -29,10 +29,11 @@ from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from calib.simulation import lwr4plus
 from trajectories.basis import Motion
-from trajectories.constraints import TorqueLimit, Workspace, box_limits
+from trajectories.constraints import TorqueLimit, box_limits
 from trajectories.fourier import fourier
 from trajectories.objectives import Excitation, TorqueSlack, condition_numbers
 from trajectories.optimise import design
+from trajectories.places import Workspace
 from trajectories.problem import Goal, Problem
 from trajectories.verify import dense_motion, ensured
 

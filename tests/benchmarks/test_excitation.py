@@ -18,11 +18,13 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.tree import standard_parameters, tree
 from calib.procedure.motion_limits import Points
 from calib.robot.load import load
-from trajectories.constraints import TorqueLimit, Workspace, box_limits
+from trajectories.constraints import TorqueLimit, box_limits
 from trajectories.fourier import fourier
 from trajectories.objectives import Excitation, condition_numbers
-from trajectories.optimise import design, random_start
+from trajectories.optimise import design
+from trajectories.places import Workspace
 from trajectories.problem import Goal, Problem, evaluate
+from trajectories.starts import random_start
 from trajectories.verify import dense_motion, ensured
 
 CHAIN = load("lwr4plus")

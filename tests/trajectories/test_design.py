@@ -12,15 +12,17 @@ import pytest
 
 from calib.dynamics import model
 from calib.dynamics.tree import standard_parameters
-from trajectories import optimise
 from trajectories.bspline import bspline
-from trajectories.constraints import BoxLimit, TorqueLimit, Workspace, box_limits
+from trajectories.constraints import BoxLimit, TorqueLimit, box_limits
 from trajectories.errors import BadInput, NotExciting, NothingFeasible
 from trajectories.fourier import fourier
 from trajectories.objectives import Duration, Excitation, FrictionCoverage, TorqueSlack, condition_numbers
-from trajectories.optimise import Found, Stuck, design, one_start
+from trajectories.optimise import design
 from trajectories.pareto import non_dominated, proposed_goals, sweep
+from trajectories.places import Workspace
 from trajectories.problem import Goal, Problem
+from trajectories.search import Found, Stuck, one_start
+from trajectories.starts import random_start
 from trajectories.verify import dense_motion, ensured, verify
 
 BASE, CHI, CHAIN = arm.lwr()
@@ -86,7 +88,7 @@ def test_the_search_beats_random_motions():
     basis, rng = spot.basis(), np.random.default_rng(0)
     values = []
     for _ in range(60):
-        motion = basis.motion(optimise.random_start(spot, basis, rng))
+        motion = basis.motion(random_start(spot, basis, rng))
         values.append(condition_numbers(BASE.regressor(motion.q, motion.v, motion.a))["raw"])
     assert found.values[0] < 0.5 * min(values)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from differences import check
 
-from trajectories.constraints import BoxLimit, Clearance, TorqueLimit, Workspace, gathered
+from trajectories.constraints import BoxLimit, TorqueLimit, gathered
 from trajectories.errors import BadInput, NotExciting
 from trajectories.fourier import fourier
 from trajectories.objectives import (
@@ -18,6 +18,7 @@ from trajectories.objectives import (
     condition_numbers,
     information,
 )  # fmt: skip
+from trajectories.places import Clearance, Workspace
 from trajectories.problem import Problem, evaluate
 
 BASE, CHI, CHAIN = arm.lwr(0.3)

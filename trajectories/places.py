@@ -1,0 +1,108 @@
+"""Constraints on where the arm is: places of the tool and of named points, and distances between bodies.
+
+Places and distances come from callables with derivative products; see `trajectories.constraints` for what a constraint
+has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from trajectories.basis import Motion
+
+
+@dataclass(frozen=True, eq=False)
+class Workspace:
+    """Distance of points from the base's z axis and their height: d_xy ≥ least_radius, lowest ≤ z ≤ highest.
+
+    Written least² - x² - y² ≤ 0 over 2 · least, which is smooth on the axis too and a length near the limit.
+
+    Attributes:
+        points: q (N, n) -> (N, k, 3) [m].
+        product: (q, G (N, k, 3)) -> (N, n), the slopes of Σ G · points.
+        names: (k,).
+        radius, lowest, highest: [m]; None: no such limit.
+    """
+
+    points: Callable[[np.ndarray], np.ndarray]
+    product: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    names: tuple[str, ...] = ("tool",)
+    radius: float | None = None
+    lowest: float | None = None
+    highest: float | None = None
+    name: str = "workspace"
+    unit: str = "m"
+
+    @property
+    def _kinds(self) -> tuple[str, ...]:
+        kinds = (("distance from the axis", self.radius), ("lowest", self.lowest), ("highest", self.highest))
+        return tuple(kind for kind, bound in kinds if bound is not None)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return tuple(f"{name} {kind}" for kind in self._kinds for name in self.names)
+
+    @property
+    def scale(self) -> np.ndarray:
+        return np.full(len(self.labels), 1.0)
+
+    @property
+    def groups(self) -> np.ndarray:
+        return np.arange(len(self.labels))
+
+    def values(self, motion: Motion) -> np.ndarray:
+        x = self.points(motion.q)
+        found = []
+        if self.radius is not None:
+            found.append((self.radius**2 - (x[..., :2] ** 2).sum(-1)) / (2 * max(self.radius, 1e-3)))
+        found += [self.lowest - x[..., 2]] if self.lowest is not None else []
+        found += [x[..., 2] - self.highest] if self.highest is not None else []
+        return np.concatenate(found, axis=1)
+
+    def slopes(self, motion: Motion, weights: np.ndarray) -> np.ndarray:
+        x, k = self.points(motion.q), len(self.names)
+        G = np.zeros_like(x)
+        parts = dict(zip(self._kinds, np.split(weights, len(self._kinds), axis=1)))
+        if self.radius is not None:
+            G[..., :2] -= parts["distance from the axis"][..., None] * x[..., :2] / max(self.radius, 1e-3)
+        G[..., 2] += parts.get("highest", np.zeros(k)) - parts.get("lowest", np.zeros(k))
+        result = np.zeros((4, *motion.q.shape))
+        result[0] = self.product(motion.q, G)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class Clearance:
+    """Distances between bodies of at least `least` [m].
+
+    Attributes:
+        distances: q (N, n) -> (N, k) [m], negative inside.
+        product: (q, G (N, k)) -> (N, n), the slopes of Σ G · distances.
+        labels: (k,) names of the pairs.
+    """
+
+    distances: Callable[[np.ndarray], np.ndarray]
+    product: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    labels: tuple[str, ...]
+    least: float = 0.0
+    name: str = "clearance"
+    unit: str = "m"
+
+    @property
+    def scale(self) -> np.ndarray:
+        return np.full(len(self.labels), 0.3)
+
+    @property
+    def groups(self) -> np.ndarray:
+        return np.zeros(len(self.labels), dtype=int)
+
+    def values(self, motion: Motion) -> np.ndarray:
+        return self.least - self.distances(motion.q)
+
+    def slopes(self, motion: Motion, weights: np.ndarray) -> np.ndarray:
+        result = np.zeros((4, *motion.q.shape))
+        result[0] = -self.product(motion.q, weights)
+        return result
