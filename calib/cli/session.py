@@ -80,15 +80,27 @@ def status(folder: Folder) -> None:
 def demo(
     out: Annotated[Path, typer.Option(help="the session's folder")] = Path("calib-demo"),
     robot: Annotated[str, typer.Option(help="a robot of the library")] = "lwr4plus",
+    geometry_only: Annotated[bool, typer.Option("--geometry-only", help="leave the dynamics out")] = False,
+    guided: Annotated[bool, typer.Option("--guided", help="stop where an engineer would")] = False,
+    bring: Annotated[Path | None, typer.Option(help="let the simulated cell bring what this session waits for")] = None,
     seed: Seed = 0,
 ) -> None:
-    """Calibrate a simulated robot with a simulated instrument, and compare with the hidden truth."""
+    """Calibrate a simulated robot with simulated instruments, and compare with the hidden truth."""
     from calib.procedure import demo as demonstration
 
     with told() as (console, say, progress):
-        found = demonstration.run(out, robot, seed, say, progress)
-    console.print(f"\n{found.seconds:.1f} s. Look at", soft_wrap=True, markup=False)
-    for words, name in demonstration.RESULTS:
+        if bring is not None:
+            demonstration.bring_what_waits(bring, say)
+            say(f"next: calib next {bring}")
+            return
+        found = demonstration.run(
+            out, robot, seed, say, progress, dynamics=not geometry_only, guided=guided,
+        )  # fmt: skip
+    for line in ("", *found.asks):
+        console.print(line, soft_wrap=True, markup=False)
+    if found.results:
+        console.print(f"{found.seconds:.1f} s, {found.memory:.0f} MB. Look at", soft_wrap=True, markup=False)
+    for words, name in found.results:
         console.print(f"  {words:15} {found.session.folder / name}", soft_wrap=True, markup=False)
     if found.verdict == "fail":
         raise typer.Exit(1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import resource
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,75 +11,171 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
-from calib.data.measurements import PoseMeasurements
 from calib.data.plans import read_poses
-from calib.dynamics.gravity import gravity_torques
-from calib.errors import SessionError
-from calib.geometry.deflection import evaluate
-from calib.geometry.first_guess import install
-from calib.geometry.fit import polish_frames
-from calib.geometry.installation import Installation, see
-from calib.procedure import calibrated, steps
+from calib.data.tables import read_table
+from calib.errors import SessionError, UsageError
+from calib.procedure import steps
+from calib.procedure.certifying import verdict_of
 from calib.procedure.guided import begin
-from calib.procedure.session import Session, locked
-from calib.robot.chain import random_joints
+from calib.procedure.session import Session, locked, open_session
+from calib.procedure.truth import TRUTH, against_truth, torques_against_truth
+from calib.robot import library
+from calib.robot.load import load
 from calib.simulation import brought
-from calib.simulation.cell import Cell, measure, true_poses
+from calib.simulation.cell import Cell, measure
 from calib.simulation.cells import virtual_cell
-from calib.transforms import to_quaternion
+from calib.simulation.moving import MovingArm, moving_arm, play, record
 
 Say = Callable[[str], None]
-FIT, VALIDATION, TRUTH = 40, 20, 2000
-RESULTS = (
-    ("certificate", "certificate.html"),
-    ("plots", "4-fit"),
-    ("calibrated URDF", "6-export/robot.urdf"),
-    ("the session", "session.toml"),
-)
+FIT, VALIDATION = 40, 20
+MOTION = {"period": 10.0, "starts": 2, "evaluations": 150, "repeats": 2, "torques": "motor"}  # little effort, for time
+LOGS = (("training", 2), ("validation", 3))  # and the numbers of their noise
 
 
 @dataclass(frozen=True)
 class Found:
-    """What the demonstration came to: the session, its verdict, and errors against the hidden truth, rms [mm]."""
+    """What the demonstration came to: the session, its verdict ("" where it stopped), what to look at, and how long.
+
+    Attributes:
+        asks: what to do now, where it stopped for an engineer.
+        nominal, calibrated: errors against the hidden truth, rms [mm]; NaN where it stopped.
+        memory: largest resident set [MB].
+    """
 
     session: Session
     verdict: str
-    nominal: float
-    calibrated: float
+    results: tuple[tuple[str, str], ...]
     seconds: float
+    asks: tuple[str, ...] = ()
+    nominal: float = float("nan")
+    calibrated: float = float("nan")
+    memory: float = 0.0
 
 
-def run(folder: Path, robot: str, seed: int, say: Say, progress: Say) -> Found:
+def run(
+    folder: Path, robot: str, seed: int, say: Say, progress: Say, *, dynamics: bool = True, guided: bool = False
+) -> Found:
     """Calibrate a simulated robot in a session, and compare with its hidden truth.
 
     Args:
         folder: new; the session.
         robot: of the library.
-        seed: of the robot's errors (other robots than lwr4plus), the noise, and the pose selection.
+        seed: of the robot's errors, the noise, the pose selection and the motions.
         say, progress: lines that stay, and words that pass.
+        dynamics: identify them, too, where the library knows the robot's masses.
+        guided: stop where an engineer would; `bring_what_waits` then plays his part.
     """
     started = time.perf_counter()
     cell = virtual_cell(robot, seed)
-    session = begin(folder, robot, "cmm", poses=FIT, validation=VALIDATION, seed=seed, base="", tip="")
+    if dynamics and cell.nominal.inertias is None:
+        known = ", ".join(name for name in library.names() if load(name).inertias is not None)
+        say(
+            f"geometry only: the library holds no masses for {robot}, so its motion cannot be simulated (of {known} "
+            "it can)"
+        )
+        dynamics = False
+    motion = MOTION if dynamics else {}
+    session = begin(folder, robot, "cmm", poses=FIT, validation=VALIDATION, seed=seed, dynamics=dynamics, **motion)
     say(f"the cell: {cell.note}")
     with locked(session):
-        steps.run_next(session, say, progress, "calib demo")
-        bring(session, cell, seed)
-        say("    (the simulated cell measures both lists of poses)")
         waiting = steps.run_next(session, say, progress, "calib demo")
+        while waiting is not None and waiting.kind == steps.WAITING and not guided:
+            bring_for(session, waiting.step.name, say)
+            waiting = steps.run_next(session, say, progress, "calib demo")
     if waiting is not None:
-        raise SessionError(f"the demonstration stopped at {waiting.step.name}: {waiting.words}")
+        if not guided:
+            raise SessionError(f"the demonstration stopped at {waiting.step.name}: {waiting.words}")
+        return Found(session, "", (), time.perf_counter() - started, stopped(session, waiting))
+    before, after = told_truth(session, cell, say)
+    seconds, memory = time.perf_counter() - started, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    return Found(session, verdict_of(session), results(session), seconds, (), before, after, memory)
+
+
+def stopped(session: Session, waiting: steps.State) -> tuple[str, ...]:
+    """Return what an engineer would be asked, and how to let the simulated cell do it."""
+    from calib.procedure.asking import asks
+
+    folder = session.folder
+    return (
+        *asks(session, waiting),
+        f"(or let the simulated cell do it: calib demo --bring {folder}; then: calib next {folder})",
+    )
+
+
+def results(session: Session) -> tuple[tuple[str, str], ...]:
+    """Return what to look at."""
+    found = [
+        ("certificate", "certificate.html"),
+        ("plots", "4-fit"),
+        ("calibrated URDF", f"{session.export}/robot.urdf"),
+    ]
+    if session.dynamic:
+        found += [("motions", "6-excitation"), ("dynamics", "8-dynamics")]
+    return (*found, ("the session", "session.toml"))
+
+
+def told_truth(session: Session, cell: Cell, say: Say) -> tuple[float, float]:
+    """Say how far the outcome is from the hidden truth, write it down, and return the errors of the tool [mm]."""
     before, after, bare = against_truth(session, cell)
-    words = (
+    lines = [
         f"hidden truth, over {TRUTH} poses of the whole joint range: the tool is off by {before:.3f} mm rms with the "
         f"nominal arm, {after:.3f} mm with the calibrated one"
-    )
+    ]
     if bare > after:
-        words += f" ({bare:.3f} mm with its URDF alone, without the joint corrections)"
-    files.write(session.path("truth.txt"), f"{cell.note}\n{words}\n")
-    say(words)
-    verdict = json.loads(session.path("5-validation/metrics.json").read_text(encoding="utf-8"))["verdict"]
-    return Found(session, verdict, before, after, time.perf_counter() - started)
+        lines[0] += f" ({bare:.3f} mm with its URDF alone, without the joint corrections)"
+    notes = [cell.note]
+    if session.dynamic:
+        arm = arm_of(session, cell)
+        found = torques_against_truth(session, cell, arm)
+        notes.append(arm.note)
+        lines.append(
+            f"hidden truth, on a motion nobody has seen: noise-free torques are predicted to {found.identified:.2f} % "
+            f"({found.nominal:.1f} % behind the gears by the nominal masses, with the true friction); of "
+            f"{found.count} base "
+            f"parameters {found.within:.0%} are within two sigmas of the truth"
+        )
+    files.write(session.path("truth.txt"), "\n".join([*notes, *lines]) + "\n")
+    for line in lines:
+        say(line)
+    return before, after
+
+
+def bring_what_waits(folder: Path, say: Say) -> None:
+    """Let the simulated cell bring what the session in `folder` waits for.
+
+    Raises:
+        UsageError: where nothing is waited for, or the session's robot is none of the library.
+    """
+    session = open_session(folder)
+    if session.settings.robot["given"] not in library.names():
+        raise UsageError(
+            f"{folder} is about {session.settings.robot['given']}; the simulated cells are of "
+            f"{', '.join(library.names())}"
+        )
+    with locked(session, say):
+        waiting = next((state for state in steps.states(session) if state.kind not in (steps.DONE, steps.KEPT)), None)
+        if waiting is None or waiting.kind != steps.WAITING:
+            raise UsageError(f"{folder} waits for nothing; next: calib next {folder}")
+        bring_for(session, waiting.step.name, say)
+
+
+def bring_for(session: Session, step: str, say: Say) -> None:
+    """Let the simulated cell do what a step waits for."""
+    seed = session.settings.seed
+    cell = virtual_cell(session.settings.robot["given"], seed)
+    if step in ("measure", "validate"):
+        bring(session, cell, seed)
+        say("    (the simulated cell measures both lists of poses)")
+    elif step in ("record", "predict"):
+        bring_logs(session, arm_of(session, cell), seed)
+        say("    (the simulated arm plays both motions)")
+    else:
+        raise SessionError(f"the demonstration cannot bring what {step} needs")
+
+
+def arm_of(session: Session, cell: Cell) -> MovingArm:
+    """Return the arm of a session's simulated cell as it moves."""
+    return moving_arm(cell, session.settings.robot["given"], session.settings.seed)
 
 
 def bring(session: Session, cell: Cell, seed: int) -> None:
@@ -90,27 +186,16 @@ def bring(session: Session, cell: Cell, seed: int) -> None:
         brought.write(measure(cell, q, np.random.default_rng([seed, number])), session.path(f"3-measured/{name}.csv"))
 
 
-def against_truth(session: Session, cell: Cell) -> tuple[float, float, float]:
-    """Return rms position errors against the noise-free truth [mm]: nominal, calibrated, and its URDF alone.
-
-    The nominal arm and the URDF get their best station and tool for these very poses, so that arms are compared.
-    """
-    q = random_joints(cell.nominal, TRUTH, 12345)
-    true = true_poses(cell, q)
-    points = true[:, :3, 3]
-    block = PoseMeasurements("pose", q, cell.nominal.joint_names, position=points, quaternion=to_quaternion(true))
-    rigid = calibrated.rigid_chain(session.path("4-fit"))
-    nominal, alone = (polish_frames(install(chain, [block]), [block]).cell for chain in (cell.nominal, rigid))
-    found = calibrated.read(session.path("4-fit"))
-    before, after, bare = (_rms(arm, q, points) for arm in (nominal, found, alone))
-    return before, after, bare
-
-
-def _rms(arm: Installation, q: np.ndarray, points: np.ndarray) -> float:
-    bases = None
-    if arm.deflection.terms:
-        reference = arm.deflection.reference or arm.chain
-        torque = None if reference.inertias is None else gravity_torques(reference, q)
-        bases = evaluate(arm.deflection, q, torque)
-    error = see(arm, q, bases=bases).point.T - points
-    return float(1e3 * np.sqrt(np.mean(np.sum(error**2, axis=1))))
+def bring_logs(session: Session, arm: MovingArm, seed: int) -> None:
+    """Let the simulated arm play the designed motions, and log them."""
+    n = arm.chain.n
+    for name, number in LOGS:
+        path = session.path(f"6-excitation/{name}/trajectory.csv")
+        if not path.exists():
+            continue
+        table = read_table(path)
+        columns = [np.column_stack([table.cells[table.header.index(f"{x}{j + 1}")] for j in range(n)]) for x in "qva"]
+        time_ = np.asarray(table.cells[table.header.index("t")], dtype=float)
+        reference = play(arm, time_, *columns, session.settings.dynamics["repeats"])
+        recorded = record(arm, reference, np.random.default_rng([seed, number]))
+        brought.write_log(recorded, session.path(f"7-recorded/{name}.csv"))

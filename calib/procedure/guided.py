@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from calib.errors import UsageError
-from calib.procedure import steps
+from calib.procedure import asking, steps
+from calib.procedure.certifying import verdict_of
 from calib.procedure.instruments import instrument as instrument_named
+from calib.procedure.motion_limits import read_motion_limits
 from calib.procedure.session import Session, create, locked, open_session
 from calib.robot.load import load, resolve
 
@@ -31,8 +32,9 @@ class Stop:
 
 
 def begin(
-    folder: Path, robot: str, instrument: str, *, poses: int, validation: int, seed: int, **links: Any
-) -> Session:
+    folder: Path, robot: str, instrument: str, *, poses: int, validation: int, seed: int, base: str = "", tip: str = "",
+    tool: Sequence[float] | None = None, limits: Path | None = None, dynamics: bool = True, **motion: Any,
+) -> Session:  # fmt: skip
     """Make a session for a robot, which is read once to see that it can be.
 
     Args:
@@ -41,16 +43,25 @@ def begin(
         instrument: a key of `calib.procedure.instruments.INSTRUMENTS`.
         poses, validation: how many to choose.
         seed: of everything random.
-        links: ``base`` and ``tip`` of a URDF, empty for its own.
+        base, tip: of a URDF, empty for its own.
+        tool: (3,) where the target roughly sits in the tip's frame [m].
+        limits: a file of limits, copied, that both poses and motions keep.
+        dynamics: identify the dynamics, too.
+        motion: other keys of ``[dynamics]``: ``torques``, ``payloads``, ``period`` …
     """
     if poses < 1 or validation < 0:
         raise UsageError(f"--poses {poses} --validation {validation}: at least one pose, and no fewer than 0")
     device, source = instrument_named(instrument), resolve(robot)
-    chain = load(robot, links["base"] or None, links["tip"] or None)
+    chain = load(robot, base or None, tip or None)
+    copied, named = {}, {}
+    if limits is not None:
+        read_motion_limits(limits, chain, source)
+        copied, named = {"limits.toml": limits}, {"limits": "limits.toml", "constraints": "limits.toml"}
+    place = {} if tool is None else {"tool": tuple(tool)}
     return create(
-        folder, source, robot, name=chain.name, seed=seed, instrument=device.label, measures=device.measures,
+        folder, source, robot, copied, name=chain.name, seed=seed, instrument=device.label, measures=device.measures,
         sigma_position=device.sigma_position, sigma_orientation=device.sigma_orientation, fit=poses,
-        validation=validation, **links,
+        validation=validation, base=base, tip=tip, dynamics=dynamics, **place, **named, **motion,
     )  # fmt: skip
 
 
@@ -66,17 +77,16 @@ def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "") 
     session = open_session(folder)
     with locked(session, say):
         if again:
-            steps.forget(session, steps.find(again))
+            steps.forget(session, steps.find(session, again))
         state = steps.run_next(session, say, progress, command)
     if state is not None:
-        return Stop(("", *steps.asks(session, state)))
-    metrics = json.loads(session.path("5-validation/metrics.json").read_text(encoding="utf-8"))
+        return Stop(("", *asking.asks(session, state)))
     lines = (
         "",
         f"done; certificate: {session.path('certificate.html')}",
-        f"robot: {session.path('6-export/robot.urdf')}",
+        f"robot: {session.path(f'{session.export}/robot.urdf')}",
     )
-    return Stop(lines, metrics["verdict"])
+    return Stop(lines, verdict_of(session))
 
 
 def status_lines(folder: Path) -> Iterator[RenderableType]:
@@ -93,6 +103,6 @@ def status_lines(folder: Path) -> Iterator[RenderableType]:
     if ahead is None:
         yield escape(f"certificate: {session.path('certificate.html')}")
     elif ahead.kind == steps.WAITING:
-        yield from (escape(line) for line in steps.asks(session, ahead))
+        yield from (escape(line) for line in asking.asks(session, ahead))
     else:
         yield escape(f"next: calib next {folder}")

@@ -201,11 +201,7 @@ def read_motion(path: str, chain: Chain, own: FileSettings, like: Motion | None 
         like: a motion whose identification band it is judged in, where the options state none; how far its own
             positions need filtering, it says itself.
     """
-    joints = Joints(
-        chain.joint_names, tuple(joint_kinds(chain)), chain.lower, chain.upper,
-        np.array([joint.velocity for joint in chain.joints]), np.array([joint.effort for joint in chain.joints]),
-    )  # fmt: skip
-    recording = read_recording(path, joints, own.recording)
+    recording = read_recording(path, joints_of(chain), own.recording)
     if like is not None and own.filter.band is None and like.band * np.median(np.diff(recording.t)) < 0.4:
         banded = replace(own.filter, band=like.band * (1.0 - 1e-9))
         motion = make_motion(recording, banded)
@@ -221,6 +217,14 @@ def read_motion(path: str, chain: Chain, own: FileSettings, like: Motion | None 
     wider = make_motion(recording, replace(own.filter, band=min(band, 0.45 * motion.rate), cutoff=cutoff))
     note = f"f_p = {wider.band:.3g} Hz instead: a short recording must not lose its ends to the decimation's window"
     return replace(wider, notes=(*motion.notes, note))
+
+
+def joints_of(chain: Chain) -> Joints:
+    """Return what a recording is held against."""
+    return Joints(
+        chain.joint_names, tuple(joint_kinds(chain)), chain.lower, chain.upper,
+        np.array([joint.velocity for joint in chain.joints]), np.array([joint.effort for joint in chain.joints]),
+    )  # fmt: skip
 
 
 def _sharper(recording: Recording, motion: Motion, options: FilterOptions) -> Motion:

@@ -5,7 +5,14 @@ session.toml     what is to be calibrated, with what, how; written by `calib new
 2-poses/         poses.csv to measure and fit, validation.csv to measure and never fit
 3-measured/      what people bring: measured.csv (any name), and files whose name starts with validation; their columns:
                  `calib formats measurements`
-4-fit/  5-validation/  6-export/  certificate.html
+4-fit/  5-validation/
+6-excitation/    training and validation: two motions for the robot to play, at the controller's rate
+7-recorded/      what people bring: the logs of them, training.csv (any name; .npz or a ROS bag, too), and files whose
+                 name starts with validation; a file whose name holds a payload's label was recorded with it on board:
+                 `calib formats recordings`
+8-dynamics/      the identified model; unseen/ holds it against the validation motion
+9-export/  certificate.html
+                 Without dynamics there are no 6 to 8, and the export is 6-export.
 state.json       which step was made from which files (SHA-256), when, by which version; written whole or not at all
 session.lock     there while a command works on the session
 """
@@ -28,8 +35,12 @@ from typing import Any
 from calib import files
 from calib.errors import SessionError
 
-SCHEMA = 1
-FOLDERS = ("1-robot", "2-poses", "3-measured", "4-fit", "5-validation", "6-export")
+SCHEMA = 2
+READ = (1, SCHEMA)  # a session of schema 1 knows no dynamics; it goes on as geometry alone
+FOLDERS = ("1-robot", "2-poses", "3-measured", "4-fit", "5-validation")
+DYNAMIC = ("6-excitation", "7-recorded", "8-dynamics")
+EXPORT = {False: "6-export", True: "9-export"}  # without, with dynamics
+TORQUES = ("motor", "link", "both")
 _HEAD = """# A calibration session; see `calib status` and `calib next`. Lengths in m, angles in rad.
 # Change what you like: steps made from something that changed are shown as stale and made again.
 schema = {schema}
@@ -48,7 +59,7 @@ name = "{instrument}"
 measures = "{measures}"                # pose (with orientation) or position
 sigma_position = {sigma_position}      # of one measurement, per axis; 0: to be estimated
 sigma_orientation = {sigma_orientation}
-tool = [0.05, 0.0, 0.05]               # where the target roughly sits in the tip's frame; only pose selection uses it
+tool = {tool}               # where the target roughly sits in the tip's frame; only pose selection uses it
 
 [poses]
 fit = {fit}                            # how many poses to choose for the fit
@@ -56,7 +67,7 @@ validation = {validation}              # how many more to measure and never fit;
 plan = true                            # false: measured files hold other poses than those chosen here
 index = "O1"
 method = "detmax"
-constraints = ""                       # a TOML file beside this one; see `calib formats constraints`
+constraints = "{constraints}"                       # a TOML file beside this one; see `calib formats constraints`
 
 [fit]
 model = "auto"                         # or frames, offsets, geometry, stiffness, bending, coupling, harmonics, wobble
@@ -66,8 +77,31 @@ stations = "each"                      # each measured file has its own base pla
 validation_frames = "fit"              # own: base and tool placement are fitted anew on validation files
 tolerance_mm = 0.0                     # largest rms [mm] on unseen poses that is good enough: above it the verdict is
                                        # fail; 0: none, and pass only means better than the nominal robot
-"""
+
+[dynamics]
+wanted = {dynamics}                          # false: geometry only
+plan = true                            # false: recorded files hold other motions than those designed here
+validation = true                      # false: no second motion is designed or asked for
+period = {period}                          # of the designed motion [s]; the validation motion's is 0.8 of it
+harmonics = 5                          # frequencies per joint
+rate = {rate}                          # of the controller [Hz]
+repeats = {repeats}                            # how often the robot plays each motion
+starts = {starts}                             # random starts of the search for a motion
+evaluations = {evaluations}                      # most per start
+limits = "{limits}"                            # a TOML file beside this one: speeds, torques, workspace, friction
+torques = "{torques}"                      # motor, link, or both: sensors behind the gears beside the motors' torques
+friction = "auto"                      # or standard, or one rung of the ladder; see calib identify --friction
+method = "wls"                         # or ols, irls, tls
+options = ""                           # a TOML file beside this one, as of calib identify --options
+tolerance_percent = 0.0                # largest torque error on unseen motion that is good enough; 0: none
+
+[dynamics.payloads]                    # label = mass [kg] of bodies at the flange: loaded = 3.28
+{payloads}"""
 _LATER = {("fit", "tolerance_mm")}  # keys that sessions made before do not have; the example's value stands for them
+_DEFAULTS: Mapping[str, Any] = {
+    "tool": (0.05, 0.0, 0.05), "constraints": "", "dynamics": True, "period": 20.0, "rate": 1000.0, "repeats": 3,
+    "starts": 4, "evaluations": 400, "limits": "", "torques": "motor", "payloads": {},
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -81,6 +115,7 @@ class Settings:
     instrument: Mapping[str, Any]
     poses: Mapping[str, Any]
     fit: Mapping[str, Any]
+    dynamics: Mapping[str, Any]
     schema: int = SCHEMA
 
 
@@ -96,15 +131,28 @@ class Session:
         """Return a file of the session by its name relative to the folder."""
         return self.folder / name
 
+    @property
+    def dynamic(self) -> bool:
+        """Whether the dynamics are identified, too."""
+        return bool(self.settings.dynamics["wanted"])
 
-def create(folder: Path, robot_file: Path, given: str, **values: Any) -> Session:
+    @property
+    def export(self) -> str:
+        """The folder of the export, relative to the session's."""
+        return EXPORT[self.dynamic]
+
+
+def create(
+    folder: Path, robot_file: Path, given: str, copied: Mapping[str, Path] | None = None, **values: Any
+) -> Session:
     """Make a session folder, whole or not at all.
 
     Args:
         folder: new, or empty.
         robot_file: the description, copied into ``1-robot``.
         given: what the user called it.
-        values: the other fields of ``session.toml``.
+        copied: other files to copy, by their names in the folder.
+        values: the other fields of ``session.toml``; those with a default may be left out.
 
     Raises:
         SessionError: where something is there already, or the folder cannot be written.
@@ -116,12 +164,15 @@ def create(folder: Path, robot_file: Path, given: str, **values: Any) -> Session
     staging = folder.parent / f".{folder.name}.part"
     try:
         shutil.rmtree(staging, ignore_errors=True)
-        for name in FOLDERS:
+        wanted = bool(values.get("dynamics", _DEFAULTS["dynamics"]))
+        for name in (*FOLDERS, *(DYNAMIC if wanted else ()), EXPORT[wanted]):
             (staging / name).mkdir(parents=True)
+        for name, source in (copied or {}).items():
+            shutil.copyfile(source, staging / name)
         target = f"1-robot/robot{robot_file.suffix}"
         shutil.copyfile(robot_file, staging / target)
         created = datetime.now().astimezone().isoformat(timespec="seconds")
-        head = _HEAD.format(schema=SCHEMA, robot=target, given=_escaped(given), created=created, **values)
+        head = _filled(robot=target, given=_escaped(given), created=created, **values)
         files.write(staging / "session.toml", head)
         if folder.exists():
             folder.rmdir()
@@ -130,6 +181,17 @@ def create(folder: Path, robot_file: Path, given: str, **values: Any) -> Session
         shutil.rmtree(staging, ignore_errors=True)
         raise SessionError(f"cannot make {folder}: {error.strerror or error}; nothing was left there") from error
     return open_session(folder)
+
+
+def _filled(**values: Any) -> str:
+    """Return ``session.toml`` with these values, defaults for the others."""
+    known = {**_DEFAULTS, **values}
+    known["dynamics"] = "true" if known["dynamics"] else "false"
+    known["tool"] = f"[{', '.join(f'{float(x)}' for x in known['tool'])}]"
+    known["payloads"] = "".join(f'"{_escaped(k)}" = {float(mass)}\n' for k, mass in known["payloads"].items())
+    for name in ("period", "rate"):
+        known[name] = float(known[name])
+    return _HEAD.format(schema=SCHEMA, **known)
 
 
 def _escaped(text: str) -> str:
@@ -154,6 +216,8 @@ def open_session(folder: Path) -> Session:
     _check_schema(path, table.get("schema"))
     known = {each.name for each in fields(Settings)}
     for section, values in tomllib.loads(example()).items():
+        if section == "dynamics" and section not in table and table["schema"] == 1:
+            table[section] = values | {"wanted": False}
         if section not in table:
             raise SessionError(f"{path}: '{section}' is missing")
         if isinstance(values, dict) and isinstance(table[section], dict):
@@ -167,19 +231,20 @@ def open_session(folder: Path) -> Session:
 
 def example() -> str:
     """Return a ``session.toml`` with every key."""
-    return _HEAD.format(
-        schema=SCHEMA, name="", created="", seed=0, robot="", given="", base="", tip="", instrument="",
-        measures="pose", sigma_position=0.0, sigma_orientation=0.0, fit=30, validation=15,
+    return _filled(
+        name="", created="", seed=0, robot="", given="", base="", tip="", instrument="", measures="pose",
+        sigma_position=0.0, sigma_orientation=0.0, fit=30, validation=15,
     )  # fmt: skip
 
 
 def _check_schema(path: Path, found: Any) -> None:
-    if found == SCHEMA:
+    if found in READ:
         return
     if isinstance(found, int) and found > SCHEMA:
         raise SessionError(f"{path}: schema {found} was made by a newer version; this one reads {SCHEMA}: upgrade")
+    known = " and ".join(map(str, READ))
     raise SessionError(
-        f"{path}: schema {found!r} is not known to this version, which reads {SCHEMA}; make a new session"
+        f"{path}: schema {found!r} is not known to this version, which reads {known}; make a new session"
     )
 
 
@@ -197,11 +262,26 @@ def _check_section(path: Path, section: str, expected: Any, found: Any) -> None:
         numeric = isinstance(value, float) and isinstance(found[key], int) and not isinstance(found[key], bool)
         if not numeric and type(found[key]) is not type(value):
             raise SessionError(f"{path}: [{section}] {key} = {found[key]!r}: expected {type(value).__name__}")
-    if found.get("tolerance_mm", 0.0) < 0.0:
-        raise SessionError(f"{path}: [{section}] tolerance_mm = {found['tolerance_mm']:g}: expected 0 or more")
+    for key in ("tolerance_mm", "tolerance_percent"):
+        if found.get(key, 0.0) < 0.0:
+            raise SessionError(f"{path}: [{section}] {key} = {found[key]:g}: expected 0 or more")
+    if section == "dynamics":
+        _check_dynamics(path, found)
     unknown = sorted(set(found) - set(expected))
     if unknown:
         raise SessionError(f"{path}: [{section}] has no key '{unknown[0]}'; it has {', '.join(expected)}")
+
+
+def _check_dynamics(path: Path, found: Mapping[str, Any]) -> None:
+    """Refuse values of the dynamics that cannot be."""
+    if found["torques"] not in TORQUES:
+        raise SessionError(f"{path}: [dynamics] torques = '{found['torques']}': expected {', '.join(TORQUES)}")
+    for key in ("period", "rate", "harmonics", "repeats", "starts", "evaluations"):
+        if not found[key] > 0:
+            raise SessionError(f"{path}: [dynamics] {key} = {found[key]:g}: expected a number above 0")
+    for label, mass in found["payloads"].items():
+        if isinstance(mass, bool) or not isinstance(mass, (int, float)) or not mass > 0:
+            raise SessionError(f"{path}: [dynamics.payloads] {label} = {mass!r}: expected its mass [kg], above 0")
 
 
 def fingerprint(path: Path) -> str:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +15,8 @@ from calib.data.plans import check_against, read_poses, write_poses
 from calib.geometry.fit import polish_frames
 from calib.geometry.weighing import Settings as FitSettings
 from calib.geometry.weighing import combine
-from calib.procedure import calibrated, certificate, comparing, fitting, inputs, outputs, proof, report
-from calib.procedure.session import Session, fingerprint, read_state
+from calib.procedure import calibrated, comparing, fitting, inputs, outputs, proof, report
+from calib.procedure.session import Session
 from calib.procedure.verdict import judge
 from calib.robot.chain import Chain
 
@@ -221,84 +220,7 @@ def export(session: Session, say: Say) -> list[str]:
     """Put the calibrated robot into the forms others read."""
     from calib.procedure.delivery import deliver
 
-    return deliver(session.path("4-fit"), robot_file(session), session.path("6-export"))
-
-
-def certify(session: Session, say: Say) -> list[str]:
-    """Print the certificate."""
-    from calib.procedure import figures
-
-    say("drawing")
-    found = report.read(session.path("4-fit"))
-    outside = json.loads(session.path("5-validation/metrics.json").read_text())
-    rows = session.path("5-validation/rows.json")
-    merged = {key: outside[key] for key in ("validation", "verdict", "reason")}
-    merged["warnings"] = [*found.metrics["warnings"], *outside["warnings"]]
-    sets = [*found.sets, *(json.loads(rows.read_text()) if rows.exists() and outside["validation"] else [])]
-    whole = replace(found, metrics=found.metrics | merged, sets=sets)
-    drawn = figures.draw(whole)
-    page = certificate.Page(
-        f"Calibration of {session.settings.name}",
-        f"{session.settings.instrument['name']}, {session.settings.created[:10]}",
-        setup(session, whole),
-        [certificate.geometry_stage(whole, drawn)],
-        listed(session),
-    )
-    files.write(session.path("certificate.html"), certificate.render(page))
-    files.write_json(session.path("5-validation/report.json"), asdict(whole))
-    return [f"verdict {outside['verdict']}: {outside['reason']}", "certificate.html"]
-
-
-def setup(session: Session, found: report.Report) -> list[tuple[str, str]]:
-    """Return what stands under Setup on the certificate."""
-    settings, fitted = session.settings, measured_files(session)
-    instrument = settings.instrument
-    stated = f", σ {1e6 * instrument['sigma_position']:g} µm" if instrument["sigma_position"] else ", σ estimated"
-    turning = f", {1e3 * instrument['sigma_orientation']:g} mrad" if instrument["sigma_orientation"] else ""
-    measured = ", ".join(path.name for path in (*fitted[0], *fitted[1]))
-    times = [path.stat().st_mtime for paths in fitted for path in paths]
-    from datetime import datetime
-
-    when = max(times, default=0.0)
-    day = datetime.fromtimestamp(when).strftime("%Y-%m-%d %H:%M") if when else "unknown"
-    return [
-        ("robot", f"{found.robot}, {found.base} to {found.tip}, {len(found.joints)} joints"),
-        ("description", settings.robot["given"]),
-        ("instrument", f"{instrument['name']}, measures {instrument['measures']}{stated}{turning}"),
-        ("session made", settings.created.replace("T", " ")),
-        ("measurements", f"{measured}; files of {day}"),
-        ("pose plan", session_plan(session)),
-        ("model", found.metrics["model"]),
-        ("tolerance", certificate.tolerance(settings.fit["tolerance_mm"])),
-        ("seed", str(settings.seed)),
-        ("command", f"calib next {session.folder.name}"),
-        ("toolkit", certificate.versions()),
-    ]
-
-
-def session_plan(session: Session) -> str:
-    """Return in a few words how the poses were chosen."""
-    path = session.path("2-poses/selection.json")
-    if not session.settings.poses["plan"] or not path.exists():
-        return "poses not planned here"
-    return str(json.loads(path.read_text()).get("words", "chosen by hand"))
-
-
-def listed(session: Session) -> list[tuple[str, str, str, str]]:
-    """Return the files the certificate rests on: name, what it is, bytes, SHA-256."""
-    roles = {"1-robot": "nominal robot", "3-measured": "measured", "4-fit": "fit", "6-export": "calibrated robot"}
-    wanted = [robot_file(session), *measured_files(session)[0], *measured_files(session)[1]]
-    wanted += [session.path("4-fit/estimate.csv"), session.path("4-fit/covariance.csv")]
-    wanted += sorted(path for path in session.path("6-export").glob("*") if path.is_file())
-    made = {name: mark for step in read_state(session)["steps"].values() for name, mark in step["outputs"].items()}
-    rows = []
-    for path in wanted:
-        name = path.relative_to(session.folder)
-        role = "measured, unseen by the fit" if path.name.lower().startswith("validation") else roles[name.parts[0]]
-        if name.parts[0] in ("4-fit", "6-export") and made.get(str(name)) != fingerprint(path):
-            role = certificate.EDITED
-        rows.append((str(name), role, f"{path.stat().st_size}", fingerprint(path)))
-    return rows
+    return deliver(session.path("4-fit"), robot_file(session), session.path(session.export))
 
 
 def clear_staging(session: Session) -> None:

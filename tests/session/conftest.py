@@ -30,7 +30,7 @@ def edit(path: Path, old: str, new: str) -> None:
 def planned_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A session that waits for measurements."""
     folder = tmp_path_factory.mktemp("planned") / "cell"
-    session = begin(folder, "lwr4plus", "cmm", poses=20, validation=8, seed=1, base="", tip="")
+    session = begin(folder, "lwr4plus", "cmm", poses=20, validation=8, seed=1, dynamics=False)
     edit(folder / "session.toml", 'model = "auto"', 'model = "geometry"')
     waiting = go_on(session)
     assert waiting is not None and waiting.step.name == "measure"

@@ -14,7 +14,7 @@ import pytest
 
 from calib import cli
 from calib.errors import CalibError, MeasurementError, SessionError
-from calib.procedure import stages, steps
+from calib.procedure import asking, certifying, steps
 from calib.procedure.session import Session, locked, open_session, read_state
 
 from .conftest import edit, go_on, quiet
@@ -40,7 +40,7 @@ def test_a_finished_session_is_done_wherever_it_is(finished: Session, tmp_path: 
 
 def test_two_lines_say_what_to_do_and_what_to_bring(planned: Session) -> None:
     waiting = next(state for state in steps.states(planned) if state.kind == steps.WAITING)
-    first, second = steps.asks(planned, waiting)
+    first, second = asking.asks(planned, waiting)
     assert "20 poses" in first and "optical CMM" in first and "poses.csv" in first
     assert "measured.csv" in second and "joint1 [deg]" in second and "qw" in second
     assert "the 8 of" in first and "2-poses/validation.csv (never fitted)" in first and "validation.csv" in second
@@ -50,7 +50,7 @@ def test_the_fit_waits_for_validation_but_not_the_other_way_round(measured: Sess
     validation = measured.path("3-measured/validation.csv").rename(measured.folder / "later.csv")
     waiting = go_on(measured)
     assert waiting is not None and waiting.step.name == "validate"
-    assert "8 poses" in steps.asks(measured, waiting)[0]
+    assert "8 poses" in asking.asks(measured, waiting)[0]
     before = measured.path("4-fit/robot.toml").stat().st_mtime_ns
     validation.rename(measured.path("3-measured/validation.csv"))
     assert go_on(measured) is None
@@ -90,7 +90,7 @@ def test_what_a_person_replaced_is_kept_and_said(finished: Session) -> None:
     urdf.write_text(urdf.read_text() + "<!-- checked -->\n")
     assert kinds(finished)["export"] == steps.DONE
     assert "replaced by hand: 6-export/robot.urdf" in words(finished, "export")
-    roles = {name: role for name, role, _, _ in stages.listed(finished)}
+    roles = {name: role for name, role, _, _ in certifying.listed(finished)}
     assert roles["6-export/robot.urdf"] == "edited by hand" and roles["6-export/robot.toml"] == "calibrated robot"
     assert go_on(finished) is None
     assert "checked" in urdf.read_text()
@@ -100,12 +100,14 @@ def test_redo_makes_a_step_and_all_behind_it_again(finished: Session) -> None:
     urdf = finished.path("6-export/robot.urdf")
     original = urdf.read_text()
     urdf.write_text("mine")
-    steps.forget(finished, steps.find("export"))
+    steps.forget(finished, steps.find(finished, "export"))
     assert kinds(finished)["fit"] == steps.DONE and kinds(finished)["export"] == steps.READY
     assert go_on(finished) is None
     assert urdf.read_text() == original
     with pytest.raises(SessionError, match="describe, select"):
-        steps.find("fitting")
+        steps.find(finished, "fitting")
+    with pytest.raises(SessionError, match="wanted = true"):
+        steps.find(finished, "identify")
 
 
 def test_killed_at_any_step_it_goes_on_from_there(measured: Session, finished_folder: Path) -> None:
@@ -194,8 +196,8 @@ def test_what_arrives_is_checked(measured: Session, change, message: str, capsys
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("schema = 1", "schema = 2", "newer version"),
-        ("schema = 1", "schema = 0", "not known"),
+        ("schema = 2", "schema = 3", "newer version"),
+        ("schema = 2", "schema = 0", "not known"),
         ('model = "auto"', "model = 3", r"\[fit\] model = 3: expected str"),
         ('loss = "none"', 'los = "none"', r"\[fit\] loss is missing"),
         ("[poses]", "[poses", "is no TOML"),
@@ -226,7 +228,7 @@ def test_a_session_made_before_tolerances_is_read(planned: Session) -> None:
     start = next(k for k, line in enumerate(lines) if line.startswith("tolerance_mm"))
     path.write_text("\n".join(lines[:start] + lines[start + 2 :]) + "\n")
     assert open_session(planned.folder).settings.fit["tolerance_mm"] == 0.0
-    path.write_text(path.read_text() + "tolerance_mm = -1.0\n")
+    edit(path, "[dynamics]", "tolerance_mm = -1.0\n\n[dynamics]")
     with pytest.raises(SessionError, match="expected 0 or more"):
         open_session(planned.folder)
 

@@ -1,0 +1,217 @@
+"""Is the recorded motion the designed one? If not: degrees, swapped joints, another speed, the other motion, or none.
+
+Both are looked at on a coarse common grid; `trajectories.recall` finds the motion and its repetitions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.signal import fftconvolve
+
+from calib.data.recording import Recording
+from calib.data.tables import read_table
+from calib.dynamics.gravity import gravity_torques
+from calib.errors import MeasurementError
+from calib.robot.chain import Chain
+from trajectories.errors import BadInput
+from trajectories.recall import recall
+
+STEP = 0.01  # of the coarse grid [s] (this and all below: our choice)
+LIKE = 0.9  # share of the motion's variance a recorded period has to explain
+LOOSE = 0.98  # below which the tracking is worth a note
+SPEEDS = (0.1, 0.2, 0.25, 0.5, 2.0)  # rehearsal factors that are tried to explain another motion
+EDGE = 0.25  # kept before and after the motion [s], for the filters' borders
+SURE = 0.8  # correlation with the gravity torque of the nominal masses from which on its sign counts
+HEAVY = 0.05  # of the torque limit: gravity torques smaller than this say nothing
+SCALE = 30.0  # a factor between measured and gravity torques that no wrong mass explains
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """One period of a designed motion: t (N,) [s] and q (N, n) [rad or m], both ends included."""
+
+    t: np.ndarray
+    q: np.ndarray
+
+    @property
+    def period(self) -> float:
+        return float(self.t[-1] - self.t[0])
+
+    def coarse(self, speed: float = 1.0) -> np.ndarray:
+        """Return positions every `STEP`, without the closing one, played at a share of the speed."""
+        count = round(self.period / speed / STEP)
+        return _sampled(self.t / speed, self.q, np.arange(count) * self.period / speed / count)
+
+
+@dataclass(frozen=True)
+class Heard:
+    """A motion found in a recording.
+
+    Attributes:
+        start, stop: the whole repetitions with a short rim [s], in the recording's time.
+        periods: how many.
+        tracking: (n,) rms of recorded minus designed positions [rad or m].
+        notes: what a user should know.
+    """
+
+    start: float
+    stop: float
+    periods: int
+    tracking: tuple[float, ...]
+    notes: tuple[str, ...]
+
+
+def read_track(path: Path, chain: Chain) -> Track:
+    """Read a designed motion as `calib.procedure.excitation_outputs` writes it."""
+    table = read_table(path)
+    wanted = ["t", *(f"q{j + 1}" for j in range(chain.n))]
+    missing = [name for name in wanted if name not in table.header]
+    if missing:
+        raise MeasurementError(f"has no column '{missing[0]}': design the motion again (calib redo … excite)", path)
+    columns = np.column_stack([np.asarray(table.cells[table.header.index(name)], dtype=float) for name in wanted])
+    return Track(columns[:, 0], columns[:, 1:])
+
+
+def find_motion(recording: Recording, track: Track, others: Mapping[str, Track], wanted: int) -> Heard:
+    """Find the designed motion in a recording.
+
+    Args:
+        track: the motion that was to be played.
+        others: the session's other motions by name, to say if one of them was played instead.
+        wanted: how many repetitions were asked for.
+
+    Raises:
+        MeasurementError: where it is not there, with what explains the recording.
+    """
+    grid = np.arange(recording.t[0], recording.t[-1], STEP)
+    q = _sampled(recording.t, recording.q, grid)
+    reference = track.coarse()
+    try:
+        found = recall(q, reference, likeness=LIKE)
+    except BadInput:
+        raise _explain(recording, q, track, others) from None
+    start, stop = grid[found.start], grid[min(found.rows.stop, len(grid) - 1)]
+    played = q[found.rows] - np.tile(reference, (found.periods, 1))[: len(q[found.rows])]
+    tracking = np.sqrt(np.mean(played**2, axis=0))
+    notes = []
+    if found.periods < wanted:
+        notes.append(f"{found.periods} of {wanted} repetitions of the motion were recorded")
+    if (worst := min(found.likeness)) < LOOSE:
+        name = recording.joint_names[int(np.argmax(tracking / np.maximum(np.std(reference, axis=0), 1e-9)))]
+        notes.append(f"the robot follows the motion loosely (it explains {worst:.1%}), {name} most: that is allowed")
+    first, last = float(recording.t[0]), float(recording.t[-1])
+    return Heard(
+        max(first, float(start) - EDGE), min(last, float(stop) + EDGE), found.periods, tuple(map(float, tracking)),
+        tuple(notes),
+    )  # fmt: skip
+
+
+def _sampled(t: np.ndarray, q: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    return np.column_stack([np.interp(grid, t, column) for column in q.T])
+
+
+def _explain(recording: Recording, q: np.ndarray, track: Track, others: Mapping[str, Track]) -> MeasurementError:
+    """Return what the recording is instead."""
+    reference = track.coarse()
+    duration = STEP * len(q)
+    for name, other in others.items():
+        if _heard(q, other.coarse()):
+            return MeasurementError(f"this is the {name} motion, which belongs into a file of its own", recording.file)
+    for speed in SPEEDS:
+        if _heard(q, track.coarse(speed)):
+            words = f"the motion is there at {speed:g} times its speed: a rehearsal? Record it at full speed"
+            return MeasurementError(words, recording.file)
+    if len(q) >= len(reference):
+        for factor, unit in ((1.0, ""), (np.pi / 180, "deg"), (180 / np.pi, "rad under a header that says deg")):
+            order, sign = _best_order(q, reference)
+            if _heard(factor * q[:, order] * sign, reference):
+                return MeasurementError(_cause(recording, order, sign, unit), recording.file)
+    if duration < track.period:
+        words = f"{duration:.1f} s are shorter than one period of the motion ({track.period:.1f} s): was it stopped?"
+        return MeasurementError(words, recording.file)
+    return MeasurementError(
+        "this is another motion than the one designed here, in no order of joints, sign, unit or speed that was tried; "
+        "play 6-excitation's, or set plan = false under [dynamics] in session.toml to identify from this one",
+        recording.file,
+    )
+
+
+def _heard(q: np.ndarray, reference: np.ndarray) -> bool:
+    try:
+        recall(q, reference, likeness=LIKE)
+    except BadInput:
+        return False
+    return True
+
+
+def _cause(recording: Recording, order: np.ndarray, sign: np.ndarray, unit: str) -> str:
+    names, causes = recording.joint_names, []
+    if unit:
+        causes.append(f"its positions are {unit}")
+    if moved := [j for j in range(len(names)) if order[j] != j]:
+        pairs = ", ".join(f"the column of {names[order[j]]} holds {names[j]}" for j in moved)
+        causes.append(f"columns are swapped ({pairs})")
+    if (sign < 0).any():
+        causes.append(f"the sign is reversed ({', '.join(names[j] for j in np.flatnonzero(sign < 0))})")
+    return f"this is the designed motion if {' and '.join(causes)}; correct the header (or the options file)"
+
+
+def _best_order(q: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return which recorded column (n,) moves most like each joint, and with which sign (n,), at any shift."""
+    n = reference.shape[1]
+    likeness = np.zeros((2, n, n))
+    for j in range(n):
+        r = reference[:, j] - reference[:, j].mean()
+        for k in range(n):
+            x = q[:, k] - q[:, k].mean()
+            crossed = fftconvolve(x, r[::-1], mode="valid") / max(np.linalg.norm(r), 1e-12)
+            power = np.sqrt(np.maximum(fftconvolve(x**2, np.ones(len(r)), mode="valid"), 1e-12))
+            likeness[0, j, k], likeness[1, j, k] = (crossed / power).max(), (-crossed / power).max()
+    order = linear_sum_assignment(-likeness.max(axis=0))[1]
+    rows = np.arange(n)
+    return order, np.where(likeness[0, rows, order] >= likeness[1, rows, order], 1.0, -1.0)
+
+
+def check_torques(recording: Recording, chain: Chain, loaded: bool = False) -> list[str]:
+    """Hold torques against the gravity of the nominal masses: reversed signs, other units.
+
+    Returns:
+        Notes.
+
+    Raises:
+        MeasurementError: where the torques of all heavy joints are reversed, or of another size.
+    """
+    if chain.inertias is None or recording.kind != "torque" or loaded:
+        return []
+    step = max(1, len(recording) // 2000)
+    gravity, torque = gravity_torques(chain, recording.q[::step]), recording.effort[::step]
+    limit = np.array([joint.effort for joint in chain.joints])
+    size = gravity.std(axis=0)
+    heavy = np.flatnonzero(size > HEAVY * np.where(np.isfinite(limit), limit, 100.0))
+    a, b = (x - x.mean(axis=0) for x in (gravity, torque))
+    alike = (a * b).sum(axis=0) / np.maximum(np.linalg.norm(a, axis=0) * np.linalg.norm(b, axis=0), 1e-12)
+    ratio = (a * b).sum(axis=0) / np.maximum((a**2).sum(axis=0), 1e-12)
+    sure = [j for j in heavy if abs(alike[j]) > SURE]
+    if not sure:
+        return []
+    names = ", ".join(recording.joint_names[j] for j in sure)
+    if all(ratio[j] < 0 for j in sure):
+        raise MeasurementError(
+            f"the torques of {names} push with gravity, not against it: reverse their sign", recording.file
+        )
+    factors = np.array([ratio[j] for j in sure])
+    if (np.abs(factors) > SCALE).all() or (np.abs(factors) < 1 / SCALE).all():
+        words = f"the torques of {names} are some {np.median(factors):.3g} times what gravity asks for"
+        guess = (
+            "mNm? Say so in the header (tau_… [mNm])"
+            if np.median(factors) > 1
+            else "currents, or torques before the gear?"
+        )
+        raise MeasurementError(f"{words}: {guess}", recording.file)
+    turned = [recording.joint_names[j] for j in sure if ratio[j] < 0]
+    return [f"torque of {', '.join(turned)} seems to have the wrong sign"] if turned else []
