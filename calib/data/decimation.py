@@ -102,6 +102,23 @@ def decimate(values: np.ndarray, decimator: Decimator, segment: np.ndarray | Non
     return np.concatenate(parts)
 
 
+def spread(values: np.ndarray, decimator: Decimator, length: int) -> np.ndarray:
+    """Return the adjoint of `decimate` on one segment of `length` samples: Σ y · decimate(x) = Σ spread(y) · x.
+
+    Args:
+        values: (M, ...) at the kept samples.
+    """
+    r, taps, count = decimator.factor, decimator.taps, len(values)
+    phases = -(-len(taps) // r)
+    weights = np.zeros(phases * r)
+    weights[: len(taps)] = taps
+    result = np.zeros((count + phases, r, *values.shape[1:]))
+    shape = (1, r, *(1 for _ in values.shape[1:]))
+    for phase in range(phases):
+        result[phase : phase + count] += weights[phase * r : (phase + 1) * r].reshape(shape) * values[:, None]
+    return result.reshape(-1, *values.shape[1:])[:length]
+
+
 def decimate_blocks(blocks: Iterable[np.ndarray], decimator: Decimator) -> Iterator[np.ndarray]:
     """Return, block by block, what `decimate` returns of the blocks (N_i, ...) of one segment joined together.
 

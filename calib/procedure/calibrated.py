@@ -19,18 +19,24 @@ Beside the robot itself (`calib.robot.description`)::
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import csv
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from calib import files
 from calib.errors import RobotError
 from calib.geometry.deflection import Deflection, Term
 from calib.geometry.installation import Installation, merged
+from calib.geometry.result import GeometricFit
 from calib.robot import description
-from calib.robot.chain import Chain
+from calib.robot.chain import Chain, element_index
 from calib.robot.tables import check_keys, number, placement, placement_table, vector
+
+COVARIANCE = "chain_covariance.csv"
+"""Covariance of the element values of the rigid geometry, by name; elements that were not fitted are not in it."""
 
 
 def tables(cell: Installation) -> dict[str, Any]:
@@ -88,6 +94,47 @@ def rigid_chain(path: str | Path) -> Chain:
     if values is None:
         return chain
     return chain.with_values(vector(values, len(chain.elements), f"{path}, provenance.rigid"))
+
+
+def write_covariance(rigid: GeometricFit, folder: Path) -> None:
+    """Write the covariance of the arm's elements of a rigid fit; nothing where it moved none of them."""
+    own = np.flatnonzero(rigid.free < len(rigid.cell.chain.elements))
+    names = [rigid.estimate.names[k] for k in own]
+    write_chain_covariance(names, rigid.estimate.covariance[np.ix_(own, own)], folder)
+
+
+def write_chain_covariance(names: Sequence[str], covariance: np.ndarray, folder: Path) -> None:
+    """Write the covariance of elements by name; nothing for none."""
+    if len(names):
+        rows = ([name, *map(float, row)] for name, row in zip(names, covariance))
+        files.write_table(folder / COVARIANCE, ("name", *names), rows)
+
+
+def chain_covariance(path: str | Path, chain: Chain) -> np.ndarray | None:
+    """Return the covariance (K, K) of a calibrated chain's element values; None where no fit has left one.
+
+    Args:
+        path: the folder of a fit, or its ``robot.toml``.
+        chain: `rigid_chain` of it; elements that were not fitted get zeros.
+
+    Raises:
+        RobotError: for a table that is not one of this chain's.
+    """
+    path = Path(path) / COVARIANCE if Path(path).is_dir() else Path(path).parent / COVARIANCE
+    if not path.is_file():
+        return None
+    with path.open(newline="", encoding="utf-8") as file:
+        header, *rows = list(csv.reader(file))
+    index = element_index(chain, header[1:])
+    try:
+        values = np.array([row[1:] for row in rows], dtype=float)
+    except ValueError as error:
+        raise RobotError(f"{path}: not a table of numbers ({error}); fit again") from None
+    if values.shape != (len(index), len(index)) or [row[0] for row in rows] != header[1:]:
+        raise RobotError(f"{path}: rows and columns do not name the same elements; fit again")
+    result = np.zeros((len(chain.elements), len(chain.elements)))
+    result[np.ix_(index, index)] = values
+    return result
 
 
 def _frames(entries: Any, where: str) -> dict[str, np.ndarray]:

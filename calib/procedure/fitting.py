@@ -22,6 +22,7 @@ from calib.geometry.installation import Installation
 from calib.geometry.ladder import Climb, climb
 from calib.geometry.observation import has_instrument
 from calib.geometry.parameters import layout
+from calib.geometry.result import GeometricFit
 from calib.geometry.weighing import Settings, combine
 from calib.procedure.comparing import Comparison, compare, compare_unseen, urdf_alone, without_corrections
 from calib.procedure.diagnosis import Outlier, named_outliers, plateau, remains
@@ -41,7 +42,7 @@ class Outcome:
     Attributes:
         inputs: what it worked on.
         climb: the rungs, the chosen model, and the fits of the nominal and the calibrated arm.
-        rigid: the best geometry without joint corrections, which a URDF holds.
+        rigid: the best fit without joint corrections: the geometry that a URDF holds and dynamics is identified on.
         fit: the two arms on the fit rows.
         validation: the two arms on unseen rows, by file name.
         outliers: rows of the fit that do not fit, worst first.
@@ -54,7 +55,7 @@ class Outcome:
 
     inputs: Inputs
     climb: Climb
-    rigid: Chain
+    rigid: GeometricFit
     fit: Comparison
     validation: Mapping[str, Comparison]
     outliers: Sequence[Outlier]
@@ -113,8 +114,8 @@ def run(
         raise NotConverged(f"the fit of model '{found.chosen}' did not converge: {status.value}", found.fit)
     say("comparing on unseen poses")
     nominal, calibrated = found.nominal.cell, found.fit.cell
-    rigid = rigid_geometry(found, inputs.fit, settings)
-    alone = without_corrections(calibrated, rigid, inputs.fit, settings)
+    rigid = rigid_fit(found, inputs.fit, settings)
+    alone = without_corrections(calibrated, rigid.cell.chain, inputs.fit, settings)
     fitted = compare(nominal, calibrated, inputs.fit, torques, "fitted on these rows", False, seed, alone=alone)
     validation = {
         name: compare_unseen(nominal, calibrated, unseen, lambda b: gravity_of(inputs.chain, b), settings, seed, alone)
@@ -135,16 +136,15 @@ def run(
     )
 
 
-def rigid_geometry(found: Climb, measured: Sequence[PoseMeasurements], settings: Settings) -> Chain:
-    """Return the best geometry without any corrections, those that came with the robot included: for a URDF."""
-    cell = found.rigid.cell
-    if not cell.known.terms:
-        return cell.chain
+def rigid_fit(found: Climb, measured: Sequence[PoseMeasurements], settings: Settings) -> GeometricFit:
+    """Return the best fit without any corrections, those that came with the robot included: for a URDF."""
+    if not found.rigid.cell.known.terms:
+        return found.rigid
     bare = polish_frames(replace(found.nominal.cell, known=Deflection()), measured, settings).cell
     drawn = not all(has_instrument(block) for block in measured)
     table = layout(bare)
     every = np.concatenate([table.arm_index, table.frame_index])
-    return fit(bare, measured, every, settings=settings, drawn=drawn).cell.chain
+    return fit(bare, measured, every, settings=settings, drawn=drawn)
 
 
 def judged(inputs: Inputs, found: Climb, named: Sequence[Outlier]) -> dict[str, Any]:

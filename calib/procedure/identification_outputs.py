@@ -16,12 +16,16 @@ from calib.dynamics.base import expressions
 from calib.errors import UsageError
 from calib.identification.scores import Part, Score
 from calib.identification.storage import to_table
+from calib.procedure import calibrated, consistency_tables
 from calib.procedure.identifying import IdentificationOutcome
 from calib.robot import description
 
-OURS = ("robot.toml", "dynamics.json", "estimate.csv", "covariance.csv", "metrics.json")
+OURS = (
+    "robot.toml", "dynamics.json", "estimate.csv", "covariance.csv", "metrics.json", calibrated.COVARIANCE,
+    *(consistency_tables.EFFECTS, consistency_tables.SENSITIVITY, consistency_tables.GEOMETRIES),
+)  # fmt: skip
 """Files of an earlier identification that a new one replaces; besides plots, ``plot_*.png``."""
-HEADER = ("name", "expression", "unit", "value", "sigma", "rsd", "essential")
+HEADER = ("name", "expression", "unit", "value", "sigma", "rsd", "essential", "sigma_torque", "sigma_geometry")
 
 
 def check_target(out: Path, source: Path | None = None) -> None:
@@ -72,26 +76,46 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     description.write(folder / "robot.toml", inputs.chain, extra, source=f"identified from {inputs.source}")
     files.write_table(folder / "estimate.csv", HEADER, estimate_rows(outcome))
     estimate = found.fitted.estimate
-    rows = ([name, *map(float, row)] for name, row in zip(found.names, estimate.covariance))
+    covariance = estimate.covariance if outcome.carried is None else outcome.carried.covariance
+    rows = ([name, *map(float, row)] for name, row in zip(found.names, covariance))
     files.write_table(folder / "covariance.csv", ("name", *found.names), rows)
+    consistency_tables.write(outcome, folder)
     files.write_json(folder / "dynamics.json", to_table(found.dynamics, found.base))
     files.write_json(folder / "metrics.json", metrics(outcome))
 
 
 def estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:
-    """Return name, expression, unit, value, σ, RSD [%] and the essential value of each parameter."""
+    """Return name, expression, unit, value, σ, RSD [%] and the essential value of each parameter, then σ's two parts.
+
+    σ is the total; the geometry's part is left out where the geometry is taken as exact.
+    """
     found = outcome.found
     estimate = found.fitted.estimate
     words = [line.split(" = ", 1)[1] for line in expressions(found.base)]
     words += [one.shape for one in found.climb.terms]
+    carried = outcome.carried
+    sigmas = estimate.sigma if carried is None else carried.sigma
+    parts = [None] * len(sigmas) if carried is None or carried.geometry is None else carried.sigma_geometry.tolist()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        relative = np.where(estimate.values == 0.0, np.inf, 100.0 * sigmas / np.abs(estimate.values))
     essential = {}
     if found.elimination is not None:
         kept = found.elimination.essential.estimate
         essential = dict(zip(kept.names, kept.values))
     return [
-        (name, expression, unit, float(value), float(sigma), _finite(rsd), _number(essential.get(own)))
-        for name, own, expression, unit, value, sigma, rsd in zip(
-            found.names, estimate.names, words, estimate.units, estimate.values, estimate.sigma, estimate.rsd
+        (
+            name,
+            expression,
+            unit,
+            float(value),
+            float(sigma),
+            _finite(rsd),
+            _number(essential.get(own)),
+            float(noise),
+            part,
+        )
+        for name, own, expression, unit, value, sigma, rsd, noise, part in zip(
+            found.names, estimate.names, words, estimate.units, estimate.values, sigmas, relative, estimate.sigma, parts
         )
     ]
 
@@ -134,6 +158,7 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
         ],
         "elimination": elimination_table(outcome),
         "filters": {case.name: filter_table(case.motion) for case in (*outcome.inputs.cases, *outcome.inputs.unseen)},
+        "geometry": consistency_tables.metrics(outcome.carried, outcome.geometries),
         "repeated": dict(outcome.repeated),
         "warnings": list(outcome.warnings),
         "verdict": outcome.verdict.level,
@@ -188,7 +213,7 @@ def elimination_table(outcome: IdentificationOutcome) -> list[dict[str, Any]]:
 def _move_files(staging: Path, out: Path) -> None:
     """Replace the files of an earlier identification one by one, the metrics last."""
     fresh = sorted(path.name for path in staging.iterdir())
-    stale = {path.name for path in out.glob("plot_*.png")} - set(fresh)
+    stale = {*OURS, *(path.name for path in out.glob("plot_*.png"))} - set(fresh)
     try:
         for name in sorted(fresh, key=lambda name: name == "metrics.json"):
             os.replace(staging / name, out / name)

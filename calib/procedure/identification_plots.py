@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from calib.identification.cases import Case
 from calib.identification.scores import Score
+from calib.procedure import consistency_figures
 from calib.procedure.drawing import AFTER, BEFORE, INK, MARK, QUIET, WIDE, save, sheet, styled
 from calib.procedure.identifying import IdentificationOutcome
 
@@ -16,13 +17,14 @@ MOST = 4000  # samples drawn per curve
 
 
 def write(outcome: IdentificationOutcome, folder: Path) -> None:
-    """Write ``plot_torque_<n>.png`` of every file, ``plot_residuals.png`` and ``plot_friction.png``."""
+    """Write ``plot_torque_<n>.png`` of every file, ``plot_residuals.png``, ``plot_friction.png`` and more."""
     cases = (*outcome.inputs.cases, *outcome.inputs.unseen)
     for number, case in enumerate(cases, start=1):
         save(torques(case, outcome.predictions[case.name], outcome), folder / f"plot_torque_{number}.png")
     proof = next(iter(outcome.validation or outcome.fit))
     save(autocorrelations({**outcome.fit, **outcome.validation}[proof], proof), folder / "plot_residuals.png")
     save(friction(outcome), folder / "plot_friction.png")
+    consistency_figures.write(folder)
 
 
 def torques(case: Case, predicted: np.ndarray, outcome: IdentificationOutcome) -> Figure:

@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from calib.identification.scores import Score
+from calib.procedure import consistency_tables
 from calib.procedure.identifying import IdentificationInputs, IdentificationOutcome
 from calib.procedure.show import COLOURS
 
@@ -42,6 +43,7 @@ def outcome_lines(outcome: IdentificationOutcome) -> Iterator[RenderableType]:
     yield words
     if found.elimination is not None:
         yield from elimination_lines(outcome)
+    yield from consistency_tables.lines(outcome)
     yield error_table(outcome)
     for line in outcome.warnings:
         yield f"[yellow]note[/]: {escape(line)}"

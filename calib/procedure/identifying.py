@@ -15,11 +15,13 @@ from calib.data.recording import Joints, Recording
 from calib.data.recording_files import read_recording
 from calib.errors import UsageError
 from calib.identification.cases import Case, case_names, make_case
+from calib.identification.consistency import Comparison, Propagation, compare, propagate
 from calib.identification.identify import Identification, identify
 from calib.identification.options import FileSettings, IdentifyOptions, file_settings
 from calib.identification.prediction import predict
 from calib.identification.scores import Score, score
 from calib.identification.settings import Settings
+from calib.procedure import calibrated
 from calib.procedure.identification_gains import FoundGains, find_gains
 from calib.procedure.identification_verdict import judge, warnings
 from calib.procedure.inputs import joint_kinds
@@ -43,6 +45,7 @@ class IdentificationInputs:
     Attributes:
         chain: the calibrated arm.
         nominal: the arm before calibration; None where the robot is not the outcome of a fit.
+        geometry: (K, K) covariance of the chain's element values; None where none is known.
         source: the file it came from.
         cases: recordings to learn from.
         unseen: recordings to be predicted.
@@ -59,6 +62,7 @@ class IdentificationInputs:
     options: IdentifyOptions
     notes: tuple[str, ...] = ()
     unit: str = "N m"
+    geometry: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +78,8 @@ class IdentificationOutcome:
         excitation: case name → what the motion can tell.
         warnings, verdict: as of `calib.procedure.identification_verdict`.
         seed: that reproduces it.
+        carried: what the geometry's uncertainty adds; None for an identification that was not asked for it.
+        geometries: the estimate on the nominal geometry beside it; None where there is no other than the nominal.
     """
 
     inputs: IdentificationInputs
@@ -87,6 +93,8 @@ class IdentificationOutcome:
     verdict: Verdict
     seed: int = 0
     extra: Mapping[str, object] = field(default_factory=dict)
+    carried: Propagation | None = None
+    geometries: Comparison | None = None
 
 
 def gather(
@@ -131,7 +139,8 @@ def gather(
     options = found.options
     cases = [read_case(path, name, motion, options, found) for name, path, motion in zip(names, paths, motions)]
     return IdentificationInputs(
-        chain, nominal, source, tuple(cases[:count]), tuple(cases[count:]), options, (*notes, *found.notes), found.unit
+        chain, nominal, source, tuple(cases[:count]), tuple(cases[count:]), options, (*notes, *found.notes), found.unit,
+        calibrated.chain_covariance(source, chain) if source.suffix == ".toml" else None,
     )  # fmt: skip
 
 
@@ -139,6 +148,7 @@ def run(inputs: IdentificationInputs, progress: Progress | None = None) -> Ident
     """Identify, predict every recording, and judge."""
     say, settings = progress or (lambda words: None), inputs.options.settings
     found = identify(inputs.chain, inputs.cases, settings, inputs.nominal, progress)
+    carried, geometries = carry(inputs, found, say)
     predictions, scores = {}, {}
     for case in (*inputs.cases, *inputs.unseen):
         say(f"predicting {case.name}")
@@ -156,8 +166,18 @@ def run(inputs: IdentificationInputs, progress: Progress | None = None) -> Ident
     proofs = {name: found_score for name, found_score in validation.items() if name not in repeated}
     verdict = judge(fit, proofs, repeated, excitation)
     return IdentificationOutcome(
-        inputs, found, fit, validation, predictions, repeated, excitation, told, verdict, settings.seed
+        inputs, found, fit, validation, predictions, repeated, excitation, told, verdict, settings.seed,
+        carried=carried, geometries=geometries,
     )  # fmt: skip
+
+
+def carry(inputs: IdentificationInputs, found: Identification, say: Progress) -> tuple[Propagation, Comparison | None]:
+    """Return what the geometry's uncertainty adds to the estimate, and the estimate on the nominal geometry beside."""
+    carried = propagate(found, inputs.chain, inputs.cases, inputs.geometry, say)
+    if inputs.nominal is None:
+        return carried, None
+    say("the same on the nominal geometry")
+    return carried, compare(found, carried, inputs.nominal, inputs.cases)
 
 
 def with_choices(options: IdentifyOptions, method: str | None, friction: str | None, seed: int) -> IdentifyOptions:
@@ -176,10 +196,15 @@ def with_choices(options: IdentifyOptions, method: str | None, friction: str | N
 
 
 def load_robot(robot: str | Path, base: str | None, tip: str | None) -> tuple[Chain, Chain | None, Path]:
-    """Return the chain, the one before its calibration (None where there was none), and the file."""
+    """Return the chain, the one before its calibration (None where there was none), and the file.
+
+    Of a fit with joint corrections the chain is the best geometry without them: torques know nothing of corrections,
+    and it is what a URDF of the fit holds.
+    """
     source = resolve(robot)
     chain = load(robot, base, tip)
     values = description.read_extra(source).get("provenance", {}).get("nominal") if source.suffix == ".toml" else None
+    chain = calibrated.rigid_chain(source) if values is not None else chain
     if values is None or len(values) != len(chain.elements) or np.array_equal(values, chain.values):
         return chain, None, source
     return chain, chain.with_values(np.asarray(values, dtype=float)), source

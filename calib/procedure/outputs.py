@@ -23,7 +23,7 @@ from calib.robot.chain import Chain
 
 OURS = (
     "robot.toml", "robot.urdf", "robot_for_corrections.urdf",
-    "estimate.csv", "covariance.csv", "residuals.csv", "joint_corrections.csv",
+    "estimate.csv", "covariance.csv", calibrated.COVARIANCE, "residuals.csv", "joint_corrections.csv",
     "joint_corrections.txt", "report.json", "certificate.html", "metrics.json",
 )  # fmt: skip
 """Files of an earlier fit that a new one replaces; besides plots, ``plot_*.png``."""
@@ -98,7 +98,7 @@ def _write_all(outcome: Outcome, folder: Path) -> None:
     extra = calibrated.tables(fit.cell) | {"provenance": _provenance(outcome)}
     description.write(folder / "robot.toml", fit.cell.chain, extra, source=f"calibrated from {outcome.inputs.source}")
     whole = merged(fit.cell)
-    urdfs = {"robot.urdf": outcome.rigid if whole.deflection.terms else fit.cell.chain}
+    urdfs = {"robot.urdf": outcome.rigid.cell.chain if whole.deflection.terms else fit.cell.chain}
     if whole.deflection.terms:
         urdfs["robot_for_corrections.urdf"] = fit.cell.chain
         write_corrections(whole.chain, whole.deflection, folder)
@@ -111,6 +111,7 @@ def _write_all(outcome: Outcome, folder: Path) -> None:
     files.write_table(folder / "estimate.csv", HEADER, table.rows())
     rows = ([name, *map(float, row)] for name, row in zip(table.names, table.covariance))
     files.write_table(folder / "covariance.csv", ("name", *table.names), rows)
+    calibrated.write_covariance(outcome.rigid, folder)
     write_residuals(outcome, folder / "residuals.csv")
     files.write_json(folder / "metrics.json", metrics(outcome))
 
@@ -155,7 +156,9 @@ def metrics(outcome: Outcome) -> dict[str, object]:
 def _provenance(outcome: Outcome) -> dict[str, object]:
     inputs = outcome.inputs
     earlier = description.read_extra(inputs.source) if inputs.source.suffix == ".toml" else {}
-    rigid = {"rigid": outcome.rigid.values.tolist()} if merged(outcome.climb.fit.cell).deflection.terms else {}
+    rigid = (
+        {"rigid": outcome.rigid.cell.chain.values.tolist()} if merged(outcome.climb.fit.cell).deflection.terms else {}
+    )
     return rigid | {
         "robot": str(inputs.source),
         "nominal": earlier.get("provenance", {}).get("nominal", inputs.chain.values.tolist()),

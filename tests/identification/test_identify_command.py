@@ -37,7 +37,17 @@ def test_the_folder_keeps_its_contract(robot, tmp_path, capsys):
     assert found["condition_number"]["raw"] > found["condition_number"]["normalised"] > 1.0
     assert found["verdict"] == "pass" and found["ladder"][0]["model"] == "standard"
     rows = list(csv.DictReader((out / "estimate.csv").open()))
-    assert list(rows[0]) == ["name", "expression", "unit", "value", "sigma", "rsd", "essential"]
+    assert list(rows[0]) == [
+        "name",
+        "expression",
+        "unit",
+        "value",
+        "sigma",
+        "rsd",
+        "essential",
+        "sigma_torque",
+        "sigma_geometry",
+    ]
     assert any("YY2" in row["expression"] for row in rows if row["name"] == "ZZ1R")
     assert {"dynamics.json", "covariance.csv", "robot.toml", "plot_torque_1.png", "plot_friction.png"} <= {
         path.name for path in out.iterdir()

@@ -1,0 +1,210 @@
+"""Claims on sensitivity and total covariance: derivative, identities, and a small Monte Carlo of whole calibrations."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import differences
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "identification"))
+import planted_motion as planted
+
+from calib import cli, files
+from calib.data.decimation import decimate, design_decimator, spread
+from calib.data.measurements import PoseMeasurements
+from calib.dynamics import base as bases
+from calib.dynamics import rigid_body
+from calib.dynamics.tree import tree
+from calib.errors import RobotError
+from calib.identification import consistency
+from calib.identification.identify import identify
+from calib.identification.settings import Settings
+from calib.procedure import calibrated, consistency_tables
+from calib.robot import description
+from calib.robot.chain import Chain, Joint
+
+PLAIN = Settings(friction="standard", essential="none")
+MOVED = {"up": np.pi / 2 + 0.01, "upper": 0.51, "shoulder": 0.02}
+
+
+@pytest.mark.parametrize("factor", [1, 3, 8])
+def test_spreading_is_the_adjoint_of_decimation(factor):
+    rng, decimator = np.random.default_rng(factor), design_decimator(100.0, factor)
+    x = rng.normal(size=(311, 2))
+    y = rng.normal(size=decimate(x, decimator).shape)
+    back = spread(y, decimator, len(x))
+    assert back.shape == x.shape
+    assert np.sum(y * decimate(x, decimator)) == pytest.approx(np.sum(back * x), abs=1e-11)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [PLAIN, replace(PLAIN, method="ols"), replace(PLAIN, friction="asymmetric"), replace(PLAIN, prior="cad")],
+    ids=["wls", "ols", "ridge", "prior"],
+)
+def test_the_sensitivity_is_the_derivative_of_the_estimate(settings):
+    arm, case = planted.arm().with_values(MOVED), planted.case("a", 0)
+    found = identify(arm, [case], settings, planted.arm())
+    how = consistency.estimator(found)
+    again, _ = consistency.estimate(how, found.rows)
+    np.testing.assert_allclose(again, found.fitted.estimate.values, atol=1e-9)
+    matrix, _, _ = consistency.sensitivity(found, arm, [case])
+
+    def refitted(values: np.ndarray) -> np.ndarray:
+        return consistency.estimate(how, consistency.rows_on(found, arm.with_values(values), [case]))[0]
+
+    differences.check(refitted, matrix[:, :-2], np.array(arm.values), step=1e-5, tolerance=1e-7)
+
+
+def test_pieces_of_a_long_recording_tell_the_same(monkeypatch):
+    arm, case = planted.arm(), planted.case("a", 0, noise=0.0, duration=60.0)
+    found = identify(arm, [case], PLAIN)
+    whole, _, _ = consistency.sensitivity(found, arm, [case])
+    monkeypatch.setattr(consistency, "SAMPLES", 6000)
+    part, _, _ = consistency.sensitivity(found, arm, [case])
+    sigma = found.fitted.estimate.sigma[:, None]
+    assert np.abs((part - whole) / sigma).max() < 0.1 * np.abs(whole / sigma).max()
+    assert not np.array_equal(part, whole)
+
+
+def test_an_element_is_a_joint_that_nobody_moves():
+    """∂tau/∂value from the kernels' exact gradient, on a chain in which every element is a joint."""
+    arm, case = planted.arm().with_values(MOVED), planted.case("a", 0, band=80.0, duration=6.0)
+    found = identify(arm, [case], PLAIN)
+    assert case.motion.decimator.factor == 1
+    _, felt, _ = consistency.sensitivity(found, arm, [case])
+    count = len(arm.elements)
+    loose = Chain(
+        "loose", tuple(Joint(f"j{k}") for k in range(count)),
+        tuple(replace(e, joint=k, owner=k, value=0.0) for k, e in enumerate(arm.elements)), gravity=arm.gravity,
+    )  # fmt: skip
+    states = [np.zeros((len(case.motion), count)) for _ in range(3)]
+    states[0] += arm.values
+    values = np.zeros((count, 10))
+    standard = bases.to_standard(found.base, found.fitted.estimate.values)[:30].reshape(3, 10)
+    for row, k in enumerate(arm.moving):
+        values[k] = standard[row]
+        for state, given in zip(states, (case.motion.q, case.motion.v, case.motion.a)):
+            state[:, k] += given[:, row]
+    square = np.zeros(count)
+    for k in arm.moving:
+        weights = np.zeros((len(case.motion), count, 10 * count))
+        weights[:, k] = values.ravel()
+        square += np.mean(rigid_body.regressor_gradient(tree(loose), *states, weights)[0] ** 2, axis=0)
+    np.testing.assert_allclose(felt[:-2], np.sqrt(square / 3), rtol=1e-7, atol=1e-9)
+
+
+def test_an_offset_of_the_last_joint_turns_its_bodys_parameters_and_nothing_else():
+    arm, case = planted.arm(), planted.case("a", 0, noise=0.0)
+    found = identify(arm, [case], PLAIN)
+    carried = consistency.propagate(found, arm, [case])
+    slope = dict.fromkeys(found.base.standard, 0.0)
+    xx, xy, xz, yy, yz, _, mx, my, _, _ = planted.INERTIAS[2]
+    slope |= {"XX3": 2 * xy, "XY3": yy - xx, "XZ3": yz, "YY3": -2 * xy, "YZ3": -xz, "MX3": my, "MY3": -mx}
+    expected = found.base.transform @ list(slope.values())
+    np.testing.assert_allclose(carried.sensitivity[:, carried.elements.index("elbow")], expected, atol=1e-7)
+    assert carried.left[carried.elements.index("elbow")] < 1e-8 < carried.felt[carried.elements.index("elbow")]
+
+
+def test_geometry_that_is_exact_adds_nothing():
+    arm, case = planted.arm(), planted.case("a", 0)
+    found = identify(arm, [case], PLAIN)
+    without = consistency.propagate(found, arm, [case])
+    assert without.geometry is None and "taken as exact" in consistency_tables.summary(without)
+    np.testing.assert_array_equal(without.covariance, found.fitted.estimate.covariance)
+    tiny = consistency.propagate(found, arm, [case], 1e-16 * np.eye(6))
+    assert not tiny.changed.any() and "no matter" in consistency_tables.summary(tiny)
+    assert np.linalg.eigvalsh(tiny.covariance - tiny.torque).min() > -1e-12
+
+
+@pytest.mark.slow
+def test_intervals_cover_the_truth_with_propagation_and_fail_without():
+    """60 calibrations: the geometry drawn from its covariance, the torques noisy; the truth stays."""
+    real, settings = planted.arm(), PLAIN
+    truth = np.append(bases.find(planted.model()).transform @ planted.truth(), [])
+    spread_of = np.diag([0.0, 2e-3, 3e-3, 1e-3, 3e-3, 0.0]) ** 2
+    rng = np.random.default_rng(3)
+    inside, outside, dominated = [], [], []
+    for _ in range(60):
+        believed = real.with_values(real.values + np.sqrt(np.diag(spread_of)) * rng.standard_normal(6))
+        case = planted.case("a", 0, noise=0.0)
+        noisy = replace(case, target=case.target + 0.2 * rng.normal(size=case.target.shape))
+        found = identify(believed, [noisy], settings, real)
+        carried = consistency.propagate(found, believed, [noisy], spread_of)
+        off = np.abs(found.fitted.estimate.values - truth)
+        inside.append(off < 1.96 * carried.sigma)
+        outside.append(off < 1.96 * carried.sigma_torque)
+        dominated.append(carried.dominated)
+    often = np.mean(dominated, axis=0) > 0.5
+    assert 0.93 < np.mean(inside) < 0.97
+    assert often.sum() >= 3 and (np.mean(outside, axis=0)[often] < 0.9).all()
+
+
+def fitted_folder(tmp_path: Path, covariance: float | None) -> Path:
+    """Return the folder of a fit of the planted arm, with the covariance of two elements."""
+    folder, nominal = tmp_path / "fit", planted.arm()
+    moved = nominal.with_values(MOVED)
+    description.write(folder / "robot.toml", moved, {"provenance": {"nominal": nominal.values.tolist()}})
+    if covariance is not None:
+        calibrated.write_chain_covariance(["up", "shoulder"], covariance * np.eye(2), folder)
+    return folder
+
+
+def run(folder: Path, tmp_path: Path) -> tuple[dict, list[dict], Path]:
+    train, out = planted.write(tmp_path, "train.npz", 0), tmp_path / "out"
+    assert cli.run(["identify", *map(str, (folder, train, "--out", out, "--friction", "standard"))]) == 0
+    rows = list(csv.DictReader((out / "estimate.csv").open()))
+    return json.loads((out / "metrics.json").read_text())["geometry"], rows, out
+
+
+def test_the_command_carries_the_fits_covariance(tmp_path, capsys):
+    found, rows, out = run(fitted_folder(tmp_path, 1e-6), tmp_path)
+    assert found["propagated"] and found["geometry_exceeds_torque"] and found["largest_growth_of_sigma"] > 1.4
+    for row in rows:
+        total = np.hypot(float(row["sigma_torque"]), float(row["sigma_geometry"]))
+        assert float(row["sigma"]) == pytest.approx(total, rel=1e-9)
+    matrix = np.genfromtxt(out / "covariance.csv", delimiter=",", skip_header=1)[:, 1:]
+    np.testing.assert_allclose(np.sqrt(np.diag(matrix)), [float(row["sigma"]) for row in rows])
+    ranked = list(csv.DictReader((out / "geometry_effects.csv").open()))
+    assert [row["element"] for row in ranked if row["sigma"]] == ["shoulder", "up"]
+    assert {row["element"] for row in ranked} > {"gravity.rx", "turn", "fore"}
+    assert (out / "plot_geometries.png").is_file() and (out / "geometries.csv").is_file()
+    assert "which geometric errors matter" in capsys.readouterr().out
+    kept = calibrated.chain_covariance(out, planted.arm())
+    assert kept is not None and kept[1, 1] == pytest.approx(1e-6), "the identified robot carries it on"
+
+
+def test_the_command_says_where_the_geometry_is_taken_as_exact(tmp_path, capsys):
+    found, rows, out = run(fitted_folder(tmp_path, None), tmp_path)
+    assert not found["propagated"] and {row["sigma_geometry"] for row in rows} == {""}
+    assert "taken as exact" in capsys.readouterr().out.replace("\n", " ")
+    assert not (out / calibrated.COVARIANCE).exists()
+
+
+def test_a_fit_leaves_the_covariance_of_its_chain(tmp_path):
+    from calib.geometry.first_guess import install
+    from calib.geometry.fit import fit
+    from calib.robot.chain import random_joints
+    from calib.simulation.cell import measure
+    from calib.simulation.cells import lwr4plus_cell
+
+    cell = lwr4plus_cell(hidden=0.0)
+    measured: PoseMeasurements = measure(cell, random_joints(cell.nominal, 40, 1), 2)
+    found = fit(install(cell.nominal, [measured]), [measured])
+    calibrated.write_covariance(found, tmp_path)
+    read = calibrated.chain_covariance(tmp_path, found.cell.chain)
+    assert read is not None
+    sigma = dict(zip(found.estimate.names, found.estimate.sigma))
+    for name, variance in zip(found.cell.chain.names, np.diag(read)):
+        assert np.sqrt(variance) == pytest.approx(sigma.get(name, 0.0), rel=1e-9)
+    arm = set(found.estimate.names) & set(found.cell.chain.names)
+    assert np.count_nonzero(np.diag(read)) == len(arm) > 20
+    files.write_table(tmp_path / calibrated.COVARIANCE, ("name", "alpha2"), [("d2", 1.0)])
+    with pytest.raises(RobotError, match="do not name the same elements"):
+        calibrated.chain_covariance(tmp_path, found.cell.chain)
