@@ -167,3 +167,52 @@ def export(
         note = f"note: the corrections in {folder}/joint_corrections.csv are in none of these files"
         note += f": {found.alone}" if found.alone else ""
         console.print(note, soft_wrap=True, markup=False)
+
+
+@app.command()
+def compensate(
+    folder: Annotated[Path, typer.Argument(metavar="FIT", help="the folder of a fit, or of a session that has one")],
+    targets: Annotated[Path, typer.Argument(help="CSV of nominal joints or tool poses: calib formats targets")],
+    out: Annotated[Path, typer.Option(help="CSV file of joint commands")],
+    frame: Annotated[
+        str, typer.Option(help="what the targets are in: base (of the calibrated robot), nominal, or a station")
+    ] = "base",
+    tool: Annotated[
+        str, typer.Option(help="what stands there: flange, a tool of the fit, or x,y,z[,roll,pitch,yaw] [m, rad]")
+    ] = "flange",
+    dof: Annotated[
+        int | None, typer.Option(help="how much counts: 6; 5, free to turn about the tool's z; 3, position only")
+    ] = None,
+    start: Annotated[
+        str | None, typer.Option(help="q1,...,qn [rad, m] near which targets without joints are sought")
+    ] = None,
+    tolerance: Annotated[
+        str, typer.Option(metavar="MM,MRAD", help="what a command may leave by the calibrated model")
+    ] = "0.001,0.01",
+    partial: Annotated[
+        bool, typer.Option("--partial", help="write what is reached, even where some targets are not")
+    ] = False,
+    seed: Seed = 0,
+) -> None:
+    """Turn nominal targets into the joint commands that put the real tool there."""
+    from calib.data.target_files import read_targets
+    from calib.procedure import compensating, compensation_outputs
+    from calib.procedure.inputs import joint_kinds
+
+    fitted = compensating.read(folder)
+    chain = fitted.nominal.chain
+    given = read_targets(targets, chain.joint_names, kinds=joint_kinds(chain), limits=(chain.lower, chain.upper))
+    may = numbers(tolerance, 2, "--tolerance")
+    compensation_outputs.check_out(out, targets, fitted)
+    with progress() as say:
+        found = compensating.compensate(
+            fitted, given, frame=frame, tool=tool, dof=dof, tolerance=(1e-3 * may[0], 1e-3 * may[1]), seed=seed,
+            start=numbers(start, chain.n, "--start") if start else None, progress=say,
+        )  # fmt: skip
+    compensation_outputs.write(found, fitted, given, out, partial)
+    console = make_console()
+    for line in compensation_outputs.lines(found, given, fitted):
+        console.print(line, soft_wrap=True, markup=False)
+    console.print(
+        f"{int(found.reached.sum())} of {len(found.q)} commands written to {out}", soft_wrap=True, markup=False
+    )

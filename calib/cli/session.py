@@ -42,7 +42,7 @@ def new(
 def formats(
     topic: Annotated[
         str | None,
-        typer.Argument(help="measurements, options, constraints, mdh, robot, session or recordings"),
+        typer.Argument(help="measurements, targets, options, constraints, mdh, robot, session or recordings"),
     ] = None,
 ) -> None:
     """Print what the files of this toolkit hold: columns, keys, units."""

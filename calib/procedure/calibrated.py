@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -76,15 +77,39 @@ def read(path: str | Path) -> Installation:
     """
     path = Path(path) / "robot.toml" if Path(path).is_dir() else Path(path)
     chain, extra, where = description.read(path), description.read_extra(path), str(path)
-    stations, tools = (_frames(extra.get(name, []), f"{where}, {name}") for name in ("station", "tool"))
-    given: dict[str, Any] = (
-        {"deflection": _deflection(extra["deflection"], chain, where)} if "deflection" in extra else {}
-    )
+    cell = _placed(chain, extra.get("station", []), extra.get("tool", []), where)
+    return replace(cell, deflection=_deflection(extra["deflection"], chain, where)) if "deflection" in extra else cell
+
+
+def _placed(chain: Chain, station: Any, tool: Any, where: str) -> Installation:
+    """Return a chain with stations and tools as their tables say; identity frames where a list is empty."""
+    stations, tools = _frames(station, f"{where}, station"), _frames(tool, f"{where}, tool")
+    given: dict[str, Any] = {}
     if stations:
         given |= {"station_names": tuple(stations), "stations": np.array(list(stations.values()))}
     if tools:
         given |= {"tool_names": tuple(tools), "tools": np.array(list(tools.values()))}
     return Installation(chain, **given)
+
+
+def nominal(path: str | Path) -> Installation:
+    """Return the nominal arm of a fit, with the frames that let it fit the same measurements best.
+
+    A fit that started from an earlier fit's folder has none: then there are no stations and no tools.
+
+    Raises:
+        RobotError: where the file does not say which arm that was.
+    """
+    path = Path(path) / "robot.toml" if Path(path).is_dir() else Path(path)
+    chain, known = description.read(path), description.read_extra(path).get("provenance", {})
+    if "nominal" not in known:
+        raise RobotError(f"{path} does not say which nominal robot it was calibrated from; fit again")
+    values = vector(known["nominal"], len(chain.elements), f"{path}, provenance.nominal")
+    station, tool = (known.get(f"nominal_{kind}", []) for kind in ("station", "tool"))
+    cell = _placed(chain.with_values(values), station, tool, f"{path}, provenance")
+    none: dict[str, Any] = {"stations": np.zeros((0, 4, 4)), "station_names": ()}
+    none |= {"tools": np.zeros((0, 4, 4)), "tool_names": ()}
+    return cell if station and tool else replace(cell, **none)
 
 
 def rigid_chain(path: str | Path) -> Chain:

@@ -6,11 +6,14 @@ rotation vector r, so that the covariance of (d, w) goes through  position = R d
 
 from __future__ import annotations
 
+import csv
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from calib.errors import UsageError
 from calib.geometry.installation import Installation
 from calib.geometry.parameters import layout, parameter_values
 from calib.geometry.result import GeometricFit
@@ -61,6 +64,38 @@ def estimate_table(found: GeometricFit, nominal: Installation) -> EstimateTable:
     covariance = full @ found.estimate.covariance @ full.T
     names, units = (tuple(part[k] for k in shown) for part in (table.names, table.units))
     return EstimateTable(names, units, before[shown], values[shown], covariance)
+
+
+def read_covariance(folder: Path, cell: Installation) -> tuple[np.ndarray, np.ndarray]:
+    """Read the covariance of the fit that `cell` came from, for steps (`calib.geometry.parameters.step`).
+
+    Returns:
+        Positions (f,) in the parameter vector, and the covariance (f, f).
+
+    Raises:
+        UsageError: where the file is missing, or belongs to another fit.
+    """
+    path = folder / "covariance.csv"
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            names, *rows = csv.reader(file)
+        names, table = names[1:], np.array([row[1:] for row in rows], dtype=float)
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{path} cannot be read ({error}); fit again") from error
+    parameters = layout(cell)
+    place = {name: k for k, name in enumerate(parameters.names)}
+    strange = [name for name in names if name not in place]
+    if strange or table.shape != (len(names), len(names)):
+        what = f"'{strange[0]}' is no parameter there" if strange else f"its shape is {table.shape}"
+        raise UsageError(f"{path} does not belong to the robot.toml beside it: {what}; fit again")
+    back, start = np.eye(len(parameters.names)), parameters.arm
+    for placement in (*cell.stations, *cell.tools):
+        block = slice(start, start + 6)
+        back[block, block] = np.linalg.inv(_to_parent(placement))
+        start += 6
+    back = back[:, [place[name] for name in names]]
+    free = np.flatnonzero(np.abs(back).max(axis=1, initial=0.0) > 0.0)
+    return free, back[free] @ table @ back[free].T
 
 
 def _elements(placement: np.ndarray) -> np.ndarray:

@@ -12,6 +12,10 @@ TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
         "CSV files of measured poses, positions, distances",
         ("calib.data.pose_files", "calib.data.robodk"),
     ),
+    "targets": (
+        "targets of calib compensate, and the commands it writes",
+        ("calib.data.target_files", "calib.procedure.compensating"),
+    ),
     "options": ("the TOML file of calib fit --options", ("calib.data.options",)),
     "constraints": ("the TOML file of calib select --constraints", ("calib.procedure.limits",)),
     "mdh": ("a robot as a table of modified Denavit-Hartenberg rows", ("calib.robot.mdh", "calib.robot.tables")),

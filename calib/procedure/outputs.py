@@ -159,7 +159,11 @@ def _provenance(outcome: Outcome) -> dict[str, object]:
     rigid = (
         {"rigid": outcome.rigid.cell.chain.values.tolist()} if merged(outcome.climb.fit.cell).deflection.terms else {}
     )
-    return rigid | {
+    frames = {} if "nominal" in earlier.get("provenance", {}) else calibrated.tables(outcome.climb.nominal.cell)
+    nominal = {f"nominal_{kind}": frames[kind] for kind in ("station", "tool") if kind in frames}
+    return {
+        **rigid,
+        **nominal,
         "robot": str(inputs.source),
         "nominal": earlier.get("provenance", {}).get("nominal", inputs.chain.values.tolist()),
         "files": [block.file for block in inputs.fit],

@@ -1,0 +1,260 @@
+"""`calib compensate`: from nominal targets to commands that put the true tool there."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib import cli
+from calib.data.target_files import read_targets
+from calib.geometry import inverse
+from calib.geometry.installation import Installation
+from calib.geometry.inverse import Goal
+from calib.procedure import compensating
+from calib.robot.kinematics import forward
+from calib.robot.load import load
+from calib.simulation.cell import Cell, Instrument, measure, true_poses
+from calib.simulation.cells import perturbed_cell
+from calib.transforms import from_xyz_rpy, rotation_vector, to_quaternion
+
+SIGMA = 20e-6
+
+
+@pytest.fixture(scope="module")
+def cell() -> Cell:
+    """A UR5 with errors in every element, gear harmonics and compliance, seen by a fine instrument."""
+    return perturbed_cell(load("ur5"), 4, Instrument(position_sigma=SIGMA, orientation_sigma=5e-5, encoder_sigma=0.0))
+
+
+def drawn(cell: Cell, count: int, seed: int) -> np.ndarray:
+    """Draw joints clear of singularities, where no arm follows a correction."""
+    q = np.random.default_rng(seed).uniform(-2.2, 2.2, (3 * count, cell.nominal.n))
+    goal = Goal(Installation(cell.nominal))
+    return q[inverse.conditions(goal, q) > 0.03][:count]
+
+
+def write(path: Path, header: list[str], rows: np.ndarray) -> Path:
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([header, *np.asarray(rows).tolist()])
+    return path
+
+
+@pytest.fixture(scope="module")
+def fitted(cell, tmp_path_factory) -> Path:
+    """The folder of a fit of 150 poses, with 50 kept aside."""
+    folder = tmp_path_factory.mktemp("compensation")
+    seen = measure(cell, drawn(cell, 200, 0), 1)
+    names = [*(f"q{k + 1}" for k in range(6)), "x", "y", "z", "qx", "qy", "qz", "qw"]
+    write(folder / "seen.csv", names, np.hstack([seen.q, seen.position, seen.quaternion]))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("calib.procedure.report.write", lambda outcome, folder: None)
+        code = cli.run(["fit", "ur5", str(folder / "seen.csv"), "--holdout", "0.25", "--out", str(folder / "done")])
+    assert code == 0
+    return folder / "done"
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def calib(capsys):
+    def run(*arguments: object) -> tuple[int, str, str]:
+        code = cli.run([str(argument) for argument in arguments])
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    return run
+
+
+def commands(path: str = "commands.csv") -> list[dict[str, str]]:
+    with Path(path).open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def numbers(rows: list[dict[str, str]], names: list[str]) -> np.ndarray:
+    return np.array([[float(row[name]) for name in names] for row in rows])
+
+
+Q = [f"q{k + 1}" for k in range(6)]
+
+
+def off(one: np.ndarray, two: np.ndarray) -> tuple[float, float]:
+    """Return rms differences of poses: position [m], orientation [rad]."""
+    shift = np.linalg.norm(one[:, :3, 3] - two[:, :3, 3], axis=1)
+    turn = np.linalg.norm(rotation_vector(one[:, :3, :3] @ np.swapaxes(two[:, :3, :3], 1, 2)), axis=1)
+    return float(np.sqrt(np.mean(shift**2))), float(np.sqrt(np.mean(turn**2)))
+
+
+def test_poses_in_the_instruments_frame_are_met_by_the_true_tool(cell, fitted, here, calib):
+    """Round trip against the hidden truth: what is left is the model's own error, as the held-out poses state it."""
+    wanted = true_poses(cell, drawn(cell, 300, 5))
+    write(here / "t.csv", ["x [mm]", "y [mm]", "z [mm]", "qx", "qy", "qz", "qw", *Q], np.hstack(
+        [1e3 * wanted[:, :3, 3], to_quaternion(wanted), drawn(cell, 300, 5)]
+    ))  # fmt: skip
+    code, out, err = calib("compensate", fitted, "t.csv", "--frame", "seen", "--tool", "tool", "--out", "commands.csv")
+    assert code == 0, err
+    assert "instrument's frame, station 'seen'" in out and "tool 'tool'" in out
+    rows = commands()
+    assert {row["status"] for row in rows} == {"reached"}
+    position, turn = off(true_poses(cell, numbers(rows, Q)), wanted)
+    unseen = float(rows[0]["unseen_rms [mm]"]) * 1e-3
+    metrics = json.loads((fitted / "metrics.json").read_text())["validation"]["seen.csv"]
+    assert unseen == pytest.approx(1e-3 * metrics["calibrated"]["position_mm"]["rms"])
+    assert position < 1.2 * unseen and turn < 2e-4
+    before = numbers(rows, ["before [mm]", "left [mm]", "sigma [mm]"]) * 1e-3
+    assert np.sqrt(np.mean(before[:, 0] ** 2)) > 10 * position
+    assert before[:, 1].max() < 1e-6
+    assert 0.2 * position < np.sqrt(np.mean(before[:, 2] ** 2)) < 2 * position
+
+
+def test_joint_targets_are_the_nominal_robots_poses(cell, fitted, here, calib):
+    """In the base that URDF users see: the calibrated flange, base to tip, stands where the nominal one would."""
+    q = drawn(cell, 100, 6)
+    write(here / "t.csv", [f"q{k + 1} [deg]" for k in range(6)], np.rad2deg(q))
+    code, out, err = calib("compensate", fitted, "t.csv", "--out", "commands.csv")
+    assert code == 0, err
+    assert "calibrated robot's base" in out and "the flange" in out
+    sent = np.deg2rad(numbers(commands(), [f"q{k + 1} [deg]" for k in range(6)]))
+    found = compensating.read(fitted)
+    goal = Goal(compensating.placements(found)[1], torques=compensating.torques_of(found))
+    at = inverse.seen_at(goal, sent).poses()
+    position, turn = off(at, forward(cell.nominal, q))
+    assert position < 1e-7 and turn < 1e-7
+    assert np.abs(sent - q).max() < 0.2
+
+
+def test_the_nominal_frame_moves_the_arm_least(cell, fitted, here, calib):
+    """Placed where it fits best, the nominal robot is off by what the fit reports as its error, and by no more."""
+    write(here / "t.csv", Q, drawn(cell, 200, 7))
+    metrics = json.loads((fitted / "metrics.json").read_text())["validation"]["seen.csv"]
+    sizes = {}
+    for frame in ("base", "nominal"):
+        assert calib("compensate", fitted, "t.csv", "--frame", frame, "--tool", "tool", "--out", "commands.csv")[0] == 0
+        sizes[frame] = np.sqrt(np.mean(numbers(commands(), ["before [mm]"]) ** 2))
+    assert sizes["nominal"] == pytest.approx(metrics["nominal"]["position_mm"]["rms"], rel=0.2)
+    assert sizes["nominal"] < sizes["base"]
+
+
+def test_positions_alone_are_sought_near_a_start(cell, fitted, here, calib):
+    q = drawn(cell, 20, 8) * 0.3 + np.array([0.0, -1.2, 1.5, -1.0, -1.4, 0.3])
+    poses = forward(cell.nominal, q)
+    write(here / "t.csv", ["x", "y", "z"], poses[:, :3, 3])
+    start = "0,-1.2,1.5,-1,-1.4,0.3"
+    code, out, err = calib("compensate", fitted, "t.csv", "--out", "commands.csv", "--start", start)
+    assert code == 0, err
+    assert "position only" in out
+    rows = commands()
+    sent = numbers(rows, list(cell.nominal.joint_names))
+    assert np.abs(sent - np.array([0.0, -1.2, 1.5, -1.0, -1.4, 0.3])).max() < 1.5
+    assert all(row["left [mrad]"] == "" for row in rows)
+
+
+def test_a_tool_given_by_numbers_is_the_flange_moved(cell, fitted, here, calib):
+    q = drawn(cell, 30, 9)
+    tool = from_xyz_rpy([0.1, 0.0, 0.2], [0.0, 0.5, 0.0])
+    at_tool = forward(cell.nominal, q) @ tool
+    write(here / "tool.csv", ["x", "y", "z", "qx", "qy", "qz", "qw", *Q], np.hstack(
+        [at_tool[:, :3, 3], to_quaternion(at_tool), q]
+    ))  # fmt: skip
+    write(here / "flange.csv", Q, q)
+    assert calib("compensate", fitted, "flange.csv", "--out", "a.csv")[0] == 0
+    code, _, err = calib("compensate", fitted, "tool.csv", "--tool", "0.1,0,0.2,0,0.5,0", "--out", "b.csv")
+    assert code == 0, err
+    assert np.abs(numbers(commands("a.csv"), Q) - numbers(commands("b.csv"), Q)).max() < 1e-7
+
+
+def test_what_is_out_of_reach_stops_all_or_is_left_empty(cell, fitted, here, calib):
+    q = drawn(cell, 3, 10)
+    poses = forward(cell.nominal, q)
+    poses[1, :3, 3] *= 3.0 / np.linalg.norm(poses[1, :3, 3])
+    write(here / "t.csv", ["x", "y", "z", "qx", "qy", "qz", "qw", *Q], np.hstack(
+        [poses[:, :3, 3], to_quaternion(poses), q]
+    ))  # fmt: skip
+    code, _, err = calib("compensate", fitted, "t.csv", "--out", "commands.csv")
+    assert (code, Path("commands.csv").exists()) == (2, False)
+    assert "1 of 3 targets" in err and "target 2: out of reach" in err and "--partial" in err
+    code, out, err = calib("compensate", fitted, "t.csv", "--out", "commands.csv", "--partial")
+    assert code == 0 and "2 of 3 commands" in out and "target 2" in out
+    rows = commands()
+    assert [row["status"] for row in rows] == ["reached", "not reached", "reached"]
+    assert rows[1]["q1"] == "" and "out of reach" in rows[1]["reason"]
+
+
+def test_joint_limits_are_kept(cell, fitted, here, calib):
+    """A target at a limit: the command would go beyond, and says so; one beyond it is named as such."""
+    limit = cell.nominal.upper[1]
+    q = np.tile([0.3, 0.0, 1.2, 0.4, 1.1, 0.2], (3, 1))
+    q[0, 1], q[1, 1], q[2, 1] = limit, -limit, limit + 0.1
+    write(here / "t.csv", Q, np.vstack([q, drawn(cell, 5, 1)]))
+    code, _, err = calib("compensate", fitted, "t.csv", "--out", "commands.csv", "--partial")
+    assert code == 0, err
+    rows = commands()
+    assert "outside the limits" in rows[2]["reason"]
+    assert {rows[0]["status"], rows[1]["status"]} == {"reached", "not reached"}  # one of the two ends is inside
+    assert any("at a limit" in row["reason"] for row in rows[:2])
+    sent = numbers([row for row in rows if row["status"] == "reached"], Q)
+    assert (sent <= cell.nominal.upper).all() and (sent >= cell.nominal.lower).all()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "is empty"),
+        ("q1,q2,q3,q4,q5,q6\n", "no data rows"),
+        ("q1,q2,q3,q4,q5,q6\n0,0,nan,0,0,0\n", "row 1, column 'q3'"),
+        ("q1,q2,q3,q4,q5,q6\n10,-90,90,0,45,90\n20,-80,90,0,45,90\n", "deg"),
+        ("x,y,z\n500,200,300\n", "name the column 'x [mm]'"),
+        ("x,y\n0.5,0.2\n", "column 'z'"),
+        ("a,b,c\n1,2,3\n", "no targets found"),
+        ("qx,qy,qz,qw\n0,0,0,1\n", "an orientation alone"),
+        ("x,y,z,qx,qy,qz,qw\n0.4,0.1,0.3,0,0,0,2\n", "norm 2"),
+        ("q1,q2,q3,q4,q5\n0,0,0,0,0\n", "column 'q6'"),
+    ],
+)
+def test_bad_targets_are_refused(fitted, here, calib, text, said):
+    (here / "t.csv").write_text(text)
+    code, _, err = calib("compensate", fitted, "t.csv", "--out", "commands.csv")
+    assert (code, Path("commands.csv").exists()) == (2, False)
+    assert said in err
+
+
+def test_folders_and_words_that_do_not_serve_are_refused(fitted, here, calib):
+    write(here / "t.csv", Q, np.zeros((1, 6)) + 0.5)
+    (here / "empty").mkdir()
+    (here / "half").mkdir()
+    (here / "half" / "robot.toml").write_text((fitted / "robot.toml").read_text())
+    for arguments, said in (
+        (("empty", "t.csv"), "no robot.toml"),
+        (("half", "t.csv"), "covariance.csv"),
+        ((fitted, "none.csv"), "none.csv"),
+        ((fitted, "t.csv", "--frame", "table"), "seen"),
+        ((fitted, "t.csv", "--tool", "1,2"), "x,y,z"),
+        ((fitted, "t.csv", "--dof", "4"), "expected 6, 5"),
+        ((fitted, "t.csv", "--start", "1,2"), "6 numbers"),
+    ):
+        code, _, err = calib("compensate", *arguments, "--out", "commands.csv")
+        assert code == 2 and said in err, (arguments, err)
+    code, _, err = calib("compensate", fitted, "t.csv", "--out", "t.csv")
+    assert code == 2 and "targets" in err
+
+
+def test_one_target_and_the_same_one_twice_are_targets(fitted, here, calib):
+    for count in (1, 3):
+        write(here / "t.csv", Q, np.full((count, 6), 0.7))
+        code, _, err = calib("compensate", fitted, "t.csv", "--out", "commands.csv")
+        assert code == 0, err
+        assert len(commands()) == count
+
+
+def test_the_file_of_targets_reads_as_documented(here):
+    write(here / "t.csv", ["name", "x_target [mm]", "y_target [mm]", "z_target [mm]"], [[1, 400, 0, 500]])
+    found = read_targets("t.csv", Q)
+    assert found.ignored == ("name",) and found.q is None
+    assert found.position.tolist() == [[0.4, 0.0, 0.5]]
