@@ -11,7 +11,8 @@ both                the pose is the target; the joints say which configuration t
 A unit in brackets is converted (``q1 [deg]``, ``x [mm]``); plain headers are SI. All other columns are ignored and
 listed. Frames are not in the file: they are said by ``--frame`` and ``--tool``.
 
-COMMANDS.csv has one row per target, in their order:
+COMMANDS.csv has one row per target, in their order. Where a target cannot be reached nothing is written, and the exit
+code is 2; with ``--partial`` the others are written, and its row has no joints:
 
 ==================  ===================================================================================================
 row                 the target's number, from 1

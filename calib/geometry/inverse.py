@@ -26,7 +26,7 @@ DONE = 1e-10  # error [m] below which a target is met
 STILL = 1e-12  # step [rad or m] that changes nothing
 FIRST, LAST = 1e-9, 1e4  # damping, in mean squared singular values of J
 CHUNK = 2000  # targets at once: bounds the memory
-BACK = (1e-3, 1e-2, 1e-1, 1.0)  # weights that hold the joints at the start [m/rad]
+BACK = np.geomspace(1e-4, 1.0, 13)  # weights that hold the joints at the start [m/rad]
 
 Torques = Callable[[np.ndarray], np.ndarray] | None
 DOF = (6, 5, 3)

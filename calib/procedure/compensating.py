@@ -3,8 +3,8 @@
 Frames are a matter of convention, since an arm that is measured from outside tells neither its base nor its flange from
 the placement of the instrument and of the target:
 
-    --frame base      targets stand in the base of the calibrated robot, as its exported URDF has it: base link and
-                      flange stay where the nominal description has them (the elements that cannot be told stay nominal)
+    --frame base      targets stand in the base of the calibrated robot, as its robot.toml has it: base link and flange
+                      stay where the nominal description has them (the elements that cannot be told stay nominal)
     --frame nominal   targets stand in the base of the nominal robot, placed in the cell where it fits the measurements
                       best: commands change least on the whole
     --frame NAME      targets stand in the frame of that instrument placement (a station of the fit)
@@ -41,6 +41,9 @@ from calib.transforms import from_xyz_rpy, invert, pose, rotation_vector
 
 TOLERANCE = (1e-6, 1e-5)  # position [m] and orientation [rad] that a command may leave; our choice, as what follows
 MOST = 0.2  # correction of one joint [rad or m] beyond which the arm is held back: it is near a singularity
+SINGULAR = 0.02  # singular values of the Jacobian, smallest over largest
+ASTRAY = 0.01  # further from a target than this no singularity is to blame [m]
+SLACK = 1e-9  # [rad or m]
 STARTS = 24  # random starts for each target without joints
 
 
@@ -121,7 +124,7 @@ def _stated_errors(folder: Path) -> tuple[float | None, float | None]:
 
 
 def _rms(found: dict) -> float:
-    return 1e-3 * float((found["position_mm"] or found.get("distance_mm"))["rms"])
+    return 1e-3 * float((found["position_mm"] or found["distance_mm"])["rms"])
 
 
 def placements(fitted: Fitted, frame: str = "base", tool: str = "flange") -> tuple[Installation, Installation]:
@@ -220,18 +223,18 @@ def compensate(
     say("the calibrated robot")
     q = inverse.reach(after, wanted, q0)
     q = inverse.nearest(after, wanted, np.clip(q0, lower, upper), q)
-    met = _within(_sizes(inverse.differences(after, q, wanted)), tolerance)
-    far = np.flatnonzero(met & (np.abs(q - q0).max(axis=1, initial=0.0) > MOST))
+    far = np.flatnonzero(np.abs(q - q0).max(axis=1, initial=0.0) > MOST)
     q[far] = inverse.held_back(after, wanted[far], q0[far], MOST)
     left = _sizes(inverse.differences(after, q, wanted))
-    reached = _within(left, tolerance) & ((q0 >= lower - 1e-9) & (q0 <= upper + 1e-9)).all(axis=1)
-    reason = tuple("" if reached[k] else _why(after, wanted[k], q0[k], q[k], left[k], k in far) for k in range(len(q)))
+    reached = _within(left, tolerance) & ((q0 >= lower - SLACK) & (q0 <= upper + SLACK)).all(axis=1)
+    singular = inverse.conditions(after, q0) < SINGULAR
+    reason = tuple("" if good else _why(one.chain, *row) for good, *row in zip(reached, q0, q, left, singular))
     say("sigmas")
     sigma = _predicted_sigmas(fitted, q, frame, tool, after)
     missed = _sizes(inverse.differences(after, np.clip(q0, lower, upper), wanted))
     if count == 3:
         sigma[:, 1] = np.nan
-    words = (frame_words(fitted, frame), tool_words(tool), *notes)
+    words = (frame_words(fitted, frame), tool_words(tool), *notes, *_turn_words(fitted, count))
     return Commands(q, q0, reached, reason, left, missed, sigma, count, words)
 
 
@@ -298,18 +301,17 @@ def _within(sizes: np.ndarray, tolerance: tuple[float, float]) -> np.ndarray:
     return (sizes[:, 0] <= tolerance[0]) & ~(sizes[:, 1] > tolerance[1])
 
 
-def _why(goal: Goal, wanted: np.ndarray, nominal: np.ndarray, q: np.ndarray, left: np.ndarray, held: bool) -> str:
-    """Say why a target is not reached."""
-    chain, rest = goal.cell.chain, f"{1e3 * left[0]:.3g} mm"
-    rest += "" if np.isnan(left[1]) else f" and {1e3 * left[1]:.3g} mrad"
+def _why(chain: Chain, nominal: np.ndarray, q: np.ndarray, left: np.ndarray, singular: bool) -> str:
+    """Say why a target is not reached, from what is left there (2,) [m, rad]."""
+    rest = f"{1e3 * left[0]:.3g} mm" + ("" if np.isnan(left[1]) else f" and {1e3 * left[1]:.3g} mrad")
     for name, value, low, high in zip(chain.joint_names, nominal, chain.lower, chain.upper):
-        if not low - 1e-9 <= value <= high + 1e-9:
+        if not low - SLACK <= value <= high + SLACK:
             return f"the target itself is outside the limits {low:.4g} to {high:.4g} of {name} ({value:.4g})"
     at = [name for name, v, j in zip(chain.joint_names, q, chain.joints) if v <= j.lower or v >= j.upper]
     if at:
         return f"{', '.join(at)} at a limit: {rest} left"
-    if held:
-        return f"near a singularity, where a correction takes joints further than {MOST:g} rad: {rest} left"
+    if singular and left[0] < ASTRAY:
+        return f"near a singularity, where joints would move by more than {MOST:g} rad or cannot follow: {rest} left"
     return f"out of reach: {rest} left at the nearest pose found"
 
 
@@ -330,7 +332,7 @@ def frame_words(fitted: Fitted, frame: str) -> str:
     if frame not in ("base", "nominal"):
         return f"targets are in the instrument's frame, station '{frame}'"
     words = {
-        "base": "targets are in the calibrated robot's base, as its URDF has it (--frame base)",
+        "base": "targets are in the calibrated robot's base, as robot.toml has it (--frame base)",
         "nominal": "targets are in the nominal robot's base where it fits the measurements best (--frame nominal)",
     }[frame]
     if set(fitted.cell.station_names) - set(fitted.nominal.station_names) or not len(fitted.nominal.stations):
@@ -339,6 +341,15 @@ def frame_words(fitted: Fitted, frame: str) -> str:
     other = {"base": "the nominal robot's best base", "nominal": "the calibrated robot's base"}[frame]
     shift, turn = np.linalg.norm(between[:3, 3]), np.linalg.norm(rotation_vector(between[:3, :3]))
     return f"{words}; {other} stands {1e3 * shift:.2f} mm and {1e3 * turn:.2f} mrad from it"
+
+
+def _turn_words(fitted: Fitted, dof: int) -> tuple[str, ...]:
+    """Say where orientations count and were never measured."""
+    table = layout(fitted.cell)
+    measured = {table.names[k] for k in fitted.free if k in set(table.tool_index)}
+    if dof == 3 or any(name.rsplit(".", 1)[-1] in ("rx", "ry", "rz") for name in measured):
+        return ()
+    return ("the fit saw no orientations: how the flange is turned behind the last joint axis stays nominal",)
 
 
 def tool_words(tool: str) -> str:
