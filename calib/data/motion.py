@@ -66,7 +66,8 @@ class Motion:
         cutoff: (n,) f_q [Hz].
         decimator: the filter of the parallel decimation to that band.
         joint_names, kind, file, drive_gain: the recording's.
-        tau_link, tau_motor, q_link, v_measured: (N, n) the recording's others on the grid, not filtered; or None.
+        tau_link, tau_motor, q_link, q_ref, tau_ff, v_measured: (N, n) the recording's others on the grid, not
+            filtered; or None.
         sampling, cutoffs: what was found; notes: what a user should be told.
     """
 
@@ -90,6 +91,8 @@ class Motion:
     tau_link: np.ndarray | None = None
     tau_motor: np.ndarray | None = None
     q_link: np.ndarray | None = None
+    q_ref: np.ndarray | None = None
+    tau_ff: np.ndarray | None = None
     v_measured: np.ndarray | None = None
     drive_gain: np.ndarray | None = None
 
@@ -102,7 +105,10 @@ class Motion:
         return self.q.shape[1]
 
 
-ROWS = ("t", "q", "v", "a", "effort", "weight", "segment", "tau_link", "tau_motor", "q_link", "v_measured")
+ROWS = (
+    "t", "q", "v", "a", "effort", "weight", "segment", "tau_link", "tau_motor", "q_link", "q_ref", "tau_ff",
+    "v_measured",
+)  # fmt: skip
 
 
 def make_motion(recording: Recording, options: FilterOptions | None = None) -> Motion:

@@ -12,7 +12,7 @@ from calib.arrays import frozen
 from calib.errors import MeasurementError, UsageError
 
 KINDS = ("torque", "current")
-SERIES = ("q", "v", "effort", "tau_link", "tau_motor", "q_link")
+SERIES = ("q", "v", "effort", "tau_link", "tau_motor", "q_link", "q_ref", "tau_ff")
 _CUT = re.compile(r"^(?P<file>.+)@(?P<start>[^@:/\\]*):(?P<stop>[^@:/\\]*)$")
 
 
@@ -61,6 +61,8 @@ class Recording:
         tau_link: (N, n) a second torque, of sensors behind the gear [N·m or N]; None where not recorded.
         tau_motor: (N, n) torque on the motor's side of the gear, as recorded [N·m]; None where not recorded.
         q_link: (N, n) second encoders, behind the gear [rad or m]; NaN in the columns of joints that have none.
+        q_ref: (N, n) positions that were asked for [rad or m]; tau_ff: (N, n) torque the controller added open loop,
+            as torques; None where not recorded.
         drive_gain: (n,) torque per current that the file states [N·m/A or N/A]; None where it states none.
         file: where it came from.
         rows: (N,) number of each sample in the file, counted from 1.
@@ -76,6 +78,8 @@ class Recording:
     tau_link: np.ndarray | None = None
     tau_motor: np.ndarray | None = None
     q_link: np.ndarray | None = None
+    q_ref: np.ndarray | None = None
+    tau_ff: np.ndarray | None = None
     drive_gain: np.ndarray | None = None
     file: str = ""
     rows: np.ndarray = None  # type: ignore[assignment]  # set below

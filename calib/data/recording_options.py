@@ -13,6 +13,9 @@ effort     torque: tau, torque, torques, effort, efforts, joint_torques, measure
 tau_link   tau_link, tau_l, tau_sensor, link_torque
 tau_motor  tau_motor, tau_m, motor_torque
 q_link     q_link, link_position
+q_ref      q_ref, q_des, q_cmd, q_desired, q_reference, q_command, q_target, position_reference, position_command,
+           desired_position, reference_position, target_position
+tau_ff     tau_ff, tau_feedforward, torque_feedforward
 ========== =============================================================================================
 
 FloBaRoID writes times, positions, velocities, torques.
@@ -39,7 +42,12 @@ SYNONYMS: Mapping[str, tuple[str, ...]] = {
     "tau_link": ("tau_link", "tau_l", "tau_sensor", "link_torque"),
     "tau_motor": ("tau_motor", "tau_m", "motor_torque"),
     "q_link": ("q_link", "link_position"),
-}
+    "q_ref": (
+        "q_ref", "q_des", "q_cmd", "q_desired", "q_reference", "q_command", "q_target", "position_reference",
+        "position_command", "desired_position", "reference_position", "target_position",
+    ),
+    "tau_ff": ("tau_ff", "tau_feedforward", "torque_feedforward"),
+}  # fmt: skip
 RATES = ("frequency", "rate", "sample_rate", "fs")
 OWN = ("joint_names", "drive_gain", "use_range")
 SCALES = {
@@ -49,7 +57,8 @@ SCALES = {
     "torque": {"nm": 1.0, "n·m": 1.0, "n.m": 1.0, "n*m": 1.0, "n m": 1.0, "n": 1.0, "mnm": 1e-3, "knm": 1e3},
     "current": {"a": 1.0, "ma": 1e-3},
 }
-SCALES |= {"tau_link": SCALES["torque"], "tau_motor": SCALES["torque"], "q_link": SCALES["q"]}
+SCALES |= {name: SCALES["torque"] for name in ("tau_link", "tau_motor", "tau_ff")}
+SCALES |= {name: SCALES["q"] for name in ("q_link", "q_ref")}
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +56,23 @@ def read_log(
         **series,
     )
     return recording if ends == (None, None) else cut(recording, *ends)
+
+
+def read_positions(
+    path: Path, joints: Joints | None = None, options: RecordingOptions | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return stamps (N,) [s] and positions (N, n) of a table without torques: of q_ref, or of q where that is not."""
+    options = options or RecordingOptions()
+    table = _numbered_brackets(read_table(path, doubles=True))
+    here = replace(options, names={key: name for key, name in options.names.items() if key in ("t", "q", "q_ref")})
+    found = _find(table, here, joints.names if joints else ())
+    ours = "q_ref" if "q_ref" in found else "q"
+    if ours not in found:
+        wanted = ", ".join((*SYNONYMS["q_ref"], *SYNONYMS["q"]))
+        message = f"has no positions that were asked for ({wanted}, with the joints' numbers or names)"
+        raise MeasurementError(f"{message}; found: {', '.join(table.header)}", path)
+    q = np.column_stack([_values(table, place, ours, options) for place in found[ours]])
+    return _stamps(table, found, options), q
 
 
 def _numbered_brackets(table: Table) -> Table:

@@ -266,6 +266,25 @@ def projected(problem: Instruments, std: np.ndarray | None = None) -> np.ndarray
     return _projected(combine(problem.data, std), problem.names)
 
 
+def testable(problem: Instruments, fit: LinearFit, std: np.ndarray | None = None) -> Triangles:
+    """Return triangles [A b; 0 ‖ρ‖] of one group, on which least squares gives the IV estimate and its covariance.
+
+    ρ = y - W x_IV, whitened. With it tests of nested models are those of two-stage least squares (Wooldridge 2010,
+    section 5.2.3): differences of ‖P_Z (y - W x)‖² against the variance of ρ.
+
+    Args:
+        problem, std: as in `iv`.
+        fit: what `iv` made of them.
+    """
+    p = len(problem.names)
+    sigma = np.ones(problem.data.groups) if std is None else std
+    squares = residual_squares(problem.data, np.concatenate([np.zeros(p), fit.estimate.values]))
+    factor = np.zeros((1, p + 1, p + 1))
+    factor[0, :p] = projected(problem, sigma)[:p]
+    factor[0, p, p] = np.sqrt(np.sum(squares / sigma**2))
+    return replace(empty(problem.names, problem.data.units[p:], 1), factors=factor, rows=problem.data.rows.sum()[None])
+
+
 def _projected(factor: np.ndarray, names: Sequence[str]) -> np.ndarray:
     """Return the R factor of P_Z [W y], after making sure that Z and Zᵀ W have full rank."""
     p = len(names)

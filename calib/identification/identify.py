@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -13,9 +13,11 @@ from calib.dynamics import base as bases
 from calib.dynamics.base import Base
 from calib.dynamics.idim import IdentificationModel, with_terms
 from calib.errors import MeasurementError, UsageError
+from calib.estimation import instruments
 from calib.estimation.essential import Elimination, Rule, eliminate
 from calib.estimation.linear import LinearFit, ridge
 from calib.estimation.triangles import Triangles, combine, condition_numbers, retriangulate
+from calib.identification.bias import LoopTest, require_loop, try_loop
 from calib.identification.cases import Case
 from calib.identification.estimators import Fitted, fit_rows, residual_inflation
 from calib.identification.ladder import Climb, Ground, Rung, climb
@@ -47,6 +49,7 @@ class Identification:
         condition: of the observation matrix of the base parameters, in its units and with columns of unit norm.
         prior: what was known of the base parameters beforehand, where it was used.
         ripples: gear ripple found above the identification band, by joint; not part of the estimate's covariance.
+        bias: what the simulated closed loop says of least squares, where a loop is stated.
     """
 
     dynamics: Dynamics
@@ -59,6 +62,7 @@ class Identification:
     condition: tuple[float, float]
     prior: Prior | None = None
     ripples: tuple[Ripple, ...] = ()
+    bias: LoopTest = field(default_factory=LoopTest)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -88,11 +92,7 @@ def identify(
     settings, say = settings or Settings(), progress or (lambda words: None)
     if not cases:
         raise UsageError("no recording to identify from")
-    if settings.method == "iv":
-        raise UsageError(
-            "method 'iv' simulates the closed loop and needs its controller and reference, which a recording does not "
-            "hold: see calib.identification.instrumental for scripts; from a recording alone use wls or irls"
-        )
+    settings = require_loop(settings) if settings.method == "iv" else settings
     model = make_model(chain, settings)
     _require_motion(cases)
     say("base parameters")
@@ -119,7 +119,13 @@ def identify(
         extend(part, climbed.terms, observe_terms(climbed.terms, case, decimator, load))
         for part, case, load in zip(rows, cases, loads)
     ]
-    fitted, condition = _estimate(full, climbed, settings, prior)
+    plain = replace(settings, method="wls") if settings.method == "iv" else settings
+    fitted, condition = _estimate(full, climbed, plain, prior)
+    if settings.loop is not None:
+        say("simulating the closed loop")
+    bias = try_loop(chain, model, base, cases, decimator, settings)
+    if settings.method == "iv" and bias.found is not None:
+        fitted = replace(fitted, fit=bias.found.fit, std=bias.found.std, method="iv")
     richer = with_terms(model, *climbed.terms)
     values = fitted.estimate.values
     standard = np.concatenate([bases.to_standard(base, values[: base.b]), values[base.b :]])
@@ -132,9 +138,10 @@ def identify(
         standard = np.concatenate([standard, *(ripple.values for ripple in ripples)])
     standard = _with_payloads(standard, richer, cases, settings)
     say("essential parameters")
-    gone = _essential(fitted, settings, prior)
+    gone = _essential(fitted, settings, prior, bias)
     return Identification(
-        Dynamics(richer, standard), base, fitted, gone, climbed, settings, tuple(full), condition, prior, tuple(ripples)
+        Dynamics(richer, standard), base, fitted, gone, climbed, settings, tuple(full), condition, prior,
+        tuple(ripples), bias,
     )  # fmt: skip
 
 
@@ -250,13 +257,17 @@ def _bounded(drawn: LinearFit, data: Triangles, std: np.ndarray, mean: np.ndarra
     return replace(drawn, estimate=replace(drawn.estimate, values=values))
 
 
-def _essential(fitted: Fitted, settings: Settings, prior: Prior | None) -> Elimination | None:
+def _essential(fitted: Fitted, settings: Settings, prior: Prior | None, bias: LoopTest) -> Elimination | None:
     """Return the elimination; none where the data alone do not determine the base parameters."""
     if settings.essential == "none" or prior is not None:
         return None
+    data, std, inflation = fitted.pooled, fitted.std, fitted.inflation
+    if fitted.method == "iv" and bias.found is not None:
+        data = instruments.testable(bias.found.problem, bias.found.fit, bias.found.std)
+        std, inflation = np.ones(1), np.array([bias.found.inflation])
     return eliminate(
-        fitted.pooled, Rule(settings.essential), ratio=settings.ratio, level=settings.level, keep=settings.keep,
-        drop=settings.drop, std=fitted.std, inflation=fitted.inflation,
+        data, Rule(settings.essential), ratio=settings.ratio, level=settings.level, keep=settings.keep,
+        drop=settings.drop, std=std, inflation=inflation,
     )  # fmt: skip
 
 

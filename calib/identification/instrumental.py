@@ -28,9 +28,10 @@ from calib.estimation import instruments
 from calib.estimation.constrained import Constrained, within
 from calib.estimation.instruments import Instruments, Strength, Verdict
 from calib.estimation.linear import LinearFit, settled_std, wls
-from calib.estimation.triangles import absorb, empty, select
+from calib.estimation.triangles import absorb, empty, residual_squares, select
 from calib.estimation.whiteness import inflation
 from calib.identification.cases import Case
+from calib.identification.prediction import carried_columns
 from calib.identification.rows import Rows, observe, segments
 from calib.simulation.closed_loop import Plant, Run, Sensing, inertia_diagonal, simulate, with_parameters
 from calib.simulation.controllers import Controller, scaled
@@ -49,7 +50,7 @@ class Loop:
     Attributes:
         controller: given, identified from the log (`calib.identification.controller`) or guessed: a third of the
             bandwidth still serves.
-        reference: at the controller's rate; its first instant is the recording's.
+        reference: at the controller's rate, in the recording's time, and spanning it.
         every: control periods per recorded sample.
         design: (n,) inertia for which the gains are what they say [kg m²]; the simulated robot then gets gains times
             J(x_k) / design, so that its bandwidth stays (Gautier & Janot). None: gains as they are.
@@ -59,6 +60,9 @@ class Loop:
     reference: Reference
     every: int = 1
     design: np.ndarray | None = None
+
+
+Runs = list[tuple[tuple[Case, Loop], Run]]
 
 
 @dataclass(frozen=True)
@@ -92,6 +96,7 @@ class Instrumental:
         distance: (n,) 100 ‖q - q_s‖ / ‖q - mean q‖ [%] of filtered measured and simulated positions: large where the
             controller is not the robot's.
         constrained: the optimum under constraints, where there are any; `fit` has its values and covariance.
+        problem: triangles of [Z W y], one group per torque row.
     """
 
     fit: LinearFit
@@ -105,6 +110,20 @@ class Instrumental:
     inflation: float
     distance: np.ndarray
     constrained: Constrained | None
+    problem: Instruments
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters that were estimated, as of `Base.names`."""
+        return self.fit.estimate.names
+
+    @property
+    def direct(self) -> np.ndarray:
+        """(n,) 100 ‖y - Z x‖ / ‖y‖ [%]: the torque of the simulated robot against the recorded, joint by joint."""
+        p = len(self.names)
+        values = np.concatenate([self.fit.estimate.values, np.zeros(p)])
+        rest, size = (residual_squares(self.problem.data, x) for x in (values, np.zeros(2 * p)))
+        return 100.0 * np.sqrt(rest / np.where(size > 0.0, size, np.inf))
 
     @property
     def shift(self) -> np.ndarray:
@@ -157,44 +176,88 @@ def identify_instrumental(
         raise UsageError(f"method '{method}' is none of {', '.join(METHODS)}")
     if model.kind != "motor" or not cases:
         raise UsageError("instruments from simulation need motor torques, and a recording with its reference")
+    task = _task(model, base, cases, decimator, method, columns, positive)
+    ordinary = _ordinary(task.observed)
+    plant, std = _regular(model, cases[0][1], inertia), ordinary.group_std
+    before: LinearFit | None = None
+    rounds: list[Round] = []
+    runs, retreats = _runs(plant, cases), 0
+    for _ in range(limit):
+        found = _estimate_round(task, runs, std)
+        new = _with_values(plant, task.standard(found.fit.estimate.values))
+        rounds.append(Round(_change(before, found.fit), found.fit.estimate.residual_std, retreats))
+        if before is not None and retreats == 0 and instruments.settled(before, found.fit, tolerance, tolerance):
+            return _result(task, found, ordinary, new, rounds, std, runs)
+        plant, runs, retreats = _simulate_new(plant, new, cases)
+        before, std = found.fit, found.fit.group_std
+    raise NotConverged(
+        f"instruments from simulation: parameters still change by {100 * rounds[-1].change:.3g} % after {limit} "
+        "rounds; estimate fewer (essential ones), or look at the controller's gains",
+        before,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """What stays the same from round to round."""
+
+    model: IdentificationModel
+    base: Base
+    kept: np.ndarray
+    cases: Sequence[tuple[Case, Loop]]
+    decimator: Decimator
+    observed: Sequence[Rows]
+    method: str
+    positive: Sequence[str]
+
+    def standard(self, values: np.ndarray) -> np.ndarray:
+        """Return standard parameters with the values of those base parameters that are estimated."""
+        whole = np.zeros(self.base.b)
+        whole[self.kept] = values
+        return bases.to_standard(self.base, whole)
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """One round's estimate, and the triangles it came from."""
+
+    problem: Instruments
+    fit: LinearFit
+    tau: float
+    bound: Constrained | None
+
+
+def _task(
+    model: IdentificationModel, base: Base, cases: Sequence[tuple[Case, Loop]], decimator: Decimator, method: str,
+    columns: np.ndarray | None, positive: Sequence[str],
+) -> _Task:  # fmt: skip
     kept = np.arange(base.b) if columns is None else np.asarray(columns, dtype=int)
     observed = [observe(model, base.kept[kept], case, decimator) for case, _ in cases]
     observed = [replace(rows, names=tuple(base.names[k] for k in kept)) for rows in observed]
-    ordinary = _ordinary(observed)
-    plant, now, std = _regular(model, cases[0][1], inertia), ordinary, ordinary.group_std
-    before: LinearFit | None = None
-    bound, tau, rounds = None, 1.0, []
-    runs = _runs(plant, cases)
-    retreats = 0
-    for _ in range(limit):
-        simulated = [
-            _observe_run(model, base.kept[kept], simulated_case(case, run, loop), rows, decimator)
-            for rows, ((case, loop), run) in zip(observed, runs)
-        ]
-        problem = _stack(observed, simulated)
-        now = _estimate(problem, method, std, tau)
-        tau = _inflation(observed, now, std)
-        now = _estimate(problem, method, std, tau)
-        now, bound = _constrain(problem, now, std, positive)
-        values = np.zeros(base.b)
-        values[kept] = now.estimate.values
-        found = _with_values(plant, bases.to_standard(base, values))
-        rounds.append(Round(_change(before, now), now.estimate.residual_std, retreats))
-        if before is not None and retreats == 0 and instruments.settled(before, now, tolerance, tolerance):
-            break
-        plant, runs, retreats = _simulate_new(plant, found, cases)
-        before, std = now, now.group_std
-    else:
-        last = rounds[-1]
-        raise NotConverged(
-            f"instruments from simulation: parameters still change by {100 * last.change:.3g} % after {limit} rounds; "
-            "estimate fewer (essential ones), or look at the controller's gains",
-            now,
-        )
-    verdict = instruments.exogeneity(problem, std, tau)
+    return _Task(model, base, kept, cases, decimator, observed, method, positive)
+
+
+def _estimate_round(task: _Task, runs: Runs, std: np.ndarray) -> _Found:
+    """Return the estimate with the instruments of these runs."""
+    simulated = [
+        _observe_run(task.model, task.base.kept[task.kept], simulated_case(case, run, loop), rows, task.decimator)
+        for rows, ((case, loop), run) in zip(task.observed, runs)
+    ]
+    problem = _stack(task.observed, simulated)
+    tau = _inflation(task.observed, _estimate(problem, task.method, std), std)
+    fit, bound = _constrain(problem, _estimate(problem, task.method, std, tau), std, task.positive)
+    return _Found(problem, fit, tau, bound)
+
+
+def _result(
+    task: _Task, found: _Found, ordinary: LinearFit, plant: Plant, rounds: Sequence[Round], std: np.ndarray, runs: Runs
+) -> Instrumental:  # fmt: skip
+    """Return the last round with what the tests say of it."""
+    verdict = instruments.exogeneity(found.problem, std, found.tau)
+    strength = instruments.strength(found.problem, std)
     return Instrumental(
-        now, ordinary, frozen(kept, int), found, tuple(rounds), instruments.strength(problem, std), verdict,
-        frozen(std), tau, _distance(runs), bound,
+        found.fit, ordinary, frozen(task.kept, int), plant, tuple(rounds), strength, verdict, frozen(std), found.tau,
+        _distance(runs), found.bound, found.problem,
     )  # fmt: skip
 
 
@@ -205,11 +268,13 @@ def simulated_case(case: Case, run: Run, loop: Loop) -> Case:
     what tells W from Z is noise.
     """
     step = loop.reference.period * loop.every
-    index = np.rint(case.motion.t / step).astype(int)
-    if index[-1] >= len(run.t) or np.abs(index * step - case.motion.t).max() > 0.01 * step:
+    t = case.motion.t - loop.reference.t[0]
+    index = np.rint(t / step).astype(int)
+    if index[0] < 0 or index[-1] >= len(run.t) or np.abs(index * step - t).max() > 0.01 * step:
         raise CalibError(
-            f"the recording runs to {case.motion.t[-1]:.6g} s in steps of {1 / case.motion.rate:.6g} s, the simulation "
-            f"to {run.t[-1]:.6g} s in steps of {step:.6g} s: give the whole reference, and `every`"
+            f"the recording runs from {case.motion.t[0]:.6g} s to {case.motion.t[-1]:.6g} s in steps of "
+            f"{1 / case.motion.rate:.6g} s, the simulation from {run.t[0]:.6g} s to {run.t[-1]:.6g} s in steps of "
+            f"{step:.6g} s: give the whole reference, and `every`"
         )
     motion, q = case.motion, np.empty_like(run.q)
     for cutoff in np.unique(motion.cutoff):
@@ -235,18 +300,21 @@ def _with_values(plant: Plant, values: np.ndarray) -> Plant:
     return with_parameters(plant, np.concatenate([values, np.zeros(len(plant.parameters) - len(values))]))
 
 
-Runs = list[tuple[tuple[Case, Loop], Run]]
-
-
 def _runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
     """Simulate every loop without noise."""
     result: Runs = []
     for case, loop in cases:
-        controller = loop.controller
+        robot, controller = _loaded(plant, case), loop.controller
         if loop.design is not None:
-            controller = scaled(controller, inertia_diagonal(plant, loop.reference.q[::200]) / loop.design)
-        result.append(((case, loop), simulate(plant, controller, loop.reference, Sensing(every=loop.every))))
+            controller = scaled(controller, inertia_diagonal(robot, loop.reference.q[::200]) / loop.design)
+        result.append(((case, loop), simulate(robot, controller, loop.reference, Sensing(every=loop.every))))
     return result
+
+
+def _loaded(plant: Plant, case: Case) -> Plant:
+    """Return the plant without the payloads that the case does not carry."""
+    there = carried_columns(IdentificationModel(plant.tree), case.carried)
+    return with_parameters(plant, plant.parameters * np.append(there, np.ones(len(plant.terms))))
 
 
 def _simulate_new(old: Plant, new: Plant, cases: Sequence[tuple[Case, Loop]]) -> tuple[Plant, Runs, int]:

@@ -50,7 +50,9 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     [gain_identification]            # torque = gain x current, from runs without and with a payload of known mass
     unloaded = "run.npz"             # recordings of the command line, or other files
     loaded = "run_load.npz"
-    [files."run_load.npz"]           # for this file only: payload, gains, and the keys of filter and recording
+    [loop]                           # the closed loop the recordings came from: see calib.identification.loop_settings
+    controller = "identify"
+    [files."run_load.npz"]           # for this file only: payload, gains, reference; keys of filter and recording
     payload = ["tool"]
 """
 
@@ -75,17 +77,19 @@ from calib.dynamics.shapes import SHAPES
 from calib.errors import CalibError, UsageError
 from calib.identification.estimators import METHODS
 from calib.identification.ladder import NAMES
+from calib.identification.loop_settings import parse_loop
 from calib.identification.settings import PRIORS, RULES, Coupling, Payload, Settings
 
 
 @dataclass(frozen=True)
 class FileSettings:
-    """How one recording is read: its reader's options, its filters, its payload labels and its gains."""
+    """How one recording is read: reader's options, filters, payload labels, gains, a file for its reference."""
 
     recording: RecordingOptions = field(default_factory=RecordingOptions)
     filter: FilterOptions = field(default_factory=FilterOptions)
     payload: tuple[str, ...] = ()
     gains: tuple[float, ...] | None = None
+    reference: str = ""
 
 
 @dataclass(frozen=True)
@@ -142,6 +146,7 @@ def parse_options(table: Mapping[str, Any], source: str = "options") -> Identify
         couplings=tuple(_coupling(v, f"{source}: coupling") for v in _list(table, "coupling", source)),
         terms=tuple(_term(v, f"{source}: term") for v in _list(table, "term", source)),
         payloads=_payloads(table.get("payload", {}), f"{source}: payload"),
+        loop=parse_loop(table["loop"], f"{source}: loop") if "loop" in table else None,
     )
     every = _file({key: table[key] for key in table if key in _FILE}, FileSettings(), settings, source)
     files = {}
@@ -151,7 +156,7 @@ def parse_options(table: Mapping[str, Any], source: str = "options") -> Identify
             inner = next(iter(own))
             if inner not in ("filter", "recording"):
                 raise UsageError(f'{place}: the dot needs quotes: [files."{name}.{inner}"]')
-        values.known(values.table(own, place), {*_FILE, "payload"}, place)
+        values.known(values.table(own, place), {*_FILE, "payload", "reference"}, place)
         files[name] = _file(own, every, settings, place)
     rest: dict[str, Any] = {key: _OWN[key](table[key], f"{source}: {key}") for key in table if key in _OWN}
     if "gain_identification" in table:
@@ -167,6 +172,8 @@ def _file(table: Mapping[str, Any], base: FileSettings, settings: Settings, plac
         result = replace(result, filter=_filter(table["filter"], base.filter, f"{place}: filter"))
     if "gains" in table:
         result = replace(result, gains=_numbers(table["gains"], f"{place}: gains"))
+    if "reference" in table:
+        result = replace(result, reference=values.text(table["reference"], f"{place}: reference"))
     if isinstance(table.get("payload"), list):
         labels = values.names(table["payload"], f"{place}: payload")
         for label in labels:
@@ -325,7 +332,7 @@ _OWN: dict[str, Callable[[Any, str], Any]] = {
     "cut_slow": values.flag,
 }
 _FILE = ("recording", "filter", "gains")
-_TABLES = ("coupling", "term", "payload", "files", "gain_identification")
+_TABLES = ("coupling", "term", "payload", "files", "gain_identification", "loop")
 assert {_FIELD.get(key, key) for key in _SETTINGS} <= {f.name for f in fields(Settings)}
 
 

@@ -14,6 +14,7 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.shapes import V0
 from calib.dynamics.tree import tree, with_gravity, with_payload
 from calib.errors import UsageError
+from calib.identification.loop_settings import LoopSettings
 from calib.robot.chain import Chain
 
 T = TypeVar("T")
@@ -58,6 +59,7 @@ class Settings:
         gravity: in the base frame [m/s²]; None: the robot's.
         samples: most rows (per torque) that are held at once; longer recordings are thinned further.
         folds: number of time blocks for cross-validation.
+        loop: the closed loop that recordings came from, for instrumental variables.
         seed: for random states.
     """
 
@@ -79,6 +81,7 @@ class Settings:
     gravity: tuple[float, float, float] | None = None
     samples: int = 20_000
     folds: int = 6
+    loop: LoopSettings | None = None
     seed: int = 0
 
 

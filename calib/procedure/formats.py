@@ -17,6 +17,10 @@ TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
         ("calib.data.target_files", "calib.procedure.compensating"),
     ),
     "options": ("the TOML file of calib fit --options", ("calib.data.options",)),
+    "identify-options": (
+        "the TOML file of calib identify --options",
+        ("calib.identification.options", "calib.identification.loop_settings"),
+    ),
     "constraints": ("the TOML file of calib select --constraints", ("calib.procedure.limits",)),
     "mdh": ("a robot as a table of modified Denavit-Hartenberg rows", ("calib.robot.mdh", "calib.robot.tables")),
     "robot": ("robot.toml as calib fit writes it", ("calib.robot.description", "calib.procedure.calibrated")),
@@ -30,7 +34,7 @@ TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
 
 def overview() -> list[str]:
     """Return one line per topic."""
-    return [f"{name:14} {words}" for name, (words, _) in TOPICS.items()]
+    return [f"{name:17} {words}" for name, (words, _) in TOPICS.items()]
 
 
 def describe(topic: str) -> str:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,12 +14,14 @@ from calib.errors import UsageError
 from calib.identification.scores import Part, Score
 from calib.identification.storage import to_table
 from calib.procedure import calibrated, consistency_tables
+from calib.procedure.folders import check_folder, write_staged
+from calib.procedure.identification_loop import loop_table, write_instrumental
 from calib.procedure.identifying import IdentificationOutcome
 from calib.robot import description
 
 OURS = (
-    "robot.toml", "dynamics.json", "estimate.csv", "covariance.csv", "metrics.json", calibrated.COVARIANCE,
-    *(consistency_tables.EFFECTS, consistency_tables.SENSITIVITY, consistency_tables.GEOMETRIES),
+    "robot.toml", "dynamics.json", "estimate.csv", "covariance.csv", "instrumental.csv", "metrics.json",
+    calibrated.COVARIANCE, consistency_tables.EFFECTS, consistency_tables.SENSITIVITY, consistency_tables.GEOMETRIES,
 )  # fmt: skip
 """Files of an earlier identification that a new one replaces; besides plots, ``plot_*.png``."""
 HEADER = ("name", "expression", "unit", "value", "sigma", "rsd", "essential", "sigma_torque", "sigma_geometry")
@@ -30,43 +29,26 @@ HEADER = ("name", "expression", "unit", "value", "sigma", "rsd", "essential", "s
 
 def check_target(out: Path, source: Path | None = None) -> None:
     """Refuse, before any work is done, a folder that cannot be written or whose files are not ours to replace."""
-    if out.exists() and not out.is_dir():
-        raise UsageError(f"{out} is a file; --out needs a folder")
+    check_folder(out)
     if source is not None and source.resolve().parent == out.resolve():
         raise UsageError(f"{out} holds the robot that is to be identified; choose another folder for --out")
     present = [name for name in OURS if (out / name).exists()]
     if present and not ((out / "metrics.json").exists() and (out / "dynamics.json").exists()):
         raise UsageError(f"{out} holds {', '.join(present)} which no earlier identification left there; choose another")
-    folder = out if out.is_dir() else next(parent for parent in out.absolute().parents if parent.exists())
-    try:
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise UsageError(f"cannot write to {folder}: {error.strerror or error}; nothing was changed there") from error
 
 
 def write_folder(
     outcome: IdentificationOutcome, out: Path, plots: Callable[[IdentificationOutcome, Path], None] | None = None
 ) -> Path:
-    """Write all files into a temporary folder beside `out` and move them there; see `calib.procedure.outputs`."""
+    """Write all files of an identification, all or none; see `calib.procedure.folders`."""
     check_target(out, outcome.inputs.source)
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        staging = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}.", suffix=".part"))
-    except OSError as error:
-        raise UsageError(f"cannot write beside {out}: {error.strerror or error}; nothing was changed there") from error
-    try:
-        _write_all(outcome, staging)
+
+    def write(folder: Path) -> None:
+        _write_all(outcome, folder)
         if plots is not None:
-            plots(outcome, staging)
-        os.chmod(staging, 0o755)
-        if out.exists():
-            _move_files(staging, out)
-        else:
-            os.replace(staging, out)
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
-    return out
+            plots(outcome, folder)
+
+    return write_staged(out, OURS, write)
 
 
 def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
@@ -80,6 +62,7 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     rows = ([name, *map(float, row)] for name, row in zip(found.names, covariance))
     files.write_table(folder / "covariance.csv", ("name", *found.names), rows)
     consistency_tables.write(outcome, folder)
+    write_instrumental(found.bias, folder)
     files.write_json(folder / "dynamics.json", to_table(found.dynamics, found.base))
     files.write_json(folder / "metrics.json", metrics(outcome))
 
@@ -157,6 +140,7 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
             for one in found.ripples
         ],
         "elimination": elimination_table(outcome),
+        "loop": loop_table(found.bias),
         "filters": {case.name: filter_table(case.motion) for case in (*outcome.inputs.cases, *outcome.inputs.unseen)},
         "geometry": consistency_tables.metrics(outcome.carried, outcome.geometries),
         "repeated": dict(outcome.repeated),
@@ -208,19 +192,6 @@ def elimination_table(outcome: IdentificationOutcome) -> list[dict[str, Any]]:
         {"name": step.name, "rsd": _finite(step.rsd), "f": _finite(step.f), "p": _finite(step.p), "listed": step.listed}
         for step in gone.steps
     ]
-
-
-def _move_files(staging: Path, out: Path) -> None:
-    """Replace the files of an earlier identification one by one, the metrics last."""
-    fresh = sorted(path.name for path in staging.iterdir())
-    stale = {*OURS, *(path.name for path in out.glob("plot_*.png"))} - set(fresh)
-    try:
-        for name in sorted(fresh, key=lambda name: name == "metrics.json"):
-            os.replace(staging / name, out / name)
-        for name in stale:
-            (out / name).unlink(missing_ok=True)
-    except OSError as error:
-        raise UsageError(f"cannot write to {out}: {error.strerror or error}") from error
 
 
 def _finite(value: float) -> float | None:

@@ -11,6 +11,7 @@ from rich.table import Table
 
 from calib.identification.scores import Score
 from calib.procedure import consistency_tables
+from calib.procedure.identification_loop import loop_lines
 from calib.procedure.identifying import IdentificationInputs, IdentificationOutcome
 from calib.procedure.show import COLOURS
 
@@ -44,6 +45,7 @@ def outcome_lines(outcome: IdentificationOutcome) -> Iterator[RenderableType]:
     if found.elimination is not None:
         yield from elimination_lines(outcome)
     yield from consistency_tables.lines(outcome)
+    yield from (escape(line) for line in loop_lines(found.bias))
     yield error_table(outcome)
     for line in outcome.warnings:
         yield f"[yellow]note[/]: {escape(line)}"

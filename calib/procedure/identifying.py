@@ -13,6 +13,7 @@ from calib.data.excitation import ExcitationReport, repeats, report_excitation
 from calib.data.motion import FilterOptions, Motion, make_motion
 from calib.data.recording import Joints, Recording
 from calib.data.recording_files import read_recording
+from calib.data.reference_files import with_reference
 from calib.errors import UsageError
 from calib.identification.cases import Case, case_names, make_case
 from calib.identification.consistency import Comparison, Propagation, compare, propagate
@@ -132,7 +133,8 @@ def gather(
     for name, path in zip(names, paths):
         say(f"reading {name}")
         like = motions[0] if len(motions) >= len(recordings) else None
-        motions.append(read_motion(path, chain, file_settings(options, path), like))
+        motion = read_motion(path, chain, file_settings(options, path), like)
+        motions.append(referred(motion, path, chain, options) if len(motions) < len(recordings) else motion)
     notes = [f"{name}: {note}" for name, motion in zip(names, motions) for note in motion.notes]
     count = len(recordings)
     found = find_gains(chain, options, dict(zip(paths, motions)), paths[:count], say)
@@ -269,6 +271,16 @@ def _sharper(recording: Recording, motion: Motion, options: FilterOptions) -> Mo
     sharper = make_motion(recording, replace(options, cutoff=f, borders=borders))
     note = f"f_q = {f:.3g} Hz instead: the positions are quiet enough"
     return replace(sharper, notes=(*motion.notes, note), cutoffs=motion.cutoffs)
+
+
+def referred(motion: Motion, path: str, chain: Chain, options: IdentifyOptions) -> Motion:
+    """Return the motion with the reference of a file of its own, where the options name one."""
+    own, loop = file_settings(options, path), options.settings.loop
+    named = own.reference or (loop.reference if loop is not None and loop.reference != "recording" else "")
+    if not named or loop is None:
+        return motion
+    beside = Path(options.source).parent / named
+    return with_reference(motion, beside if beside.exists() else Path(named), Joints(chain.joint_names), own.recording)
 
 
 def check_files(options: IdentifyOptions, paths: Sequence[str]) -> None:

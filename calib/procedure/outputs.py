@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,6 +14,7 @@ from calib.geometry.installation import merged
 from calib.procedure import calibrated
 from calib.procedure.estimates import HEADER, estimate_table
 from calib.procedure.fitting import Outcome
+from calib.procedure.folders import check_folder, write_staged
 from calib.procedure.residual_table import write_residuals
 from calib.robot import description, urdf_write
 from calib.robot.chain import Chain
@@ -52,45 +50,24 @@ robot.toml holds the same geometry and terms, and `calib.procedure.calibrated.re
 
 def check_target(out: Path, source: Path | None = None) -> None:
     """Refuse, before any work is done, a folder that cannot be written or whose files are not ours to replace."""
-    if out.exists() and not out.is_dir():
-        raise UsageError(f"{out} is a file; --out needs a folder")
+    check_folder(out)
     if source is not None and source.resolve().parent == out.resolve() and source.name in OURS:
         raise UsageError(f"{out} holds the robot that is to be calibrated; choose another folder for --out")
     present = [name for name in OURS if (out / name).exists()]
     if present and not (out / "metrics.json").exists():
         raise UsageError(f"{out} holds {', '.join(present)} which no earlier fit has left there; choose another --out")
-    folder = out if out.is_dir() else next(parent for parent in out.absolute().parents if parent.exists())
-    try:
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise UsageError(f"cannot write to {folder}: {error.strerror or error}; nothing was changed there") from error
 
 
 def write_folder(outcome: Outcome, out: Path, plots: Callable[[Outcome, Path], None] | None = None) -> Path:
-    """Write all files of a fit into a temporary folder beside `out` and move them there.
-
-    A folder that is not there appears whole; in one from an earlier fit each file is replaced, its own other files
-    (an old joint correction table) go, and what else lies there stays.
-    """
+    """Write all files of a fit, all or none; see `calib.procedure.folders`."""
     check_target(out, outcome.inputs.source)
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        staging = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}.", suffix=".part"))
-    except OSError as error:
-        raise UsageError(f"cannot write beside {out}: {error.strerror or error}; nothing was changed there") from error
-    try:
-        _write_all(outcome, staging)
+
+    def write(folder: Path) -> None:
+        _write_all(outcome, folder)
         if plots is not None:
-            plots(outcome, staging)
-        os.chmod(staging, 0o777 & ~_umask())
-        if out.exists():
-            _move_files(staging, out)
-        else:
-            os.replace(staging, out)
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
-    return out
+            plots(outcome, folder)
+
+    return write_staged(out, OURS, write)
 
 
 def _write_all(outcome: Outcome, folder: Path) -> None:
@@ -187,22 +164,3 @@ def write_corrections(chain: Chain, deflection: Deflection, folder: Path) -> Non
         folder / "joint_corrections.csv", ("corrected", "unit", "basis", "joint", "order", "coefficient"), rows
     )
     files.write(folder / "joint_corrections.txt", CORRECTIONS)
-
-
-def _move_files(staging: Path, out: Path) -> None:
-    """Replace the files of an earlier fit one by one, the metrics last, since they say that the rest is there."""
-    fresh = sorted(path.name for path in staging.iterdir())
-    stale = {name for name in OURS if name not in fresh} | {path.name for path in out.glob("plot_*.png")} - set(fresh)
-    try:
-        for name in sorted(fresh, key=lambda name: name == "metrics.json"):
-            os.replace(staging / name, out / name)
-        for name in stale:
-            (out / name).unlink(missing_ok=True)
-    except OSError as error:
-        raise UsageError(f"cannot write to {out}: {error.strerror or error}") from error
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

@@ -1,0 +1,177 @@
+"""The closed loop in ``calib identify``: instruments that are right where least squares is not, and refusals."""
+
+from __future__ import annotations
+
+import csv
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import planted_motion as planted
+import pytest
+
+from calib import cli
+from calib.errors import CalibError, UsageError
+from calib.identification import loop_settings, options
+from calib.simulation import controllers, references
+from calib.simulation.closed_loop import Plant, Run, Sensing, simulate
+
+RATE, EVERY = 1000.0, 4
+KP, KD = np.array([4000.0, 3000.0, 500.0]), np.array([200.0, 150.0, 25.0])
+V0 = 0.3  # wide: W stays linear in the noise
+GAINS = f'controller = "pd"\nkp = {KP.tolist()}\nkd = {KD.tolist()}\nrate = 1000\n'
+PLAIN = f"v0 = {V0}\n[filter]\ncutoff = 20\nband = 8\nclock = 'stamps'\n"
+
+
+def plant() -> Plant:
+    from dataclasses import replace
+
+    model = planted.model()
+    terms = tuple(replace(one, settings=(V0,)) if one.shape == "sign" else one for one in model.terms)
+    return Plant(model.tree, terms, planted.truth())
+
+
+@cache
+def motion(seed: int) -> references.Reference:
+    limit = np.full(3, 1.5)
+    return references.random_fourier(-limit, limit, np.full(3, 3.0), 16.0, RATE, 10, acceleration=15.0, seed=seed)
+
+
+@cache
+def moved(seed: int) -> Run:
+    return simulate(plant(), controllers.pd(KP, KD), motion(seed), Sensing(sigma_tau=0.1, every=EVERY), seed)
+
+
+def log(folder: Path, name: str, seed: int, noise: float = 0.0, form: str = "q_ref{}", factor: float = 1.0) -> Path:
+    """Write a CSV log; `noise` [rad] is on the logged positions alone."""
+    run = moved(seed)
+    q = run.q + noise * np.random.default_rng(seed).normal(size=run.q.shape)
+    names = ["t", *(f"q{j}" for j in (1, 2, 3)), *(f"tau{j}" for j in (1, 2, 3))]
+    parts = [run.t, q, run.tau]
+    if form:
+        names += [form.format(j) for j in (1, 2, 3)]
+        parts.append(factor * motion(seed).q[::EVERY])
+    np.savetxt(folder / name, np.column_stack(parts), delimiter=",", header=",".join(names), comments="", fmt="%.8g")
+    return folder / name
+
+
+def identify(robot: Path, folder: Path, train: Path, loop: str, method: str = "iv", *more: object) -> tuple[int, Path]:
+    (folder / "options.toml").write_text(PLAIN + (f"[loop]\n{loop}" if loop else ""))
+    out = folder / f"out_{method}"
+    chosen = ["--options", folder / "options.toml", "--method", method, "--friction", "standard", "--out", out, *more]
+    return cli.run(["identify", str(robot), str(train), *map(str, chosen)]), out
+
+
+def friction_error(out: Path) -> float:
+    """Return the rms relative error of the viscous and Coulomb parameters."""
+    rows = {row["name"]: float(row["value"]) for row in csv.DictReader((out / "estimate.csv").open())}
+    truth = {f"{name}{j + 1}": planted.DRIVES[name][j] for name in ("Fv", "Fc") for j in range(3)}
+    return float(np.sqrt(np.mean([(rows[name] / value - 1.0) ** 2 for name, value in truth.items()])))
+
+
+def test_iv_is_right_where_noisy_positions_bias_least_squares(robot, tmp_path, capsys):
+    """Both through the command, on another motion whose log is clean."""
+    train, other = log(tmp_path, "train.csv", 1, noise=3e-3), log(tmp_path, "other.csv", 2)
+    results = {m: identify(robot, tmp_path, train, GAINS, m, "--validate", other) for m in ("wls", "iv")}
+    text = capsys.readouterr().out
+    found = {m: json.loads((out / "metrics.json").read_text()) for m, (_, out) in results.items()}
+    unseen = {
+        m: one["validation"]["other.csv"]["filtered"]["relative_error_percent"]["total"] for m, one in found.items()
+    }
+    assert unseen["iv"] < 0.5 * unseen["wls"]
+    assert friction_error(results["iv"][1]) < 0.5 * friction_error(results["wls"][1])
+    for one in found.values():
+        test = one["loop"]
+        assert test["durbin_wu_hausman"]["least_squares_biased"] and test["valid"] and not test["instruments_weak"]
+        assert test["largest_shift_sigma"] > 3.0 and max(test["distance_percent"]) < 2.0
+    assert found["iv"]["method"] == "iv" and found["wls"]["method"] == "wls"
+    assert "least squares is biased" in text and "--method iv is not" in text
+    table = list(csv.DictReader((results["wls"][1] / "instrumental.csv").open()))
+    assert [row["name"] for row in table] == [
+        row["name"] for row in csv.DictReader((results["iv"][1] / "estimate.csv").open())
+    ]
+
+
+def test_without_noise_in_the_positions_least_squares_stands(robot, tmp_path):
+    """What the test still sees is small: no parameter is off by three sigma."""
+    code, out = identify(robot, tmp_path, log(tmp_path, "train.csv", 1), GAINS, "wls")
+    found = json.loads((out / "metrics.json").read_text())
+    assert code == 0 and found["loop"]["largest_shift_sigma"] < 3.0 and found["loop"]["valid"]
+    assert not any("--method iv" in line for line in found["warnings"])
+
+
+def test_the_controller_may_be_read_from_the_log(robot, tmp_path, capsys):
+    train = log(tmp_path, "train.csv", 1, noise=1e-5, form="q_des_{}")
+    code, out = identify(robot, tmp_path, train, 'controller = "identify"\nband = 8\nrate = 1000\n')
+    read = json.loads((out / "metrics.json").read_text())["loop"]
+    assert code == 0 and min(read["controller_explains_percent"]) > 80.0
+    np.testing.assert_allclose(read["controller"]["kp"], KP, rtol=0.1)
+    np.testing.assert_allclose(read["controller"]["kd"], KD, rtol=0.3)
+    assert "controller read from train.csv" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("kind", ["csv", "npz"])
+def test_the_reference_may_be_a_file_of_its_own(robot, tmp_path, kind):
+    train = log(tmp_path, "train.csv", 1, noise=1e-3, form="")
+    asked = motion(1)
+    if kind == "csv":
+        table = np.column_stack([asked.t, np.rad2deg(asked.q)])
+        header = "t,q1 [deg],q2 [deg],q3 [deg]"
+        np.savetxt(tmp_path / "asked.csv", table, delimiter=",", header=header, comments="")
+    else:
+        np.savez(tmp_path / "asked.npz", t=asked.t, q_ref=asked.q)
+    code, out = identify(robot, tmp_path, train, GAINS + f'reference = "asked.{kind}"\n')
+    assert code == 0 and max(json.loads((out / "metrics.json").read_text())["loop"]["distance_percent"]) < 1.0
+
+
+def test_wrong_gains_are_noticed(robot, tmp_path, capsys):
+    """At a hundredth of the stiffness the simulated robot is another robot; the tool says so and trusts no test."""
+    wrong = f'controller = "pd"\nkp = {(KP / 100).tolist()}\nkd = {(KD / 10).tolist()}\nrate = 1000\n'
+    identify(robot, tmp_path, log(tmp_path, "train.csv", 1, noise=1e-3), wrong, "wls")
+    found = json.loads((tmp_path / "out_wls" / "metrics.json").read_text())
+    told = [line for line in found["warnings"] if "does not follow" in line or "failed" in line]
+    assert told and not (found["loop"].get("valid") or False)
+
+
+REFUSED = [
+    ({"form": ""}, GAINS, "holds no reference"),
+    ({"factor": 180.0 / np.pi}, GAINS, "looks like deg"),
+    ({"factor": 3.0}, GAINS, "is this the reference of this recording"),
+    ({}, GAINS.replace("1000", "1100"), "no whole multiple"),
+    ({}, 'controller = "pd"\nkp = [1, 2]\nkd = [1]\n', "2 values for 3 joints"),
+    ({}, 'controller = "pd"\nkp = [1]\n', "needs kp and kd"),
+    ({}, 'controller = "pid"\n', "one of pd, cascade, identify"),
+    ({}, GAINS + "reset = 1.0\n", "belongs to controller 'cascade'"),
+    ({}, "kp = [1]\n", "there is no 'controller'"),
+    ({}, GAINS + 'reference = "nowhere.csv"\n', "cannot be read"),
+    ({}, GAINS + 'reference = "short.csv"\n', "do not span"),
+    ({}, GAINS + 'feedforward = "recording"\n', "no column tau_ff"),
+    ({}, "", "state its controller"),
+]
+
+
+@pytest.mark.parametrize("log_as, loop, message", REFUSED, ids=[message for *_, message in REFUSED])
+def test_what_cannot_be_simulated_is_refused(robot, tmp_path, capsys, log_as, loop, message):
+    asked = motion(1)
+    short = np.column_stack([asked.t, asked.q])[:3000]
+    np.savetxt(tmp_path / "short.csv", short, delimiter=",", header="t,q1,q2,q3", comments="")
+    code, out = identify(robot, tmp_path, log(tmp_path, "train.csv", 1, **log_as), loop)
+    assert code == 2 and message in " ".join(capsys.readouterr().err.split()) and not out.exists()
+
+
+def test_every_key_of_the_loop_is_documented_and_read():
+    for key in loop_settings._PARSERS:
+        assert f"{key} =" in loop_settings.__doc__ or f" {key} " in loop_settings.__doc__, key
+    found = options.parse_options(
+        {"loop": {"controller": "cascade", "position": 40, "velocity": [9.0, 5.0, 1.0], "reset": 0.1, "delay": 2}}
+    ).settings.loop
+    assert found is not None
+    made = loop_settings.stated_controller(found, 3)
+    np.testing.assert_allclose(made.kp, np.array([9.0, 5.0, 1.0]) * (40 + 10))
+    np.testing.assert_allclose(made.ki, np.array([9.0, 5.0, 1.0]) * 400)
+    assert made.delay == 2
+    with pytest.raises(UsageError, match="expected a whole number of control periods"):
+        options.parse_options({"loop": {"controller": "identify", "delay": -1}})
+    with pytest.raises(CalibError, match="there is no key 'gain'"):
+        options.parse_options({"loop": {"controller": "identify", "gain": 1}})
