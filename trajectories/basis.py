@@ -8,7 +8,7 @@ every x gives a motion that starts and ends at rest.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -119,6 +119,27 @@ def freedom(rows: np.ndarray, values: np.ndarray) -> Freedom:
     if not np.allclose(rows @ particular, values, atol=1e-9):
         raise BadInput("a joint has too few coefficients to start at rest at the given pose: allow more harmonics")
     return Freedom(particular, null_space(rows))
+
+
+def holding(
+    counts: Sequence[int], none: int, start: np.ndarray | None, held: Mapping[int, float] | None
+) -> tuple[tuple[int, ...], list[float | None]]:
+    """Return the coefficient counts and the start values of the joints, those held at a value put in.
+
+    Args:
+        none: the count that locks a joint.
+
+    Raises:
+        BadInput: for a joint that is not there, a value that is none, or one that the start contradicts.
+    """
+    found, first = list(counts), [None if start is None else float(start[j]) for j in range(len(counts))]
+    for j, value in (held or {}).items():
+        if not 0 <= j < len(found) or not np.isfinite(value):
+            raise BadInput(f"joint {j + 1} of {len(found)} cannot be held at {value:g}")
+        if start is not None and start[j] != value:
+            raise BadInput(f"joint {j + 1} is held at {value:g}, but the motion is to start from {start[j]:g}")
+        found[j], first[j] = none, float(value)
+    return tuple(found), first
 
 
 def assemble(times: np.ndarray, tables: Sequence[np.ndarray], freedoms: Sequence[Freedom]) -> Basis:

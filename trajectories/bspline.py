@@ -5,13 +5,13 @@ q_j(t) = Σ_{i=1}^{C} c_ji B_i(t),    uniform knots over one period, B_i periodi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import BSpline as ScipyBSpline
 
-from trajectories.basis import Basis, Freedom, aligned_period, assemble, freedom, joined, projected
+from trajectories.basis import Basis, Freedom, aligned_period, assemble, freedom, holding, joined, projected
 from trajectories.errors import BadInput
 
 
@@ -85,13 +85,14 @@ def bspline(
     degree: int = 5,
     rest: bool = True,
     start: np.ndarray | None = None,
+    held: Mapping[int, float] | None = None,
     rate: float | None = None,
 ) -> BSpline:
     """Return the family of periodic splines with `points` control points (one number, or (n,); 1 locks a joint).
 
     Args:
         degree: 5 or more, so that the jerk has no kinks.
-        period, joints, rest, start, rate: as of `trajectories.fourier.fourier`.
+        period, joints, rest, start, held, rate: as of `trajectories.fourier.fourier`.
     """
     counts = tuple(int(k) for k in (np.full(joints or 0, points) if np.ndim(points) == 0 else points))  # type: ignore[arg-type]
     if not counts or any(c != 1 and c <= degree for c in counts) or max(counts) == 1:
@@ -103,10 +104,11 @@ def bspline(
     if rate is not None:
         aligned_period(period, rate)
     freedoms = []
-    for j, count in enumerate(counts):
+    counts, begin = holding(counts, 1, start, held)
+    for count, first in zip(counts, begin):
         at_start = table(np.zeros(1), period, count, degree)[:, 0]
-        orders = [0] * (start is not None) + ([1, 2] if rest and count > 1 else [])
-        values = ([] if start is None else [float(start[j])]) + [0.0] * (2 if rest and count > 1 else 0)
+        orders = [0] * (first is not None) + ([1, 2] if rest and count > 1 else [])
+        values = ([] if first is None else [first]) + [0.0] * (2 if rest and count > 1 else 0)
         freedoms.append(freedom(at_start[orders], np.array(values)))
     return BSpline(float(period), counts, degree, tuple(freedoms))
 

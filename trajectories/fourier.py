@@ -7,12 +7,12 @@ Rest at the start, and by periodicity at the end: Σ k a_jk = 0 and Σ k² b_jk 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from trajectories.basis import Basis, Freedom, aligned_period, assemble, freedom, joined, projected
+from trajectories.basis import Basis, Freedom, aligned_period, assemble, freedom, holding, joined, projected
 from trajectories.errors import BadInput
 
 
@@ -75,6 +75,7 @@ def fourier(
     *,
     rest: bool = True,
     start: np.ndarray | None = None,
+    held: Mapping[int, float] | None = None,
     resonance: float | None = None,
     rate: float | None = None,
 ) -> Fourier:
@@ -86,6 +87,7 @@ def fourier(
         joints: n, where `harmonics` is one number.
         rest: velocity and acceleration are zero at t = 0 and T0, whatever the variables.
         start: (n,) pose to start from [rad or m]; None: free.
+        held: joints (from 0) that stay, with their values [rad or m].
         resonance: smallest resonance frequency ω_r [rad/s]; n_f ω0 has to stay below (the paper, section 4.3).
         rate: the controller's [Hz]; a period has to hold a whole number of its samples.
 
@@ -103,7 +105,8 @@ def fourier(
     first = None if start is None else np.asarray(start, dtype=float)
     if first is not None and (first.shape != (len(counts),) or not np.isfinite(first).all()):
         raise BadInput(f"start: expected {len(counts)} finite joint values, found {start}")
-    freedoms = [_freedom(count, period, rest, None if first is None else first[j]) for j, count in enumerate(counts)]
+    counts, begin = holding(counts, 0, first, held)
+    freedoms = [_freedom(count, period, rest, begin[j]) for j, count in enumerate(counts)]
     return Fourier(float(period), counts, tuple(freedoms))
 
 

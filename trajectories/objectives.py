@@ -48,9 +48,10 @@ class Excitation:
         index: "cond", "logdet" or "smallest".
         scaling: "raw", "normalised", or (b,) by which the columns are divided.
         sharpness: p of the smoothing; infinite for the index itself.
-        sigmas: (n,) standard deviations of the torques [N m or N]; None: 1.
+        sigmas: (n,) standard deviations of the torques [N m or N]; None: 1. Infinite: that joint's rows tell nothing.
         existing: (b, b) information of motions recorded before, in the same sigmas: the next motion complements them.
             A triangle R of theirs gives it as Rᵀ R.
+        columns: (c,) which of the regressor's columns count; None: all.
     """
 
     index: Index = "cond"
@@ -58,6 +59,7 @@ class Excitation:
     sharpness: float = np.inf
     sigmas: np.ndarray | None = None
     existing: np.ndarray | None = None
+    columns: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if self.index not in get_args(Index):
@@ -73,7 +75,12 @@ class Excitation:
         """Return the index and ∂F/∂regressor."""
         weighted = regressor if self.sigmas is None else regressor / self.sigmas[:, None]
         stacked = _stacked(weighted)
-        value, by_m = self.of_information(information(stacked, self.existing))
+        M = information(stacked, self.existing)
+        if self.columns is None:
+            value, by_m = self.of_information(M)
+        else:
+            part, by_m = np.ix_(self.columns, self.columns), np.zeros(M.shape)
+            value, by_m[part] = self.of_information(M[part])
         slope = (2 * stacked @ by_m).reshape(regressor.shape[1], regressor.shape[0], -1).transpose(1, 0, 2)
         return Value(value, slope if self.sigmas is None else slope / self.sigmas[:, None])
 
@@ -203,7 +210,10 @@ def information(stacked: np.ndarray, existing: np.ndarray | None = None) -> np.n
 
 
 def condition_numbers(
-    regressor: np.ndarray, sigmas: np.ndarray | None = None, existing: np.ndarray | None = None
+    regressor: np.ndarray,
+    sigmas: np.ndarray | None = None,
+    existing: np.ndarray | None = None,
+    columns: np.ndarray | None = None,
 ) -> dict[str, float]:
     """Return cond of the observation matrix, columns raw and normalised, by SVD (not by way of M).
 
@@ -211,12 +221,14 @@ def condition_numbers(
         regressor: (N, n, b).
         sigmas: (n,) row weights; None: 1.
         existing: (b, b) information of motions recorded before.
+        columns: (c,) which columns count; None: all.
     """
     W = _stacked(regressor if sigmas is None else regressor / sigmas[:, None])
     triangle = np.linalg.qr(W, mode="r")
     if existing is not None:
         values, V = np.linalg.eigh(existing)
         triangle = np.concatenate([triangle, np.sqrt(np.maximum(values, 0.0))[:, None] * V.T])
+    triangle = triangle if columns is None else triangle[:, columns]
     norms = np.linalg.norm(triangle, axis=0)
     if not norms.all():
         return {"raw": np.inf, "normalised": np.inf}

@@ -22,6 +22,8 @@ def random_start(problem: Problem, basis: Basis, rng: np.random.Generator) -> np
         lower, upper = np.maximum(lower, box.lower), np.minimum(upper, box.upper)
     middle, half = (lower + upper) / 2, (upper - lower) / 2
     poses = middle + half * rng.uniform(-0.6, 0.6, (200, n))
+    fixed = ~basis.used.any(axis=1)
+    poses[:, fixed] = basis.offsets[0, 0, fixed]
     still = np.zeros((200, n))
     resting = Motion(np.arange(200.0), poses, still, still, still)
     excess = np.zeros(200)

@@ -9,48 +9,30 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calib import files
-from calib.errors import UsageError
+from calib.procedure import motion_files
 from calib.procedure.drawing import AFTER, BEFORE, MARK, QUIET, WIDE, save, sheet, styled
 from calib.procedure.motion_planning import Planned
-from trajectories.messages import joint_trajectory, to_json, to_yaml
 from trajectories.timing import ACTIVE
-from trajectories.track import Track
 
 OURS = ("metrics.json", "motion.csv", "trajectory.yaml", "trajectory.json")
 UNITS = {"velocity": "rad/s", "acceleration": "rad/s²", "torque": "N m"}
 
 
 def check_target(out: Path) -> None:
-    """Refuse, before any work is done, a file, or a folder whose files of these names are not ours to replace."""
-    if out.exists() and not out.is_dir():
-        raise UsageError(f"{out} is a file; --out needs a folder")
-    present = [name for name in OURS if (out / name).exists()]
-    if present and not all((out / name).exists() for name in OURS):
-        raise UsageError(f"{out} holds {', '.join(present)} which no earlier plan left there; choose another")
+    """Refuse, before any work is done, what is not ours to replace."""
+    motion_files.check_target(out, OURS, "plan")
 
 
 def write_folder(planned: Planned, out: Path) -> Path:
     """Write the folder; each file whole or not at all, ``metrics.json`` last."""
-    write_track(planned.track, out / "motion.csv")
-    message = joint_trajectory(planned.track, planned.chain.joint_names)
-    files.write(out / "trajectory.json", to_json(message))
-    files.write(out / "trajectory.yaml", to_yaml(message))
-    for name, track in (("approach", planned.approach), ("rehearsal", planned.rehearsal)):
-        if track is not None:
-            write_track(track, out / f"{name}.csv")
-        else:
-            (out / f"{name}.csv").unlink(missing_ok=True)
+    motion_files.write_track(planned.track, out / "motion.csv")
+    motion_files.write_messages(planned.track, planned.chain.joint_names, out)
+    motion_files.write_optional(planned.approach, out / "approach.csv")
+    motion_files.write_optional(planned.rehearsal, out / "rehearsal.csv")
     save(motion_figure(planned), out / "plot_motion.png")
     save(profile_figure(planned), out / "plot_profile.png")
     files.write_json(out / "metrics.json", metrics(planned))
     return out
-
-
-def write_track(track: Track, path: Path) -> Path:
-    """Write t, q, v, a and, where known, tau; SI, a row per sample of the controller."""
-    parts = {"q": track.q, "v": track.v, "a": track.a} | ({} if track.tau is None else {"tau": track.tau})
-    header = ["t", *(f"{letter}{j + 1}" for letter in parts for j in range(track.n))]
-    return files.write_table(path, header, np.column_stack([track.times, *parts.values()]).tolist())
 
 
 def metrics(planned: Planned) -> dict[str, Any]:

@@ -19,12 +19,12 @@ from calib.errors import RobotError, UsageError
 from calib.identification.prediction import Dynamics, carried_columns
 from calib.identification.storage import read_dynamics
 from calib.procedure.inputs import joint_kinds, load_robot
+from calib.procedure.motion_approach import approach_to
 from calib.procedure.motion_limits import MotionLimits, read_motion_limits
 from calib.procedure.torque_margin import Uncertainty, read_uncertainty
 from calib.robot.chain import Chain
 from calib.robot.kinematics import element_jacobian, forward, joint_jacobian, sweep
 from calib.robot.tables import check_keys, load, vector
-from trajectories.approach import approach
 from trajectories.basis import Motion
 from trajectories.constraints import BoxLimit
 from trajectories.lines import line
@@ -37,8 +37,6 @@ from trajectories.track import Track, joined, slowed
 
 DRIVES = ("Ia", "Fv", "Fc", "off")
 COARSE = 150  # grid of the outer loop
-ACCELERATION, JERK = 2.0, 20.0  # of an approach, per s and s² times the velocity limit, where nothing else is said
-LEISURE = 1.0  # [rad/s or m/s] an approach is no faster than this (our choice)
 Progress = Callable[[str], None]
 
 
@@ -137,10 +135,10 @@ def plan(
         timings = tuple(time_optimal(path, bounds, law, rate=rate) for path in paths)
     torque = None if law is None else law.torque
     motion = joined([track(one.path, one.profile, rate, torque) for one in timings])
-    lead = None if start is None else _approach(np.asarray(start, dtype=float), motion, known, chain, lower, upper)
+    lead, told = (None, ()) if start is None else approach_to(start, motion.q[0], rate, known, chain)
     return Planned(
         chain, law, bounds, lower, upper, timings, motion, margins, deviation, shaped, lead,
-        slowed(motion, slower) if slower != 1 else None, sigma, (*known.notes, *notes),
+        slowed(motion, slower) if slower != 1 else None, sigma, (*known.notes, *notes, *told),
     )  # fmt: skip
 
 
@@ -274,19 +272,3 @@ def _duration(path: JointPath, limits: Limits, law: PathDynamics | None, lower, 
     check_places(path, known)
     return time_optimal(path, limits, law, grid=COARSE).duration
 
-
-def _approach(start, motion: Track, known: MotionLimits, chain: Chain, lower, upper) -> Track:
-    """Return the way to the start of the motion; limits of the file, else of the robot and our own choice."""
-    if start.shape != (chain.n,):
-        raise UsageError(f"--start: expected {chain.n} joint values, found {start.size}")
-    for j, name in enumerate(chain.joint_names):
-        if not lower[j] <= start[j] <= upper[j]:
-            raise UsageError(f"--start: {name} at {start[j]:g} is beyond its limits {lower[j]:.4g} to {upper[j]:.4g}")
-    boxes = {one.order: one.upper for one in known.constraints if isinstance(one, BoxLimit)}
-    free = np.full(chain.n, np.inf)
-    velocity = np.minimum(boxes.get(1, free), LEISURE)
-    acceleration, jerk = (
-        np.where(np.isfinite(boxes.get(order, free)), boxes.get(order, free), factor * velocity)
-        for order, factor in ((2, ACCELERATION), (3, JERK))
-    )
-    return approach(start, motion.q[0], velocity, acceleration, jerk, motion.rate)
