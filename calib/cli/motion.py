@@ -30,6 +30,15 @@ def excite(
     starts: Annotated[int, typer.Option(help="random starts of the search")] = 6,
     evaluations: Annotated[int, typer.Option(help="most evaluations per start")] = 600,
     front: Annotated[int, typer.Option(help="motions on the front of condition number and torque; 0 for none")] = 0,
+    start: Annotated[str | None, typer.Option(help="joint values with commas: an approach from there")] = None,
+    repeat: Annotated[int, typer.Option(help="periods to run one after the other")] = 1,
+    slower: Annotated[float, typer.Option(help="factor of a slow rehearsal, written beside the motion")] = 1.0,
+    existing: Annotated[
+        list[str] | None, typer.Option(help="a recording, or an earlier --out, that counts already; repeatable")
+    ] = None,
+    lock: Annotated[
+        list[str] | None, typer.Option(help="joints that stay: joint4,joint7, or joint4=0.5 [rad or m]; repeatable")
+    ] = None,
     workers: Annotated[str, typer.Option(help="local processes, or the address of a Dask scheduler")] = "1",
     base: Base = None,
     tip: Tip = None,
@@ -40,11 +49,13 @@ def excite(
     from calib.procedure import excitation_outputs, exciting
 
     excitation_outputs.check_target(out)
+    stands = None if start is None else numbers(start, start.count(",") + 1, "--start")
     with work.workers(workers) as mapped, progress() as say:
         designed = exciting.excite(
             robot, model=model, limits=limits, goals=goal or [], hard=hard or [], period=period, harmonics=harmonics,
-            family=family, drives_=drives, rate=rate, starts=starts, evaluations=evaluations, front=front, base=base,
-            tip=tip, seed=seed, map=mapped, progress=say,
+            family=family, drives_=drives, rate=rate, starts=starts, evaluations=evaluations, front=front, start=stands,
+            repeat=repeat, slower=slower, existing=existing or [], lock=lock or [], base=base, tip=tip, seed=seed,
+            map=mapped, progress=say,
         )  # fmt: skip
         say("writing")
         excitation_outputs.write_folder(designed, out)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,15 +14,22 @@ from calib.errors import UsageError
 from calib.procedure.excitable import Dynamics
 from calib.procedure.motion_limits import MotionLimits
 from calib.robot.chain import Chain
-from trajectories.objectives import Excitation, FrictionCoverage, Objective, TorqueSlack
+from trajectories.objectives import Excitation, FrictionCoverage, Objective, Scaling, TorqueSlack
 from trajectories.problem import Goal
 from trajectories.search import Found
 
+SCALINGS: tuple[Scaling, ...] = ("raw", "normalised")
+
 
 def read_goals(
-    texts: Sequence[str], dynamics: Dynamics, chain: Chain, limits: MotionLimits, soft: int
+    texts: Sequence[str], dynamics: Dynamics, chain: Chain, limits: MotionLimits, soft: int, condition: Excitation
 ) -> list[tuple[str, Goal]]:
-    """Return the goals said on the command line, by name; those from `soft` on are hard."""
+    """Return the goals said on the command line, by name.
+
+    Args:
+        soft: those from here on are hard.
+        condition: what a condition number is of: columns, rows, what is known already.
+    """
     result = []
     for number, text in enumerate(texts):
         name, _, amount = text.partition("=")
@@ -29,18 +37,18 @@ def read_goals(
             value = float(amount)
         except ValueError:
             raise UsageError(f"goal '{text}': expected NAME=NUMBER, e.g. wrist=0.1") from None
-        objective, goal = objective_of(name, value, dynamics, chain, limits, text)
+        objective, goal = objective_of(name, value, dynamics, chain, limits, text, condition)
         result.append((name, Goal(objective, goal, None if number < soft else 0.0)))
     return result
 
 
 def objective_of(
-    name: str, value: float, dynamics: Dynamics, chain: Chain, limits: MotionLimits, text: str
+    name: str, value: float, dynamics: Dynamics, chain: Chain, limits: MotionLimits, text: str, condition: Excitation
 ) -> tuple[Objective, float]:
-    if name in ("raw", "normalised"):
+    if name in SCALINGS:
         if not value > 1:
             raise UsageError(f"goal '{text}': a condition number is above 1")
-        return Excitation("cond", name), value
+        return scaled(condition, name), value
     if name == "coverage":
         speeds = np.array([joint.velocity for joint in chain.joints])
         if not np.isfinite(speeds).all() or not 0 < value < 0.25:
@@ -56,8 +64,12 @@ def objective_of(
     return TorqueSlack(numbered[name], dynamics.values, limits.torque), 1.0 - value
 
 
-def with_conditions(wanted: list[tuple[str, Goal]], found: Found) -> tuple[Goal, ...]:
+def scaled(condition: Excitation, scaling: Scaling) -> Excitation:
+    return replace(condition, scaling=scaling)
+
+
+def with_conditions(wanted: list[tuple[str, Goal]], found: Found, condition: Excitation) -> tuple[Goal, ...]:
     """Add the condition numbers with what the first run reached as their goals."""
-    both = zip(("raw", "normalised"), found.values)
-    conditions = (Goal(Excitation("cond", scaling), float(value)) for scaling, value in both)
+    both = zip(SCALINGS, found.values)
+    conditions = (Goal(scaled(condition, scaling), float(value)) for scaling, value in both)
     return (*(goal for _, goal in wanted), *conditions)

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.errors import UsageError
-from calib.procedure import excitation_plots, exciting
+from calib.procedure import excitation_plots, exciting, motion_files
 from calib.procedure.drawing import save
 from calib.procedure.exciting import Designed
 from calib.robot.tables import dumps
@@ -17,15 +16,12 @@ from trajectories.basis import Motion
 from trajectories.verify import dense_motion
 
 OURS = ("metrics.json", "trajectory.csv", "trajectory.toml")
+MESSAGES = 100.0  # points per second of the ROS message, whose controllers interpolate (our choice)
 
 
 def check_target(out: Path) -> None:
-    """Refuse, before any work is done, a file, or a folder whose files of these names are not ours to replace."""
-    if out.exists() and not out.is_dir():
-        raise UsageError(f"{out} is a file; --out needs a folder")
-    present = [name for name in OURS if (out / name).exists()]
-    if present and not all((out / name).exists() for name in OURS):
-        raise UsageError(f"{out} holds {', '.join(present)} which no earlier excitation left there; choose another")
+    """Refuse, before any work is done, what is not ours to replace."""
+    motion_files.check_target(out, OURS, "excitation")
 
 
 def write_folder(designed: Designed, out: Path) -> Path:
@@ -35,6 +31,13 @@ def write_folder(designed: Designed, out: Path) -> Path:
     table = np.concatenate([motion.times[:, None], motion.q, motion.v, motion.a], axis=1)
     files.write_table(out / "trajectory.csv", header, table.tolist())
     files.write(out / "trajectory.toml", dumps(coefficients(designed)))
+    played = designed.playback
+    longer = played.approach is not None or played.repeat > 1
+    motion_files.write_optional(played.run if longer else None, out / "run.csv")
+    motion_files.write_optional(played.approach, out / "approach.csv")
+    motion_files.write_optional(played.rehearsal, out / "rehearsal.csv")
+    every = max(1, round(designed.rate / MESSAGES))
+    motion_files.write_messages(played.run, designed.chain.joint_names, out, every)
     save(excitation_plots.motion_figure(designed), out / "plot_motion.png")
     save(excitation_plots.path_figure(designed), out / "plot_path.png")
     save(excitation_plots.history_figure(designed), out / "plot_history.png")
@@ -57,6 +60,7 @@ def coefficients(designed: Designed) -> dict[str, Any]:
     """Return the content of ``trajectory.toml``: eq. 23 of Kolyubin et al. 2019, or control points."""
     head: dict[str, Any] = {
         "robot": designed.chain.name, "family": designed.kind, "period": designed.period, "rate": designed.rate,
+        "repeat": designed.playback.repeat,
         "note": "q(t) = q0 + sum_k a_k sin(k w t) + b_k cos(k w t), w = 2 pi / period; rad, m, s"
         if designed.kind == "fourier" else "periodic spline, uniform knots over the period; rad, m, s",
     }  # fmt: skip
@@ -74,10 +78,12 @@ def coefficients(designed: Designed) -> dict[str, Any]:
 def lines(designed: Designed) -> list[str]:
     """Return what a person wants to read at the end."""
     found, cond = designed.found, designed.condition
-    columns = len(designed.dynamics.exact.names)
+    columns = len(designed.told.names)
     result = [
+        *(["interrupted: this is the best motion found until then"] if found.interrupted else []),
         f"condition number of {columns} columns: {cond['raw']:.4g} raw, {cond['normalised']:.4g} normalised "
         f"({designed.kind}, period {designed.period:g} s)",
+        *_together(designed),
         *(f"goal {name}: {value:.4g} (asked: {goal:.4g})" for name, goal, _, value in designed.goals),
         f"{found.evaluations} evaluations, {found.feasible:.0%} of them feasible, {found.seconds:.1f} s",
         f"every limit is kept, at {designed.proof.instants} instants and between them; smallest margins:",
@@ -87,4 +93,20 @@ def lines(designed: Designed) -> list[str]:
         result.append(
             f"  {name:12} {one.margin:.4g} {one.unit} ({one.label}, t = {one.time:.2f} s; between instants: {how})"
         )
+    played = designed.playback
+    parts = ["the approach"] if played.approach is not None else []
+    parts.append(f"{played.repeat} period{'s' if played.repeat > 1 else ''}")
+    result.append(f"to run: {' and '.join(parts)}, {played.run.duration:.1f} s")
     return result + [f"note: {note}" for note in designed.notes]
+
+
+def _together(designed: Designed) -> list[str]:
+    """Return what motions before have, and this one alone."""
+    if designed.existing is None:
+        return []
+    cond = designed.condition
+    return [
+        f"together with {', '.join(designed.existing.names)} ({designed.existing.seconds:.1f} s), which alone has "
+        f"{cond['raw_before']:.4g} raw, {cond['normalised_before']:.4g} normalised; this motion alone "
+        f"{cond['raw_alone']:.4g} and {cond['normalised_alone']:.4g}"
+    ]

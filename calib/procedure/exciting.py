@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,13 +13,16 @@ import numpy as np
 from calib.data.options import FitOptions
 from calib.errors import UsageError
 from calib.procedure.excitable import Dynamics, read_dynamics
-from calib.procedure.excitation_goals import objective_of, read_goals, with_conditions
+from calib.procedure.excitation_existing import Existing, read_existing
+from calib.procedure.excitation_goals import SCALINGS, objective_of, read_goals, scaled, with_conditions
+from calib.procedure.excitation_holding import Told, read_held, told
+from calib.procedure.excitation_playback import Playback, check_playback, play
 from calib.procedure.inputs import load_robot
 from calib.procedure.motion_limits import MotionLimits, read_motion_limits
 from calib.robot.chain import Chain
 from trajectories.basis import Family, aligned_period
 from trajectories.bspline import bspline
-from trajectories.constraints import Constraint, TorqueLimit
+from trajectories.constraints import BoxLimit, Constraint, TorqueLimit
 from trajectories.fourier import fourier
 from trajectories.objectives import Excitation, TorqueSlack, condition_numbers
 from trajectories.optimise import design
@@ -44,6 +47,9 @@ class Designed:
         condition: raw and normalised, of `INSTANTS` samples over the period with the model's own Coulomb sign.
         goals: name, goal, weight and what was reached.
         front: trade-offs, where asked for.
+        playback: what a controller is to run.
+        held: joints that stay, and their values; `told`: the columns that can be told.
+        existing: what motions before tell; None without any.
         rate: of the controller [Hz].
         notes: what a user should know.
     """
@@ -58,6 +64,10 @@ class Designed:
     condition: dict[str, float]
     goals: tuple[tuple[str, float, float, float], ...]
     front: Front | None
+    playback: Playback
+    held: Mapping[int, float]
+    told: Told
+    existing: Existing | None
     rate: float
     kind: str
     notes: tuple[str, ...]
@@ -83,6 +93,11 @@ def excite(
     starts: int = 6,
     evaluations: int = 600,
     front: int = 0,
+    start: Sequence[float] | None = None,
+    repeat: int = 1,
+    slower: float = 1.0,
+    existing: Sequence[str] = (),
+    lock: Sequence[str] = (),
     base: str | None = None,
     tip: str | None = None,
     seed: int = 0,
@@ -108,41 +123,70 @@ def excite(
         rate: the controller's [Hz].
         samples, starts, evaluations, seed, map: of the search.
         front: motions on the front between the normalised condition number and the first torque goal.
+        start: (n,) where the robot stands, for an approach; repeat: periods; slower: factor of a rehearsal.
+        existing: recordings, or folders of earlier excitations, that count already; the new motion counts `repeat`
+            times.
+        lock: joints that stay, ``joint4`` or ``joint4=0.5``.
+
+    Ctrl-C ends the search; the best motion found so far is verified and returned.
     """
     say = progress or (lambda words: None)
     chain, source = load_robot(robot, None, FitOptions(), base, tip)
     found_limits = read_motion_limits(limits, chain, source)
     dynamics = read_dynamics(chain, model, drives_, found_limits)
-    motions = _family(family, harmonics, period, chain, found_limits, rate)
+    check_playback(repeat, slower, start, chain, found_limits)
+    held = read_held(lock, chain, *_position_limits(found_limits))
+    motions = _family(family, harmonics, period, held, chain, found_limits, rate)
     search, check, notes = _constraints(dynamics, found_limits)
+    before = read_existing(existing, dynamics, chain)
+    columns = told(dynamics, chain, held, None if before is None else before.information)
+    known = None if before is None else before.per_sample(samples, repeat * period)
+    condition = Excitation("cond", sigmas=columns.sigmas, existing=known, columns=columns.columns)
     problem = Problem(
         motions, dynamics.smooth.regressor, dynamics.smooth.regressor_gradient,
-        ((Excitation("cond", "raw"), 0.5), (Excitation("cond", "normalised"), 0.5)), search, samples=samples,
+        tuple((scaled(condition, scaling), 0.5) for scaling in SCALINGS), search, samples=samples,
     )  # fmt: skip
-    wanted = read_goals([*goals, *hard], dynamics, chain, found_limits, len(goals))
+    wanted = read_goals([*goals, *hard], dynamics, chain, found_limits, len(goals), condition)
     run = partial(design, evaluations=evaluations, seed=seed, map=map, report=_reporter(say))
-    found, problem = _searched(problem, wanted, starts, run, say)
+    found, problem = _searched(problem, wanted, starts, run, say, condition)
     say("verifying")
     found, proof = ensured(problem, found, check)
-    trade = _front(problem, dynamics, chain, found_limits, found, wanted, front, _reporter(say)) if front else None
-    condition = condition_of(dynamics, motions, found)
+    trade = None
+    if front and not found.interrupted:
+        trade = _front(problem, dynamics, chain, found_limits, found, wanted, front, condition, _reporter(say))
+    reached = condition_of(dynamics, motions, found, columns, before, repeat)
+    played = play(motions, found, dynamics, chain, found_limits, rate=rate, start=start, repeat=repeat, slower=slower)
+    stays = {j: float(played.run.q[-1, j]) for j in held}
     return Designed(
-        chain, dynamics, found_limits, motions, problem, found, proof, condition, _reached(problem, found), trade,
-        rate, family, (*found_limits.notes, *dynamics.notes, *notes),
+        chain, dynamics, found_limits, motions, problem, found, proof, reached, _reached(problem, found), trade,
+        played, stays, columns, before, rate, family,
+        (*found_limits.notes, *dynamics.notes, *notes, *columns.notes, *played.notes),
     )  # fmt: skip
+
+
+def _position_limits(limits: MotionLimits) -> tuple[np.ndarray, np.ndarray]:
+    box = next(one for one in limits.constraints if isinstance(one, BoxLimit) and one.order == 0)
+    return box.lower, box.upper
 
 
 def _searched(
-    problem: Problem, wanted: list[tuple[str, Goal]], starts: int, search: Callable[..., Found], say: Progress
+    problem: Problem,
+    wanted: list[tuple[str, Goal]],
+    starts: int,
+    search: Callable[..., Found],
+    say: Progress,
+    condition: Excitation,
 ) -> tuple[Found, Problem]:
     """Search without goals, or for the goals: with a first run that proposes some for the condition numbers."""
     if not wanted:
         return search(problem, starts=starts), problem
-    if {"raw", "normalised"} & {name for name, _ in wanted}:
+    if set(SCALINGS) & {name for name, _ in wanted}:
         problem = replace(problem, goals=tuple(goal for _, goal in wanted))
         return search(problem, starts=starts), problem
     first = search(problem, starts=starts)
-    problem = replace(problem, goals=with_conditions(wanted, first))
+    if first.interrupted:
+        return first, problem
+    problem = replace(problem, goals=with_conditions(wanted, first, condition))
     say("goal attainment")
     found = search(problem, starts=max(1, starts // 3), guesses=(first.x,))
     spent, seconds = first.evaluations + found.evaluations, first.seconds + found.seconds
@@ -153,11 +197,23 @@ def _reporter(say: Progress) -> Callable[[int, int, str], None]:
     return lambda done, total, what: say(f"{what} ({done} of {total})")
 
 
-def condition_of(dynamics: Dynamics, family: Family, found: Found) -> dict[str, float]:
-    """Return the condition numbers of `INSTANTS` samples over the period, with the model's own Coulomb sign."""
+def condition_of(
+    dynamics: Dynamics, family: Family, found: Found, told: Told, existing: Existing | None = None, repeat: int = 1
+) -> dict[str, float]:
+    """Return the condition numbers of `INSTANTS` samples over the period, with the model's own Coulomb sign.
+
+    With motions before they are those of all motions together; ``alone`` and ``before`` say what each has by itself.
+    """
     times = family.period * found.factor / INSTANTS * np.arange(INSTANTS)
     motion = dense_motion(family, found.x, times, found.factor)
-    return condition_numbers(dynamics.exact.regressor(motion.q, motion.v, motion.a))
+    Y = dynamics.exact.regressor(motion.q, motion.v, motion.a)
+    alone = condition_numbers(Y, told.sigmas, columns=told.columns)
+    if existing is None:
+        return alone
+    known = existing.per_sample(INSTANTS, repeat * family.period * found.factor)
+    both = condition_numbers(Y, told.sigmas, known, told.columns)
+    before = condition_numbers(0.0 * Y, None, known, told.columns)
+    return both | {f"{key}_alone": alone[key] for key in alone} | {f"{key}_before": before[key] for key in before}
 
 
 def metrics(designed: Designed) -> dict[str, Any]:
@@ -182,19 +238,38 @@ def metrics(designed: Designed) -> dict[str, Any]:
         "setting": {
             "robot": designed.chain.name, "family": designed.kind, "period": designed.period,
             "harmonics": list(getattr(designed.family, "harmonics", getattr(designed.family, "counts", ()))),
-            "columns": list(designed.dynamics.exact.names), "samples": designed.problem.samples,
+            "columns": list(designed.told.names), "samples": designed.problem.samples,
             "samples_reported": INSTANTS, "instants_verified": designed.proof.instants, "rate": designed.rate,
             "interrupted": found.interrupted,
+            "held": {designed.chain.joint_names[j]: value for j, value in designed.held.items()},
+        },
+        "existing": None if designed.existing is None
+        else {"names": list(designed.existing.names), "seconds": designed.existing.seconds},
+        "playback": {
+            "repeat": designed.playback.repeat, "seconds": designed.playback.run.duration,
+            "approach": None if designed.playback.approach is None else designed.playback.approach.duration,
+            "rehearsal": None if designed.playback.rehearsal is None else designed.playback.rehearsal.duration,
         },
         "notes": list(designed.notes),
     }  # fmt: skip
 
 
-def _family(kind: str, harmonics: int, period: float, chain: Chain, limits: MotionLimits, rate: float) -> Family:
+def _family(
+    kind: str,
+    harmonics: int,
+    period: float,
+    held: Mapping[int, float | None],
+    chain: Chain,
+    limits: MotionLimits,
+    rate: float,
+) -> Family:
+    values = {j: value for j, value in held.items() if value is not None}
     if kind == "fourier":
-        return fourier(harmonics, period, chain.n, resonance=limits.resonance, rate=rate)
+        counts = [0 if j in held else harmonics for j in range(chain.n)]
+        return fourier(counts, period, held=values, resonance=limits.resonance, rate=rate)
     if kind == "bspline":
-        return bspline(harmonics, period, chain.n, rate=rate)
+        counts = [1 if j in held else harmonics for j in range(chain.n)]
+        return bspline(counts, period, held=values, rate=rate)
     raise UsageError(f"family '{kind}' is none of fourier, bspline")
 
 
@@ -232,19 +307,20 @@ def _front(
     found: Found,
     wanted: list[tuple[str, Goal]],
     count: int,
+    condition: Excitation,
     report: Callable[[int, int, str], None],
 ) -> Front:
     """Sweep the first torque goal (default: the wrist) between what this motion has and what it can reach alone."""
     slack = next((goal.objective for _, goal in wanted if isinstance(goal.objective, TorqueSlack)), None)
     if slack is None:
-        slack = objective_of("wrist", 0.5, dynamics, chain, limits, "wrist")[0]
+        slack = objective_of("wrist", 0.5, dynamics, chain, limits, "wrist", condition)[0]
     motion = problem.basis().motion(found.x)
     begin = slack.evaluate(motion, problem.regressor(motion.q, motion.v, motion.a)).value
     (end, alone), *_ = proposed_goals(
         replace(problem, goals=()), [slack], starts=1, evaluations=150, guesses=(found.x,)
     )
     levels = np.linspace(begin, end, count + 1)[:-1].tolist() if end < begin else [begin]
-    return sweep(problem, Excitation("cond", "normalised"), slack, levels, found.x, alone.x, report=report)
+    return sweep(problem, scaled(condition, "normalised"), slack, levels, found.x, alone.x, report=report)
 
 
 def periods(designed: Designed) -> int:

@@ -34,7 +34,7 @@ def approach_to(
     """
     here = np.asarray(start, dtype=float)
     boxes = {one.order: one for one in known.constraints if isinstance(one, BoxLimit)}
-    _check_start(here, boxes[0], chain)
+    check_start(here, chain, known)
     sizes = {order: box.upper for order, box in boxes.items()}
     free = np.full(chain.n, np.inf)
     velocity = np.minimum(sizes.get(1, free), LEISURE)
@@ -47,7 +47,9 @@ def approach_to(
     return found, tuple(note for note in notes if note)
 
 
-def _check_start(start: np.ndarray, limits: BoxLimit, chain: Chain) -> None:
+def check_start(start: np.ndarray, chain: Chain, known: MotionLimits) -> None:
+    """Refuse a pose (n,) that the robot cannot be in."""
+    limits = next(one for one in known.constraints if isinstance(one, BoxLimit) and one.order == 0)
     if start.shape != (chain.n,):
         raise UsageError(f"--start: expected {chain.n} joint values, found {start.size}")
     for name, value, lower, upper in zip(chain.joint_names, start, limits.lower, limits.upper):

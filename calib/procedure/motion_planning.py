@@ -271,4 +271,3 @@ def _duration(path: JointPath, limits: Limits, law: PathDynamics | None, lower, 
     check_within(path, lower, upper)
     check_places(path, known)
     return time_optimal(path, limits, law, grid=COARSE).duration
-
