@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from itertools import takewhile
 from typing import get_args
 
 import numpy as np
@@ -54,7 +55,8 @@ def design(
     found, stuck, spent = list[Found](), list[Stuck](), 0
     interrupted = False
     try:
-        for number, run in enumerate(map(partial(one_start, problem, evaluations, method, seed), tasks), 1):
+        wanted = takewhile(lambda _: not interrupted, tasks)  # a map in other processes may still hand back what it has
+        for number, run in enumerate(map(partial(one_start, problem, evaluations, method, seed), wanted), 1):
             if isinstance(run, Found):
                 found.append(run)
             else:
@@ -63,9 +65,7 @@ def design(
             if report:
                 best = min((one.merit for one in found), default=np.inf)
                 report(number, len(tasks), f"best so far {best:.4g}" if found else "nothing feasible yet")
-            if isinstance(run, Found) and run.interrupted:
-                interrupted = True
-                break
+            interrupted |= isinstance(run, Found) and run.interrupted
     except KeyboardInterrupt:
         if not found:
             raise

@@ -93,7 +93,8 @@ def told(
     still = ", ".join(chain.joint_names[j] for j in held)
     gone = [name for k, name in enumerate(names) if k not in set(kept.tolist())]
     note = (
-        f"held: {still}; a held joint's torque is stiction in part and is left out; {len(kept)} of {len(names)} columns can be "
-        f"told ({len(gone)} fold into others or vanish: {', '.join(gone[:12])}{', ...' if len(gone) > 12 else ''})"
+        f"held: {still}; a held joint's torque is stiction in part and is left out; {len(kept)} of {len(names)} "
+        f"columns can be told ({len(gone)} fold into others or vanish: {', '.join(gone[:12])}"
+        f"{', ...' if len(gone) > 12 else ''})"
     )
     return Told(np.asarray(kept), sigmas, tuple(names[k] for k in kept), (note,) if gone else ())

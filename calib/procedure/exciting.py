@@ -156,11 +156,12 @@ def excite(
         trade = _front(problem, dynamics, chain, found_limits, found, wanted, front, condition, _reporter(say))
     reached = condition_of(dynamics, motions, found, columns, before, repeat)
     played = play(motions, found, dynamics, chain, found_limits, rate=rate, start=start, repeat=repeat, slower=slower)
+    cut = ("interrupted before the goals were searched for",) if wanted and not problem.goals else ()
     stays = {j: float(played.run.q[-1, j]) for j in held}
     return Designed(
         chain, dynamics, found_limits, motions, problem, found, proof, reached, _reached(problem, found), trade,
         played, stays, columns, before, rate, family,
-        (*found_limits.notes, *dynamics.notes, *notes, *columns.notes, *played.notes),
+        (*found_limits.notes, *dynamics.notes, *notes, *columns.notes, *cut, *played.notes),
     )  # fmt: skip
 
 
