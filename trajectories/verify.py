@@ -123,7 +123,10 @@ def ensured(
         again = one_start(tighter, 240, "slsqp", found.seed, y)
         spent += again.evaluations
         if isinstance(again, Found):
-            found = replace(again, history=found.history, seconds=found.seconds + again.seconds)
+            found = replace(
+                again, history=found.history, seconds=found.seconds + again.seconds,
+                interrupted=found.interrupted or again.interrupted,
+            )  # fmt: skip
             report = verify(problem.family, found.x, checked, factor=found.factor, instants=instants)
     if not report.feasible:
         worst = min(report.margins, key=lambda one: one.share)

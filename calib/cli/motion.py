@@ -1,4 +1,4 @@
-"""Motions: excite, plan."""
+"""Motions: excite, recall, plan."""
 
 from __future__ import annotations
 
@@ -61,6 +61,25 @@ def excite(
         excitation_outputs.write_folder(designed, out)
     console = make_console()
     for line in excitation_outputs.lines(designed):
+        console.print(line, soft_wrap=True, markup=False)
+    console.print(f"written to {out}", soft_wrap=True, markup=False)
+
+
+@app.command()
+def recall(
+    folder: Annotated[Path, typer.Argument(help="what calib excite wrote")],
+    log: Annotated[str, typer.Argument(help="a recording of it; log.npz@0:90 cuts")],
+    out: Annotated[Path, typer.Option(help="the averaged period: .npz with its variance, or .csv")],
+    skip: Annotated[int, typer.Option(help="whole periods to leave out at the beginning")] = 0,
+) -> None:
+    """Find a designed motion in a log, and average its periods to a recording for calib identify."""
+    from calib.procedure import excitation_recall
+
+    excitation_recall.check_target(out)
+    found = excitation_recall.find(folder, log, skip)
+    excitation_recall.write(found, out)
+    console = make_console()
+    for line in excitation_recall.lines(found):
         console.print(line, soft_wrap=True, markup=False)
     console.print(f"written to {out}", soft_wrap=True, markup=False)
 

@@ -25,6 +25,14 @@ TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "mdh": ("a robot as a table of modified Denavit-Hartenberg rows", ("calib.robot.mdh", "calib.robot.tables")),
     "robot": ("robot.toml as calib fit writes it", ("calib.robot.description", "calib.procedure.calibrated")),
     "session": ("a session's folder and its session.toml", ("calib.procedure.session",)),
+    "limits": (
+        "the TOML file of calib excite --limits and calib plan --limits",
+        ("calib.procedure.motion_limits",),
+    ),
+    "excitation": (
+        "trajectory.toml of calib excite, and what calib recall writes",
+        ("calib.procedure.excitation_table", "calib.procedure.excitation_recall"),
+    ),
     "recordings": (
         "recordings of motion, for calib identify",
         ("calib.data.recording_options", "calib.data.recording_tables", "calib.data.archives", "calib.data.bags"),

@@ -4,22 +4,35 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from differences import check
 
+from calib.data.recording_files import read_recording
 from calib.dynamics import base, drives
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.tree import standard_parameters, tree
+from calib.procedure import excitation_outputs, excitation_table, exciting
 from calib.procedure.excitable import read_dynamics
+from calib.procedure.excitation_existing import read_existing
+from calib.procedure.excitation_holding import told
 from calib.procedure.motion_limits import Points, read_motion_limits
 from calib.robot.kinematics import forward
 from calib.robot.load import load
 from trajectories.basis import Motion
 from trajectories.fourier import evaluate
+from trajectories.objectives import condition_numbers
+from trajectories.search import Run
+from trajectories.verify import dense_motion
 
 LIMITS = """
 [target]
@@ -33,14 +46,17 @@ all = 12.0
 Fv = [14.4, 15.3, 6.55, 11.0, 4.29, 2.26, 1.6]
 Fc = [11.9, 11.5, 8.98, 8.35, 8.31, 4.72, 6.04]
 """
-QUICK = ("--starts", 1, "--evaluations", 90, "--period", 16, "--harmonics", 4, "--rate", 100)
+QUICK = ("--starts", 1, "--evaluations", 60, "--period", 16, "--harmonics", 4, "--rate", 100)
+SHORT: Any = {"starts": 1, "evaluations": 45, "period": 16.0, "harmonics": 4, "rate": 100.0, "samples": 120}
 
 
 def test_the_motion_keeps_its_limits_and_is_written_for_a_controller(cell, calib):
     Path("limits.toml").write_text(LIMITS)
-    code, out, err = calib("excite", "lwr4plus", "--limits", "limits.toml", "--out", "e", *QUICK)
+    stands = "-0.8,-1.0,-1.0,-1.2,0.2,-1.5,0.3"
+    played = ("--start", stands, "--repeat", 2, "--slower", 3)
+    code, out, err = calib("excite", "lwr4plus", "--limits", "limits.toml", "--out", "e", *QUICK, *played)
     assert code == 0, err
-    assert "64 columns" in out and "every limit is kept" in out
+    assert "64 columns" in out and "every limit is kept" in out and "the approach and 2 periods" in out
     metrics = json.loads(Path("e/metrics.json").read_text())
     assert {"condition_number", "objective", "feasible", "margins", "seconds", "evaluations", "history"} <= set(metrics)
     assert metrics["feasible"] is True and metrics["condition_number"]["normalised"] < 12
@@ -62,18 +78,157 @@ def test_the_motion_keeps_its_limits_and_is_written_for_a_controller(cell, calib
     table = tomllib.loads(Path("e/trajectory.toml").read_text())
     series = [np.concatenate([[joint["q0"]], joint["a"], joint["b"]]) for joint in table["joint"]]
     assert np.allclose(evaluate(series, table["period"], rows[:, 0]), q, atol=1e-9)
+    check_playback(q, np.array(stands.split(","), dtype=float), metrics["playback"])
 
 
-def test_goals_raise_the_torque_of_the_wrist_and_the_front_is_drawn(cell, calib):
-    Path("limits.toml").write_text(LIMITS)
-    code, _, err = calib(
-        "excite", "lwr4plus", "--limits", "limits.toml", "--out", "e", *QUICK, "--hard", "wrist=0.18", "--front", 2
-    )
+def columns(name: str) -> dict[str, np.ndarray]:
+    with Path(name).open(newline="") as file:
+        table = list(csv.DictReader(file))
+    result = {letter: np.array([[float(r[f"{letter}{j}"]) for j in range(1, 8)] for r in table]) for letter in "qva"}
+    return result | {"tau": np.array([[float(r[f"tau{j}"]) for j in range(1, 8)] for r in table])}
+
+
+def check_playback(q: np.ndarray, stands: np.ndarray, metrics: dict) -> None:
+    """The run is the approach and two periods without a jump; messages say the same; the rehearsal is slower."""
+    run, lead, slow = (columns(f"e/{name}.csv") for name in ("run", "approach", "rehearsal"))
+    assert np.allclose(run["q"][0], stands) and np.abs(run["v"][[0, -1]]).max() < 1e-9
+    assert len(run["q"]) == len(lead["q"]) + 2 * 1600 and metrics["seconds"] == pytest.approx((len(run["q"]) - 1) / 100)
+    assert np.allclose(run["q"][len(lead["q"]) - 1 :][:1601], q) and np.allclose(run["q"][-1601:], q)
+    assert np.abs(np.diff(run["q"], axis=0) * 100 - (run["v"][1:] + run["v"][:-1]) / 2).max() < 0.01
+    once = len(lead["q"]) + 1600
+    assert len(slow["q"]) == 3 * (once - 1) + 1 and np.allclose(slow["q"][::3], run["q"][:once], atol=1e-9)
+    assert (np.abs(run["tau"]) <= [joint.effort for joint in load("lwr4plus").joints]).all()
+    message = json.loads(Path("e/trajectory.json").read_text())
+    points = np.array([point["positions"] for point in message["points"]])
+    assert np.allclose(points, run["q"], atol=1e-8) and message["joint_names"] == list(load("lwr4plus").joint_names)
+
+
+@pytest.fixture(scope="module")
+def earlier(tmp_path_factory) -> Path:
+    """Return the folder of a quick excitation, two periods of it."""
+    folder = tmp_path_factory.mktemp("excited") / "e"
+    designed = exciting.excite("lwr4plus", repeat=2, **SHORT)
+    return excitation_outputs.write_folder(designed, folder)
+
+
+def test_motions_before_count(earlier, tmp_path):
+    """Designed with what is known, the two motions together tell more than twice the first one would."""
+    before = excitation_table.read(earlier)
+    known = json.loads((earlier / "metrics.json").read_text())["condition_number"]
+    second = exciting.excite("lwr4plus", existing=[str(earlier)], **SHORT)
+    assert second.condition["raw_before"] == pytest.approx(known["raw"], rel=0.02)
+    assert second.condition["raw"] < 0.9 * second.condition["raw_before"]
+    # the same from the matrices themselves
+    sharp, period = second.dynamics.exact.regressor, second.period
+    times = np.arange(1000) * (period / 1000)
+    one = np.sqrt(2) * sharp(*before.orders(times))
+    motion = dense_motion(second.family, second.found.x, times)
+    both = np.concatenate([one, sharp(motion.q, motion.v, motion.a)])
+    assert condition_numbers(both)["raw"] == pytest.approx(second.condition["raw"], rel=0.02)
+    # a recording of the first motion counts as the motion itself, less what the filters' borders eat
+    q = np.tile(before.orders(np.arange(1600) / 100)[0], (2, 1))
+    np.savez(tmp_path / "log.npz", t=np.arange(len(q)) / 100, q=q, tau=q)
+    found = read_existing([str(tmp_path / "log.npz")], second.dynamics, second.chain)
+    assert found is not None
+    ratio = np.diag(found.information) / np.diag(second.existing.information)
+    assert 0.9 < np.median(ratio) < 1.02
+
+
+def test_a_held_joint_stays_and_its_columns_are_said(cell, calib):
+    code, out, err = calib("excite", "lwr4plus", "--lock", "joint4=0.5", "--out", "e", *QUICK)
     assert code == 0, err
-    reached = json.loads(Path("e/metrics.json").read_text())["goals"]
-    assert reached["torque slack of joints 6, 7"]["reached"] <= 0.82 + 1e-5
-    assert {"cond raw", "cond normalised"} < set(reached)
-    assert Path("e/plot_front.png").exists() and len(Path("e/front.csv").read_text().splitlines()) > 1
+    metrics = json.loads(Path("e/metrics.json").read_text())
+    told = metrics["setting"]["columns"]
+    assert metrics["setting"]["held"] == {"joint4": 0.5} and "held: joint4" in out
+    assert len(told) < 64 and f"condition number of {len(told)} columns" in out
+    assert not {"Fv4", "Fc4", "off4"} & set(told) and {"Fv3", "Fc5"} < set(told)
+    assert metrics["condition_number"]["normalised"] < 100
+    with Path("e/trajectory.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {float(row["q4"]) for row in rows} == {0.5} and {float(row["v4"]) for row in rows} == {0.0}
+
+
+def test_the_columns_told_with_a_joint_held_are_all_there_are():
+    chain = load("lwr4plus")
+    dynamics = read_dynamics(chain, None, "Fv Fc off", read_motion_limits(None, chain))
+    rng = np.random.default_rng(3)
+    q, v, a = rng.uniform(-2, 2, (3, 400, 7))
+    q[:, 3], v[:, 3], a[:, 3] = 0.5, 0.0, 0.0
+    W = np.delete(dynamics.exact.regressor(q, v, a), 3, axis=1).reshape(-1, 64)
+    held = told(dynamics, chain, {3: 0.5})
+    scaled = W / np.maximum(np.linalg.norm(W, axis=0), 1e-12)
+    assert len(held.names) == np.linalg.matrix_rank(scaled, 1e-4)
+    assert np.linalg.cond(scaled[:, held.columns]) < 200
+
+
+def test_a_motion_is_recalled_from_a_log_and_read_by_identify(earlier, tmp_path, cell, calib):
+    reference = excitation_table.read(earlier)
+    times, sigma = np.arange(4 * 1600) / 100, 0.02
+    q, rng = reference.orders(times)[0], np.random.default_rng(0)
+    log = np.concatenate([np.tile(q[0], (137, 1)), q, np.tile(q[0], (80, 1))])
+    tau = np.cos(log) + sigma * rng.normal(size=log.shape)
+    np.savez(tmp_path / "log.npz", t=np.arange(len(log)) / 100 + 5.0, q=log, tau=tau)
+    code, out, err = calib("recall", earlier, tmp_path / "log.npz", "--out", tmp_path / "a.npz", "--skip", 1)
+    assert code == 0, err
+    assert "3 whole periods" in out and "from 17.370 s" in out
+    found = np.load(tmp_path / "a.npz")
+    assert np.allclose(found["q"], q[:1600], atol=1e-6)
+    assert np.sqrt(found["variance_tau"].mean()) == pytest.approx(sigma, rel=0.05)
+    assert (found["tau"] - np.cos(q[:1600])).std() == pytest.approx(sigma / np.sqrt(3), rel=0.05)
+    assert len(read_recording(tmp_path / "a.npz")) == 1600
+    assert calib("recall", earlier, tmp_path / "log.npz", "--out", tmp_path / "a.csv")[0] == 0
+    table = read_recording(tmp_path / "a.csv")
+    assert np.allclose(table.q, q[:1600], atol=1e-6) and table.kind == "torque"
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("no/where", "log.npz"), "holds no trajectory.toml"),
+        (("{earlier}", "other.npz"), "is not in the recording"),
+        (("{earlier}", "none.npz"), "cannot be read"),
+        (("{earlier}", "other.npz", "--skip", "-1"), "--skip -1"),
+        (("{earlier}", "other.npz", "--out", "a.txt"), "suffix .npz or .csv"),
+    ],
+)
+def test_bad_recalls(earlier, cell, calib, options, words):
+    times = np.arange(4000)[:, None] / 100
+    np.savez("other.npz", t=times[:, 0], q=np.sin(times * np.arange(1, 8)), tau=np.cos(times * np.arange(1, 8)))
+    given = [word.replace("{earlier}", str(earlier)) for word in options]
+    code, _, err = calib("recall", *given, *(() if "--out" in given else ("--out", "a.npz")))
+    assert (code, words in err) == (2, True), err
+
+
+def test_ctrl_c_keeps_the_best_motion_so_far(cell, calib, monkeypatch):
+    """An interrupt in the middle of the search: the folder is written, verified, and says so."""
+    remember = Run._remember
+
+    def interrupting(run, y, found):
+        remember(run, y, found)
+        if run.kept == 5:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Run, "_remember", interrupting)
+    code, out, err = calib("excite", "lwr4plus", "--out", "e", "--goal", "wrist=0.1", *QUICK)
+    assert code == 0 and "interrupted: this is the best" in out, err
+    assert "note: interrupted before the goals were searched for" in out
+    metrics = json.loads(Path("e/metrics.json").read_text())
+    assert metrics["setting"]["interrupted"] and metrics["feasible"] and metrics["evaluations"] < 60
+    assert metrics["history"][-1] < metrics["history"][0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("whom", ["the terminal's group", "the command alone"])
+def test_ctrl_c_in_worker_processes(tmp_path, whom):
+    words = ["excite", "lwr4plus", "--out", str(tmp_path / "e"), "--starts", "20", "--workers", "2"]
+    run = subprocess.Popen(
+        [sys.executable, "-m", "calib.cli", *words], stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
+    time.sleep(20)
+    (os.killpg if "group" in whom else os.kill)(run.pid, signal.SIGINT)
+    out, _ = run.communicate(timeout=60)
+    assert run.returncode == 0 and "interrupted: this is the best" in out
+    assert json.loads((tmp_path / "e/metrics.json").read_text())["feasible"]
 
 
 @pytest.mark.parametrize(
@@ -86,6 +241,17 @@ def test_goals_raise_the_torque_of_the_wrist_and_the_front_is_drawn(cell, calib)
         ("[target]\nheight = 1.5", (), "breaks the workspace limit"),
         ("[torque]\nall = 0.05", (), "breaks the torque limit"),
         ("[torque]\nmargin = 1.5", (), "torque margin 1.5"),
+        ("[joints]\nq2 = [-1.0, 1.0]", ("--start", "0,1.2,0,0,0,0,0"), "joint2 at 1.2 is beyond its limits -1 to 1"),
+        ("", ("--start", "0,nan,0,0,0,0,0"), "joint2 at nan is beyond"),
+        ("", ("--start", "0,0"), "expected 7 joint values, found 2"),
+        ("", ("--repeat", "0"), "--repeat 0"),
+        ("", ("--slower", "0.5"), "--slower 0.5"),
+        ("", ("--lock", "joint9"), "'joint9' is no joint"),
+        ("", ("--lock", "joint4=9"), "joint4 at 9 is beyond its limits"),
+        ("", ("--lock", "joint4=x"), "'x' is not a number"),
+        ("", ("--lock", "q1,q2,q3,q4,q5,q6,q7"), "nothing is left to move"),
+        ("", ("--existing", "nowhere.npz"), "cannot be read"),
+        ('[frequency]\nresonance = "0.25 Hz"', (), "take fewer harmonics or a period above 16 s"),
         ("[target]\nreach = nan", (), "not a number"),
         ("", ("--hard", "wrist=0.9"), "hard goal torque slack of joints 6, 7"),
         ("", ("--goal", "wrist=2"), "above 0 and below 1"),

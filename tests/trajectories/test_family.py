@@ -91,6 +91,12 @@ def test_variables_are_read_back_from_coefficients(family):
     assert np.allclose(family.variables(family.coefficients(x)), x, atol=1e-12)
 
 
+@pytest.mark.parametrize("family", [fourier(3, 4.0, 3, held={1: 0.7}), bspline(9, 4.0, 3, held={1: 0.7})])
+def test_a_joint_is_held_at_its_value(family):
+    motion = family.basis(sample_times(4.0, 20)).motion(drawn(family))
+    assert np.allclose(motion.q[:, 1], 0.7) and not motion.v[:, 1].any() and np.ptp(motion.q[:, 0]) > 0
+
+
 def test_a_locked_joint_stands_still():
     family = fourier((3, 0, 2), 4.0)
     motion = family.basis(sample_times(4.0, 20)).motion(drawn(family))
@@ -106,6 +112,8 @@ def test_a_locked_joint_stands_still():
         (lambda: fourier(5, 0.0, 7), "period 0"),
         (lambda: fourier(5, float("nan"), 7), "period nan"),
         (lambda: fourier(2, 4.0, 2, start=np.array([0.0, np.nan])), "2 finite joint values"),
+        (lambda: fourier(4, 4.0, 2, held={2: 0.0}), "joint 3 of 2 cannot be held"),
+        (lambda: fourier(4, 4.0, 2, held={0: 0.5}, start=np.zeros(2)), "held at 0.5, but"),
         (lambda: bspline(5, 4.0, 3), "more than the degree"),
         (lambda: bspline(9, 4.0, 3, degree=4), "jerk"),
     ],

@@ -32,6 +32,7 @@ OBJECTIVES = [
     Excitation("cond", np.linspace(0.5, 2.0, 64), sharpness=10.0),
     Excitation("logdet", "raw", sigmas=np.linspace(0.2, 2.0, 7)),
     Excitation("logdet", "normalised", existing=PAST.T @ PAST),
+    Excitation("cond", "normalised", sigmas=np.where(np.arange(7) == 4, np.inf, 1.0), columns=np.arange(3, 40)),
     Excitation("smallest", "raw"),
     Excitation("smallest", "normalised", sharpness=8.0, existing=PAST.T @ PAST),
     TorqueSlack((5, 6), CHI, LIMITS),
