@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from calib.cli.shared import Base, Seed, Tip, make_console, told
+
+if TYPE_CHECKING:
+    from calib.procedure.answers import Answers
 
 app = typer.Typer()
 
@@ -17,8 +20,23 @@ Folder = Annotated[Path, typer.Argument(help="the session's folder")]
 @app.command()
 def new(
     folder: Folder,
-    robot: Annotated[str, typer.Option(help="a .urdf, an MDH .toml, a library name, or the folder of an earlier fit")],
-    instrument: Annotated[str, typer.Option(help="cmm, tracker, tracker6d, mocap, camera, other-pose, other-position")],
+    robot: Annotated[
+        str | None, typer.Option(help="a .urdf, an MDH .toml, a library name, or the folder of an earlier fit")
+    ] = None,
+    instrument: Annotated[
+        str | None, typer.Option(help="cmm, tracker, tracker6d, mocap, camera, other-pose, other-position")
+    ] = None,
+    tool: Annotated[
+        str | None, typer.Option(help="x,y,z: where the target roughly sits in the tip's frame [m]")
+    ] = None,
+    limits: Annotated[Path | None, typer.Option(help="TOML: where, how fast the arm may go; poses and motions")] = None,
+    dynamics: Annotated[
+        bool | None, typer.Option("--dynamics/--geometry-only", help="identify the dynamics, too (default)")
+    ] = None,
+    payload: Annotated[
+        list[str] | None, typer.Option(help="label=kg of a body to record with as well; may be repeated")
+    ] = None,
+    torques: Annotated[str | None, typer.Option(help="motor, link, or both: what the log holds")] = None,
     poses: Annotated[int, typer.Option(help="poses to choose for the fit")] = 40,
     validation: Annotated[int, typer.Option(help="poses to measure and never fit; 0 for none")] = 20,
     base: Base = "",
@@ -27,15 +45,41 @@ def new(
 ) -> None:
     """Make a session FOLDER: calibrate a robot step by step, with a certificate at the end.
 
-    What is to be measured goes into FOLDER/3-measured as CSV (calib formats measurements); how the session goes on is
-    said in FOLDER/session.toml (calib formats session).
+    What is to be measured goes into FOLDER/3-measured as CSV (calib formats measurements), what is to be recorded into
+    FOLDER/7-recorded (calib formats recordings); how the session goes on is said in FOLDER/session.toml (calib formats
+    session). Without --robot or --instrument, at a terminal, it asks.
     """
     from calib.procedure import guided
+    from calib.procedure.answers import Answers, checked
 
+    given = Answers(robot, instrument, tool, limits, dynamics, tuple(payload or ()), torques)
+    if robot is None or instrument is None:
+        given = _asked(given)
     made = guided.begin(
-        folder, robot, instrument, poses=poses, validation=validation, base=base or "", tip=tip or "", seed=seed
+        folder, poses=poses, validation=validation, base=base or "", tip=tip or "", seed=seed, **checked(given)
     )
     make_console().print(f"made {made.folder}; next: calib next {made.folder}", soft_wrap=True, markup=False)
+
+
+def _asked(given: Answers) -> Answers:
+    """Ask for what was not given, at a terminal."""
+    import sys
+
+    from calib.errors import CalibError, UsageError
+    from calib.procedure.answers import QUESTIONS, with_answer
+
+    if not sys.stdin.isatty():
+        missing = "--robot" if given.robot is None else "--instrument"
+        raise UsageError(f"{missing} is missing (at a terminal, calib new asks)")
+    for question in QUESTIONS:
+        while question.open(given):
+            answer = typer.prompt(question.words, default=question.default, show_default=bool(question.default))
+            try:
+                given = with_answer(given, question, answer.strip())
+                break
+            except CalibError as error:
+                typer.echo(f"  {error}")
+    return given
 
 
 @app.command()
@@ -60,7 +104,7 @@ def next_step(folder: Folder) -> None:
 @app.command()
 def redo(
     folder: Folder,
-    step: Annotated[str, typer.Argument(help="describe, select, measure, fit, validate, export, certificate")],
+    step: Annotated[str, typer.Argument(help="a step's name or number, see calib status")],
 ) -> None:
     """Make a step of a session again, and all that rests on it."""
     _go_on(folder, f"calib redo {folder} {step}", step)

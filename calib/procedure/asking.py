@@ -30,7 +30,9 @@ def _at_the_robot(session: Session, name: str, both: bool) -> str:
     count = sum(1 for _ in path.open()) - 1
     return (
         f"Drive the {count} poses of {path}{_and_validation(session) if both else ''}, let the arm settle, measure the "
-        f"target's {what} with the {device} and log the joint angles read back."
+        f"target's {what} with the {device} and log the joint angles read back; the first three once more at the end "
+        "show drift "
+        "(into drift.csv, if you like)."
     )
 
 

@@ -22,12 +22,13 @@ from calib.procedure.truth import TRUTH, against_truth, torques_against_truth
 from calib.robot import library
 from calib.robot.load import load
 from calib.simulation import brought
-from calib.simulation.cell import Cell, measure
+from calib.simulation.cell import Cell, measure, wandering
 from calib.simulation.cells import virtual_cell
 from calib.simulation.moving import MovingArm, moving_arm, play, record
 
 Say = Callable[[str], None]
-FIT, VALIDATION = 40, 20
+FIT, VALIDATION, AGAIN = 40, 20, 3
+DRIFT = 10e-6  # how far the simulated instrument wanders over a series [m]
 MOTION = {"period": 10.0, "starts": 2, "evaluations": 150, "repeats": 2, "torques": "motor"}  # little effort, for time
 LOGS = (("training", 2), ("validation", 3))  # and the numbers of their noise
 
@@ -179,11 +180,15 @@ def arm_of(session: Session, cell: Cell) -> MovingArm:
 
 
 def bring(session: Session, cell: Cell, seed: int) -> None:
-    """Let the simulated cell measure the planned poses."""
+    """Let the simulated cell measure the planned poses, and three of them once more at the end; the CMM wanders."""
     kinds = [joint.kind for joint in cell.nominal.joints]
     for number, (plan, name) in enumerate((("poses", "measured"), ("validation", "validation"))):
         q = read_poses(session.path(f"2-poses/{plan}.csv"), cell.nominal.joint_names, kinds=kinds)
-        brought.write(measure(cell, q, np.random.default_rng([seed, number])), session.path(f"3-measured/{name}.csv"))
+        seen = wandering(measure(cell, q, np.random.default_rng([seed, number])), DRIFT, seed)
+        brought.write(seen, session.path(f"3-measured/{name}.csv"))
+        if plan == "poses":
+            again = measure(cell, q[:AGAIN], np.random.default_rng([seed, 7]))
+            brought.write(wandering(again, DRIFT, seed, begin=1.0), session.path("3-measured/drift.csv"))
 
 
 def bring_logs(session: Session, arm: MovingArm, seed: int) -> None:

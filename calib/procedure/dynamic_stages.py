@@ -80,7 +80,7 @@ def excite(session: Session, say: Say) -> list[str]:
         designed = exciting.excite(
             session.path("4-fit"), limits=limits, period=wanted["period"] * (1.0 if first else SHORTER),
             harmonics=wanted["harmonics"], rate=wanted["rate"], starts=wanted["starts"] if first else 1,
-            evaluations=wanted["evaluations"] if first else max(50, wanted["evaluations"] // 3),
+            evaluations=wanted["evaluations"] if first else max(20, wanted["evaluations"] // 3),
             seed=session.settings.seed + (0 if first else OTHER),
             progress=lambda words, name=name: say(f"{name} motion: {words}"),
         )  # fmt: skip

@@ -45,6 +45,7 @@ from calib.robot.tables import check_keys, load, number, placement, vector
 from poses import constraints
 from poses.space import Constraint
 
+MOTION = ("velocity", "acceleration", "jerk", "torque", "friction", "point", "frequency")  # `motion_limits` reads them
 MARGIN, RADIUS = 0.01, 0.05  # [m], where the file does not tell (our choice)
 
 
@@ -67,7 +68,7 @@ class Limits:
 
 
 def read_limits(
-    path: Path | None, cell: Installation, source: Path | None = None, beside: tuple[str, ...] = ()
+    path: Path | None, cell: Installation, source: Path | None = None, beside: tuple[str, ...] = MOTION
 ) -> Limits:
     """Read the constraints for an arm with its targets.
 
@@ -75,7 +76,7 @@ def read_limits(
         path: the file; None for the joint limits alone.
         cell: the arm, see `calib.procedure.observing.targets_of`.
         source: the robot's file, whose collision shapes are used where it is a URDF.
-        beside: tables of the file that somebody else reads.
+        beside: tables of the file that somebody else reads; one file may serve poses and motions.
 
     Raises:
         UsageError: for an unknown key or a value that a key cannot have.

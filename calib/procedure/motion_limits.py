@@ -45,7 +45,6 @@ from trajectories.basis import Motion
 from trajectories.constraints import Constraint, box_limits
 from trajectories.places import Clearance, Workspace
 
-TABLES = ("velocity", "acceleration", "jerk", "torque", "friction", "point", "frequency")
 STEP = 1e-6  # [rad or m] of the central differences of collision distances (our choice)
 
 
@@ -82,7 +81,7 @@ def read_motion_limits(path: Path | None, chain: Chain, source: Path | None = No
         UsageError: for an unknown key or a value that a key cannot have.
     """
     cell = targets_of(chain)
-    found = read_limits(path, cell, source, TABLES)
+    found = read_limits(path, cell, source)
     table, where = ({}, "limits") if path is None else (load(path), str(path))
     try:
         velocity = _per_joint(table, "velocity", chain, where, np.array([j.velocity for j in chain.joints]))

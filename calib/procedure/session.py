@@ -3,8 +3,8 @@
 session.toml     what is to be calibrated, with what, how; written by `calib new`, edited by people
 1-robot/         the robot's description, copied, so that the folder can move
 2-poses/         poses.csv to measure and fit, validation.csv to measure and never fit
-3-measured/      what people bring: measured.csv (any name), and files whose name starts with validation; their columns:
-                 `calib formats measurements`
+3-measured/      what people bring: measured.csv (any name), files whose name starts with validation, and drift.csv,
+                 some of the poses measured once more at the end (never fitted); columns: `calib formats measurements`
 4-fit/  5-validation/
 6-excitation/    training and validation: two motions for the robot to play, at the controller's rate
 7-recorded/      what people bring: the logs of them, training.csv (any name; .npz or a ROS bag, too), and files whose

@@ -15,7 +15,7 @@ from calib.data.plans import check_against, read_poses, write_poses
 from calib.geometry.fit import polish_frames
 from calib.geometry.weighing import Settings as FitSettings
 from calib.geometry.weighing import combine
-from calib.procedure import calibrated, comparing, fitting, inputs, outputs, proof, report
+from calib.procedure import arrival, calibrated, comparing, fitting, inputs, outputs, proof, report
 from calib.procedure.session import Session
 from calib.procedure.verdict import judge
 from calib.robot.chain import Chain
@@ -60,7 +60,13 @@ def measured_files(session: Session) -> tuple[list[Path], list[Path]]:
     """Return the CSV files people have brought: for the fit, and for validation (names starting with it)."""
     found = sorted(session.path("3-measured").glob("*.csv"))
     unseen = [path for path in found if path.name.lower().startswith("validation")]
-    return [path for path in found if path not in unseen], unseen
+    aside = [*unseen, *measured_again(session)]
+    return [path for path in found if path not in aside], unseen
+
+
+def measured_again(session: Session) -> list[Path]:
+    """Return the files of poses measured once more at the end (names starting with drift); they are not fitted."""
+    return [path for path in sorted(session.path("3-measured").glob("*.csv")) if path.name.lower().startswith("drift")]
 
 
 def describe(session: Session, say: Say) -> list[str]:
@@ -112,6 +118,7 @@ def arrive(session: Session, say: Say) -> list[str]:
     plan = planned(session, chain, "poses")
     for path in fit:
         notes += check_file(session, chain, path, plan)
+    notes += drifts(session, chain)
     files.write(session.path("3-measured/checked.txt"), "\n".join(notes) + "\n")
     return notes
 
@@ -131,8 +138,18 @@ def check_file(session: Session, chain: Chain, path: Path, plan: np.ndarray | No
         notes.insert(0, f"{path.name}: {len(block)} rows of kind {block.kind}{ignored}")
         notes += [f"{path.name}: {note}" for note in block.notes]
         if plan is not None:
-            notes += [f"{path.name}: {note}" for note in check_against(plan, block)]
+            notes += [f"{path.name}: {note}" for note in (*check_against(plan, block), *arrival.readback(plan, block))]
     return notes
+
+
+def drifts(session: Session, chain: Chain) -> list[str]:
+    """Return what poses that were measured more than once say of drift."""
+    options = options_of(session)
+    first, again = (
+        [block for path in paths for block in inputs.read_file(path, chain, options)]
+        for paths in (measured_files(session)[0], measured_again(session))
+    )
+    return arrival.drift(chain, first, again, session.settings.instrument["sigma_position"])
 
 
 def gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:

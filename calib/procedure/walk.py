@@ -44,7 +44,8 @@ def _plan(session: Session) -> list[Path]:
 
 
 def _arrived(session: Session) -> list[Path]:
-    return [*_robot(session), session.path("2-poses/poses.csv"), *_options(session), *stages.measured_files(session)[0]]
+    brought = [*stages.measured_files(session)[0], *stages.measured_again(session)]
+    return [*_robot(session), session.path("2-poses/poses.csv"), *_options(session), *brought]
 
 
 def _options(session: Session) -> list[Path]:

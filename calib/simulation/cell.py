@@ -9,7 +9,7 @@ base's orientation noise acts with the lever between the two.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -115,6 +115,17 @@ def measure(
         tool_names=cell.truth.tool_names,
         file=file,
     )
+
+
+def wandering(measured: PoseMeasurements, drift: float, seed: int, begin: float = 0.0) -> PoseMeasurements:
+    """Return positions as an instrument sees them that wanders by `drift` [m] from `begin` (0 to 1) to the series' end.
+
+    The direction is the seed's, so that several series can share it.
+    """
+    assert measured.position is not None
+    direction = np.random.default_rng([seed, 5]).standard_normal(3)
+    way = np.linspace(begin, 1.0, len(measured))[:, None] * direction / np.linalg.norm(direction)
+    return replace(measured, position=measured.position + drift * way)
 
 
 def _noisy(poses: np.ndarray, instrument: Instrument, rng: np.random.Generator) -> np.ndarray:
