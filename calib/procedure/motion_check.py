@@ -7,15 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.signal import fftconvolve
+from scipy.signal import fftconvolve, savgol_filter
 
 from calib.data.recording import Recording
 from calib.data.tables import read_table
-from calib.dynamics.gravity import gravity_torques
+from calib.dynamics.rigid_body import inverse_dynamics
+from calib.dynamics.tree import standard_parameters, tree
 from calib.errors import MeasurementError
 from calib.robot.chain import Chain
 from trajectories.errors import BadInput
@@ -26,9 +28,10 @@ LIKE = 0.9  # share of the motion's variance a recorded period has to explain
 LOOSE = 0.98  # below which the tracking is worth a note
 SPEEDS = (0.1, 0.2, 0.25, 0.5, 2.0)  # rehearsal factors that are tried to explain another motion
 EDGE = 0.25  # kept before and after the motion [s], for the filters' borders
-SURE = 0.8  # correlation with the gravity torque of the nominal masses from which on its sign counts
-HEAVY = 0.05  # of the torque limit: gravity torques smaller than this say nothing
-SCALE = 30.0  # a factor between measured and gravity torques that no wrong mass explains
+SMOOTH = 10  # half width of the window for derivatives, in steps of the coarse grid
+SURE = 0.8  # partial correlation with the torque of the nominal masses from which on its sign counts
+HEAVY = 0.03  # of the torque limit: rigid-body torques smaller than this say nothing
+SCALE = 10.0  # a factor between measured and nominal torques that no wrong mass explains
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,41 +180,52 @@ def _best_order(q: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.nd
     return order, np.where(likeness[0, rows, order] >= likeness[1, rows, order], 1.0, -1.0)
 
 
-def check_torques(recording: Recording, chain: Chain, loaded: bool = False) -> list[str]:
-    """Hold torques against the gravity of the nominal masses: reversed signs, other units.
+def check_torques(recording: Recording, chain: Chain) -> list[str]:
+    """Hold torques against those of the nominal masses, friction left free: reversed signs, other units.
 
     Returns:
         Notes.
 
     Raises:
-        MeasurementError: where the torques of all heavy joints are reversed, or of another size.
+        MeasurementError: where the torques of all joints that carry much are reversed, or of another size.
     """
-    if chain.inertias is None or recording.kind != "torque" or loaded:
+    if chain.inertias is None or recording.kind != "torque":
         return []
-    step = max(1, len(recording) // 2000)
-    gravity, torque = gravity_torques(chain, recording.q[::step]), recording.effort[::step]
-    limit = np.array([joint.effort for joint in chain.joints])
-    size = gravity.std(axis=0)
-    heavy = np.flatnonzero(size > HEAVY * np.where(np.isfinite(limit), limit, 100.0))
-    a, b = (x - x.mean(axis=0) for x in (gravity, torque))
-    alike = (a * b).sum(axis=0) / np.maximum(np.linalg.norm(a, axis=0) * np.linalg.norm(b, axis=0), 1e-12)
-    ratio = (a * b).sum(axis=0) / np.maximum((a**2).sum(axis=0), 1e-12)
-    sure = [j for j in heavy if abs(alike[j]) > SURE]
+    share, alike, heavy = _against_masses(recording, chain)
+    sure = [j for j in np.flatnonzero(heavy) if alike[j] > SURE]
     if not sure:
         return []
     names = ", ".join(recording.joint_names[j] for j in sure)
-    if all(ratio[j] < 0 for j in sure):
-        raise MeasurementError(
-            f"the torques of {names} push with gravity, not against it: reverse their sign", recording.file
-        )
-    factors = np.array([ratio[j] for j in sure])
-    if (np.abs(factors) > SCALE).all() or (np.abs(factors) < 1 / SCALE).all():
-        words = f"the torques of {names} are some {np.median(factors):.3g} times what gravity asks for"
-        guess = (
-            "mNm? Say so in the header (tau_… [mNm])"
-            if np.median(factors) > 1
-            else "currents, or torques before the gear?"
-        )
+    size = np.abs(share[sure])
+    if (size > SCALE).all() or (size < 1 / SCALE).all():
+        guess = "are they mNm? Say so in the header (tau_… [mNm])"
+        if np.median(size) < 1:
+            guess = "are they currents (i_… [A]), or torques before the gear?"
+        words = f"the torques of {names} are some {np.median(size):.2g} times what the nominal masses ask for"
         raise MeasurementError(f"{words}: {guess}", recording.file)
-    turned = [recording.joint_names[j] for j in sure if ratio[j] < 0]
+    if all(share[j] < 0 for j in sure):
+        words = f"the torques of {names} push the wrong way for the nominal masses: reverse their sign"
+        raise MeasurementError(words, recording.file)
+    turned = [recording.joint_names[j] for j in sure if share[j] < 0]
     return [f"torque of {', '.join(turned)} seems to have the wrong sign"] if turned else []
+
+
+def _against_masses(recording: Recording, chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return how much of the nominal masses' torque is in each measured one (n,), how surely, and which carry much.
+
+    Least squares of τ_j on [τ_nominal,j, v_j, sign(v_j), 1]; how surely is the partial correlation with the first.
+    """
+    grid = np.arange(recording.t[0], recording.t[-1], STEP)
+    smooth = partial(savgol_filter, window_length=2 * SMOOTH + 1, polyorder=3, axis=0)
+    q, torque = (_sampled(recording.t, x, grid) for x in (recording.q, recording.effort))
+    q, v, a = smooth(q), smooth(q, deriv=1, delta=STEP), smooth(q, deriv=2, delta=STEP)
+    rigid = inverse_dynamics(tree(chain), standard_parameters(chain), q, v, a)
+    limit = np.array([joint.effort for joint in chain.joints])
+    share, alike = np.zeros(chain.n), np.zeros(chain.n)
+    for j in range(chain.n):
+        others = np.column_stack([v[:, j], np.tanh(v[:, j] / 0.05), np.ones(len(q))])
+        left = [x - others @ np.linalg.lstsq(others, x, rcond=None)[0] for x in (rigid[:, j], smooth(torque)[:, j])]
+        power = left[0] @ left[0]
+        share[j] = left[0] @ left[1] / max(power, 1e-12)
+        alike[j] = abs(left[0] @ left[1]) / max(np.sqrt(power * (left[1] @ left[1])), 1e-12)
+    return share, alike, rigid.std(axis=0) > HEAVY * np.where(np.isfinite(limit), limit, 100.0)

@@ -118,10 +118,13 @@ def _missing(session: Session, step: Step) -> str:
 def _inputs(session: Session, step: Step) -> dict[str, str]:
     """Return the fingerprints of what a step depends on."""
     marks = {str(path.relative_to(session.folder)): fingerprint(path) for path in step.inputs(session) if path.exists()}
-    for section in step.settings:
+    for setting in step.settings:
+        section, _, key = setting.partition(".")
         if section == "dynamics" and not session.dynamic:
             continue
-        marks[f"session.toml [{section}]"] = json.dumps(getattr(session.settings, section), sort_keys=True)
+        values = getattr(session.settings, section)
+        place = f"session.toml [{section}] {key}".rstrip()
+        marks[place] = json.dumps(values[key] if key else values, sort_keys=True)
     return marks
 
 

@@ -18,7 +18,7 @@ class Step:
 
     Attributes:
         name, purpose: for people.
-        settings: sections of ``session.toml`` it depends on.
+        settings: sections of ``session.toml`` it depends on, or single keys of them (``dynamics.period``).
         inputs: the files it reads, as they are now.
         make: runs it; returns what is to be said.
         outputs: names or patterns, relative to the session, of what it makes.
@@ -112,6 +112,14 @@ def _certified(session: Session) -> list[Path]:
     return [session.path(name) for name in names]
 
 
+PLAN = "plan validation period harmonics rate starts evaluations limits"
+MODEL = "torques friction method options payloads"
+
+
+def _keys(names: str) -> tuple[str, ...]:
+    return tuple(f"dynamics.{name}" for name in names.split())
+
+
 STEPS = (
     Step("describe", "read the robot", ("robot",), _robot, stages.describe, ("1-robot/summary.txt",)),
     Step(
@@ -128,24 +136,26 @@ STEPS = (
         stages.validate, ("5-validation/metrics.json", "5-validation/errors.csv", "5-validation/rows.json"),
     ),
     Step(
-        "excite", "design the motions to record", ("dynamics", "seed"), _excited, dynamic_stages.excite,
+        "excite", "design the motions to record", (*_keys(PLAN), "seed"), _excited, dynamic_stages.excite,
         ("6-excitation/*/*",), True,
     ),
     Step(
-        "record", "check what was recorded", ("dynamics",), _recorded, dynamic_stages.record,
-        ("7-recorded/checked.txt", "7-recorded/cuts.json"), True,
+        "record", "check what was recorded", _keys("plan repeats torques options payloads"), _recorded,
+        dynamic_stages.record, ("7-recorded/checked.txt", "7-recorded/cuts.json"), True,
     ),
     Step(
-        "identify", "identify the dynamics", ("dynamics", "seed"), _identified, dynamic_stages.identify,
+        "identify", "identify the dynamics", (*_keys(MODEL), "seed"), _identified, dynamic_stages.identify,
         ("8-dynamics/*",), True,
     ),
     Step(
-        "predict", "hold it against unseen motion", ("dynamics", "seed"), _predicted, dynamic_stages.predict,
+        "predict", "hold it against unseen motion",
+        (*_keys(f"plan validation repeats tolerance_percent {MODEL}"), "seed"), _predicted, dynamic_stages.predict,
         ("8-dynamics/unseen/*",), True,
     ),
     Step("export", "write the calibrated robot", ("robot",), _exported, stages.export, ("6-export/*", "9-export/*")),
     Step(
-        "certificate", "print the certificate", ("name", "created", "instrument", "poses", "fit", "dynamics"),
-        _certified, certifying.certify, ("certificate.html",),
+        "certificate", "print the certificate",
+        ("name", "created", "instrument", "poses", "fit", *_keys("torques payloads tolerance_percent")), _certified,
+        certifying.certify, ("certificate.html",),
     ),
 )  # fmt: skip

@@ -1,0 +1,229 @@
+"""A session with dynamics walks to its end, says what a wrong recording is, and survives what people do."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib import cli
+from calib.errors import MeasurementError
+from calib.procedure import asking, demo, excitation_outputs, guided, identification_plots, steps
+from calib.procedure.guided import begin
+from calib.procedure.session import Session, open_session
+from calib.simulation.cells import virtual_cell
+
+from .conftest import edit, go_on
+
+QUICK = {"period": 6.0, "starts": 1, "evaluations": 40, "repeats": 2, "rate": 250.0}
+
+
+def kinds(session: Session) -> dict[str, str]:
+    return {state.step.name: state.kind for state in steps.states(open_session(session.folder))}
+
+
+@pytest.fixture(scope="module")
+def waiting_folder(finished_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session with a fitted geometry, whose dynamics were asked for afterwards, and that waits for recordings."""
+    folder = tmp_path_factory.mktemp("dynamic") / "cell"
+    shutil.copytree(finished_folder, folder)
+    path = folder / "session.toml"
+    edit(path, "wanted = false", "wanted = true")
+    edit(path, 'friction = "auto"', 'friction = "standard"')
+    for key, value in QUICK.items():
+        lines = [f"{key} = {value}" if line.startswith(f"{key} =") else line for line in path.read_text().splitlines()]
+        path.write_text("\n".join(lines) + "\n")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(excitation_outputs, "save", lambda figure, path: path)
+        waiting = go_on(open_session(folder))
+    assert waiting is not None and waiting.step.name == "record"
+    return folder
+
+
+@pytest.fixture(scope="module")
+def recorded_folder(waiting_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recorded") / "cell"
+    shutil.copytree(waiting_folder, folder)
+    session = open_session(folder)
+    demo.bring_logs(session, demo.arm_of(session, virtual_cell("lwr4plus", 1)), 1)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole_folder(recorded_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("whole") / "cell"
+    shutil.copytree(recorded_folder, folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(identification_plots, "write", lambda outcome, path: None)
+        assert go_on(open_session(folder)) is None
+    return folder
+
+
+@pytest.fixture
+def waiting(waiting_folder: Path, tmp_path: Path) -> Session:
+    shutil.copytree(waiting_folder, tmp_path / "cell")
+    return open_session(tmp_path / "cell")
+
+
+@pytest.fixture
+def recorded(recorded_folder: Path, tmp_path: Path) -> Session:
+    shutil.copytree(recorded_folder, tmp_path / "cell")
+    return open_session(tmp_path / "cell")
+
+
+@pytest.fixture
+def whole(whole_folder: Path, tmp_path: Path) -> Session:
+    shutil.copytree(whole_folder, tmp_path / "cell")
+    return open_session(tmp_path / "cell")
+
+
+def test_dynamics_asked_for_afterwards_keep_the_geometry(waiting: Session) -> None:
+    found = kinds(waiting)
+    assert [name for name, kind in found.items() if kind == steps.DONE] == [
+        "describe", "select", "measure", "fit", "validate", "excite",
+    ]  # fmt: skip
+    assert not waiting.path("6-export").exists() and waiting.path("9-export/robot.urdf").exists()
+
+
+def test_two_lines_say_what_to_play_and_what_to_log(waiting: Session) -> None:
+    state = next(state for state in steps.states(waiting) if state.kind == steps.WAITING)
+    first, second = asking.asks(waiting, state)
+    assert "6-excitation/training/trajectory.csv" in first and "validation/trajectory.csv" in first
+    assert "2 times" in first and "250 Hz" in first and "never learnt from" in first
+    assert "7-recorded/training.csv" in second and "q_joint1 [deg]" in second and "tau_joint7 [Nm]" in second
+
+
+def test_it_ends_in_one_certificate_of_both(whole: Session) -> None:
+    assert set(kinds(whole).values()) == {steps.DONE}
+    page = whole.path("certificate.html").read_text()
+    for words in (
+        "Torque errors",
+        "Excitation",
+        "Identified parameters",
+        "ZZ2R",
+        "7-recorded/training.csv",
+        "Geometry",
+    ):
+        assert words in page
+    found = json.loads(whole.path("8-dynamics/unseen/report.json").read_text())
+    own = found["validation"]["validation.csv"]
+    assert own["evidence"] and own["raw"]["relative_error_percent"]["total"] < 10.0
+    assert own["filtered"]["relative_error_percent"]["total"] < 3.0
+
+
+def test_the_parameters_are_those_of_the_hidden_arm(whole: Session) -> None:
+    from calib.procedure.truth import torques_against_truth
+
+    cell = virtual_cell("lwr4plus", 1)
+    found = torques_against_truth(whole, cell, demo.arm_of(whole, cell))
+    assert found.identified < 1.5 < found.nominal
+
+
+def test_a_worse_stage_decides(whole: Session) -> None:
+    before = whole.path("8-dynamics/estimate.csv").stat().st_mtime_ns
+    edit(whole.path("session.toml"), "tolerance_percent = 0.0", "tolerance_percent = 0.1")
+    assert kinds(whole)["identify"] == steps.DONE and kinds(whole)["predict"] == steps.STALE
+    stop = guided.go_on(whole.folder, lambda words: None, lambda words: None, "calib next")
+    assert stop.verdict == "fail"
+    assert "above the tolerance of 0.1 %" in whole.path("certificate.html").read_text()
+    assert whole.path("8-dynamics/estimate.csv").stat().st_mtime_ns == before
+    assert json.loads(whole.path("5-validation/metrics.json").read_text())["verdict"] != "fail"
+
+
+def reheaded(change: Callable[[list[str]], list[str]]) -> Callable[[str], str]:
+    def changed(text: str) -> str:
+        head, rest = text.split("\n", 1)
+        return ",".join(change(head.split(","))) + "\n" + rest
+
+    return changed
+
+
+def swapped(header: list[str]) -> list[str]:
+    names = [name.replace("joint2 ", "?").replace("joint3 ", "joint2 ").replace("?", "joint3 ") for name in header]
+    return [new if new[:2] == "q_" else old for old, new in zip(header, names)]
+
+
+def numbers(change: Callable[[np.ndarray, list[str]], np.ndarray]) -> Callable[[str], str]:
+    def changed(text: str) -> str:
+        head, *lines = text.strip().split("\n")
+        table = change(np.array([line.split(",") for line in lines], dtype=float), head.split(","))
+        return "\n".join([head, *(",".join(f"{x:.8g}" for x in row) for row in table)]) + "\n"
+
+    return changed
+
+
+def slowed(table: np.ndarray, header: list[str]) -> np.ndarray:
+    table[:, 0] *= 2.0
+    return table
+
+
+def reversed_torques(table: np.ndarray, header: list[str]) -> np.ndarray:
+    table[:, [name.startswith("tau_joint") for name in header]] *= -1.0
+    return table
+
+
+def small(table: np.ndarray, header: list[str]) -> np.ndarray:
+    table[:, [name.startswith("tau_joint") for name in header]] *= 1e-2
+    return table
+
+
+def another(table: np.ndarray, header: list[str]) -> np.ndarray:
+    columns = [name.startswith("q_") for name in header]
+    table[:, columns] = 30.0 * np.sin(np.outer(table[:, 0], np.arange(1, 8)))
+    return table
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (reheaded(lambda header: [name.replace("[deg]", "[rad]") for name in header]), "looks like deg"),
+        (reheaded(swapped), r"columns are swapped \(the column of joint3 holds joint2, .*joint2 holds joint3"),
+        (numbers(slowed), "0.5 times its speed"),
+        (numbers(reversed_torques), "reverse their sign"),
+        (numbers(small), "times what the nominal masses ask for"),
+        (numbers(another), "another motion than the one designed"),
+        (numbers(lambda table, header: table[:1000]), "shorter than one period"),
+        (reheaded(lambda header: [name.replace("q_joint4", "x4") for name in header]), "joint"),
+    ],
+    ids=["rad", "swapped", "rehearsal", "sign", "unit", "another", "stopped", "missing"],
+)
+def test_a_wrong_recording_is_said(recorded: Session, change: Callable[[str], str], message: str) -> None:
+    path = recorded.path("7-recorded/training.csv")
+    path.write_text(change(path.read_text()))
+    with pytest.raises(MeasurementError, match=message):
+        go_on(recorded)
+    assert kinds(recorded)["excite"] == steps.DONE and not recorded.path("8-dynamics/dynamics.json").exists()
+
+
+def test_the_validation_motion_is_not_learnt_from_and_the_training_motion_no_proof(recorded: Session) -> None:
+    one, two = recorded.path("7-recorded/training.csv"), recorded.path("7-recorded/validation.csv")
+    shutil.copyfile(two, one)
+    with pytest.raises(MeasurementError, match="this is the validation motion"):
+        go_on(recorded)
+
+
+def test_recordings_keep_the_plan_they_were_made_to(whole: Session) -> None:
+    before = whole.path("6-excitation/training/trajectory.csv").read_text()
+    edit(whole.path("session.toml"), "harmonics = 5", "harmonics = 4")
+    assert kinds(whole)["excite"] == steps.KEPT
+    assert whole.path("6-excitation/training/trajectory.csv").read_text() == before
+
+
+def test_a_guided_demonstration_stops_where_an_engineer_would(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    out = str(tmp_path / "cell")
+    assert cli.run(["demo", "--guided", "--geometry-only", "--out", out]) == 0
+    said = capsys.readouterr().out.replace("\n", "")
+    assert "Drive the 40 poses" in said and f"calib demo --bring {out}" in said
+    assert not list((tmp_path / "cell/3-measured").iterdir())
+    assert cli.run(["demo", "--bring", out]) == 0
+    assert (tmp_path / "cell/3-measured/validation.csv").exists()
+    assert cli.run(["demo", "--bring", out]) == 2 and "waits for nothing" in capsys.readouterr().err
+
+
+def test_a_robot_without_masses_is_calibrated_without_dynamics(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    session = begin(tmp_path / "cell", "ur5", "cmm", poses=5, validation=0, seed=0, dynamics=False)
+    assert not session.dynamic and not session.path("7-recorded").exists()
