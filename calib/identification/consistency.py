@@ -45,6 +45,7 @@ from calib.robot.chain import Chain
 STEP = 1e-5  # of the central differences [m or rad]
 BLOCK = 512  # samples at a time: the regressor of so many stays in the processor's cache
 SAMPLES = 30_000  # at the full rate; longer recordings are represented by pieces spread over them (our choice)
+CHUNK = 2000  # thinned samples at a time, where each needs its own line of a matrix
 PIECE = 32  # thinned samples of such a piece at least
 NOTHING = 0.01  # a σ that grows by a smaller share has not changed (our choice)
 TILTS = ("gravity.rx", "gravity.ry")
@@ -111,11 +112,6 @@ class Propagation:
         """(p,) bool: the geometric part exceeds the torque part."""
         return self.sigma_geometry > self.sigma_torque
 
-    @property
-    def shifts(self) -> np.ndarray:
-        """(p, K + 2) what one standard deviation of each element does, in σ_torque; NaN without one."""
-        return self.sensitivity * self.deviations / self.sigma_torque[:, None]
-
 
 def propagate(
     found: Identification,
@@ -177,7 +173,8 @@ def sensitivity(
     change = np.concatenate([x.reshape(-1, count) for x in changes])
     share = float(np.count_nonzero(scale) / sum(np.count_nonzero(part.present) for part in found.rows))
     white = matrix * scale[:, None]
-    solved = np.linalg.solve(white.T @ white + share * how.prior, pulled - white.T @ (change * scale[:, None]))
+    inverse = _inverse(white.T @ white + share * how.prior)
+    solved = inverse @ (pulled - white.T @ (change * scale[:, None]))
     seen = scale > 0.0
     after = change + matrix @ solved
     return solved, _rms(change[seen]), _rms(after[seen])
@@ -209,30 +206,28 @@ def estimator(found: Identification) -> Estimator:
     deviation = deviation * np.sqrt(fitted.inflation)
     factors = (fitted.pooled.factors / deviation[:, None, None]).reshape(-1, p + 1)
     own = factors.T @ factors
-    unit = fitted.estimate.sigma
-    posterior = np.linalg.inv(fitted.estimate.covariance / np.outer(unit, unit)) / np.outer(unit, unit)
+    posterior = _inverse(fitted.estimate.covariance)
     return Estimator(deviation, posterior - own[:p, :p], posterior @ fitted.estimate.values - own[:p, p])
 
 
 def estimate(how: Estimator, all_rows: Sequence[Rows]) -> tuple[np.ndarray, np.ndarray]:
-    """Return φ (p,) from rows, and the gain dφ/dy (p, rows of all samples)."""
-    matrix, scale, target = (
-        np.concatenate(x)
-        for x in zip(*[(_stacked(part), _weights(how, part), part.target.ravel()) for part in all_rows])
-    )
-    white = matrix * scale[:, None]
-    gain = np.linalg.solve(white.T @ white + how.prior, (white * scale[:, None]).T)
-    return gain @ target + np.linalg.solve(white.T @ white + how.prior, how.pull), gain
+    """Return φ (p,) from rows, and A⁻¹ (p, p)."""
+    normal, right = np.array(how.prior), np.array(how.pull)
+    for part in all_rows:
+        scale = _weights(how, part)
+        white = _stacked(part) * scale[:, None]
+        normal += white.T @ white
+        right += white.T @ (part.target.ravel() * scale)
+    inverse = _inverse(normal)
+    return inverse @ right, inverse
 
 
 def rows_on(found: Identification, chain: Chain, cases: Sequence[Case]) -> list[Rows]:
     """Return the rows of an identification as another geometry would have given them; friction's columns stay."""
-    model = replace(found.dynamics.model, tree=make_model(chain, found.settings).tree)
-    decimator = common_decimator(cases, found.settings)
+    model, decimator = make_model(chain, found.settings), common_decimator(cases, found.settings)
     result = []
     for part, case in zip(found.rows, cases):
-        load = None if found.dynamics.model.kind == "drive" else np.zeros(case.motion.q.shape)
-        own = observe(model, found.base.kept, case, decimator, load)
+        own = observe(model, found.base.kept, case, decimator)
         matrix = np.concatenate([own.matrix, part.matrix[:, :, found.base.b :]], axis=2)
         result.append(replace(part, matrix=matrix))
     return result
@@ -265,17 +260,28 @@ class Comparison:
 
 
 def compare(found: Identification, carried: Propagation, nominal: Chain, cases: Sequence[Case]) -> Comparison:
-    """Estimate the same columns from the same torques on the nominal geometry, and say how far apart the two are."""
-    how, noise = estimator(found), np.asarray(found.fitted.std) ** 2 * found.fitted.inflation
-    first, gain = estimate(how, rows_on(found, nominal, cases))
-    _, own = estimate(how, found.rows)
-    variance = np.tile(noise, sum(len(part.target) for part in found.rows))
-    apart = np.sum((gain - own) ** 2 * variance, axis=1) + carried.sigma_geometry**2
-    sigma = np.sqrt(np.sum(gain**2 * variance, axis=1))
-    values = np.stack([first, found.fitted.estimate.values])
+    """Estimate the same columns from the same torques on the nominal geometry, and say how far apart the two are.
+
+    Both by weighted least squares with the same weights; the difference is added to the estimate that there is.
+    """
+    how, noise = estimator(found), np.array(found.fitted.std) * np.sqrt(found.fitted.inflation)
+    both = (rows_on(found, nominal, cases), found.rows)
+    (first, inverse), (second, own) = (estimate(how, rows) for rows in both)
+    values = np.asarray(found.fitted.estimate.values)
+    alone, apart = np.zeros(len(values)), np.array(carried.sigma_geometry**2)
+    for one, other in zip(*both):
+        for start in range(0, len(one.target), CHUNK):
+            part = slice(start, start + CHUNK)
+            gain, ours = (
+                matrix @ (_stacked(cut(rows, part)) * _weights(how, cut(rows, part), how.deviation**2)[:, None]).T
+                for matrix, rows in ((inverse, one), (own, other))
+            )
+            spread_of = np.tile(noise, len(one.target[part]))
+            alone += np.sum((gain * spread_of) ** 2, axis=1)
+            apart += np.sum(((gain - ours) * spread_of) ** 2, axis=1)
     return Comparison(
-        found.names, found.fitted.estimate.units, frozen(values), frozen(np.stack([sigma, carried.sigma])),
-        frozen(np.sqrt(apart)),
+        found.names, found.fitted.estimate.units, frozen(np.stack([values + first - second, values])),
+        frozen(np.stack([np.sqrt(alone), carried.sigma])), frozen(np.sqrt(apart)),
     )  # fmt: skip
 
 
@@ -360,12 +366,19 @@ def _differences(
     return np.tile(thinned, (1, times, 1)), result
 
 
+def _inverse(matrix: np.ndarray) -> np.ndarray:
+    """Return the inverse of a positive definite matrix whose rows have units of their own."""
+    unit = 1.0 / np.sqrt(np.diag(matrix))
+    return np.linalg.inv(matrix * np.outer(unit, unit)) * np.outer(unit, unit)
+
+
 def _stacked(rows: Rows) -> np.ndarray:
     return rows.matrix.reshape(-1, rows.matrix.shape[2])
 
 
-def _weights(how: Estimator, rows: Rows) -> np.ndarray:
-    return (rows.present / how.deviation).ravel()
+def _weights(how: Estimator, rows: Rows, by: np.ndarray | None = None) -> np.ndarray:
+    """Return 1 / deviation (or 1 / `by`) of each row, all stacked; zero where nothing was learnt."""
+    return (rows.present / (how.deviation if by is None else by)).ravel()
 
 
 def _rms(values: np.ndarray) -> np.ndarray:

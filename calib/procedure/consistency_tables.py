@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from calib import files
-from calib.identification.consistency import NOTHING, Comparison, Propagation
+from calib.identification.consistency import NOTHING, TILTS, Comparison, Propagation
 from calib.procedure import calibrated
 from calib.procedure.identifying import IdentificationOutcome
 
@@ -51,7 +51,7 @@ def write(outcome: IdentificationOutcome, folder: Path) -> None:
 def ranking(carried: Propagation) -> np.ndarray:
     """Return the elements' indices: by the largest shift that one σ of theirs causes, then the ones without any σ."""
     known = np.isfinite(carried.deviations)
-    unit = np.abs(carried.sensitivity / carried.sigma_torque[:, None]).max(axis=0, initial=0.0)
+    unit = _per_sigma(carried).max(axis=0, initial=0.0)
     size = np.where(known, unit * np.where(known, carried.deviations, 0.0), unit)
     return np.lexsort((-size, ~known))
 
@@ -64,9 +64,9 @@ def effects(carried: Propagation) -> list[tuple[Any, ...]]:
     torque_rms_left: after the parameters have been estimated anew. An element matters where it alone raises some σ by
     more than 1 %; without a σ nothing can be said.
     """
-    found = []
+    found, units = [], _per_sigma(carried)
     for rank, k in enumerate(ranking(carried), start=1):
-        per_unit = np.abs(carried.sensitivity[:, k] / carried.sigma_torque)
+        per_unit = units[:, k]
         worst, sigma = int(np.argmax(per_unit)), carried.deviations[k]
         known = bool(np.isfinite(sigma))
         shifts = per_unit * sigma
@@ -116,6 +116,7 @@ def metrics(carried: Propagation | None, compared: Comparison | None) -> dict[st
         "parameters": len(carried.names),
         "changed": [name for name, yes in zip(carried.names, carried.changed) if yes],
         "geometry_exceeds_torque": [name for name, yes in zip(carried.names, carried.dominated) if yes],
+        "moved_by_1_mrad_of_tilt": {"parameter": tilt(carried)[0], "sigmas": tilt(carried)[1]},
         "largest_growth_of_sigma": float(growth.max(initial=1.0)),
         "largest_change_nominal_to_calibrated_percent": None if compared is None else _largest(compared),
     }
@@ -143,7 +144,15 @@ def lines(outcome: IdentificationOutcome) -> Iterator[RenderableType]:
     if carried is None:
         return
     yield escape(summary(carried))
-    if carried.geometry is None or not carried.changed.any():
+    if carried.geometry is None:
+        return
+    name, size = tilt(carried)
+    if size > LEAST:
+        yield escape(
+            f"not part of it is how level the base stands: 1 mrad against gravity would move {name} by {size:.2g} of "
+            "its sigma of torque noise"
+        )
+    if not carried.changed.any():
         return
     table = Table("geometric error", title="which geometric errors matter for the dynamics", title_justify="left")
     for name in ("sigma", "moves most", "by, in its sigma of torque", "parameters moved", "torque rms [N m]"):
@@ -152,6 +161,19 @@ def lines(outcome: IdentificationOutcome) -> Iterator[RenderableType]:
         sigma = f"{1e3 * row[3]:.3g} {'mm' if row[2] == 'm' else 'mrad'}"
         table.add_row(escape(row[1]), sigma, row[5], f"{row[6]:.2f}", f"{row[7]}", f"{row[8]:.2g}")
     yield table
+
+
+def tilt(carried: Propagation) -> tuple[str, float]:
+    """Return which parameter 1 mrad of tilt of the base against gravity moves most, and by how many σ of torque."""
+    size = 1e-3 * _per_sigma(carried)[:, -len(TILTS) :].max(axis=1, initial=0.0)
+    worst = int(np.argmax(size))
+    return carried.names[worst], float(size[worst])
+
+
+def _per_sigma(carried: Propagation) -> np.ndarray:
+    """Return |dφ/dg| in σ of torque noise (p, K + 2); zero where a parameter has no σ."""
+    sigma = carried.sigma_torque[:, None]
+    return np.divide(np.abs(carried.sensitivity), sigma, out=np.zeros(carried.sensitivity.shape), where=sigma > 0.0)
 
 
 def _largest(compared: Comparison) -> dict[str, float]:

@@ -1,0 +1,337 @@
+"""Consistent geometry and dynamics on the simulated LWR4+: do the intervals cover the truth, and what is CAD worth?
+
+Coverage: many whole calibrations. Each measures the poses anew (truth: the calibrated column of Table 2 of Kolyubin,
+Shiriaev & Jubien 2019, no hidden deflections), fits the geometry, records the torques anew (joint torque sensors or
+motors, encoder noise), identifies the base parameters on the geometry it found, and carries that geometry's covariance
+along. How often do the 95 % intervals hold the true base parameters, with the geometry's part and without it? For a
+fine instrument and many poses, and for a coarse one and few.
+
+Geometries: the same torques identified on the true geometry, on calibrated ones, on CAD, and on CADs further off. How
+wrong is the torque on other motion, against the torque without noise, and how far off are the parameters?
+
+    python examples/lwr4plus/consistency.py --out lwr4plus-consistency [--runs 20] [--kind link] [--workers 1]
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib import files
+from calib.data.decimation import decimate
+from calib.data.motion import FilterOptions, make_motion
+from calib.data.recording import Recording
+from calib.dynamics.tree import standard_parameters
+from calib.geometry.first_guess import install
+from calib.geometry.fit import fit
+from calib.identification import consistency
+from calib.identification.cases import Case, make_case
+from calib.identification.identify import Identification, common_decimator, find_base, identify
+from calib.identification.settings import Payload, Settings, make_model
+from calib.robot.chain import Chain, random_joints
+from calib.simulation import robots
+from calib.simulation.cell import Cell, Instrument, measure
+from calib.simulation.cells import lwr4plus_cell
+from calib.simulation.references import Reference, random_fourier
+from calib.workers import workers
+
+PAYLOAD = "8"
+RATE, DURATION, HARMONICS = 200.0, 25.0, 5
+REACH = 0.8 * np.deg2rad([170.0, 120.0, 170.0, 120.0, 170.0, 90.0, 170.0])
+SPEED = 0.8 * np.deg2rad([110.0, 110.0, 128.0, 128.0, 204.0, 184.0, 184.0])
+LIMIT = np.array([176.0, 176.0, 100.0, 100.0, 100.0, 38.0, 38.0])
+FILTERS = FilterOptions(cutoff=20.0, band=10.0, clock="stamps")
+SETS = {"link": "Fvl Fcl offl", "motor": "Ia Fv Fc off"}
+WITHIN = 1.959964  # sigmas of a 95 % interval
+FURTHER = (1, 3, 10)  # CAD, and geometries so many times as far off
+
+
+@dataclass(frozen=True)
+class Setup:
+    """An instrument and how many poses it measures."""
+
+    name: str
+    position: float
+    orientation: float
+    poses: int
+
+    @property
+    def instrument(self) -> Instrument:
+        return Instrument(self.name, self.position, self.orientation)
+
+
+SETUPS = (
+    Setup("fine instrument, many poses", 60e-6, 0.2e-3, 60),
+    Setup("coarse instrument, few poses", 1e-3, 2e-3, 20),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """What is true, and what every run shares.
+
+    Attributes:
+        cell: the arm and its instrument.
+        settings: of the identification.
+        motion: the reference.
+        clean: torques without noise (N, n), without and with the payload.
+        names, base: the true base parameters (b,), regrouped on the true geometry.
+        noise: (n,) standard deviation of the torque.
+        poses: (m, n) joint values.
+    """
+
+    cell: Cell
+    settings: Settings
+    motion: Reference
+    clean: list[np.ndarray]
+    names: tuple[str, ...]
+    base: np.ndarray
+    noise: np.ndarray
+    poses: np.ndarray
+
+
+def world(setup: Setup, kind: str, seed: int) -> World:
+    """Return the truth of a setup; the arm's CAD inertias are the true ones."""
+    cell = lwr4plus_cell(setup.instrument, hidden=0.0)
+    settings = Settings(
+        kind=kind, sets=(SETS[kind],), friction="standard", essential="none", prior="none",
+        payloads={PAYLOAD: Payload()},
+    )  # fmt: skip
+    motion, true = reference(seed), cell.truth.chain
+    values, clean = true_torques(true, settings, motion)
+    cases = cases_of(motion, clean, kind, np.zeros(true.n), 0)
+    base = find_base(true, make_model(true, settings), settings, cell.nominal, cases)
+    noise = robots.truth("lwr4plus")["noise"]["sigma_tau_l" if kind == "link" else "sigma_tau_m"] * LIMIT
+    poses = random_joints(cell.nominal, setup.poses, [seed, setup.poses])
+    return World(cell, settings, motion, clean, base.names, base.transform @ values, noise, poses)
+
+
+def true_torques(true: Chain, settings: Settings, motion: Reference) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return the true standard parameters, and the torques without and with the payload (N, n)."""
+    known, model = robots.truth("lwr4plus"), make_model(true, settings)
+    drives = [drive_values(known)[name] for name in model.names[10 * model.tree.bodies :]]
+    values = np.concatenate([standard_parameters(true), known["payload"]["inertia"], drives])
+    loads = ((), (PAYLOAD,))
+    return values, [model.regressor(motion.q, motion.v, motion.a, carried=load) @ values for load in loads]
+
+
+def reference(seed: int) -> Reference:
+    """Return a random motion of one period of 25 s."""
+    return random_fourier(-REACH, REACH, SPEED, DURATION, RATE, HARMONICS, seed=np.random.default_rng(seed))
+
+
+def drive_values(known: dict[str, Any]) -> dict[str, float]:
+    """Return the true drive parameters by name; what a motor sees as one is the sum of both sides."""
+    own = dict(known["drives"])
+    own["off"] = np.add(own["offl"], own["offm"])
+    return {f"{name}{joint + 1}": float(x) for name, row in own.items() for joint, x in enumerate(row)}
+
+
+def cases_of(
+    motion: Reference, clean: Any, kind: str, noise: np.ndarray, seed: Any, sigma_q: float = 0.0
+) -> list[Case]:
+    """Return the two recordings, without and with the payload."""
+    rng = np.random.default_rng(seed)
+    result = []
+    for name, tau, load in (("empty", clean[0], ()), ("loaded", clean[1], (PAYLOAD,))):
+        tau = tau + noise * rng.normal(size=tau.shape)
+        q = motion.q + sigma_q * rng.normal(size=tau.shape)
+        names = tuple(f"joint{j + 1}" for j in range(tau.shape[1]))
+        recording = Recording(motion.t, q, tau, "torque", names, tau_link=tau if kind == "link" else None)
+        result.append(make_case(name, make_motion(recording, FILTERS), kind, carried=load))
+    return result
+
+
+def calibrate(given: World, seed: list[int]) -> tuple[Chain, np.ndarray]:
+    """Measure the poses and fit: the calibrated chain and the covariance (K, K) of its elements."""
+    measured = measure(given.cell, given.poses, np.random.default_rng([*seed, 1]))
+    found = fit(install(given.cell.nominal, [measured]), [measured])
+    chain = found.cell.chain
+    own = np.flatnonzero(found.free < len(chain.elements))
+    covariance = np.zeros((len(chain.elements), len(chain.elements)))
+    covariance[np.ix_(found.free[own], found.free[own])] = found.estimate.covariance[np.ix_(own, own)]
+    return chain, covariance
+
+
+def once(given: World, seed: list[int]) -> np.ndarray:
+    """Calibrate geometry and dynamics: errors, σ_torque and σ_geometry of the base parameters (3, b)."""
+    chain, covariance = calibrate(given, seed)
+    cases = cases_of(given.motion, given.clean, given.settings.kind, given.noise, [*seed, 2], 1e-5)
+    found = identify(chain, cases, given.settings, given.cell.nominal)
+    carried = consistency.propagate(found, chain, cases, covariance)
+    off = found.fitted.estimate.values - given.base
+    return np.stack([off, carried.sigma_torque, carried.sigma_geometry])
+
+
+def coverage(setup: Setup, kind: str, runs: int, seed: int, where: str | None) -> dict[str, Any]:
+    """Return how often the intervals hold the truth, pooled and by parameter."""
+    given, start = world(setup, kind, seed), time.perf_counter()
+    with workers(where) as mapped:
+        found = []
+        for number, one in enumerate(mapped(partial(once, given), [[seed, k] for k in range(runs)]), start=1):
+            found.append(one)
+            spent = time.perf_counter() - start
+            print(f"\r{setup.name}: {number} of {runs}, {spent:.0f} s", end="", file=sys.stderr, flush=True)
+    print(file=sys.stderr)
+    off, torque, geometry = np.abs(np.stack(found, axis=1))
+    with_it, without = off <= WITHIN * np.hypot(torque, geometry), off <= WITHIN * torque
+    share = np.mean(geometry, axis=0) / np.mean(torque, axis=0)
+    over = share > 1.0
+    grows = np.hypot(1.0, share) - 1.0
+    names = given.names
+    return {
+        "runs": runs, "parameters": len(names),
+        "pooled": {"with": float(with_it.mean()), "without": float(without.mean())},
+        "geometry_exceeds_torque": {
+            "parameters": [name for name, yes in zip(names, over) if yes],
+            "with": _mean(with_it[:, over]), "without": _mean(without[:, over]),
+            "largest_without": _mean(without[:, over].mean(axis=0).max(initial=0.0) if over.any() else np.zeros(0)),
+        },
+        "unchanged": {
+            "parameters": [name for name, x in zip(names, grows) if x <= consistency.NOTHING],
+            "with": _mean(with_it[:, grows <= consistency.NOTHING]),
+            "without": _mean(without[:, grows <= consistency.NOTHING]),
+        },
+        "by_parameter": [
+            {"name": name, "sigma_geometry_over_torque": float(s), "with": float(a), "without": float(b)}
+            for name, s, a, b in zip(names, share, with_it.mean(axis=0), without.mean(axis=0))
+        ],
+        "rms_error_in_sigma": {
+            "with": float(np.sqrt(np.mean((off / np.hypot(torque, geometry)) ** 2))),
+            "without": float(np.sqrt(np.mean((off / torque) ** 2))),
+        },
+        "seconds_per_run": (time.perf_counter() - start) / runs,
+    }  # fmt: skip
+
+
+def _mean(values: np.ndarray) -> float | None:
+    return float(np.mean(values)) if np.size(values) else None
+
+
+def geometries(kind: str, seed: int) -> dict[str, Any]:
+    """Return what identification on one geometry or another costs, in torque and in parameters."""
+    fine, coarse = (world(setup, kind, seed) for setup in SETUPS)
+    true, nominal = fine.cell.truth.chain, fine.cell.nominal
+    chains = {"true geometry": true}
+    chains |= {
+        f"calibrated, {setup.name}": calibrate(given, [seed, 0])[0] for setup, given in zip(SETUPS, (fine, coarse))
+    }
+    for times in FURTHER:
+        chains["CAD" if times == 1 else f"CAD, {times} times as far off"] = true.with_values(
+            true.values + times * (nominal.values - true.values)
+        )
+    cases = cases_of(fine.motion, fine.clean, kind, fine.noise, [seed, 3], 1e-5)
+    found = identify(true, cases, fine.settings, nominal)
+    other = unseen(fine, seed)
+    return {name: judged(fine, found, chain, cases, other) for name, chain in chains.items()}
+
+
+def unseen(given: World, seed: int) -> list[Case]:
+    """Return another motion's cases, torques without noise."""
+    motion, true = reference(seed + 1001), given.cell.truth.chain
+    _, clean = true_torques(true, given.settings, motion)
+    return cases_of(motion, clean, given.settings.kind, np.zeros(true.n), 0)
+
+
+def judged(given: World, found: Identification, chain: Chain, cases: list[Case], other: list[Case]) -> dict[str, Any]:
+    """Return the error of the torque on other motion and the parameters' bias, of the model identified on a geometry.
+
+    The torque's error is that of the noisy estimate, against noise-free torque; the bias that of noise-free torques.
+    """
+    how = consistency.estimator(found)
+    rows = consistency.rows_on(found, chain, cases)
+    noisy, _ = consistency.estimate(how, rows)
+    decimator = common_decimator(cases, given.settings)
+    exact = [
+        replace(part, target=decimate(tau, decimator)[: len(part.target)])
+        for part, tau in zip(rows, _cut(given, cases))
+    ]
+    biased, _ = consistency.estimate(how, exact)
+    size = (biased - given.base) / found.fitted.estimate.sigma
+    model, error, torque = make_model(chain, given.settings), [], []
+    for case in other:
+        motion = case.motion
+        regressor = model.regressor(motion.q, motion.v, motion.a, carried=case.carried)[:, :, found.base.kept]
+        error.append(regressor @ np.stack([noisy, biased], axis=1) - case.target[:, :, None])
+        torque.append(case.target)
+    off, whole = np.concatenate(error), np.concatenate(torque)
+    percent = 100.0 * np.sqrt((off**2).sum(axis=(0, 1)) / (whole**2).sum())
+    joints = 100.0 * np.linalg.norm(off[:, :, 0], axis=0) / np.linalg.norm(whole, axis=0)
+    order = np.argsort(-np.abs(size))
+    return {
+        "torque_error_percent": float(percent[0]), "torque_error_without_noise_percent": float(percent[1]),
+        "joints_percent": joints.tolist(), "rms": np.sqrt((off[:, :, 0] ** 2).mean(axis=0)).tolist(),
+        "bias_in_sigma": {"rms": float(np.sqrt(np.mean(size**2))), "largest": float(np.abs(size).max()),
+                          "beyond_2": int((np.abs(size) > 2.0).sum())},
+        "by_parameter": {found.names[k]: float(size[k]) for k in order},
+    }  # fmt: skip
+
+
+def _cut(given: World, cases: list[Case]) -> list[np.ndarray]:
+    """Return the noise-free torques at the samples that the filters left of each case."""
+    result = []
+    for tau, case in zip(given.clean, cases):
+        first = round((case.motion.t[0] - given.motion.t[0]) * RATE)
+        result.append(tau[first : first + len(case.motion)])
+    return result
+
+
+def run(out: Path, runs: int = 20, kind: str = "link", seed: int = 0, where: str | None = None) -> dict[str, Any]:
+    """Run both halves; write and return the metrics."""
+    metrics: dict[str, Any] = {"kind": kind, "seed": seed, "geometries": geometries(kind, seed)}
+    metrics["coverage"] = {setup.name: coverage(setup, kind, runs, seed, where) for setup in SETUPS} if runs else {}
+    files.write_json(out / "metrics.json", metrics)
+    return metrics
+
+
+def show(metrics: dict[str, Any]) -> None:
+    """Print both halves."""
+    print(f"rows: {metrics['kind']}; error against noise-free torque on unseen motion, bias in sigmas of torque noise")
+    for name, one in metrics["geometries"].items():
+        bias, worst = one["bias_in_sigma"], list(one["by_parameter"].items())[:4]
+        clean = one["torque_error_without_noise_percent"]
+        print(
+            f"{name:45} {one['torque_error_percent']:7.3f} % (no noise {clean:.4f} %)  "
+            f"bias rms {bias['rms']:.2f}, {bias['beyond_2']} beyond 2, most "
+            + ", ".join(f"{parameter} {size:.1f}" for parameter, size in worst)
+        )
+    for name, one in metrics["coverage"].items():
+        print(f"{name}: {one['runs']} calibrations, {one['parameters']} base parameters")
+        over, same, every = one["geometry_exceeds_torque"], one["unchanged"], one["pooled"]
+        print(f"  95 % intervals hold the truth, pooled: {_percent(every['with'])} with propagation, "
+              f"{_percent(every['without'])} without")  # fmt: skip
+        print(f"  geometry exceeds torque in {len(over['parameters'])}: {_percent(over['with'])} with, "
+              f"{_percent(over['without'])} without (best of them {_percent(over['largest_without'])}): "
+              f"{' '.join(over['parameters'])}")  # fmt: skip
+        print(f"  propagation changes nothing in {len(same['parameters'])}: {_percent(same['with'])} with, "
+              f"{_percent(same['without'])} without")  # fmt: skip
+        size = one["rms_error_in_sigma"]
+        print(f"  rms error in sigma {size['with']:.3f} with, {size['without']:.3f} without; "
+              f"{one['seconds_per_run']:.2f} s per run")  # fmt: skip
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100.0 * share:.1f} %"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, required=True, help="folder for metrics.json")
+    parser.add_argument("--runs", type=int, default=20, help="simulated calibrations per setup; 0 for none")
+    parser.add_argument("--kind", choices=sorted(SETS), default="link", help="joint torque sensors, or motor torques")
+    parser.add_argument("--workers", default=None, help="number of processes, or a Dask scheduler's address")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    show(run(options.out, options.runs, options.kind, options.seed, options.workers))
+
+
+if __name__ == "__main__":
+    main()
