@@ -78,6 +78,7 @@ def geometries(rows: Sequence[Row]) -> Figure:
         for axis in (above, below):
             axis.set_xlim(-0.7, len(rows) - 0.3)
             axis.grid(axis="y")
+            axis.set_axisbelow(True)
         above.set_xticks(x, [])
         below.set_xticks(x, [row["name"] for row in rows], rotation=90, fontsize=6.5)
     return figure

@@ -118,7 +118,7 @@ def metrics(carried: Propagation | None, compared: Comparison | None) -> dict[st
         "geometry_exceeds_torque": [name for name, yes in zip(carried.names, carried.dominated) if yes],
         "moved_by_1_mrad_of_tilt": {"parameter": tilt(carried)[0], "sigmas": tilt(carried)[1]},
         "largest_growth_of_sigma": float(growth.max(initial=1.0)),
-        "largest_change_nominal_to_calibrated_percent": None if compared is None else _largest(compared),
+        "largest_changes_from_nominal": [] if compared is None else _largest(compared),
     }
 
 
@@ -176,8 +176,14 @@ def _per_sigma(carried: Propagation) -> np.ndarray:
     return np.divide(np.abs(carried.sensitivity), sigma, out=np.zeros(carried.sensitivity.shape), where=sigma > 0.0)
 
 
-def _largest(compared: Comparison) -> dict[str, float]:
-    """Return the five parameters that differ most between the geometries, in their total σ, with the difference [%]."""
-    size = np.abs(compared.values[0] - compared.values[1]) / np.where(compared.sigma[1] > 0.0, compared.sigma[1], 1.0)
-    order = [k for k in np.argsort(-size)[:5] if np.isfinite(compared.relative[k])]
-    return {compared.names[k]: float(compared.relative[k]) for k in order}
+def _largest(compared: Comparison) -> list[dict[str, Any]]:
+    """Return the five parameters that differ most between the geometries, in their total σ, and by how much [%]."""
+    size = (compared.values[0] - compared.values[1]) / np.where(compared.sigma[1] > 0.0, compared.sigma[1], np.inf)
+    return [
+        {
+            "name": compared.names[k],
+            "sigmas": float(size[k]),
+            "percent": float(compared.relative[k]) if np.isfinite(compared.relative[k]) else None,
+        }
+        for k in np.argsort(-np.abs(size))[:5]
+    ]
