@@ -29,6 +29,7 @@ TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
         "the TOML file of calib excite --limits and calib plan --limits",
         ("calib.procedure.motion_limits",),
     ),
+    "waypoints": ("the CSV of calib plan --waypoints", ("calib.procedure.motion_waypoints",)),
     "excitation": (
         "trajectory.toml of calib excite, and what calib recall writes",
         ("calib.procedure.excitation_table", "calib.procedure.excitation_recall"),

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from calib.data.options import FitOptions
-from calib.data.plans import read_poses
 from calib.dynamics import drives
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.path_dynamics import PathDynamics, of_standard
@@ -18,9 +17,10 @@ from calib.dynamics.tree import standard_parameters, tree
 from calib.errors import RobotError, UsageError
 from calib.identification.prediction import Dynamics, carried_columns
 from calib.identification.storage import read_dynamics
-from calib.procedure.inputs import joint_kinds, load_robot
+from calib.procedure.inputs import load_robot
 from calib.procedure.motion_approach import approach_to
 from calib.procedure.motion_limits import MotionLimits, read_motion_limits
+from calib.procedure.motion_waypoints import read_waypoints
 from calib.procedure.torque_margin import Uncertainty, read_uncertainty
 from calib.robot.chain import Chain
 from calib.robot.kinematics import element_jacobian, forward, joint_jacobian, sweep
@@ -111,8 +111,8 @@ def plan(
     known = read_motion_limits(limits, chain, source)
     law, notes, unsure = _law(chain, model, payloads, drives_file, known)
     lower, upper, bounds = _bounds(chain, known, law)
-    points = read_poses(waypoints, chain.joint_names, kinds=joint_kinds(chain))
     arm = chain if model is None else read_dynamics(model)[0]
+    points = read_waypoints(waypoints, arm, lower, upper, start)
     say("the path")
     paths, deviation = _paths(arm, points, lines)
     for path in paths:

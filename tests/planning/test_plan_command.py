@@ -15,9 +15,11 @@ from calib import cli, files
 from calib.dynamics import drives
 from calib.dynamics.tree import STANDARD
 from calib.procedure import motion_outputs, motion_planning
+from calib.procedure.motion_waypoints import read_waypoints
 from calib.robot import description
 from calib.robot.kinematics import forward
 from calib.simulation.robots import truth
+from calib.transforms import to_quaternion
 
 
 @pytest.fixture
@@ -127,6 +129,31 @@ def test_limits_that_leave_no_motion(room, capsys, limits, message):
     said = capsys.readouterr().err
     assert message in said and said.count("\n") == 1
     assert not (room / "out").exists()
+
+
+def test_waypoints_of_the_tool(room, capsys):
+    """Places are met exactly: with an orientation, without one, and in the configuration that joints beside it say."""
+    poses = forward(CHAIN, WAYPOINTS)
+    table = np.hstack([1e3 * poses[:, :3, 3], to_quaternion(poses)])
+    write_waypoints(table, "pose.csv", "x [mm],y [mm],z [mm],qx,qy,qz,qw")
+    write_waypoints(table[:, :3], "place.csv", "x [mm],y [mm],z [mm]")
+    write_waypoints(
+        np.hstack([WAYPOINTS + 0.05, table]), "both.csv", "q1,q2,q3,q4,q5,q6,q7,x [mm],y [mm],z [mm],qx,qy,qz,qw"
+    )
+    for name in ("pose", "place", "both"):
+        q = read_waypoints(room / f"{name}.csv", CHAIN, CHAIN.lower, CHAIN.upper)
+        assert (q >= CHAIN.lower).all() and (q <= CHAIN.upper).all()
+        found = forward(CHAIN, q)
+        np.testing.assert_allclose(found[:, :3, 3], poses[:, :3, 3], atol=1e-6)
+        if name != "place":
+            np.testing.assert_allclose(found, poses, atol=2e-6)
+    assert np.abs(q - WAYPOINTS).max() < 0.2
+    planned = motion_planning.plan("lwr4plus", room / "both.csv", drives_file=room / "drives.toml")
+    tool = forward(CHAIN, planned.track.q)[:, :3, 3]
+    assert all(np.linalg.norm(tool - place, axis=1).min() < 2e-3 for place in poses[:, :3, 3])
+    write_waypoints([[0.2, 0.1, 0.6], [2.0, 0.0, 0.5]], "far.csv", "x,y,z")
+    assert plan("--waypoints", "far.csv") == 2
+    assert "waypoint 2 is out of reach" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
