@@ -87,9 +87,7 @@ def recall(
 @app.command()
 def plan(
     robot: Robot,
-    waypoints: Annotated[
-        Path, typer.Option(help="CSV of joint values, or x y z, qx qy qz qw of the tip")
-    ],
+    waypoints: Annotated[Path, typer.Option(help="CSV of joint values, or x y z, qx qy qz qw of the tip")],
     out: Annotated[Path, typer.Option(help="folder for the motion, its figures and metrics.json")],
     model: Annotated[Path | None, typer.Option(help="folder of an identification: the dynamics to plan with")] = None,
     payload: Annotated[list[str] | None, typer.Option(help="an identified payload on board; may be repeated")] = None,
