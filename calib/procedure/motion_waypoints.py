@@ -2,7 +2,7 @@
 
 A CSV, a row per waypoint, in order: the robot's joints, or the tip's place ``x y z`` in the robot's base frame, with
 its orientation ``qx qy qz qw`` (or ``r11`` to ``r33``); without one only the position counts. Units stand in brackets,
-plain headers are SI. With both, the place is met and the joints say in which configuration; without joints each place is
+plain headers are SI. With both, the place is met and the joints say in which configuration; without joints each is
 reached from the configuration before it, the first one from --start, or near the middle of the joint limits.
 """
 
