@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import jinja2
 
+from calib.procedure import repeatability
 from calib.procedure.report import Report
 
 if TYPE_CHECKING:
@@ -147,7 +148,7 @@ def versions() -> str:
 def geometry_stage(report: Report, drawn: Mapping[str, Drawn]) -> Stage:
     """Return the stage of the geometric fit: errors, ladder, parameters, identifiability, figures, outliers."""
     metrics = report.metrics
-    blocks: list[Block] = [error_table(metrics)]
+    blocks: list[Block] = [error_table(metrics), *repeatability.blocks(metrics)]
     if any(rung["cross_validated_mm"] is not None for rung in metrics["ladder"]):
         blocks += [ladder_table(metrics), _pictures("", drawn, ("ladder",))]
     blocks.append(_pictures("Before and after", drawn, ("position", "orientation", "distance")))

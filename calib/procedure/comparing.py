@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation
 from calib.geometry.weighing import Settings
+from calib.procedure import repeatability
 from calib.procedure.inputs import Unseen, pose_count
 from calib.robot.chain import Chain
 
@@ -36,6 +38,7 @@ class Comparison:
         alone: errors of the calibrated robot as a URDF holds it, without corrections and with frames fitted for it
             on the same rows as theirs; None where that is all there is.
         shares_frames: True where another file's base and tool placement was used.
+        repeated: what poses that were measured several times say (`calib.procedure.repeatability`); None without any.
     """
 
     blocks: tuple[PoseMeasurements, ...]
@@ -48,6 +51,7 @@ class Comparison:
     proves: bool = True
     alone: Errors | None = None
     shares_frames: bool = False
+    repeated: Mapping[str, Any] | None = None
 
     def table(self) -> dict[str, object]:
         """Return the comparison as ``metrics.json`` holds it."""
@@ -58,6 +62,8 @@ class Comparison:
             result["urdf_alone"] = summary(self.alone)
         if len(self.pairs[0]):
             result["pair_distance_mm"] = {arm: statistics(sizes, 1e3) for arm, sizes in zip(arms, self.pairs)}
+        if self.repeated is not None:
+            result["iso9283"] = self.repeated
         return result
 
 
@@ -80,7 +86,7 @@ def compare(
     rigid = None if alone is None else errors(alone, blocks)
     return Comparison(
         tuple(blocks), torques, cells, (one, two), (first, second), pose_count(blocks), frames, proves, rigid,
-        shares_frames,
+        shares_frames, repeatability.table(cells, blocks, torques),
     )  # fmt: skip
 
 

@@ -102,25 +102,25 @@ def read(folder: str | Path) -> Fitted:
         UsageError: where it is none, or lacks something.
     """
     folder = Path(folder)
+    proof = folder / "5-validation" / "metrics.json"
     if not (folder / "robot.toml").is_file() and (folder / "4-fit" / "robot.toml").is_file():
         folder = folder / "4-fit"
     if not (folder / "robot.toml").is_file():
         raise UsageError(f"{folder} holds no robot.toml; give the folder that `calib fit --out` has written")
     cell, nominal = calibrated.read(folder), calibrated.nominal(folder)
     free, covariance = read_covariance(folder, cell)
-    unseen, fitted = _stated_errors(folder)
+    unseen, fitted = _stated_errors(folder / "metrics.json", proof if proof.is_file() else folder / "metrics.json")
     return Fitted(folder, cell, nominal, free, covariance, unseen, fitted)
 
 
-def _stated_errors(folder: Path) -> tuple[float | None, float | None]:
-    """Return the calibrated arm's rms errors on unseen and on fitted poses [m], from the fit's metrics."""
-    path = folder / "metrics.json"
+def _stated_errors(fit: Path, proof: Path) -> tuple[float | None, float | None]:
+    """Return the calibrated arm's rms errors on unseen and on fitted poses [m], from the metrics of fit and proof."""
     try:
-        metrics = json.loads(path.read_text(encoding="utf-8"))
-        unseen = [_rms(found["calibrated"]) for found in metrics["validation"].values()]
-        return (max(unseen) if unseen else None), _rms(metrics["fit"]["calibrated"])
+        fitted, proved = (json.loads(path.read_text(encoding="utf-8")) for path in (fit, proof))
+        unseen = [_rms(found["calibrated"]) for found in proved["validation"].values()]
+        return (max(unseen) if unseen else None), _rms(fitted["fit"]["calibrated"])
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UsageError(f"{path} cannot be read ({error}); fit again") from error
+        raise UsageError(f"{fit.parent}: its metrics cannot be read ({error}); fit again") from error
 
 
 def _rms(found: dict) -> float:

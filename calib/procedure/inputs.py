@@ -13,6 +13,7 @@ from calib.data.options import FitOptions, check_files
 from calib.data.pose_files import joint_columns, read_measurements
 from calib.errors import MeasurementError, UsageError
 from calib.geometry.deflection import Deflection
+from calib.geometry.repeatability import repeated_rows
 from calib.procedure import calibrated
 from calib.procedure.plausible_frames import check_orientations
 from calib.procedure.repeats import repeated
@@ -164,7 +165,8 @@ def _unlimited(joint: Joint) -> bool:
 def hold_out(block: PoseMeasurements, share: float, seed: int) -> tuple[PoseMeasurements, PoseMeasurements | None]:
     """Divide a block into rows to fit and rows kept aside (None for a share of 0).
 
-    Poses are permuted, not rows: the reflectors of one pose stay together, and so do the two rows of a distance.
+    Poses are permuted, not rows: the reflectors of one pose stay together, and so do the two rows of a distance and the
+    cycles of a repeated pose.
     """
     if share == 0.0:
         return block, None
@@ -179,9 +181,14 @@ def hold_out(block: PoseMeasurements, share: float, seed: int) -> tuple[PoseMeas
 
 
 def units(block: PoseMeasurements) -> np.ndarray:
-    """Return for each row the number (m,) of the pose (or measured pair) it belongs to, counted from 0."""
+    """Return for each row the number (m,) of the pose (or measured pair) it belongs to, counted from 0.
+
+    Cycles of one repeated pose are one pose.
+    """
     assert block.rows is not None and block.group is not None
-    labels = block.group if block.kind == "distance" else block.rows
+    labels = np.array(block.group if block.kind == "distance" else block.rows)
+    for cycles in repeated_rows(block) if block.kind in ("pose", "position") else []:
+        labels[np.isin(labels, labels[cycles])] = labels[cycles[0]]
     _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
     rank = np.empty(len(first), dtype=int)
     rank[np.argsort(first)] = np.arange(len(first))

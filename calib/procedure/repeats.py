@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from calib.data.measurements import PoseMeasurements
+from calib.geometry.repeatability import SAME
 
 MOST = 0.5  # of a validation file's rows that are the fit's: from there on it proves nothing (our choice)
 
@@ -23,7 +25,7 @@ class Aside(Protocol):
 
 
 def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, Aside]) -> tuple[set[str], list[str]]:
-    """Find rows with the same joint values and the same measured numbers as another.
+    """Find rows with the joint values and the measured numbers of another, and unseen ones at joints of the fit.
 
     Args:
         fit: the fit's blocks.
@@ -45,12 +47,23 @@ def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, Aside]) -> tu
             notes.append(f"{name}: {_rows(before)} with the numbers of a row fitted already: is the file given twice?")
         known.update(marks)
     for name, aside in unseen.items():
-        same = _numbers(aside.block, [mark in known for mark in _marks(aside.block)])
-        if same:
-            notes.append(f"{name}: {_rows(same)} with the numbers of a row of the fit: not unseen")
+        copied = [mark in known for mark in _marks(aside.block)]
+        again = _measured_again(fit, aside.block) & ~np.array(copied, dtype=bool)
+        for chosen, words in ((copied, "with the numbers of a row of the fit"), (again, "at joints that were fitted")):
+            if told := _numbers(aside.block, chosen):
+                notes.append(f"{name}: {_rows(told)} {words}: not unseen")
+        same = _numbers(aside.block, again | copied)
         if len(same) > MOST * len(aside.block) and not aside.held_out:
             proofless.add(name)
     return proofless, notes
+
+
+def _measured_again(fit: Sequence[PoseMeasurements], aside: PoseMeasurements) -> np.ndarray:
+    """Say which rows (m,) were measured at joints at which rows of the fit were measured."""
+    seen = [block.q for block in fit if block.kind == aside.kind and block.kind in ("pose", "position")]
+    if not seen:
+        return np.zeros(len(aside), dtype=bool)
+    return KDTree(np.concatenate(seen)).query(aside.q, p=np.inf)[0] <= SAME
 
 
 def _marks(block: PoseMeasurements) -> list[bytes]:
@@ -62,7 +75,7 @@ def _marks(block: PoseMeasurements) -> list[bytes]:
     return [row.tobytes() for row in np.round(table, 12) + 0.0]
 
 
-def _numbers(block: PoseMeasurements, chosen: Sequence[bool]) -> list[int]:
+def _numbers(block: PoseMeasurements, chosen: Sequence[bool] | np.ndarray) -> list[int]:
     assert block.rows is not None
     return [int(row) for row in dict.fromkeys(block.rows[np.array(chosen, dtype=bool)])]
 

@@ -10,6 +10,7 @@ from rich.console import RenderableType
 from rich.markup import escape
 from rich.table import Table
 
+from calib.procedure import repeatability
 from calib.procedure.comparing import Comparison
 from calib.procedure.fitting import Outcome
 from calib.procedure.inputs import Inputs
@@ -43,6 +44,9 @@ def outcome_lines(outcome: Outcome) -> Iterator[RenderableType]:
     """Say what came of a fit."""
     yield ladder_table(outcome)
     yield error_table(outcome)
+    for name, found in (("fitted", outcome.fit), *outcome.validation.items()):
+        if found.repeated:
+            yield escape(f"{name}: {repeatability.sentence(found.repeated)}")
     for line in outcome.unclear:
         yield f"[yellow]identifiability[/]: {escape(line)}"
     for line in outcome.warnings:
