@@ -62,19 +62,17 @@ def _play(session: Session, step: str) -> str:
     names = _motions(session, step)
     if not wanted["plan"]:
         return "Record the robot moving in all its joints, in one motion to learn from and in another, unseen one."
-    motions = " and, into a file of its own, ".join(
-        str(session.path(f"6-excitation/{name}/trajectory.csv")) for name in names
-    )
+    file = "run.csv" if wanted["repeats"] > 1 else "trajectory.csv"
+    motions = " and, into a file of its own, ".join(str(session.path(f"6-excitation/{name}/{file}")) for name in names)
     unseen = " (never learnt from)" if "validation" in names else ""
     loads = ", ".join(f"'{label}' ({mass:g} kg)" for label, mass in wanted["payloads"].items())
-    again = (
-        f" Then once more with {loads} on the flange, its label in the file's name."
-        if loads and step == "record"
-        else ""
-    )
+    again = f" Then once more with {loads} on the flange, the label in the file's name." if loads else ""
     return (
-        f"Play {motions}{unseen}, each {wanted['repeats']} times in a row at {wanted['rate']:g} Hz, from rest at its "
-        f"first row, slowly first to see that the way is free; log joint positions and torques all the while.{again}"
+        f"Play {motions}{unseen}, {wanted['repeats']} times the motion each, at {wanted['rate']:g} Hz, from rest at "
+        "its "
+        "first row; before that rehearsal.csv, slowly, to see that the way is free; log joint positions and torques "
+        "all "
+        f"the while.{again if step == 'record' else ''}"
     )
 
 

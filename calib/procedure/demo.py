@@ -12,9 +12,8 @@ import numpy as np
 
 from calib import files
 from calib.data.plans import read_poses
-from calib.data.tables import read_table
 from calib.errors import SessionError, UsageError
-from calib.procedure import steps
+from calib.procedure import dynamic_stages, steps
 from calib.procedure.certifying import verdict_of
 from calib.procedure.guided import begin
 from calib.procedure.session import Session, locked, open_session
@@ -193,14 +192,11 @@ def bring(session: Session, cell: Cell, seed: int) -> None:
 
 def bring_logs(session: Session, arm: MovingArm, seed: int) -> None:
     """Let the simulated arm play the designed motions, and log them."""
-    n = arm.chain.n
+    motions = dynamic_stages.designed_motions(session)
     for name, number in LOGS:
-        path = session.path(f"6-excitation/{name}/trajectory.csv")
-        if not path.exists():
+        if name not in motions:
             continue
-        table = read_table(path)
-        columns = [np.column_stack([table.cells[table.header.index(f"{x}{j + 1}")] for j in range(n)]) for x in "qva"]
-        time_ = np.asarray(table.cells[table.header.index("t")], dtype=float)
-        reference = play(arm, time_, *columns, session.settings.dynamics["repeats"])
+        t = np.arange(round(motions[name].period * motions[name].rate) + 1) / motions[name].rate
+        reference = play(t, *motions[name].orders(t), motions[name].repeat)
         recorded = record(arm, reference, np.random.default_rng([seed, number]))
         brought.write_log(recorded, session.path(f"7-recorded/{name}.csv"))

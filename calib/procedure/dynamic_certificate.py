@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from calib.data.tables import read_table
 from calib.errors import UsageError
-from calib.procedure import dynamic_plots
+from calib.procedure import consistency_figures, dynamic_plots, excitation_table
 from calib.procedure.certificate import Block, Pictures, Stage, Table, Text
 from calib.procedure.drawing import svg
 from calib.procedure.predicting import SCHEMA
 
 TOLD = 50.0  # RSD [%] from which on a parameter is not told from zero: two sigmas
+DRAWN = 300  # points per curve of the excitation
 WHITE = 0.10  # share of autocorrelations beyond the bound below which a residual may be called white (0.05 if it is)
 
 
@@ -58,32 +58,29 @@ def read(folder: Path) -> DynamicReport:
     return DynamicReport(unseen["verdict"], unseen["reason"], metrics, estimate, unseen)
 
 
-def dynamics_stage(found: DynamicReport, excitation: Path) -> Stage:
+def dynamics_stage(found: DynamicReport, folder: Path, excitation: Path) -> Stage:
     """Return the stage of the dynamics: errors on unseen motion, torques, excitation, parameters, what is not told.
 
     Args:
+        folder: of the identification.
         excitation: folder with ``training/trajectory.csv`` and its ``metrics.json``, if one was planned.
     """
-    blocks: list[Block] = [error_table(found), pictures("", judged_figures(found))]
+    blocks: list[Block] = [error_table(found), Pictures("", judged_figures(found))]
     for number, curves in enumerate(found.unseen["curves"]):
         figure = dynamic_plots.torques(curves, found.unseen["rows"], found.unseen["units"])
         seen = "unseen" if found.unseen["validation"] else "fitted"
         words = f"Torques on {curves['name']}, {seen}: measured, predicted, and what is left."
-        blocks.append(pictures("Torques" if number == 0 else "", [(svg(figure, f"torques{number}"), words, True)]))
+        blocks.append(Pictures("Torques" if number == 0 else "", [(svg(figure, f"torques{number}"), words, True)]))
     blocks += planned(excitation)
     if len(found.metrics["ladder"]) > 1:
         blocks.append(friction_table(found))
     blocks.append(Text("What the motion can tell", identifiability(found)))
-    blocks += [pictures("Dynamic parameters", [significance(found)]), parameter_table(found)]
+    blocks += consistency(folder)
+    blocks += [Pictures("Dynamic parameters", [significance(found)]), parameter_table(found)]
     notes = [*found.metrics["warnings"], *(w for w in found.unseen["warnings"] if w not in found.metrics["warnings"])]
     if notes:
         blocks.append(Text("Notes on the dynamics", notes))
     return Stage("Dynamics", found.verdict, found.reason, key_figures(found), blocks)
-
-
-def pictures(title: str, items: list[tuple[str, str, bool]]) -> Pictures:
-    """Return figures as SVG with captions, under a title."""
-    return Pictures(title, items)
 
 
 def proof_of(found: DynamicReport) -> tuple[Mapping[str, Any], str]:
@@ -166,27 +163,31 @@ def judged_figures(found: DynamicReport) -> list[tuple[str, str, bool]]:
 
 def planned(excitation: Path) -> list[Block]:
     """Return the designed motion: a picture, and how well it tells the parameters."""
-    path = excitation / "training/trajectory.csv"
-    if not path.exists():
+    folder = excitation / "training"
+    if not (folder / excitation_table.NAME).exists():
         return []
-    table = read_table(path)
-    n = sum(name[0] == "q" for name in table.header)
-    t, *series = (
-        np.column_stack([np.asarray(table.cells[table.header.index(name)], dtype=float) for name in names])
-        for names in (["t"], *([f"{x}{j + 1}" for j in range(n)] for x in "qv"))
-    )
-    made = json.loads((excitation / "training/metrics.json").read_text(encoding="utf-8"))
+    motion = excitation_table.read(folder)
+    t = np.linspace(0.0, motion.period, DRAWN)
+    q, v, _ = motion.orders(t)
+    made = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
     condition, setting = made["condition_number"], made["setting"]
     margins = ", ".join(f"{name} {one['share']:.1%} of its scale" for name, one in made["margins"].items())
     words = (
         f"The training motion, one period of {setting['period']:g} s: condition number {condition['raw']:.3g} raw, "
-        f"{condition['normalised']:.3g} with unit columns, of {len(setting['columns'])} columns. Every limit was "
-        "kept, at "
-        f"and between {setting['instants_verified']} instants; smallest margins: {margins}."
+        f"{condition['normalised']:.3g} with unit columns, of {len(setting['columns'])} columns. Every limit was kept, "
+        f"at and between {setting['instants_verified']} instants; smallest margins: {margins}."
     )
-    names = [f"joint {j + 1}" for j in range(n)]
-    figure = dynamic_plots.motion(t[:, 0], series[0], series[1], names, ["rad"] * n)
-    return [pictures("Excitation", [(svg(figure, "motion"), words, True)])]
+    names = [f"joint {j + 1}" for j in range(q.shape[1])]
+    figure = dynamic_plots.motion(t, q, v, names, ["rad"] * len(names))
+    return [Pictures("Excitation", [(svg(figure, "motion"), words, True)])]
+
+
+def consistency(folder: Path) -> list[Block]:
+    """Return what the geometry's uncertainty does to the dynamics: figures of `consistency_figures`, if there are "
+    "any."""
+    drawn = consistency_figures.from_folder(folder)
+    items = [(svg(one.figure, f"consistency-{name}"), one.caption, one.wide) for name, one in drawn.items()]
+    return [Pictures("Geometry and dynamics", items)] if items else []
 
 
 def friction_table(found: DynamicReport) -> Table:

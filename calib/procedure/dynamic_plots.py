@@ -10,8 +10,6 @@ from matplotlib.figure import Figure
 
 from calib.procedure.drawing import AFTER, BEFORE, HALF, INK, MARK, QUIET, WIDE, sheet, styled
 
-DRAWN = 300  # points per curve of the excitation (our choice)
-
 
 def torques(curves: Mapping[str, Any], rows: Sequence[str], units: Sequence[str]) -> Figure:
     """Draw measured and predicted torque of every row over time, and what is left."""
@@ -73,13 +71,12 @@ def whiteness(values: Sequence[Sequence[float] | None], bounds: Sequence[float |
 
 def motion(t: np.ndarray, q: np.ndarray, v: np.ndarray, names: Sequence[str], units: Sequence[str]) -> Figure:
     """Draw the designed positions and speeds of every joint over one period."""
-    step = max(1, len(t) // DRAWN)
     with styled():
         figure, axes = sheet(2, len(names), WIDE, 2.4)
         for j, name in enumerate(names):
             for k, (series, unit) in enumerate(((q, units[j]), (v, f"{units[j]}/s"))):
                 axis = axes[k * len(names) + j]
-                axis.plot(t[::step], series[::step, j], color=AFTER, linewidth=0.8)
+                axis.plot(t, series[:, j], color=AFTER, linewidth=0.8)
                 axis.axhline(0.0, color=QUIET, linewidth=0.4)
                 axis.tick_params(labelsize=5.5)
                 if k == 0:

@@ -15,7 +15,8 @@ from calib import files
 from calib.data.recording_files import read_recording
 from calib.identification.options import FileSettings, IdentifyOptions, file_settings, read_options
 from calib.identification.settings import Payload
-from calib.procedure import identifying, motion_check, predicting
+from calib.procedure import excitation_table, identifying, motion_check, predicting
+from calib.procedure.excitation_table import Periodic
 from calib.procedure.session import Session
 from calib.robot.chain import Chain
 from calib.robot.load import load
@@ -23,6 +24,7 @@ from calib.robot.load import load
 Say = Callable[[str], None]
 SUFFIXES = (".csv", ".npz", ".mcap", ".bag", ".db3")
 SETS = {"motor": ("Ia Fv Fc off",), "link": ("Fvl Fcl offl",), "both": ("Ia Fvl Fcl offl Fvm Fcm offm",)}
+SLOWER = 4.0  # of the rehearsal (our choice)
 SHORTER, OTHER = (
     0.8,
     3,
@@ -81,7 +83,7 @@ def excite(session: Session, say: Say) -> list[str]:
             session.path("4-fit"), limits=limits, period=wanted["period"] * (1.0 if first else SHORTER),
             harmonics=wanted["harmonics"], rate=wanted["rate"], starts=wanted["starts"] if first else 1,
             evaluations=wanted["evaluations"] if first else max(20, wanted["evaluations"] // 3),
-            seed=session.settings.seed + (0 if first else OTHER),
+            seed=session.settings.seed + (0 if first else OTHER), repeat=wanted["repeats"], slower=SLOWER,
             progress=lambda words, name=name: say(f"{name} motion: {words}"),
         )  # fmt: skip
         if designed.found.interrupted:  # a session is resumed, not gone on with half a search
@@ -127,11 +129,11 @@ def check_recording(session: Session, path: Path, name: str) -> tuple[list[float
     notes += (
         [f"{path.name}: {note}" for note in motion_check.check_torques(recording, chain)] if not own.payload else []
     )
-    tracks = designed_motions(session, chain)
-    if name not in tracks:
+    motions = designed_motions(session)
+    if name not in motions:
         return None, notes
-    others = {other: track for other, track in tracks.items() if other != name}
-    found = motion_check.find_motion(recording, tracks[name], others, session.settings.dynamics["repeats"])
+    others = {other: motion for other, motion in motions.items() if other != name}
+    found = motion_check.find_motion(recording, motions[name], others, session.settings.dynamics["repeats"])
     worst = max(found.tracking)
     notes.append(
         f"{path.name}: the {name} motion, {found.periods} times, from {found.start:.2f} s on; off its design by up to "
@@ -140,12 +142,12 @@ def check_recording(session: Session, path: Path, name: str) -> tuple[list[float
     return [found.start, found.stop], notes + [f"{path.name}: {note}" for note in found.notes]
 
 
-def designed_motions(session: Session, chain: Chain) -> dict[str, motion_check.Track]:
+def designed_motions(session: Session) -> dict[str, Periodic]:
     """Return the session's motions by name; none where it does not plan."""
     if not session.settings.dynamics["plan"]:
         return {}
-    paths = {name: session.path(f"6-excitation/{name}/trajectory.csv") for name in ("training", "validation")}
-    return {name: motion_check.read_track(path, chain) for name, path in paths.items() if path.exists()}
+    folders = {name: session.path(f"6-excitation/{name}") for name in ("training", "validation")}
+    return {name: excitation_table.read(folder) for name, folder in folders.items() if folder.exists()}
 
 
 def cut_paths(paths: list[Path], cuts: dict[str, Any]) -> list[str]:

@@ -8,17 +8,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.signal import fftconvolve, savgol_filter
 
 from calib.data.recording import Recording
-from calib.data.tables import read_table
 from calib.dynamics.rigid_body import inverse_dynamics
 from calib.dynamics.tree import standard_parameters, tree
 from calib.errors import MeasurementError
+from calib.procedure.excitation_table import Periodic
 from calib.robot.chain import Chain
 from trajectories.errors import BadInput
 from trajectories.recall import recall
@@ -32,23 +31,6 @@ SMOOTH = 10  # half width of the window for derivatives, in steps of the coarse 
 SURE = 0.8  # partial correlation with the torque of the nominal masses from which on its sign counts
 HEAVY = 0.03  # of the torque limit: rigid-body torques smaller than this say nothing
 SCALE = 10.0  # a factor between measured and nominal torques that no wrong mass explains
-
-
-@dataclass(frozen=True, eq=False)
-class Track:
-    """One period of a designed motion: t (N,) [s] and q (N, n) [rad or m], both ends included."""
-
-    t: np.ndarray
-    q: np.ndarray
-
-    @property
-    def period(self) -> float:
-        return float(self.t[-1] - self.t[0])
-
-    def coarse(self, speed: float = 1.0) -> np.ndarray:
-        """Return positions every `STEP`, without the closing one, played at a share of the speed."""
-        count = round(self.period / speed / STEP)
-        return _sampled(self.t / speed, self.q, np.arange(count) * self.period / speed / count)
 
 
 @dataclass(frozen=True)
@@ -69,22 +51,17 @@ class Heard:
     notes: tuple[str, ...]
 
 
-def read_track(path: Path, chain: Chain) -> Track:
-    """Read a designed motion as `calib.procedure.excitation_outputs` writes it."""
-    table = read_table(path)
-    wanted = ["t", *(f"q{j + 1}" for j in range(chain.n))]
-    missing = [name for name in wanted if name not in table.header]
-    if missing:
-        raise MeasurementError(f"has no column '{missing[0]}': design the motion again (calib redo … excite)", path)
-    columns = np.column_stack([np.asarray(table.cells[table.header.index(name)], dtype=float) for name in wanted])
-    return Track(columns[:, 0], columns[:, 1:])
+def coarse(motion: Periodic, speed: float = 1.0) -> np.ndarray:
+    """Return one period's positions every `STEP` or so, without the closing one, played at a share of the speed."""
+    count = round(motion.period / speed / STEP)
+    return motion.orders(np.arange(count) * motion.period / count)[0]
 
 
-def find_motion(recording: Recording, track: Track, others: Mapping[str, Track], wanted: int) -> Heard:
+def find_motion(recording: Recording, motion: Periodic, others: Mapping[str, Periodic], wanted: int) -> Heard:
     """Find the designed motion in a recording.
 
     Args:
-        track: the motion that was to be played.
+        motion: the one that was to be played.
         others: the session's other motions by name, to say if one of them was played instead.
         wanted: how many repetitions were asked for.
 
@@ -93,11 +70,11 @@ def find_motion(recording: Recording, track: Track, others: Mapping[str, Track],
     """
     grid = np.arange(recording.t[0], recording.t[-1], STEP)
     q = _sampled(recording.t, recording.q, grid)
-    reference = track.coarse()
+    reference = coarse(motion)
     try:
         found = recall(q, reference, likeness=LIKE)
     except BadInput:
-        raise _explain(recording, q, track, others) from None
+        raise _explain(recording, q, motion, others) from None
     start, stop = grid[found.start], grid[min(found.rows.stop, len(grid) - 1)]
     played = q[found.rows] - np.tile(reference, (found.periods, 1))[: len(q[found.rows])]
     tracking = np.sqrt(np.mean(played**2, axis=0))
@@ -118,15 +95,15 @@ def _sampled(t: np.ndarray, q: np.ndarray, grid: np.ndarray) -> np.ndarray:
     return np.column_stack([np.interp(grid, t, column) for column in q.T])
 
 
-def _explain(recording: Recording, q: np.ndarray, track: Track, others: Mapping[str, Track]) -> MeasurementError:
+def _explain(recording: Recording, q: np.ndarray, motion: Periodic, others: Mapping[str, Periodic]) -> MeasurementError:
     """Return what the recording is instead."""
-    reference = track.coarse()
+    reference = coarse(motion)
     duration = STEP * len(q)
     for name, other in others.items():
-        if _heard(q, other.coarse()):
+        if _heard(q, coarse(other)):
             return MeasurementError(f"this is the {name} motion, which belongs into a file of its own", recording.file)
     for speed in SPEEDS:
-        if _heard(q, track.coarse(speed)):
+        if _heard(q, coarse(motion, speed)):
             words = f"the motion is there at {speed:g} times its speed: a rehearsal? Record it at full speed"
             return MeasurementError(words, recording.file)
     if len(q) >= len(reference):
@@ -134,8 +111,8 @@ def _explain(recording: Recording, q: np.ndarray, track: Track, others: Mapping[
             order, sign = _best_order(q, reference)
             if _heard(factor * q[:, order] * sign, reference):
                 return MeasurementError(_cause(recording, order, sign, unit), recording.file)
-    if duration < track.period:
-        words = f"{duration:.1f} s are shorter than one period of the motion ({track.period:.1f} s): was it stopped?"
+    if duration < motion.period:
+        words = f"{duration:.1f} s are shorter than one period of the motion ({motion.period:.1f} s): was it stopped?"
         return MeasurementError(words, recording.file)
     return MeasurementError(
         "this is another motion than the one designed here, in no order of joints, sign, unit or speed that was tried; "

@@ -21,7 +21,7 @@ from calib.procedure.walk import STEPS, Step
 
 Say = Callable[[str], None]
 DONE, READY, WAITING, STALE, KEPT, AFTER = "done", "ready", "waiting", "stale", "kept", "after"
-PLANS = ("poses.csv", "validation.csv", "selection.json", "trajectory.csv")  # there only where we plan
+PLANS = ("poses.csv", "validation.csv", "selection.json", "trajectory.toml")  # there only where we plan
 
 
 @dataclass(frozen=True)

@@ -68,7 +68,7 @@ def _excited(session: Session) -> list[Path]:
 
 
 def _recorded(session: Session) -> list[Path]:
-    plan = session.path("6-excitation/training/trajectory.csv")
+    plan = session.path("6-excitation/training/trajectory.toml")
     return [
         session.path("4-fit/robot.toml"),
         plan,
@@ -89,7 +89,7 @@ def _identified(session: Session) -> list[Path]:
 
 def _predicted(session: Session) -> list[Path]:
     own = [session.path(f"8-dynamics/{name}") for name in ("robot.toml", "dynamics.json", "metrics.json")]
-    plan = session.path("6-excitation/validation/trajectory.csv")
+    plan = session.path("6-excitation/validation/trajectory.toml")
     training, unseen = dynamic_stages.recordings(session)
     cuts = session.path("7-recorded/cuts.json")
     return [*own, plan, cuts, *_reading(session), *files_of(training), *files_of(unseen)]

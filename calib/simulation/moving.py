@@ -89,26 +89,19 @@ def moving_arm(cell: Cell, robot: str, seed: int = 0) -> MovingArm:
     )  # fmt: skip
 
 
-def play(arm: MovingArm, t: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray, repeats: int) -> Reference:
-    """Return a designed motion, both ends included, repeated, with rest before and after.
+def play(t: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray, repeats: int) -> Reference:
+    """Return one period of a motion, both ends included, repeated, with rest before and after.
 
     Args:
-        t, q, v, a: (N,), (N, n) of one period.
+        t: (N,), even steps [s].
+        q, v, a: (N, n).
     """
     rate = (len(t) - 1) / (t[-1] - t[0])
-    count = round(REST * rate)
-    still = np.zeros((count, q.shape[1]))
-    parts = [
-        np.concatenate(
-            [
-                still + q[0] if at_rest else still,
-                np.tile(x[:-1], (repeats, 1)),
-                x[-1:],
-                still + q[-1] if at_rest else still,
-            ]
-        )
-        for x, at_rest in ((q, True), (v, False), (a, False))
-    ]
+    still = np.zeros((round(REST * rate), q.shape[1]))
+    parts = []
+    for series, ends in ((q, (q[0], q[-1])), (v, (0.0, 0.0)), (a, (0.0, 0.0))):
+        repeated = np.tile(series[:-1], (repeats, 1))
+        parts.append(np.concatenate([still + ends[0], repeated, series[-1:], still + ends[1]]))
     return Reference(np.arange(len(parts[0])) / rate, *parts)
 
 
