@@ -38,14 +38,14 @@ from calib.dynamics.tree import Tree
 from calib.identification.cases import Case
 from calib.identification.identify import Identification, common_decimator
 from calib.identification.prediction import carried_columns
-from calib.identification.rows import Rows, observe, segments
+from calib.identification.refit import cut, estimator, inverted, stacked, weights
+from calib.identification.rows import Rows, segments
 from calib.identification.settings import make_model
 from calib.robot.chain import Chain
 
 STEP = 1e-5  # of the central differences [m or rad]
 BLOCK = 512  # samples at a time: the regressor of so many stays in the processor's cache
 SAMPLES = 30_000  # at the full rate; longer recordings are represented by pieces spread over them (our choice)
-CHUNK = 2000  # thinned samples at a time, where each needs its own line of a matrix
 PIECE = 32  # thinned samples of such a piece at least
 NOTHING = 0.01  # a σ that grows by a smaller share has not changed (our choice)
 TILTS = ("gravity.rx", "gravity.ry")
@@ -169,120 +169,15 @@ def sensitivity(
             change, pull = _differences(found, moved, case, span, weighed, decimator)
             changes.append(change)
             pulled[: found.base.b] += pull
-    matrix, scale = (np.concatenate(x) for x in zip(*[(_stacked(part), _weights(how, part)) for part in used]))
+    matrix, scale = (np.concatenate(x) for x in zip(*[(stacked(part), weights(how, part)) for part in used]))
     change = np.concatenate([x.reshape(-1, count) for x in changes])
     share = float(np.count_nonzero(scale) / sum(np.count_nonzero(part.present) for part in found.rows))
     white = matrix * scale[:, None]
-    inverse = _inverse(white.T @ white + share * how.prior)
+    inverse = inverted(white.T @ white + share * how.prior)
     solved = inverse @ (pulled - white.T @ (change * scale[:, None]))
     seen = scale > 0.0
     after = change + matrix @ solved
     return solved, _rms(change[seen]), _rms(after[seen])
-
-
-@dataclass(frozen=True, eq=False)
-class Estimator:
-    """An estimate as a function of its rows: A φ = Wᵀ R⁻¹ y + pull, A = Wᵀ R⁻¹ W + prior.
-
-    Attributes:
-        deviation: (rows,) R = diag(deviation²).
-        prior: (p, p) information of what was known beforehand; zero for none.
-        pull: (p,) that information times its mean; what keeps parameters within bounds is part of it.
-    """
-
-    deviation: np.ndarray
-    prior: np.ndarray
-    pull: np.ndarray
-
-
-def estimator(found: Identification) -> Estimator:
-    """Return how an identification weighed its rows, and what it knew beforehand."""
-    fitted = found.fitted
-    p = fitted.pooled.parameters
-    drawn = fitted.method == "wls" and (found.prior is not None or len(found.climb.terms) > 0)
-    deviation = np.ones(len(fitted.std)) if fitted.method == "ols" else np.array(fitted.std)
-    if not drawn:
-        return Estimator(deviation, np.zeros((p, p)), np.zeros(p))
-    deviation = deviation * np.sqrt(fitted.inflation)
-    factors = (fitted.pooled.factors / deviation[:, None, None]).reshape(-1, p + 1)
-    own = factors.T @ factors
-    posterior = _inverse(fitted.estimate.covariance)
-    return Estimator(deviation, posterior - own[:p, :p], posterior @ fitted.estimate.values - own[:p, p])
-
-
-def estimate(how: Estimator, all_rows: Sequence[Rows]) -> tuple[np.ndarray, np.ndarray]:
-    """Return φ (p,) from rows, and A⁻¹ (p, p)."""
-    normal, right = np.array(how.prior), np.array(how.pull)
-    for part in all_rows:
-        scale = _weights(how, part)
-        white = _stacked(part) * scale[:, None]
-        normal += white.T @ white
-        right += white.T @ (part.target.ravel() * scale)
-    inverse = _inverse(normal)
-    return inverse @ right, inverse
-
-
-def rows_on(found: Identification, chain: Chain, cases: Sequence[Case]) -> list[Rows]:
-    """Return the rows of an identification as another geometry would have given them; friction's columns stay."""
-    model, decimator = make_model(chain, found.settings), common_decimator(cases, found.settings)
-    result = []
-    for part, case in zip(found.rows, cases):
-        own = observe(model, found.base.kept, case, decimator)
-        matrix = np.concatenate([own.matrix, part.matrix[:, :, found.base.b :]], axis=2)
-        result.append(replace(part, matrix=matrix))
-    return result
-
-
-@dataclass(frozen=True, eq=False)
-class Comparison:
-    """Two estimates from the same torques, on two geometries.
-
-    Attributes:
-        names, units: of the p parameters.
-        values: (2, p) on the nominal (CAD) and on the calibrated geometry.
-        sigma: (2, p) of each: of torque noise alone on the nominal, total on the calibrated one.
-        difference: (p,) standard deviation of the difference: the geometry's part, and what little of the torque noise
-            the two do not share.
-    """
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    values: np.ndarray
-    sigma: np.ndarray
-    difference: np.ndarray
-
-    @property
-    def relative(self) -> np.ndarray:
-        """(p,) 100 (nominal - calibrated) / |calibrated| [%]; NaN at zero."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            found = 100.0 * (self.values[0] - self.values[1]) / np.abs(self.values[1])
-        return np.where(self.values[1] == 0.0, np.nan, found)
-
-
-def compare(found: Identification, carried: Propagation, nominal: Chain, cases: Sequence[Case]) -> Comparison:
-    """Estimate the same columns from the same torques on the nominal geometry, and say how far apart the two are.
-
-    Both by weighted least squares with the same weights; the difference is added to the estimate that there is.
-    """
-    how, noise = estimator(found), np.array(found.fitted.std) * np.sqrt(found.fitted.inflation)
-    both = (rows_on(found, nominal, cases), found.rows)
-    (first, inverse), (second, own) = (estimate(how, rows) for rows in both)
-    values = np.asarray(found.fitted.estimate.values)
-    alone, apart = np.zeros(len(values)), np.array(carried.sigma_geometry**2)
-    for one, other in zip(*both):
-        for start in range(0, len(one.target), CHUNK):
-            part = slice(start, start + CHUNK)
-            gain, ours = (
-                matrix @ (_stacked(cut(rows, part)) * _weights(how, cut(rows, part), how.deviation**2)[:, None]).T
-                for matrix, rows in ((inverse, one), (own, other))
-            )
-            spread_of = np.tile(noise, len(one.target[part]))
-            alone += np.sum((gain * spread_of) ** 2, axis=1)
-            apart += np.sum(((gain - ours) * spread_of) ** 2, axis=1)
-    return Comparison(
-        found.names, found.fitted.estimate.units, frozen(np.stack([values + first - second, values])),
-        frozen(np.stack([np.sqrt(alone), carried.sigma])), frozen(np.sqrt(apart)),
-    )  # fmt: skip
 
 
 def neighbours(found: Identification, chain: Chain) -> list[tuple[Tree, Tree]]:
@@ -325,13 +220,6 @@ def pieces(case: Case, decimator: Decimator, step: int = 1) -> list[tuple[slice,
     return result
 
 
-def cut(rows: Rows, own: slice) -> Rows:
-    """Return some of the rows."""
-    return replace(
-        rows, matrix=rows.matrix[own], target=rows.target[own], present=rows.present[own], block=rows.block[own]
-    )
-
-
 def _differences(
     found: Identification, moved: Sequence[tuple[Tree, Tree]], case: Case, span: slice, residual: np.ndarray,
     decimator: Decimator,
@@ -364,21 +252,6 @@ def _differences(
     result = np.zeros((b, len(moved)))
     result[inertial] = (pulled * onboard[:, None])[found.base.kept[inertial]]
     return np.tile(thinned, (1, times, 1)), result
-
-
-def _inverse(matrix: np.ndarray) -> np.ndarray:
-    """Return the inverse of a positive definite matrix whose rows have units of their own."""
-    unit = 1.0 / np.sqrt(np.diag(matrix))
-    return np.linalg.inv(matrix * np.outer(unit, unit)) * np.outer(unit, unit)
-
-
-def _stacked(rows: Rows) -> np.ndarray:
-    return rows.matrix.reshape(-1, rows.matrix.shape[2])
-
-
-def _weights(how: Estimator, rows: Rows, by: np.ndarray | None = None) -> np.ndarray:
-    """Return 1 / deviation (or 1 / `by`) of each row, all stacked; zero where nothing was learnt."""
-    return (rows.present / (how.deviation if by is None else by)).ravel()
 
 
 def _rms(values: np.ndarray) -> np.ndarray:

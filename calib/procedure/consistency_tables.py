@@ -12,7 +12,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from calib import files
-from calib.identification.consistency import NOTHING, TILTS, Comparison, Propagation
+from calib.identification.consistency import NOTHING, TILTS, Propagation
+from calib.identification.geometries import Comparison
 from calib.procedure import calibrated
 from calib.procedure.identifying import IdentificationOutcome
 

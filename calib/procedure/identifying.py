@@ -16,7 +16,8 @@ from calib.data.recording_files import read_recording
 from calib.data.reference_files import with_reference
 from calib.errors import UsageError
 from calib.identification.cases import Case, case_names, make_case
-from calib.identification.consistency import Comparison, Propagation, compare, propagate
+from calib.identification.consistency import Propagation, propagate
+from calib.identification.geometries import Comparison, compare
 from calib.identification.identify import Identification, identify
 from calib.identification.options import FileSettings, IdentifyOptions, file_settings
 from calib.identification.prediction import predict

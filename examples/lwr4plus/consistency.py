@@ -31,7 +31,7 @@ from calib.data.recording import Recording
 from calib.dynamics.tree import standard_parameters
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit
-from calib.identification import consistency
+from calib.identification import consistency, refit
 from calib.identification.cases import Case, make_case
 from calib.identification.identify import Identification, common_decimator, find_base, identify
 from calib.identification.settings import Payload, Settings, make_model
@@ -245,15 +245,15 @@ def judged(given: World, found: Identification, chain: Chain, cases: list[Case],
 
     The torque's error is that of the noisy estimate, against noise-free torque; the bias that of noise-free torques.
     """
-    how = consistency.estimator(found)
-    rows = consistency.rows_on(found, chain, cases)
-    noisy, _ = consistency.estimate(how, rows)
+    how = refit.estimator(found)
+    rows = refit.rows_on(found, chain, cases)
+    noisy, _ = refit.estimate(how, rows)
     decimator = common_decimator(cases, given.settings)
     exact = [
         replace(part, target=decimate(tau, decimator)[: len(part.target)])
         for part, tau in zip(rows, _cut(given, cases))
     ]
-    biased, _ = consistency.estimate(how, exact)
+    biased, _ = refit.estimate(how, exact)
     size = (biased - given.base) / found.fitted.estimate.sigma
     model, error, torque = make_model(chain, given.settings), [], []
     for case in other:

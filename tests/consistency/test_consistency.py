@@ -22,7 +22,7 @@ from calib.dynamics import base as bases
 from calib.dynamics import rigid_body
 from calib.dynamics.tree import tree
 from calib.errors import RobotError
-from calib.identification import consistency
+from calib.identification import consistency, refit
 from calib.identification.identify import identify
 from calib.identification.settings import Settings
 from calib.procedure import calibrated, consistency_tables
@@ -51,13 +51,13 @@ def test_spreading_is_the_adjoint_of_decimation(factor):
 def test_the_sensitivity_is_the_derivative_of_the_estimate(settings):
     arm, case = planted.arm().with_values(MOVED), planted.case("a", 0)
     found = identify(arm, [case], settings, planted.arm())
-    how = consistency.estimator(found)
-    again, _ = consistency.estimate(how, found.rows)
+    how = refit.estimator(found)
+    again, _ = refit.estimate(how, found.rows)
     np.testing.assert_allclose(again, found.fitted.estimate.values, atol=1e-9)
     matrix, _, _ = consistency.sensitivity(found, arm, [case])
 
     def refitted(values: np.ndarray) -> np.ndarray:
-        return consistency.estimate(how, consistency.rows_on(found, arm.with_values(values), [case]))[0]
+        return refit.estimate(how, refit.rows_on(found, arm.with_values(values), [case]))[0]
 
     differences.check(refitted, matrix[:, :-2], np.array(arm.values), step=1e-5, tolerance=1e-7)
 
