@@ -6,6 +6,7 @@ raise their own subclasses of `ValueError`.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -69,3 +70,15 @@ class NotConverged(CalibError):
 
 class SessionError(CalibError):
     """A session folder that is busy, damaged, or not in the state a command needs."""
+
+
+def exit_code(error: Exception) -> int | None:
+    """Return the exit code of an error raised on purpose, 2 or 3 (not identifiable, not converged); None for others."""
+    if isinstance(error, (NotConverged, Unidentifiable)):
+        return 3
+    if isinstance(error, CalibError):
+        return 2
+    module = sys.modules.get("poses.errors")
+    if module is not None and isinstance(error, module.NotIdentifiable):
+        return 3
+    return 2 if type(error).__module__.split(".")[0] in ("poses", "trajectories") else None

@@ -59,7 +59,9 @@ def run(arguments: list[str] | None = None) -> int:
     except (KeyboardInterrupt, typer.Abort):
         return _complain(INTERRUPTED, 130)
     except Exception as error:
-        code = _code(error)
+        from calib.errors import exit_code
+
+        code = exit_code(error)
         if code is None or os.environ.get("CALIB_DEBUG"):
             raise
         return _complain(str(error), code)
@@ -85,22 +87,6 @@ def _spread(arguments: list[str]) -> list[str]:
             positionals += 1
         result.append(word)
     return result if {"fit", "identify"} & set(arguments[:2]) else arguments
-
-
-def _code(error: Exception) -> int | None:
-    """Return the exit code of an error raised on purpose; None for any other."""
-    from calib.errors import CalibError, NotConverged, Unidentifiable
-
-    if isinstance(error, (NotConverged, Unidentifiable)):
-        return 3
-    if isinstance(error, CalibError):
-        return 2
-    module = sys.modules.get("poses.errors")
-    if module is not None and isinstance(error, module.NotIdentifiable):
-        return 3
-    if type(error).__module__.split(".")[0] in ("poses", "trajectories"):
-        return 2
-    return None
 
 
 def _complain(message: str, code: int) -> int:

@@ -150,6 +150,35 @@ def demo(
         raise typer.Exit(1)
 
 
+@app.command("run")
+def run_sessions(
+    sessions: Annotated[list[Path], typer.Argument(help="session.toml files, or the sessions' folders")],
+    workers: Annotated[str, typer.Option(help="local processes, or the address of a Dask scheduler")] = "1",
+) -> None:
+    """Run many SESSIONS, one folder per robot, each as far as it goes; a table at the end says how they stand.
+
+    A robot that fails does not stop the others; its folder's run.log says why. The exit code is the worst of all.
+    """
+    import time
+
+    from calib import workers as work
+    from calib.procedure import fleet
+
+    folders, started, outcomes = fleet.folders_of(sessions), time.perf_counter(), []
+    with told() as (console, say, progress), work.workers(workers) as mapped:
+        progress(f"running {len(folders)} sessions")
+        for outcome in fleet.run(folders, mapped, f"calib run --workers {workers}"):
+            outcomes.append(outcome)
+            say(f"{outcome.folder}: {outcome.state}{f', {outcome.verdict}' if outcome.verdict else ''}")
+            progress(f"{len(outcomes)} of {len(folders)} sessions")
+    console.print(fleet.table(outcomes))
+    for line in fleet.remarks(outcomes):
+        console.print(line, soft_wrap=True, markup=False)
+    console.print(fleet.summary(outcomes, time.perf_counter() - started), soft_wrap=True, markup=False)
+    if code := fleet.worst_code(outcomes):
+        raise typer.Exit(code)
+
+
 def _go_on(folder: Path, command: str, again: str = "") -> None:
     from calib.procedure import guided
 

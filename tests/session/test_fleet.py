@@ -1,0 +1,76 @@
+"""A fleet of sessions: each goes as far as it can, one that fails stops none, and the table says how they stand."""
+
+from __future__ import annotations
+
+import pickle
+import runpy
+import shutil
+import sys
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from calib import cli
+from calib.errors import MeasurementError, NotConverged, Unidentifiable, UsageError, exit_code
+from calib.procedure import fleet
+
+from .conftest import edit
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def cells(finished_folder: Path, planned_folder: Path, tmp_path: Path) -> Path:
+    """Four folders: done, with a damaged file, waiting, and no session."""
+    for name, source in (("a", finished_folder), ("b", finished_folder), ("c", planned_folder)):
+        shutil.copytree(source, tmp_path / "cells" / name)
+    edit(tmp_path / "cells/b/3-measured/measured.csv", "joint1 [deg]", "joint1 [rad]")
+    (tmp_path / "cells/d").mkdir()
+    return tmp_path / "cells"
+
+
+def test_one_that_fails_stops_none(cells: Path, capsys: pytest.CaptureFixture) -> None:
+    assert cli.run(["run", *map(str, sorted(cells.iterdir()))]) == 2
+    said = capsys.readouterr().out
+    assert "1 of 4 done" in said and "1 waiting, 2 failed" in said
+    assert f"{cells / 'b'} failed" in said and "looks like" in said and f"{cells / 'c'} waits for a file" in said
+    assert "looks like" in (cells / "b/run.log").read_text() and "Bring " in (cells / "c/run.log").read_text()
+    assert not list((cells / "d").iterdir())
+    assert cli.run(["run", str(cells / "a/session.toml")]) == 0
+    assert cli.run(["run", str(cells / "a"), str(cells / "a/session.toml")]) == 2
+
+
+def test_a_failing_verdict_is_code_1(cells: Path) -> None:
+    path = cells / "a/5-validation/metrics.json"
+    path.write_text(path.read_text().replace('"verdict": "', '"verdict": "fail", "was": "'))
+    assert [one.code for one in fleet.run([cells / "a", cells / "c"], map, "test")] == [1, 0]
+
+
+def test_an_unforeseen_error_stops_none_either(cells: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fleet.steps, "run_next", lambda *given: 1 / 0)
+    one = fleet.run_one(cells / "a")
+    assert one.state == fleet.FAILED and one.code == 1 and "ZeroDivisionError" in one.words
+    assert "Traceback" in (cells / "a/run.log").read_text() and not (cells / "a/session.lock").exists()
+
+
+def test_what_workers_get_pickles(cells: Path) -> None:
+    task = pickle.loads(pickle.dumps(partial(fleet.run_one, command="test")))
+    outcome = task(cells / "d")
+    assert pickle.loads(pickle.dumps(outcome)) == outcome
+
+
+def test_exit_codes_by_error() -> None:
+    from poses.errors import NotIdentifiable
+
+    assert [exit_code(error) for error in (UsageError("x"), MeasurementError("x", "f"))] == [2, 2]
+    assert [exit_code(error) for error in (Unidentifiable("x"), NotConverged("x"))] == [3, 3]
+    assert exit_code(KeyError("x")) is None and exit_code(NotIdentifiable.__new__(NotIdentifiable)) == 3
+
+
+@pytest.mark.slow
+def test_a_session_as_a_script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = ["--out", str(tmp_path / "cell"), "--geometry-only", "--robot", "ur5"]
+    monkeypatch.setattr(sys, "argv", ["session_as_script.py", *given])
+    runpy.run_path(str(ROOT / "examples/session_as_script.py"), run_name="__main__")
+    assert (tmp_path / "cell/certificate.html").exists()
