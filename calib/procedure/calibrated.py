@@ -15,6 +15,9 @@ Beside the robot itself (`calib.robot.description`)::
     joint = "q4"                     # the joint (or the body behind it) it comes from
     order = 2                        # k of sin and cos; axis of a lever (0 x, 1 y, 2 z)
     coefficient = 1.2e-5
+
+``chain_covariance.csv`` beside it: the covariance [m, rad] of the element values of the best geometry without
+deflections (``provenance.rigid``, where there are any), by name; elements that are not in it were not fitted.
 """
 
 from __future__ import annotations

@@ -1,4 +1,18 @@
-"""What the geometry's uncertainty does to an identification, as tables, as metrics and in words."""
+"""What the geometry's uncertainty does to an identification, as tables, as metrics and in words.
+
+Beside what every identification writes (``calib identify --out``)::
+
+    estimate.csv          sigma and rsd are totals; sigma_torque is the part of the torques' noise, sigma_geometry that
+                          of the geometry, empty where the robot came without a covariance (no folder of a fit)
+    covariance.csv        total: Sigma_torque + S Sigma_geometry S'
+    sensitivity.csv       S: change of each parameter per m or rad of each element of the chain, and per rad of tilt of
+                          gravity about the base's x and y axes (gravity.rx, gravity.ry)
+    geometry_effects.csv  the elements ranked by what one sigma of theirs does: the parameter that moves most, by how
+                          many of its sigma_torque, and the rms of the torque before and after re-estimation; without a
+                          sigma: not fitted (a choice of frames, or not told by the poses), effect of 1 mm or 1 mrad
+    geometries.csv        each parameter on the nominal and on the calibrated geometry, from the same torques
+    chain_covariance.csv  that of the fit, for whoever goes on from this folder
+"""
 
 from __future__ import annotations
 
