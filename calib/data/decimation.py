@@ -98,7 +98,9 @@ def decimate(values: np.ndarray, decimator: Decimator, segment: np.ndarray | Non
     values = np.asarray(values, dtype=float)
     segment = np.zeros(len(values), dtype=int) if segment is None else segment
     edges = np.concatenate([[0], np.flatnonzero(np.diff(segment)) + 1, [len(segment)]])
-    parts = [_window_sums(values[a:b], decimator) for a, b in pairwise(edges)]
+    parts = [np.empty((0, *values.shape[1:]))]
+    for a, b in pairwise(edges):
+        parts += [np.moveaxis(part, -1, 0) for part in decimate_blocks([np.moveaxis(values[a:b], 0, -1)], decimator)]
     return np.concatenate(parts)
 
 
@@ -120,20 +122,33 @@ def spread(values: np.ndarray, decimator: Decimator, length: int) -> np.ndarray:
 
 
 def decimate_blocks(blocks: Iterable[np.ndarray], decimator: Decimator) -> Iterator[np.ndarray]:
-    """Return, block by block, what `decimate` returns of the blocks (N_i, ...) of one segment joined together.
+    """Return, block by block, what `decimate` returns of the blocks (..., N_i) of one segment joined together.
 
-    Holds one block and twice the reach of the filter.
+    The sample axis is the last one. Holds one block, and of those before it the sums that windows still need: every
+    sample is multiplied once, as products of r rows with all the windows that they take part in.
     """
-    rest, skip = None, 0
+    r, taps = decimator.factor, decimator.taps
+    if r == 1 and len(taps) == 1:
+        yield from blocks
+        return
+    phases = -(-len(taps) // r)
+    weights = np.zeros(phases * r)
+    weights[: len(taps)] = taps
+    turned = np.ascontiguousarray(weights.reshape(phases, r).T)
+    rest, sums, seen, done = None, None, 0, 0
     for block in blocks:
-        rest = np.asarray(block, dtype=float) if rest is None else np.concatenate([rest, block])
-        if skip:  # blocks may be shorter than the factor
-            rest, skip = rest[skip:], max(0, skip - len(rest))
-        done = _window_sums(rest, decimator)
-        if len(done):
-            yield done
-            used = len(done) * decimator.factor
-            rest, skip = rest[used:], max(0, used - len(rest))
+        seen += block.shape[-1]
+        rest = block if rest is None or not rest.shape[-1] else np.concatenate([rest, block], axis=-1)
+        sums = _with_sums(sums, rest, turned)
+        rest = rest[..., rest.shape[-1] // r * r :]
+        if (count := sums.shape[-2] - phases + 1) > 0:
+            yield _windows(sums, count)
+            sums, done = sums[..., count:, :], done + count
+    if rest is None or (count := (seen - len(taps)) // r + 1 - done) <= 0:
+        return
+    padded = np.zeros((*rest.shape[:-1], r))  # the last window reaches into an incomplete group
+    padded[..., : rest.shape[-1]] = rest
+    yield _windows(_with_sums(sums, padded, turned), count)
 
 
 def decimate_regressor(
@@ -151,27 +166,22 @@ def decimate_regressor(
     edges = np.concatenate([[0], np.flatnonzero(np.diff(motion.segment)) + 1, [len(motion.segment)]])
     for a, b in pairwise(edges):
         spans = [slice(i, min(i + block, b)) for i in range(a, b, block)]
-        yield from decimate_blocks((regressor(motion.q[s], motion.v[s], motion.a[s]) for s in spans), decimator)
+        blocks = (np.moveaxis(regressor(motion.q[s], motion.v[s], motion.a[s]), 0, -1) for s in spans)
+        yield from (np.moveaxis(part, -1, 0) for part in decimate_blocks(blocks, decimator))
 
 
-def _window_sums(values: np.ndarray, decimator: Decimator) -> np.ndarray:
-    """Return Σ_m taps_m x(k r + m) for all windows inside `values` (N, ...), as products of r rows at a time."""
-    r, taps = decimator.factor, decimator.taps
-    count = (len(values) - len(taps)) // r + 1
-    if count <= 0:
-        return np.empty((0, *values.shape[1:]))
-    if r == 1 and len(taps) == 1:
-        return values
-    phases = -(-len(taps) // r)
-    weights = np.zeros(phases * r)
-    weights[: len(taps)] = taps
-    rows = (count + phases - 1) * r
-    flat = values.reshape(len(values), -1)
-    if len(flat) < rows:  # the padded taps are zeros there
-        flat = np.concatenate([flat, np.zeros((rows - len(flat), flat.shape[1]))])
-    sums = weights.reshape(phases, r) @ flat[:rows].reshape(-1, r, flat.shape[1])  # (rows / r, phases, columns)
-    out = sum(sums[i : i + count, i] for i in range(phases))
-    return np.asarray(out).reshape(count, *values.shape[1:])
+def _with_sums(before: np.ndarray | None, values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the sums (..., g, phases) of the groups of r samples before and of those in `values` (..., N)."""
+    r, phases = weights.shape
+    groups = values.shape[-1] // r
+    whole = np.ascontiguousarray(values[..., : groups * r]).reshape(-1, r)
+    sums = (whole @ weights).reshape(*values.shape[:-1], groups, phases)
+    return sums if before is None else np.concatenate([before, sums], axis=-2)
+
+
+def _windows(sums: np.ndarray, count: int) -> np.ndarray:
+    """Return the first `count` windows (..., count): each phase's share from the group it falls into."""
+    return np.asarray(sum(sums[..., i : i + count, i] for i in range(sums.shape[-1])))
 
 
 def _kaiser(factor: int) -> np.ndarray:

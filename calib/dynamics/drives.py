@@ -9,7 +9,7 @@ is not a special case. Joint numbers here count from 0, in names from 1.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -139,10 +139,22 @@ def fill(terms: Sequence[Term], out: np.ndarray, motions: Sequence[np.ndarray | 
     """
     state = 0
     for column, one in zip(out, terms, strict=True):
-        for row, motion in one.acts:
-            seen = _join(one, motion, motions, states[state] if one.form.remembers else None)
-            state += one.form.remembers
-            column[row] += one.form.values(seen, one.settings)
+        own = len(one.acts) if one.form.remembers else 0
+        for row, values in acting(one, motions, states[state : state + own]):
+            column[row] += values
+        state += own
+
+
+def acting(one: Term, motions: Sequence[np.ndarray | None], states: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield each torque row that a term acts on, and its column there (N,).
+
+    Args:
+        motions: as in `fill`.
+        states: (s, N) of this term alone, see `friction_states`.
+    """
+    for k, (row, motion) in enumerate(one.acts):
+        seen = _join(one, motion, motions, states[k] if one.form.remembers else None)
+        yield row, one.form.values(seen, one.settings)
 
 
 def slopes(

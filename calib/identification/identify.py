@@ -170,9 +170,11 @@ def find_base(
 
 
 def common_decimator(cases: Sequence[Case], settings: Settings) -> Decimator:
-    """Return the filter of all rows: the widest of the cases' bands, narrower where that makes too many rows.
+    """Return the filter of all rows: the widest of the cases' bands; where that makes too many rows, of every second,
+    third, ... one alone.
 
-    Too many are more than ``settings.samples``.
+    Too many are more than ``settings.samples``. The band stays: long recordings have rows to spare, but what they show
+    of fast motion no other row tells.
     """
     rates = [case.motion.rate for case in cases]
     if max(rates) > 1.02 * min(rates):
@@ -181,9 +183,9 @@ def common_decimator(cases: Sequence[Case], settings: Settings) -> Decimator:
             f"recordings of {slowest:.4g} Hz and {fastest:.4g} Hz do not go together; resample one of them"
         )
     total = sum(len(case.motion) for case in cases)
-    by_rule = min(case.motion.decimator.factor for case in cases)
-    least = int(np.ceil(total / settings.samples))  # what the memory asks for
-    return design_decimator(rates[0], max(least, by_rule))
+    widest = design_decimator(rates[0], min(case.motion.decimator.factor for case in cases))
+    one_in = -(-total // (widest.factor * settings.samples))  # what the memory asks for
+    return replace(widest, factor=one_in * widest.factor)
 
 
 def first_fit(rows: Sequence[Rows]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

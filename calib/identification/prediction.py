@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.arrays import frozen
-from calib.dynamics.idim import IdentificationModel, with_load
+from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.rigid_body import inverse_dynamics
 from calib.dynamics.tree import FIXED
 from calib.identification.cases import Case
-from calib.identification.rows import BLOCK, segmented_states
+from calib.identification.rows import BLOCK, term_columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,16 +33,18 @@ class Dynamics:
 
 
 def predict(dynamics: Dynamics, case: Case) -> np.ndarray:
-    """Return the torques of all rows at the full rate (N, rows) [N m or N]: W(q, v, a) · values, block by block."""
-    model, motion = dynamics.model, case.motion
-    load = transmitted(dynamics, case) if with_load(model) else None
-    states = segmented_states(model.columns, case)
-    result = np.empty((len(motion), model.rows))
-    for start in range(0, len(motion), BLOCK):
-        part = slice(start, start + BLOCK)
-        own = None if load is None else load[part]
-        block = model.regressor(motion.q[part], motion.v[part], motion.a[part], own, case.carried, states[:, part])
-        result[part] = block @ dynamics.values
+    """Return the torques of all rows at the full rate (N, rows) [N m or N]: W(q, v, a) · values, without W."""
+    model, n = dynamics.model, case.motion.n
+    result = np.zeros((len(case.motion), model.rows))
+    first, load = 0, None
+    if model.kind != "drive":
+        first, load = 10 * model.tree.bodies, transmitted(dynamics, case)
+        result[:, :n] = result[:, -n:] = load
+    for one, value in zip(model.columns, dynamics.values[first:]):
+        for row, values in term_columns(one, case, load):
+            result[:, model.rows - n + row] += value * values
+            if model.kind == "both" and one.side == "link":
+                result[:, row] += value * values
     return result
 
 
@@ -50,7 +52,11 @@ def transmitted(dynamics: Dynamics, case: Case) -> np.ndarray:
     """Return the torques (N, n) the gears pass on to the bodies, by the model: what load-dependent friction feels."""
     model, motion = dynamics.model, case.motion
     bodies = np.array(dynamics.values[: 10 * model.tree.bodies]) * carried_columns(model, case.carried)
-    return inverse_dynamics(model.tree, bodies, motion.q, motion.v, motion.a)
+    result = np.empty(motion.q.shape)
+    for start in range(0, len(motion), BLOCK):
+        part = slice(start, start + BLOCK)
+        result[part] = inverse_dynamics(model.tree, bodies, motion.q[part], motion.v[part], motion.a[part])
+    return result
 
 
 def carried_columns(model: IdentificationModel, carried: Collection[str]) -> np.ndarray:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -34,6 +35,7 @@ LEAST = 0.1  # [rad] that a joint must travel
 BLOCKS = 8
 PAYS = 0.04  # of the fast residual's power on left-out blocks, per pair: 2 % of its rms
 START = 0.5  # [s] left out at the beginning, where robots start
+MOST = 300_000  # samples that are looked at; of longer recordings every second, third, ... one
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,15 +62,16 @@ def find_all(cases: Sequence[Case], residuals: Sequence[np.ndarray]) -> list[Rip
     Args:
         residuals: per case (N, n), torque not explained at the full rate; what is slow in it is taken off here.
     """
-    fast = [_fast(case, residual) for case, residual in zip(cases, residuals)]
-    used = np.concatenate([case.motion.weight > 0.5 for case in cases])
-    block = np.where(used, _blocks(cases), -1)
+    step = -(-sum(len(case.motion) for case in cases) // MOST)
+    used = np.concatenate([case.motion.weight[::step] > 0.5 for case in cases])
+    block = np.where(used, np.concatenate([own[::step] for own in _blocks(cases)]), -1)
     found = []
     for j in range(cases[0].motion.n):
-        q, v = (np.concatenate([getattr(case.motion, name)[:, j] for case in cases]) for name in ("q", "v"))
+        q, v = (np.concatenate([getattr(case.motion, name)[::step, j] for case in cases]) for name in ("q", "v"))
         if np.ptp(q) < LEAST:
             continue
-        one = find(j, q, v, np.concatenate([part[:, j] for part in fast]), block)
+        fast = [_fast(case, residual[:, j])[::step] for case, residual in zip(cases, residuals)]
+        one = find(j, q, v, np.concatenate(fast), block)
         found += [one] if one is not None else []
     return found
 
@@ -122,14 +125,14 @@ def columns(q: np.ndarray, v: np.ndarray, orders: Sequence[float]) -> np.ndarray
 
 
 def _fast(case: Case, residual: np.ndarray) -> np.ndarray:
-    """Return what of a residual (N, n) lies above twice the motion's own band, each segment by itself."""
+    """Return what of a residual (N,) lies above twice the motion's own band, each segment by itself."""
     motion = case.motion
     cutoff = min(2.0 * motion.cutoffs.dynamics, 0.4 * motion.rate)
     slow = [low_pass(residual[a:b], motion.rate, cutoff) for a, b in segments(motion.segment)]
     return residual - np.concatenate(slow)
 
 
-def _blocks(cases: Sequence[Case]) -> np.ndarray:
+def _blocks(cases: Sequence[Case]) -> list[np.ndarray]:
     """Number contiguous blocks of all cases, about `BLOCKS` in all; -1 at the start of a recording."""
     sizes = [len(case.motion) for case in cases]
     own = [max(1 if len(cases) > 1 else 2, round(BLOCKS * size / sum(sizes))) for size in sizes]
@@ -138,7 +141,7 @@ def _blocks(cases: Sequence[Case]) -> np.ndarray:
         number = first + np.arange(size) * count // size
         numbers.append(np.where(case.motion.t < START, -1, number))
         first += count
-    return np.concatenate(numbers)
+    return numbers
 
 
 def _strongest(q: np.ndarray, v: np.ndarray, residual: np.ndarray) -> float:
@@ -147,20 +150,24 @@ def _strongest(q: np.ndarray, v: np.ndarray, residual: np.ndarray) -> float:
     power = np.zeros(len(orders))
     step = max(1, len(q) // 20_000)
     q, v, residual = q[::step], v[::step], residual[::step]
-    for i, order in enumerate(orders):
-        wave = np.exp(-1j * order * q) * residual
-        for gain in _gains(v, order):
-            size = float(gain @ gain)
-            if size > 30.0:
-                power[i] += 2.0 * abs(gain @ wave) ** 2 / size
+    for own in (v > 0.0, v < 0.0):
+        turns, turn = np.abs(v[own]) / (2.0 * np.pi), np.exp(-1j * q[own])
+        wave = np.exp(-1j * LOWEST * q[own]) * residual[own]
+        for i, order in enumerate(orders):
+            for gain in _hats(order * turns):
+                size = float(gain @ gain)
+                if size > 30.0:
+                    power[i] += 2.0 * ((gain @ wave.real) ** 2 + (gain @ wave.imag) ** 2) / size
+            wave *= turn
     return float(orders[int(np.argmax(power[:-2] + power[2:]))])
 
 
-def _gains(v: np.ndarray, order: float) -> list[np.ndarray]:
-    """Return the gains (N,) of all bands and directions: at q = 0 the cosine is one."""
-    still = Joined(np.zeros_like(v), v, v)
-    own = [one for one in terms(0, (order,), (-np.inf, np.inf)) if one.shape == "cosine_band"]
-    return [one.form.values(still, one.settings) for one in own]
+def _hats(frequency: np.ndarray) -> list[np.ndarray]:
+    """Return the gains (N,) of all bands for one direction, as `shapes` has them: what rises at a node and not yet at
+    the next one."""
+    nodes = (0.0, *NODES)
+    rises = [np.clip((frequency - a) / (b - a), 0.0, 1.0) for a, b in pairwise(nodes)]
+    return [*(here - ahead for here, ahead in pairwise(rises)), rises[-1]]
 
 
 def _judge(matrix: np.ndarray, residual: np.ndarray, block: np.ndarray) -> tuple[float, float]:

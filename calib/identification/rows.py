@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
 from calib.data.decimation import Decimator, decimate, decimate_blocks, kept
-from calib.dynamics import drives
+from calib.dynamics import drives, rigid_body
 from calib.dynamics.drives import Term
 from calib.dynamics.idim import IdentificationModel
 from calib.estimation.triangles import Triangles, absorb, empty, retriangulate
@@ -50,16 +50,21 @@ def observe(
         load: (N, n) transmitted torques at the full rate, where a term needs them.
     """
     motion = case.motion
+    single = replace(model, kind="motor") if model.kind == "both" else model
+    column, row = _live(single, columns)
+    matrix = np.zeros((len(kept(motion.segment, decimator)), single.rows, len(columns)))
     states = segmented_states(model.columns, case)
-    unfiltered = len(decimator.taps) == 1
-    parts = []
+    step, place = max(1, BLOCK // decimator.factor) * decimator.factor, 0
     for start, stop in segments(motion.segment):
-        blocks = (
-            _block(model, columns, case, slice(i, min(i + BLOCK, stop)), load, states)
-            for i in range(start, stop, BLOCK)
-        )
-        parts += list(blocks if unfiltered else decimate_blocks(blocks, decimator))
-    matrix = np.concatenate(parts) if parts else np.zeros((0, model.rows, len(columns)))
+        spans = [slice(i, min(i + step, stop)) for i in range(start, stop, step)]
+        blocks = (_block(single, columns[column], row, case, part, load, states) for part in spans)
+        for part in decimate_blocks(blocks, decimator):
+            matrix[place : place + part.shape[1], row, column] = part.T
+            place += part.shape[1]
+    if model.kind == "both":  # what the sensors see, the motors see as well
+        hidden = {one.name for one in model.columns if one.side == "motor"}
+        seen = np.array([model.names[k] not in hidden for k in columns], dtype=float)
+        matrix = np.concatenate([matrix * seen, matrix], axis=1)
     names, units = model.names, model.units
     return _rows([names[k] for k in columns], [units[k] for k in columns], matrix, case, decimator)
 
@@ -67,29 +72,28 @@ def observe(
 def observe_terms(
     terms: Sequence[Term], case: Case, decimator: Decimator, load: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the columns of drive terms alone, (M, n, k), filtered and thinned; for a model of kind ``motor``."""
-    motion = case.motion
-    if not terms:
-        return np.zeros((len(kept(motion.segment, decimator)), motion.n, 0))
-    full = term_columns(terms, case, load)
-    return np.asarray(decimate(full, decimator, motion.segment))
+    """Return the columns of drive terms alone, (M, n, k), filtered and thinned; for a model of kind ``motor``.
+
+    One column at a time at the full rate: an hour of all friction there is would fill 15 GB.
+    """
+    segment = case.motion.segment
+    out = np.zeros((len(kept(segment, decimator)), case.motion.n, len(terms)))
+    for k, one in enumerate(terms):
+        for row, values in term_columns(one, case, load):
+            out[:, row, k] += decimate(values, decimator, segment)
+    return out
 
 
-def term_columns(terms: Sequence[Term], case: Case, load: np.ndarray | None = None) -> np.ndarray:
-    """Return the columns of drive terms at the full rate, (N, n, k)."""
+def term_columns(one: Term, case: Case, load: np.ndarray | None = None) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield the torque rows that a drive term acts on, each with its column (N,) at the full rate."""
     motion = case.motion
-    motions = [np.ascontiguousarray(x.T) for x in (motion.q, motion.v, motion.a)]
-    out = np.zeros((len(terms), motion.n, len(motion)))
-    drives.fill(terms, out, [*motions, None if load is None else load.T], segmented_states(terms, case))
-    return out.transpose(2, 1, 0)
+    motions = [motion.q.T, motion.v.T, motion.a.T, None if load is None else load.T]
+    return drives.acting(one, motions, segmented_states([one], case))
 
 
 def segmented_states(terms: Sequence[Term], case: Case) -> np.ndarray:
     """Return the states (s, N) of friction with memory; each segment starts unstressed."""
-    parts = [
-        drives.friction_states(terms, np.ascontiguousarray(case.motion.q[a:b].T))
-        for a, b in segments(case.motion.segment)
-    ]
+    parts = [drives.friction_states(terms, case.motion.q[a:b].T) for a, b in segments(case.motion.segment)]
     return np.concatenate(parts, axis=1)
 
 
@@ -153,18 +157,35 @@ def pool(data: Triangles, rows: int, blocks: Sequence[int] | None = None) -> Tri
     return replace(data, factors=factors, rows=data.rows[index].sum(axis=1))
 
 
+def _live(model: IdentificationModel, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (k,) column, of those chosen, and (k,) torque row of all entries of the regressor that can differ from 0.
+
+    A body's parameters reach the joints before it, a drive's its own: half of all entries, or less.
+    """
+    first = 0 if model.kind == "drive" else 10 * model.tree.bodies
+    entries = np.zeros((model.p, model.rows), dtype=bool)
+    if first:  # what is zero at a random state is zero everywhere
+        state = np.random.default_rng(0).uniform(0.5, 1.5, (3, 4, model.tree.n))
+        entries[:first] = (rigid_body.regressor(model.tree, *state) != 0.0).any(axis=0).T
+    for k, one in enumerate(model.columns):
+        entries[first + k, [row for row, _ in one.acts]] = True
+    return np.nonzero(entries[columns])
+
+
 def _block(
     model: IdentificationModel,
     columns: np.ndarray,
+    rows: np.ndarray,
     case: Case,
     part: slice,
     load: np.ndarray | None,
     states: np.ndarray,
 ) -> np.ndarray:
+    """Return the entries (k, N_i) of the regressor in these columns and rows, each (k,), of a part of the samples."""
     motion = case.motion
     own = None if load is None else load[part]
     full = model.regressor(motion.q[part], motion.v[part], motion.a[part], own, case.carried, states[:, part])
-    return full.transpose(2, 1, 0)[columns].transpose(2, 1, 0)
+    return full.transpose(2, 1, 0)[columns, rows]
 
 
 def _rows(names: Sequence[str], units: Sequence[str], matrix: np.ndarray, case: Case, decimator: Decimator) -> Rows:

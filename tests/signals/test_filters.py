@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -106,10 +108,19 @@ def test_the_chebyshev_decimator_is_scipys():
 def test_blocks_give_what_the_whole_gives(block):
     x = np.random.default_rng(4).normal(size=(3001, 2, 3))
     decimator = design_decimator(RATE, 8)
-    blocks = (x[i : i + block] for i in range(0, len(x), block))
-    np.testing.assert_allclose(
-        np.concatenate(list(decimate_blocks(blocks, decimator))), decimate(x, decimator), atol=1e-13
-    )
+    blocks = (np.moveaxis(x[i : i + block], 0, -1) for i in range(0, len(x), block))
+    joined = np.moveaxis(np.concatenate(list(decimate_blocks(blocks, decimator)), axis=-1), -1, 0)
+    whole = np.apply_along_axis(np.convolve, 0, x, decimator.taps, "same")[kept(np.zeros(len(x), int), decimator)]
+    np.testing.assert_allclose(joined, whole, atol=1e-13)
+    np.testing.assert_allclose(decimate(x, decimator), whole, atol=1e-13)
+
+
+@pytest.mark.parametrize(("factor", "sparse"), [(8, 5), (3, 40), (2, 19)])
+def test_the_same_band_of_every_kth_row_alone(factor, sparse):
+    x = np.random.default_rng(5).normal(size=2000)
+    decimator = design_decimator(RATE, factor)
+    few = replace(decimator, factor=sparse * factor)
+    np.testing.assert_allclose(decimate(x, few), decimate(x, decimator)[::sparse], atol=1e-14)
 
 
 def test_segments_do_not_mix_and_regressors_are_decimated_in_blocks():
