@@ -65,8 +65,9 @@ def propose_cutoffs(sampled: Resampled, dynamics: float | None = None) -> Cutoff
         dynamics: f_dyn where it is known [Hz] (the bandwidth of the position loop); else it is read from the data.
     """
     longest = np.bincount(sampled.segment).argmax()
-    own = sampled.segment == longest
-    size = min(int(own.sum()), max(64, int(WINDOW * sampled.rate)))
+    start, stop = (int(i) for i in np.searchsorted(sampled.segment, [longest, longest + 1]))
+    own = slice(start, stop)
+    size = min(stop - start, max(64, int(WINDOW * sampled.rate)))
     f, power = spectrum(sampled.series["q"][own], sampled.rate, size)
     _, effort = spectrum(sampled.series["effort"][own], sampled.rate, size)
     floor = np.median(power[int(0.6 * len(f)) : int(0.9 * len(f))], axis=0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.fft import next_fast_len
 from scipy.signal import detrend, find_peaks, get_window
 from scipy.spatial import KDTree
 
@@ -18,6 +19,7 @@ FUNCTION = 0.02  # of the largest singular value: a function of time that counts
 STILL = 1e-3  # a joint that goes less far has not moved [rad or m]
 NEAR = 0.05  # a state is met again if it differs by less than this share of the motion's spread, in the rms over all
 MOST = 20_000  # states of a motion that are compared
+LONG = 100_000  # samples beyond which positions are thinned to what their own low-pass filter left: four times f_q
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,9 +56,12 @@ def report_excitation(motion: Motion) -> ExcitationReport:
 
     One frequency cannot tell inertia from gravity and stiffness: with q = A sin ωt, q̈ = -ω² (q - q̄).
     """
-    q = detrend(motion.q[motion.segment == np.bincount(motion.segment).argmax()], axis=0, type="constant")
+    longest = int(np.bincount(motion.segment).argmax())
+    start, stop = (int(i) for i in np.searchsorted(motion.segment, [longest, longest + 1]))
+    thin = max(1, int(motion.rate / (4.0 * float(motion.cutoff.max())))) if stop - start > LONG else 1
+    q = detrend(motion.q[start:stop:thin], axis=0, type="constant")
     still = np.ptp(q, axis=0) < STILL
-    found = [(0, np.nan, 0.0) if still[j] else _lines(q[:, j], motion.rate) for j in range(motion.n)]
+    found = [(0, np.nan, 0.0) if still[j] else _lines(q[:, j], motion.rate / thin) for j in range(motion.n)]
     unit = q / np.where(still, np.inf, np.sqrt((q**2).sum(axis=0)))
     correlation = unit.T @ unit
     singular = np.linalg.svd(unit[:: max(1, len(unit) // MOST)], compute_uv=False)
@@ -80,13 +85,14 @@ def repeats(training: Motion, other: Motion) -> float:
     if not moves.any() or training.n != other.n:
         return 0.0
     states = []
-    for motion in (training, other):
-        own = ~standstill(motion)
+    for motion, most in ((training, MOST), (other, MOST // 10)):
+        own = np.flatnonzero(~standstill(motion))
+        own = own[:: max(1, len(own) // most)]
         states.append(np.hstack([motion.q[own], motion.v[own]]))
     spread = np.hstack([training.q.std(axis=0), training.v.std(axis=0)])
     fixed = ~np.hstack([moves, moves])
     spread[fixed] = np.maximum(np.abs(np.hstack([other.q.std(axis=0), other.v.std(axis=0)]))[fixed], STILL)
-    seen, new = (state[:: max(1, len(state) // most)] / spread for state, most in zip(states, (MOST, MOST // 10)))
+    seen, new = (state / spread for state in states)
     if not len(seen) or not len(new):
         return 0.0
     limit = NEAR * np.sqrt(seen.shape[1])
@@ -96,16 +102,16 @@ def repeats(training: Motion, other: Motion) -> float:
 
 def _lines(q: np.ndarray, rate: float) -> tuple[int, float, float]:
     """Return the number of lines of a series (N,), the best sine's frequency [Hz], and the variance it explains."""
-    window = np.asarray(get_window("hann", len(q)))
-    power = np.abs(np.fft.rfft(window * (q - window @ q / window.sum()), 4 * len(q))) ** 2
+    window, size = np.asarray(get_window("hann", len(q))), next_fast_len(4 * len(q), real=True)
+    power = np.abs(np.fft.rfft(window * (q - window @ q / window.sum()), size)) ** 2
     peaks, _ = find_peaks(power, height=LINE * power.max(), distance=8, prominence=0.5 * LINE * power.max())
-    best, frequency = max((_one_sine(q, f, rate), f) for f in _about(int(np.argmax(power)), rate, len(q)))
+    best, frequency = max((_one_sine(q, f, rate), f) for f in _about(int(np.argmax(power)), rate, size))
     return max(1, len(peaks)), frequency, best
 
 
-def _about(top: int, rate: float, n: int) -> list[float]:
-    """Return frequencies about the strongest line of the padded transform, an eighth of its step apart [Hz]."""
-    return [(top + i / 8) * rate / (4 * n) for i in range(-16, 17) if top + i / 8 > 0.5]
+def _about(top: int, rate: float, size: int) -> list[float]:
+    """Return frequencies about the strongest line of a transform of `size`, an eighth of its step apart [Hz]."""
+    return [(top + i / 8) * rate / size for i in range(-16, 17) if top + i / 8 > 0.5]
 
 
 def _one_sine(q: np.ndarray, f: float, rate: float) -> float:

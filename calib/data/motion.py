@@ -111,23 +111,27 @@ ROWS = (
 )  # fmt: skip
 
 
-def make_motion(recording: Recording, options: FilterOptions | None = None) -> Motion:
+def make_motion(recording: Recording, options: FilterOptions | None = None, sampled: Resampled | None = None) -> Motion:
     """Return the motion of a recording: dated, on an even grid, low-passed without phase shift, differentiated.
+
+    Args:
+        sampled: the recording on its grid, where it is known from before, with the same clock and gap (`sample`).
 
     Raises:
         MeasurementError: for a cut-off at or above the Nyquist frequency; for segments that the filters eat up.
         UsageError: for a list of cut-offs of another length than the joints.
     """
     options = options or FilterOptions()
-    sampled = resample(recording, options.clock, options.gap)
+    sampled = sample(recording, options) if sampled is None else sampled
     cutoffs = propose_cutoffs(sampled, options.dynamics)
     cutoff = _per_joint(cutoffs.position if options.cutoff is None else options.cutoff, recording)
     for value in cutoff:
         check_cutoff(float(value), sampled.rate, recording.file)
     decimator = _decimator(cutoffs, options, sampled.rate, recording.file)
-    q, v, a, inside = _derive(sampled, cutoff, options)
-    if not len(kept(sampled.segment[inside], decimator)):
-        raise too_short(int(inside.sum()), decimator)
+    q, v, a, mask = _derive(sampled, cutoff, options)
+    if not len(kept(sampled.segment[mask], decimator)):
+        raise too_short(int(mask.sum()), decimator)
+    inside = _span(mask)
     others = {name: read_only(value[inside]) for name, value in sampled.series.items() if name not in ("q", "v")}
     v_measured = read_only(sampled.series["v"][inside]) if "v" in sampled.series else None
     return Motion(
@@ -148,6 +152,11 @@ def make_motion(recording: Recording, options: FilterOptions | None = None) -> M
         v_measured=v_measured,
         **others,
     )
+
+
+def sample(recording: Recording, options: FilterOptions) -> Resampled:
+    """Return a recording on its even grid: the part of `make_motion` that no filter changes."""
+    return resample(recording, options.clock, options.gap)
 
 
 def filters_of(motion: Motion) -> FilterOptions:
@@ -220,6 +229,12 @@ def _derive(
         edge = max(edge, options.width)
         inside[start + edge : max(start + edge, stop - edge)] = True
     return q, v, a, inside
+
+
+def _span(mask: np.ndarray) -> np.ndarray | slice:
+    """Return a mask (N,) as a slice where it is one run: slices copy nothing."""
+    first, stop = int(np.argmax(mask)), len(mask) - int(np.argmax(mask[::-1]))
+    return slice(first, stop) if mask[first:stop].all() else mask
 
 
 def _decimator(cutoffs: Cutoffs, options: FilterOptions, rate: float, file: str) -> Decimator:

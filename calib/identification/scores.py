@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,41 +61,61 @@ def score(case: Case, predicted: np.ndarray, slow: float | tuple[float, ...] | N
     """Return the errors of a prediction (N, rows) at the full rate; lost samples count nowhere."""
     motion = case.motion
     known = motion.weight > 0.5
-    target, predicted = np.asarray(case.target), np.asarray(predicted)
     moves = moving(motion) if slow is None else moving(motion, slow)
-    moves = np.hstack([moves] * (target.shape[1] // motion.n))
-    low = [in_band(motion, values) for values in (target, predicted)]
-    factor = motion.decimator.factor
-    seen = np.repeat(known[:, None], target.shape[1], axis=1)
+    count = case.target.shape[1]
+    rows = [_row(case, np.asarray(predicted)[:, k], k, known, moves[:, k % motion.n]) for k in range(count)]
+    every = motion.decimator.factor
+    residual = np.stack([row.low for row in rows], axis=1)
     return Score(
-        part(target, predicted, seen),
-        part(low[0], low[1], seen),
-        part(target, predicted, seen & moves),
-        part(target, predicted, seen & ~moves),
-        _above(target, low[0]),
-        np.array([r_squared(target[known, j], (target - predicted)[known, j]) for j in range(target.shape[1])]),
-        _whiteness((low[0] - low[1])[::factor], motion.segment[::factor]),
-        motion.rate / factor,
+        *(_together([row.sums[k] for row in rows]) for k in range(4)),
+        np.array([row.above for row in rows]),
+        np.array([row.r_squared for row in rows]),
+        _whiteness(residual, motion.segment[::every]),
+        motion.rate / every,
         float(moves.mean()),
     )
 
 
-def part(target: np.ndarray, predicted: np.ndarray, used: np.ndarray) -> Part:
-    """Return the errors over the entries (N, rows) in use."""
-    square = np.where(used, (target - predicted) ** 2, 0.0).sum(axis=0)
-    size, count = np.where(used, target**2, 0.0).sum(axis=0), used.sum(axis=0)
+@dataclass(frozen=True, eq=False)
+class _Row:
+    """One torque row's share of a score: an hour's rows would not fit into memory side by side.
+
+    Attributes:
+        sums: (4, 3) Σ (τ - τ̂)², Σ τ² and their number of all samples, raw and in the band, of moving and of standing
+            ones.
+        above, r_squared: as in `Score`.
+        low: (M,) the residual in the band, thinned.
+    """
+
+    sums: np.ndarray
+    above: float
+    r_squared: float
+    low: np.ndarray
+
+
+def _row(case: Case, predicted: np.ndarray, k: int, known: np.ndarray, moves: np.ndarray) -> _Row:
+    motion, target = case.motion, case.target[:, k]
+    low = in_band(motion, np.stack([target, predicted], axis=1))
+    residual, own = target - predicted, low[:, 0] - low[:, 1]
+    sums = [_sums(target, residual, known), _sums(low[:, 0], own, known)]
+    sums += [_sums(target, residual, known & moves), _sums(target, residual, known & ~moves)]
+    size = float(np.linalg.norm(target))
+    above = 100.0 * float(np.linalg.norm(target - low[:, 0])) / size if size > 0.0 else 0.0
+    return _Row(np.array(sums), above, r_squared(target[known], residual[known]), own[:: motion.decimator.factor])
+
+
+def _sums(target: np.ndarray, residual: np.ndarray, used: np.ndarray) -> tuple[float, float, float]:
+    return float(np.sum(residual[used] ** 2)), float(np.sum(target[used] ** 2)), float(used.sum())
+
+
+def _together(sums: Sequence[np.ndarray]) -> Part:
+    """Return the errors of all rows from their sums, each (3,)."""
+    square, size, count = np.array(sums).T
     with np.errstate(divide="ignore", invalid="ignore"):
         joints = 100.0 * np.sqrt(square / size)
         rms = np.sqrt(square / count)
         total = float(100.0 * np.sqrt(square.sum() / size.sum()))
     return Part(total, np.where(size > 0.0, joints, np.nan), np.where(count > 0, rms, np.nan), int(count.sum()))
-
-
-def _above(target: np.ndarray, low: np.ndarray) -> np.ndarray:
-    """Return the share of the torque above the band (rows,) [%]."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        share = 100.0 * np.linalg.norm(target - low, axis=0) / np.linalg.norm(target, axis=0)
-    return np.where(np.isfinite(share), share, 0.0)
 
 
 def _whiteness(residual: np.ndarray, segment: np.ndarray) -> tuple[Whiteness | None, ...]:

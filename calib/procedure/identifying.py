@@ -10,10 +10,11 @@ import numpy as np
 
 from calib.data.decimation import SHARE
 from calib.data.excitation import ExcitationReport, repeats, report_excitation
-from calib.data.motion import FilterOptions, Motion, make_motion
+from calib.data.motion import FilterOptions, Motion, make_motion, sample
 from calib.data.recording import Joints, Recording
 from calib.data.recording_files import read_recording
 from calib.data.reference_files import with_reference
+from calib.data.resampling import Resampled
 from calib.errors import UsageError
 from calib.identification.cases import Case, case_names, make_case
 from calib.identification.consistency import Propagation, propagate
@@ -230,19 +231,20 @@ def read_motion(path: str, chain: Chain, own: FileSettings, like: Motion | None 
             positions need filtering, it says itself.
     """
     recording = read_recording(path, joints_of(chain), own.recording)
+    sampled = sample(recording, own.filter)
     if like is not None and own.filter.band is None and like.band * np.median(np.diff(recording.t)) < 0.4:
         banded = replace(own.filter, band=like.band * (1.0 - 1e-9))
-        motion = make_motion(recording, banded)
-        return motion if own.filter.cutoff is not None else _sharper(recording, motion, banded)
-    motion = make_motion(recording, own.filter)
+        motion = make_motion(recording, banded, sampled)
+        return motion if own.filter.cutoff is not None else _sharper(recording, motion, banded, sampled)
+    motion = make_motion(recording, own.filter, sampled)
     if own.filter.cutoff is None:
-        motion = _sharper(recording, motion, own.filter)
+        motion = _sharper(recording, motion, own.filter, sampled)
     widest = LOST * len(motion) / WINDOW  # decimation factor
     if own.filter.band is not None or motion.decimator.factor <= max(widest, 1.0):
         return motion
     band = SHARE * motion.rate / (2 * max(1, int(widest)))
     cutoff = tuple(float(f) for f in motion.cutoff)
-    wider = make_motion(recording, replace(own.filter, band=min(band, 0.45 * motion.rate), cutoff=cutoff))
+    wider = make_motion(recording, replace(own.filter, band=min(band, 0.45 * motion.rate), cutoff=cutoff), sampled)
     note = f"f_p = {wider.band:.3g} Hz instead: a short recording must not lose its ends to the decimation's window"
     return replace(wider, notes=(*motion.notes, note))
 
@@ -255,7 +257,7 @@ def joints_of(chain: Chain) -> Joints:
     )  # fmt: skip
 
 
-def _sharper(recording: Recording, motion: Motion, options: FilterOptions) -> Motion:
+def _sharper(recording: Recording, motion: Motion, options: FilterOptions, sampled: Resampled) -> Motion:
     """Return the motion with a higher f_q, where the encoders are quiet enough: f_q ≥ 5 f_dyn is a least value.
 
     White noise of the positions, σ_q, makes σ_a = σ_q (2π)² sqrt(2 f_q⁵ / (5 f_s)) in the accelerations; f_q is
@@ -269,7 +271,7 @@ def _sharper(recording: Recording, motion: Motion, options: FilterOptions) -> Mo
     if f > 0.4 * motion.rate or not moves.any() or not (noise < QUIET * size)[moves].all():
         return motion
     borders = 2.0 / cutoff if options.borders is None else options.borders  # no samples that the wider band would add
-    sharper = make_motion(recording, replace(options, cutoff=f, borders=borders))
+    sharper = make_motion(recording, replace(options, cutoff=f, borders=borders), sampled)
     note = f"f_q = {f:.3g} Hz instead: the positions are quiet enough"
     return replace(sharper, notes=(*motion.notes, note), cutoffs=motion.cutoffs)
 

@@ -229,3 +229,33 @@ def test_recordings_and_options_are_held_to_their_shapes(recording):
         RecordingOptions(names={"torqe": "x"})
     with pytest.raises(UsageError, match="none of rad"):
         RecordingOptions(units={"q": "grad"})
+
+
+def test_blocks_of_numbers_and_what_is_none_of_them_read_alike(tmp_path, monkeypatch):
+    from calib.data import tables
+
+    monkeypatch.setattr(tables, "_CHUNK", 4)
+    rows = [f"{k}.5,{-k}e-3,{k}" for k in range(11)]
+    plain, mixed = tmp_path / "plain.csv", tmp_path / "mixed.csv"
+    plain.write_text("\n".join(["a,b,c", *rows]))
+    rows[5] = "# a comment\n\n" + rows[5]
+    rows[9] = '9.5,"-9e-3",'
+    mixed.write_text("\n".join(["a,b,c", *rows, ""]))
+    found, other = tables.read_table(plain), tables.read_table(mixed)
+    expected = np.array([[k + 0.5, float(f"{-k}e-3"), k] for k in range(11)])
+    np.testing.assert_array_equal(np.stack(found.cells, axis=1), expected)
+    expected[9, 2] = np.nan
+    np.testing.assert_array_equal(np.stack(other.cells, axis=1), expected)
+    np.testing.assert_array_equal(other.rows, np.arange(1, 12))
+
+
+def test_half_an_hours_stamps_fall_on_their_grid():
+    from calib.data.clock import find_clock
+    from calib.data.recording import Recording
+    from calib.data.resampling import resample
+
+    t = np.arange(2_000_000) / 1000.0
+    q = np.sin(t)[:, None]
+    recording = Recording(t, q, q, "torque", ("a",))
+    assert abs(find_clock(recording).period * 1000.0 - 1.0) < 1e-12
+    np.testing.assert_array_equal(resample(recording).series["q"], q)
