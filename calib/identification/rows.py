@@ -105,6 +105,8 @@ def segments(segment: np.ndarray) -> list[tuple[int, int]]:
 
 def extend(rows: Rows, terms: Sequence[Term], columns: np.ndarray) -> Rows:
     """Return rows with more columns (M, rows, k) behind their own."""
+    if not terms:
+        return rows
     return replace(
         rows,
         names=(*rows.names, *(one.name for one in terms)),
