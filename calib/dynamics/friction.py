@@ -44,9 +44,13 @@ def load_dependent(joint: int, v0: float = V0, viscous: bool = False) -> tuple[T
     return (first, term(f"Fvt{joint + 1}", "load_velocity", joint)) if viscous else (first,)
 
 
-def presliding(joint: int, widths: Sequence[float]) -> tuple[Term, ...]:
-    """Return one stop operator per width [rad or m], ``Fp3.1 Fp3.2 …``: friction at rest that depends on the past."""
-    return tuple(term(f"Fp{joint + 1}.{k + 1}", "stop", joint, width) for k, width in enumerate(widths))
+def presliding(joint: int, widths: Sequence[float], v0: float = V0) -> tuple[Term, ...]:
+    """Return ``Fp3.1 Fp3.2 …``: friction at rest that depends on the past, one stop operator z per width [rad or m].
+
+    tau += Fp (z - sign(v)): z is sign(v) in steady sliding, so that Fc stays the Coulomb friction of steady sliding
+    (our choice; columns z would span the same torques, and share Fc out among themselves).
+    """
+    return tuple(term(f"Fp{joint + 1}.{k + 1}", "presliding", joint, width, v0) for k, width in enumerate(widths))
 
 
 def ripple(joint: int, orders: Sequence[float], speed: float = float("inf")) -> tuple[Term, ...]:

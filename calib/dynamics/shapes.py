@@ -129,6 +129,9 @@ SHAPES: dict[str, Shape] = {
     ),
     "load_velocity": Shape(lambda m, s: np.abs(_given(m.load)) * m.v, None, "s/rad", "s/m", loaded=True),
     "stop": Shape(lambda m, s: _given(m.state), None, "N m", "N", ("width",), remembers=True),
+    "presliding": Shape(
+        lambda m, s: _given(m.state) - smooth_sign(m.v, s[1]), None, "N m", "N", ("width", "v0"), remembers=True
+    ),
     "sine": Shape(
         lambda m, s: np.sin(s[0] * m.x) * _fading(m.v, s[1]),
         lambda m, s: _ripple_slopes(np.sin(s[0] * m.x), np.cos(s[0] * m.x), m, s),

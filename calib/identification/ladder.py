@@ -188,7 +188,7 @@ def _terms(ground: Ground, name: str) -> list[Term]:
         v0 = float(ground.v0[j])
         terms = {
             "load": lambda: friction.load_dependent(j, v0, viscous=True),  # noqa: B023
-            "presliding": lambda: friction.presliding(j, [travel * x for x in WIDTHS]),  # noqa: B023
+            "presliding": lambda: friction.presliding(j, [travel * x for x in WIDTHS], v0),  # noqa: B023
             "stribeck": lambda: (
                 *friction.stribeck(j, 0.05 * peak, v0=v0),  # noqa: B023
                 replace(friction.stribeck(j, 0.2 * peak, v0=v0)[0], name=f"Fs{j + 1}.2"),  # noqa: B023

@@ -106,6 +106,10 @@ def test_stop_operator_is_coulomb_in_motion_and_a_spring_at_rest():
     whole = column(model, "Fp3.1", q, 0 * q, 0 * q)[:, 2]
     later = model.regressor(q[150:], 0 * q[150:], 0 * q[150:], states=state[None, 150:])[:, 2, -1]
     assert np.array_equal(whole, state) and np.array_equal(later, state[150:])
+    v = np.gradient(q, axis=0)
+    sliding = np.abs(state) == 1.0
+    off = column(IdentificationModel(tree(TX40), friction.presliding(2, [0.1], 0.0)), "Fp3.1", q, v, 0 * q)[:, 2]
+    assert np.array_equal(off, state - np.sign(v[:, 2])) and np.all(off[sliding & (np.abs(v[:, 2]) > 0)] == 0.0)
 
 
 def test_ripple_fades_with_speed():
