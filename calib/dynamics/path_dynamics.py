@@ -25,7 +25,8 @@ from calib.dynamics.tree import Tree
 from calib.errors import CalibError
 
 AFFINE = ("acceleration", "one", "position")  # shapes that Proposition 1 holds for; all others are friction
-SMOOTHED = {"sign": 0, "dead": 0, "stribeck": 2, "load": 0, "presliding": 1}  # which setting smooths or delays Coulomb's sign
+# which setting smooths or delays Coulomb's sign
+SMOOTHED = {"sign": 0, "dead": 0, "stribeck": 2, "load": 0, "presliding": 1}
 MIXED = 1e-6  # of a column, beyond which friction counts as regrouped with something else
 
 Regressor = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
