@@ -72,6 +72,8 @@ class RecordingOptions:
         rate: sampling rate of a file without stamps [Hz].
         topic: of a ROS bag with several topics of joint states.
         use_range: follow the file's own `use_range` where the path has no cut.
+        wanted: which torques are to be explained, ``motor``, ``link``, ``both`` or ``drive`` (motor less link): where
+            it is not the motor's alone and no column is called a torque or current, tau_motor is the effort.
     """
 
     kind: str = ""
@@ -80,6 +82,7 @@ class RecordingOptions:
     rate: float | None = None
     topic: str = ""
     use_range: bool = True
+    wanted: str = "motor"
 
     def __post_init__(self) -> None:
         if self.kind not in ("", "torque", "current"):
@@ -125,6 +128,8 @@ def one_effort(
         wanted = ", ".join(SYNONYMS["q"])
         raise MeasurementError(f"has no joint positions ({wanted}); found: {', '.join(members)}", path)
     kinds = [kind for kind in ("torque", "current") if kind in found]
+    if not kinds and options.wanted != "motor":
+        kinds = _two_torques(found, options.wanted, members, path)
     if not kinds and "tau_link" in found:
         found["torque"] = found.pop("tau_link")
         kinds = ["torque"]
@@ -135,6 +140,22 @@ def one_effort(
     if kind not in found:  # the options say that what is called a torque is a current
         found[kind] = found.pop(kinds[0])
     return {ours: theirs for ours, theirs in found.items() if ours not in ("torque", "current") or ours == kind}
+
+
+def _two_torques(found: dict[str, str], wanted: str, members: tuple[str, ...], path: Path) -> list[str]:
+    """Put the motors' torque (or, where the sensors' alone are wanted, theirs) among `found` as the effort."""
+    own = "tau_motor" if "tau_motor" in found else "tau_link"
+    if "tau_link" not in found or (wanted != "link" and own == "tau_link"):
+        message = f"rows '{wanted}' need " + (
+            "torques of sensors" if wanted == "link" else "two torques, of motors and"
+        )
+        message += " behind the gear" if wanted == "link" else " of sensors behind the gear"
+        wanted_names = f"{', '.join(SYNONYMS['tau_motor'])}; {', '.join(SYNONYMS['tau_link'])}"
+        raise MeasurementError(f"{message} ({wanted_names}); found: {', '.join(members)}", path)
+    found["torque"] = found[own]
+    if own == "tau_motor":
+        del found[own]
+    return ["torque"]
 
 
 def joint_order(names: list[str], joints: Joints | None, n: int, path: str | Path) -> tuple[list[int], tuple[str, ...]]:

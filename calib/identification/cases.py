@@ -59,7 +59,10 @@ def make_case(
     """
     effort = np.array(motion.effort) if gains is None else motion.effort * gains
     if kind != "motor" and motion.tau_link is None:
-        raise MeasurementError(f"rows '{kind}' need torques of sensors behind the gear (tau_link)", motion.file)
+        raise MeasurementError(
+            f"rows '{kind}' need torques of sensors behind the gear (columns tau_l1 …, tau_sensor1 …) beside motors'",
+            motion.file,
+        )
     link = effort if motion.tau_link is None else np.asarray(motion.tau_link)
     target = {"motor": effort, "link": link, "both": np.hstack([link, effort]), "drive": effort - link}[kind]
     known = np.repeat(motion.weight[:, None] > 0.5, motion.n, axis=1)
@@ -67,6 +70,12 @@ def make_case(
         known &= moving(motion, slow)
     present = np.hstack([known, known]) if kind == "both" else known
     return Case(name, motion, frozen(target), tuple(carried), frozen(present, bool))
+
+
+def row_labels(kind: str, n: int) -> tuple[str, ...]:
+    """Return how tables call the torque rows: by the joint's number, sensors' before motors' where both are there."""
+    joints = [str(j + 1) for j in range(n)]
+    return tuple([*(f"l{j}" for j in joints), *(f"m{j}" for j in joints)] if kind == "both" else joints)
 
 
 def case_names(paths: Sequence[str]) -> tuple[str, ...]:

@@ -104,7 +104,7 @@ def identify(
     say("first fit")
     std, tau, values = first_fit(rows)
     first = Dynamics(model, bases.to_standard(base, values))
-    loads = [transmitted(first, case) for case in cases]
+    loads = [transmitted(first, case) if settings.kind == "motor" else None for case in cases]
     prior = _prior(chain, model, base, rows, cases, std, tau, settings)
     known = None if prior is None else prior.rows
     n = chain.n
@@ -116,7 +116,7 @@ def identify(
     climbed = climb(ground, friction, progress) if settings.kind == "motor" else Climb((), (), ())
     say("estimate")
     full = [
-        extend(part, climbed.terms, observe_terms(climbed.terms, case, decimator, load))
+        extend(part, climbed.terms, observe_terms(climbed.terms, case, decimator, load)) if climbed.terms else part
         for part, case, load in zip(rows, cases, loads)
     ]
     plain = replace(settings, method="wls") if settings.method == "iv" else settings

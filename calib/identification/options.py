@@ -5,9 +5,11 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     friction = "auto"                # auto, standard, or a rung: load, presliding, stribeck, asymmetric, root, cubic,
                                      # ripple
     method = "wls"                   # ols, wls, irls, tls, iv
-    drives = "Ia Fv Fc off"          # a text for all joints, or one per joint; with torque sensors Fvl Fcl offl, Fvm …
+    drives = "Ia Fv Fc off"          # a text for all joints, or one per joint; default by rows: motor as here, link
+                                     # Fvl Fcl offl, drive Ia Fvm Fcm offm, both all seven
     v0 = 0.01                        # smoothing of the Coulomb sign [rad/s or m/s], or one per joint
-    rows = "motor"                   # motor, link, both, drive: which torques are explained (joint torque sensors)
+    rows = "motor"                   # which torques are explained: motor; with joint torque sensors (columns tau_l and
+                                     # tau_m or tau) also link (Model 1), both (Model 2), drive (Model 3: tau_m - tau_l)
     gravity = [0, 0, -9.81]          # in the robot's base frame; default the robot's own
     gains = [10.0, 10.7]             # torque per current of each joint, signed; default the file's own
     slow = 0.01                      # a joint stands below this share of its peak speed; or a speed per joint
@@ -122,8 +124,9 @@ class IdentifyOptions:
     source: str = ""
 
     def for_file(self, path: str | Path) -> FileSettings:
-        """Return the settings of the recording at `path`."""
-        return values.own_table(self.files, path) or self.every
+        """Return the settings of the recording at `path`, whose torques are those the model's rows explain."""
+        found = values.own_table(self.files, path) or self.every
+        return replace(found, recording=replace(found.recording, wanted=self.settings.kind))
 
 
 def read_options(path: str | Path | None = None) -> IdentifyOptions:

@@ -20,6 +20,13 @@ from calib.robot.chain import Chain
 T = TypeVar("T")
 RULES = ("none", "rsd", "f", "both")
 PRIORS = ("auto", "none", "cad")
+DRIVES = {
+    "motor": "Ia Fv Fc off",
+    "link": "Fvl Fcl offl",
+    "both": "Ia Fvl Fcl offl Fvm Fcm offm",
+    "drive": "Ia Fvm Fcm offm",
+}
+"""Drive terms of a joint by the kind of rows, where none are stated: those of Kolyubin, Shiriaev & Jubien (2019)."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +50,7 @@ class Settings:
     """The choices of an identification; the defaults suit a serial arm with motor torques.
 
     Attributes:
-        sets: names of the standard drive terms, one text per joint, or one for all.
+        sets: names of the standard drive terms, one text per joint, or one for all; none: `DRIVES` of the kind.
         v0: smoothing of the Coulomb sign [rad/s or m/s], one per joint, or one for all.
         kind: of the rows, `calib.dynamics.idim.KINDS`.
         couplings, terms: what a joint-by-joint model lacks.
@@ -63,7 +70,7 @@ class Settings:
         seed: for random states.
     """
 
-    sets: tuple[str, ...] = ("Ia Fv Fc off",)
+    sets: tuple[str, ...] = ()
     v0: tuple[float, ...] = (V0,)
     kind: str = "motor"
     couplings: tuple[Coupling, ...] = ()
@@ -93,7 +100,7 @@ def make_model(chain: Chain, settings: Settings) -> IdentificationModel:
     for label in settings.payloads:
         bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1)
     linear = [joint.kind == "prismatic" for joint in chain.joints]
-    sets = per_joint(settings.sets, chain.n, "drives")
+    sets = per_joint(settings.sets or (DRIVES[settings.kind],), chain.n, "drives")
     v0 = per_joint(settings.v0, chain.n, "v0")
     own = list(drives.standard(sets, v0, linear))
     for coupling in settings.couplings:

@@ -23,7 +23,6 @@ from calib.robot.load import load
 
 Say = Callable[[str], None]
 SUFFIXES = (".csv", ".npz", ".mcap", ".bag", ".db3")
-SETS = {"motor": ("Ia Fv Fc off",), "link": ("Fvl Fcl offl",), "both": ("Ia Fvl Fcl offl Fvm Fcm offm",)}
 SLOWER = 4.0  # of the rehearsal (our choice)
 SHORTER, OTHER = (
     0.8,
@@ -57,7 +56,7 @@ def options_of(session: Session) -> IdentifyOptions:
     settings = options.settings
     if not wanted["options"]:
         kind = wanted["torques"]
-        settings = replace(settings, kind=kind, sets=SETS[kind], friction=wanted["friction"], method=wanted["method"])
+        settings = replace(settings, kind=kind, friction=wanted["friction"], method=wanted["method"])
     known = {label: Payload(float(mass)) for label, mass in wanted["payloads"].items()}
     settings = replace(settings, payloads={**known, **settings.payloads}, seed=session.settings.seed)
     own = dict(options.files)

@@ -11,6 +11,7 @@ import numpy as np
 from calib import files
 from calib.dynamics.base import expressions
 from calib.errors import UsageError
+from calib.identification.cases import row_labels
 from calib.identification.scores import Part, Score
 from calib.identification.storage import to_table
 from calib.procedure import calibrated, consistency_tables
@@ -120,6 +121,8 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
             "base": found.base.b + len(found.climb.terms),
             "essential": essential,
         },
+        "counts": {"without_effect": len(found.base.without_effect), "regrouped": len(found.base.regrouped)},
+        "rows": list(row_labels(found.settings.kind, outcome.inputs.chain.n)),
         "condition_number": {"raw": _finite(found.condition[0]), "normalised": _finite(found.condition[1])},
         "friction": found.climb.chosen,
         "method": found.fitted.method,

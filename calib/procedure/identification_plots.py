@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from calib.identification.cases import Case
+from calib.identification.cases import Case, row_labels
 from calib.identification.scores import Score
 from calib.procedure import consistency_figures
 from calib.procedure.drawing import AFTER, BEFORE, INK, MARK, QUIET, WIDE, save, sheet, styled
@@ -32,6 +32,7 @@ def torques(case: Case, predicted: np.ndarray, outcome: IdentificationOutcome) -
     rows = case.target.shape[1]
     step = max(1, len(case.target) // MOST)
     t = case.motion.t[::step]
+    labels = row_labels(outcome.found.settings.kind, case.motion.n)
     kind = "fitted" if case.name in outcome.fit else "repeat" if case.name in outcome.repeated else "unseen"
     with styled():
         figure, axes = sheet(rows, 1, WIDE, 1.15 * rows + 0.5)
@@ -40,7 +41,7 @@ def torques(case: Case, predicted: np.ndarray, outcome: IdentificationOutcome) -
             axis.plot(t, target, color=BEFORE, linewidth=0.8, label="measured")
             axis.plot(t, model, color=AFTER, linewidth=0.8, label="predicted")
             axis.plot(t, target - model, color=QUIET, linewidth=0.5, label="residual")
-            axis.set_ylabel(f"{j % case.motion.n + 1}")
+            axis.set_ylabel(labels[j])
         axes[0].legend(ncols=3, loc="upper right", fontsize=7)
         axes[0].set_title(f"{case.name} ({kind}): torque of each joint")
         axes[-1].set_xlabel("time [s]")

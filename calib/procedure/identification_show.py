@@ -9,6 +9,7 @@ from rich.console import RenderableType
 from rich.markup import escape
 from rich.table import Table
 
+from calib.identification.cases import row_labels
 from calib.identification.scores import Score
 from calib.procedure import consistency_tables
 from calib.procedure.identification_loop import loop_lines
@@ -39,8 +40,10 @@ def outcome_lines(outcome: IdentificationOutcome) -> Iterator[RenderableType]:
         words = f"ripple at joint {one.joint + 1}, orders {orders} per turn: explains {100 * one.share:.0f} % of the"
         yield f"{words} fast residual's power on unseen time, at positions it has been to"
     raw, normalised = found.condition
-    words = f"{found.dynamics.model.p} standard parameters, {found.base.b} base"
-    words += f", {len(found.climb.terms)} of richer friction; condition {raw:.0f}, with unit columns {normalised:.0f}"
+    base = found.base
+    words = f"{found.dynamics.model.p} standard parameters: {len(base.without_effect)} without effect, "
+    words += f"{len(base.regrouped)} regrouped, {base.b} base; {len(found.climb.terms)} of richer friction; "
+    words += f"condition {raw:.0f}, with unit columns {normalised:.0f}"
     yield words
     if found.elimination is not None:
         yield from elimination_lines(outcome)
@@ -79,7 +82,7 @@ def ladder_table(outcome: IdentificationOutcome) -> Table:
 def error_table(outcome: IdentificationOutcome) -> Table:
     """Return the errors of every file, raw and below the band."""
     table = Table("file", "samples", title="100 |tau - predicted| / |tau| [%]", title_justify="left")
-    for name in ("total", *(f"{j + 1}" for j in range(outcome.inputs.chain.n))):
+    for name in ("total", *row_labels(outcome.found.settings.kind, outcome.inputs.chain.n)):
         table.add_column(name, justify="right")
     for role, scores in (("fitted", outcome.fit), ("unseen", outcome.validation)):
         for name, found in scores.items():
