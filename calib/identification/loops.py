@@ -147,19 +147,31 @@ def make_reference(motion: Motion, rate: float | None = None) -> tuple[Reference
     Raises:
         UsageError: where the control rate is no whole multiple of the motion's.
     """
-    every = int(np.ceil(LEAST_RATE / motion.rate - 1e-6)) if rate is None else round(rate / motion.rate)
-    every = max(1, every) if rate is None else every
-    if every < 1 or (rate is not None and abs(rate / motion.rate - every) > WHOLE * every):
-        raise UsageError(
-            f"[loop] rate: {rate:g} Hz is no whole multiple of {motion.rate:.6g} Hz, the rate of {motion.file}; "
-            f"near it are {max(1, every) * motion.rate:.6g} and {(max(1, every) + 1) * motion.rate:.6g} Hz"
-        )
+    every = periods_per_sample(motion, rate)
     cutoff = min(SMOOTH * float(motion.cutoff.max()), USABLE * motion.rate / 2)
     smooth = low_pass(np.asarray(motion.q_ref), motion.rate, cutoff)
     spline = CubicSpline(np.arange(len(smooth)), smooth)
     place = np.arange((len(smooth) - 1) * every + 1) / every
     v, a = (spline(place, order) * motion.rate**order for order in (1, 2))
     return Reference(motion.t[0] + place / motion.rate, spline(place), v, a), every
+
+
+def periods_per_sample(motion: Motion, rate: float | None = None) -> int:
+    """Return how many control periods a sample lasts; without a rate, as few as make `LEAST_RATE`.
+
+    Raises:
+        UsageError: where the control rate is no whole multiple of the motion's.
+    """
+    if rate is None:
+        return max(1, int(np.ceil(LEAST_RATE / motion.rate - 1e-6)))
+    every = round(rate / motion.rate)
+    if every < 1 or abs(rate / motion.rate - every) > WHOLE * every:
+        least = max(1, int(rate / motion.rate))
+        raise UsageError(
+            f"[loop] rate: {rate:g} Hz is no whole multiple of {motion.rate:.6g} Hz, the rate of {motion.file}; "
+            f"near it are {least * motion.rate:.6g} and {(least + 1) * motion.rate:.6g} Hz"
+        )
+    return every
 
 
 def _inside(motion: Motion) -> slice:

@@ -17,6 +17,7 @@ from calib.identification.storage import to_table
 from calib.procedure import calibrated, consistency_tables
 from calib.procedure.folders import check_folder, write_staged
 from calib.procedure.identification_loop import loop_table, write_instrumental
+from calib.procedure.identification_tracking import tracking_table
 from calib.procedure.identifying import IdentificationOutcome
 from calib.robot import description
 
@@ -144,6 +145,7 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
         ],
         "elimination": elimination_table(outcome),
         "loop": loop_table(found.bias),
+        "tracking": tracking_table(outcome.tracking),
         "filters": {case.name: filter_table(case.motion) for case in (*outcome.inputs.cases, *outcome.inputs.unseen)},
         "geometry": consistency_tables.metrics(outcome.carried, outcome.geometries),
         "repeated": dict(outcome.repeated),

@@ -13,6 +13,7 @@ from calib.identification.cases import row_labels
 from calib.identification.scores import Score
 from calib.procedure import consistency_tables
 from calib.procedure.identification_loop import loop_lines
+from calib.procedure.identification_tracking import tracking_lines
 from calib.procedure.identifying import IdentificationInputs, IdentificationOutcome
 from calib.procedure.show import COLOURS
 
@@ -50,6 +51,7 @@ def outcome_lines(outcome: IdentificationOutcome) -> Iterator[RenderableType]:
     yield from consistency_tables.lines(outcome)
     yield from (escape(line) for line in loop_lines(found.bias))
     yield error_table(outcome)
+    yield from tracking_lines(outcome.tracking, outcome.inputs.chain)
     for line in outcome.warnings:
         yield f"[yellow]note[/]: {escape(line)}"
     verdict = outcome.verdict

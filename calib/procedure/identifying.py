@@ -26,6 +26,7 @@ from calib.identification.scores import Score, score
 from calib.identification.settings import Settings
 from calib.procedure import calibrated
 from calib.procedure.identification_gains import FoundGains, find_gains
+from calib.procedure.identification_tracking import Tracking, track
 from calib.procedure.identification_verdict import judge, warnings
 from calib.procedure.inputs import joint_kinds
 from calib.procedure.verdict import Verdict
@@ -98,6 +99,7 @@ class IdentificationOutcome:
     extra: Mapping[str, object] = field(default_factory=dict)
     carried: Propagation | None = None
     geometries: Comparison | None = None
+    tracking: Tracking = field(default_factory=Tracking)
 
 
 def gather(
@@ -158,6 +160,8 @@ def run(inputs: IdentificationInputs, progress: Progress | None = None) -> Ident
         say(f"predicting {case.name}")
         predictions[case.name] = predict(found.dynamics, case)
         scores[case.name] = score(case, predictions[case.name], inputs.options.slow)
+    say("tracking with the model fed forward")
+    tracking = track(inputs.chain, found, inputs.cases, inputs.unseen, predictions, inputs.unit)
     say("judging")
     shares = {
         case.name: max(repeats(own.motion, case.motion) for own in inputs.cases) for case in inputs.unseen
@@ -171,7 +175,7 @@ def run(inputs: IdentificationInputs, progress: Progress | None = None) -> Ident
     verdict = judge(fit, proofs, repeated, excitation)
     return IdentificationOutcome(
         inputs, found, fit, validation, predictions, repeated, excitation, told, verdict, settings.seed,
-        carried=carried, geometries=geometries,
+        carried=carried, geometries=geometries, tracking=tracking,
     )  # fmt: skip
 
 

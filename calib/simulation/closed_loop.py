@@ -103,6 +103,7 @@ def simulate(
     sensing: Sensing | None = None,
     seed: int | np.random.Generator = 0,
     start: tuple[np.ndarray, np.ndarray] | None = None,
+    push: np.ndarray | None = None,
 ) -> Run:
     """Let the robot follow a reference.
 
@@ -110,6 +111,7 @@ def simulate(
         reference: sampled at the controller's rate, which is taken from it.
         seed: of all noise; the same seed gives the same run to the last bit.
         start: q, v (n,) at the first instant; None: on the reference.
+        push: (N, n) torque that acts besides, at the reference's instants [N m or N]; None for none.
 
     Raises:
         CalibError: where the inertia is not positive definite, or friction too stiff for the rate.
@@ -124,6 +126,9 @@ def simulate(
     drawn = {name: _draw(rng, size, count) for name, size in noise.items()}
     if sensing.push_band is not None:
         drawn["push"] = _coloured(drawn["push"], 2.0 * np.pi * sensing.push_band * reference.period)
+    if push is not None:
+        own = shaped(push, reference.q.shape, "push")
+        drawn["push"] = np.ascontiguousarray(own + drawn["push"] if len(drawn["push"]) else own)
     q, v = (np.array(x, dtype=float) for x in (start if start is not None else (reference.q[0], reference.v[0])))
     out = np.empty((5, -(-count // sensing.every), n))
     model = np.empty((0, 0)) if controller.model is None else _body(plant.tree, controller.model)

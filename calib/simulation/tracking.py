@@ -24,6 +24,15 @@ def feed_forward(believed: Plant, reference: Reference) -> np.ndarray:
     return np.concatenate([regressor @ believed.parameters for regressor in regressors])
 
 
+def replayed_error(
+    robot: Plant, controller: Controller, reference: Reference, ahead: np.ndarray | None, push: np.ndarray
+) -> np.ndarray:
+    """Return the rms of q - q_r (n,) [rad or m] under torques (N, n) ahead and (N, n) that push, without noise."""
+    own = controller if ahead is None else with_feedforward(controller, ahead)
+    run = simulate(robot, own, reference, push=push)
+    return np.sqrt(np.mean((run.q - reference.q) ** 2, axis=0))
+
+
 def tracking_error(
     robot: Plant,
     believed: Plant | None,

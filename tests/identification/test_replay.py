@@ -1,0 +1,93 @@
+"""The second judgement: what replaying a recording says of a feed-forward is what the true robot would do."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+
+import numpy as np
+import planted_motion as planted
+import pytest
+
+from calib import cli
+from calib.data.motion import FilterOptions, make_motion
+from calib.data.recording import Recording
+from calib.errors import CalibError
+from calib.identification import replay as replays
+from calib.identification.cases import Case, make_case
+from calib.identification.loop_settings import LoopSettings
+from calib.identification.prediction import Dynamics, predict
+from calib.simulation import controllers, references
+from calib.simulation.closed_loop import Plant, simulate
+from calib.simulation.tracking import replayed_error
+
+KP, KD = (900.0, 700.0, 120.0), (80.0, 60.0, 10.0)
+PD = controllers.pd(np.array(KP), np.array(KD))
+LOOP = LoopSettings("pd", kp=KP, kd=KD, rate=1000.0)
+
+
+def plant() -> Plant:
+    return Plant(planted.model().tree, planted.model().terms, planted.truth())
+
+
+@cache
+def recorded() -> tuple[references.Reference, np.ndarray, Case]:
+    """Return what was asked, what pushed, what came of it and the case; torques without noise."""
+    limit = np.full(3, 1.2)
+    asked = references.random_fourier(-limit, limit, np.full(3, 2.5), 12.0, 1000.0, 8, acceleration=10.0, seed=3)
+    omega = 2 * np.pi * np.array([0.7, 1.3, 2.9])
+    push = np.array([3.0, 2.0, 0.6]) * np.sin(np.outer(asked.t, omega) + np.arange(3.0))
+    run = simulate(plant(), PD, asked, push=push)
+    names = tuple(f"joint{j + 1}" for j in range(3))
+    motion = make_motion(Recording(run.t, run.q, run.tau, "torque", names), FilterOptions(cutoff=60.0, clock="stamps"))
+    return asked, push, make_case("log", motion)
+
+
+@pytest.mark.parametrize("share", [0.8, 1.0])
+def test_the_replay_tells_how_the_true_robot_would_track(share):
+    """A model whose friction falls short, fed forward on the true robot, pushed as it was: the same rms within 10 %."""
+    _, push, case = recorded()
+    values = planted.truth()
+    values[30:] = [x * (share if one.name.startswith(("Fc", "Fv")) else 1.0)
+                   for x, one in zip(values[30:], planted.model().terms)]  # fmt: skip
+    dynamics = Dynamics(planted.model(), values)
+    predicted = predict(dynamics, case)
+    found = replays.replay(planted.arm(), dynamics, case, predicted, LOOP)
+    motion = case.motion
+    start = round(motion.t[0] * 1000)
+    followed = references.Reference(motion.t, motion.q, motion.v, motion.a)
+    own = push[start : start + len(motion)]
+    for name, ahead in ((replays.FEEDBACK, None), (replays.IDENTIFIED, predicted)):
+        true = replayed_error(plant(), PD, followed, ahead, own)
+        np.testing.assert_allclose(found.rms[name], true, rtol=0.1)
+    assert (found.rms[replays.FLOOR] < 0.1 * found.rms[replays.IDENTIFIED]).all()
+
+
+def test_better_models_track_better_and_cad_knows_no_friction():
+    _, _, case = recorded()
+    errors = []
+    for factor in (0.5, 0.8, 1.0):
+        dynamics = Dynamics(planted.model(), factor * planted.truth())
+        found = replays.replay(planted.arm(), dynamics, case, predict(dynamics, case), LOOP)
+        errors.append(np.mean(found.rms[replays.IDENTIFIED] / found.rms[replays.FEEDBACK]))
+        assert (found.rms[replays.CAD] > found.rms[replays.IDENTIFIED]).all() or factor < 1.0
+    assert errors[0] > errors[1] > errors[2]
+
+
+def test_a_model_of_no_possible_robot_is_said_not_to_be_simulated(robot, tmp_path):
+    _, _, case = recorded()
+    dynamics = Dynamics(planted.model(), -planted.truth())
+    with pytest.raises(CalibError, match="not positive"):
+        replays.replay(planted.arm(), dynamics, case, predict(dynamics, case))
+
+
+def test_the_command_reports_it(robot, tmp_path, capsys):
+    train, other = planted.write(tmp_path, "train.npz", 0), planted.write(tmp_path, "other.npz", 1)
+    out = tmp_path / "out"
+    files = [str(train), "--validate", str(other), "--out", str(out), "--friction", "standard"]
+    assert cli.run(["identify", str(robot), *files]) == 0
+    said = json.loads((out / "metrics.json").read_text())["tracking"]["other.npz"]
+    assert said["unseen"] and not said["controller"]["stated"] and said["feedback_over_model"] > 5.0
+    assert set(said["rms"]) == {"feedback", "cad", "model", "floor"} and len(said["rms"]["model"]) == 3
+    assert np.all(np.array(said["rms"]["model"]) < 0.5 * np.array(said["rms"]["cad"]))
+    assert "divides the tracking error by" in capsys.readouterr().out
