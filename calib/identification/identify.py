@@ -116,7 +116,7 @@ def identify(
     climbed = climb(ground, friction, progress) if settings.kind == "motor" else Climb((), (), ())
     say("estimate")
     full = [
-        extend(part, climbed.terms, observe_terms(climbed.terms, case, decimator, load)) if climbed.terms else part
+        extend(part, climbed.terms, observe_terms(climbed.terms, case, decimator, load))
         for part, case, load in zip(rows, cases, loads)
     ]
     plain = replace(settings, method="wls") if settings.method == "iv" else settings
