@@ -31,7 +31,7 @@ class Found:
         x: variables of the family; `factor` multiplies its period.
         merit: the weighted sum, or γ.
         values: (k,) of the objectives or goals, not smoothed, at the problem's samples.
-        history: merits of the improving feasible iterates, falling.
+        history: merits of the improving feasible iterates, falling; `times`: of them, processor seconds since its start.
         evaluations: of everything, with gradients.
         feasible: share of them that kept all constraints at the samples.
         seconds: it took.
@@ -48,6 +48,7 @@ class Found:
     seconds: float
     seed: int = 0
     interrupted: bool = False
+    times: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +99,7 @@ def one_start(problem: Problem, evaluations: int, method: Method, seed: int, sta
     label = int(start) if isinstance(start, int | np.integer) else -1
     return Found(
         run.best[:p], factor, run.merit, run.values, tuple(run.history), run.count, share, seconds, label,
-        run.interrupted,
+        run.interrupted, tuple(run.times),
     )  # fmt: skip
 
 
@@ -113,6 +114,8 @@ class Run:
         self.merit, self.least = np.inf, (np.inf, np.inf)
         self.values = np.zeros(0)
         self.history: list[float] = []
+        self.times: list[float] = []
+        self.began = time.process_time()
         self.count = self.kept = 0
         self.interrupted, self.reason, self.scale = False, "", 1.0
         self._at: tuple[bytes, tuple[float, float]] | None = None
@@ -139,6 +142,7 @@ class Run:
         if value < self.merit:
             self.best, self.merit, self.values = y, value, values
             self.history.append(value)
+            self.times.append(time.process_time() - self.began)
 
     def repaired(self, y: np.ndarray, evaluations: int = 80) -> np.ndarray:
         """Return a point that keeps the constraints, or the nearest found: min Σ max(0, c + 0.01)² by L-BFGS."""

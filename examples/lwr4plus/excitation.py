@@ -1,33 +1,43 @@
-"""The excitation of the LWR4+ study, scripted: trajectory A, trajectory B, random waypoints and trapezoidal moves.
+"""The excitation of the LWR4+ study, scripted: trajectories A and B against random waypoints and trapezoidal moves.
 
-Kolyubin, Shiriaev & Jubien (2019), Int. J. Adv. Manuf. Technol. 101, 243-259, sections 4.3 and 6.2. Motor torques only
-(the paper's Model 2 has joint torques, too), so 69 base columns: 43 inertial, Ia 3 to 7 and Fv Fc off of all seven
-drives. A minimises cond(Ω_B), columns in SI units; B attains cond ≤ 35 and mean |τ| of joints 6 and 7 of a tenth of
-their limits (eq. 24). Baselines: minimum-jerk and trapezoidal moves between random poses, at the same limits.
+Kolyubin, Shiriaev & Jubien (2019), Int. J. Adv. Manuf. Technol. 101, 243-259, sections 4.3 and 6.2. Model 2 (joint and
+motor torques) without payload has 92 base columns, Model 1 64, Model 3 28; motor torques alone 69. A minimises
+cond(Ω_B), columns in SI units; B attains cond ≤ 35 and mean |τ| of joints 6 and 7 of a tenth of their limits (eq. 24);
+D, ours, minimises -log det. Baselines go through random waypoints at the same limits of position, velocity, torque and
+workspace, as fast as these allow. Every motion is sampled at 20 Hz; noise is white, 0.3 % of the limits on joint
+torques and 1.5 % on motor torques (chosen, the truth's); or coloured: besides, Stribeck friction of up to 0.3 Fc below
+some 0.05 rad/s that no model knows.
 
-    python examples/lwr4plus/excitation.py --out lwr4plus-excitation [--quick] [--period 25] [--seed 0]
+Why RSDs differ: σ_k = 1 / (‖w_k‖ √(1 - R_k²)), ‖w_k‖ the size of a whitened column and √(1 - R_k²) what no other column
+explains of it. A condition number of normalised columns sees the second factor alone; speed and acceleration make the
+first.
 
-Some two minutes; --quick takes half a minute.
+    python examples/lwr4plus/excitation.py --out lwr4plus-excitation [--full] [--seed 0]
+
+Some ten seconds; --full sweeps T0, Models 1 to 3 and both geometries, some ten minutes of processor time.
 """
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import excitation_figures as figures
 import numpy as np
+from excitation_moves import moves
 
 from calib import files
 from calib.dynamics import base, drives
 from calib.dynamics.base import BaseModel
-from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.idim import MODELS, IdentificationModel
 from calib.dynamics.tree import standard_parameters, tree
+from calib.procedure.drawing import save
 from calib.procedure.motion_limits import Points
-from calib.robot import description, library
 from calib.robot.chain import Chain
-from calib.robot.kinematics import forward
-from calib.simulation import lwr4plus
+from calib.simulation import lwr4plus, robots
 from trajectories.basis import Motion
 from trajectories.constraints import TorqueLimit, box_limits
 from trajectories.fourier import fourier
@@ -37,145 +47,259 @@ from trajectories.places import Workspace
 from trajectories.problem import Goal, Problem
 from trajectories.verify import dense_motion, ensured
 
-HARMONICS, SAMPLES = 5, 500  # samples of every motion that identification sees, whatever its length
-NOISE = 0.015  # of the torque limits, white (the truth table's motor torque)
+HARMONICS, RATE, SEEDS = 5, 20.0, 20
+NOISE = {"link": 0.003, "motor": 0.015}  # of the torque limits
+STRIBECK, SLOW = 0.3, 0.05  # share of Fc at most, and speed [rad/s]
+KINDS = {f"Model {number}": kind for number, kind in MODELS.items()} | {"motor torques": "motor"}
+TOLD = 30.0  # RSD [%] up to which a motion tells a parameter
 
 
-def truth(chain: Chain) -> tuple[BaseModel, BaseModel, np.ndarray]:
-    """Return the model for the search, the one with its Coulomb sign sharp, and the true base parameters."""
-    known = description.read_extra(library.path("lwr4plus_truth"))["truth"]["drives"]
-    values = np.column_stack([known["Ia"], known["Fv"], known["Fc"], np.add(known["offl"], known["offm"])])
-    models = [IdentificationModel(tree(chain), drives.standard(["Ia Fv Fc off"] * 7, v0)) for v0 in (0.05, 0.01)]
-    # columns chosen on the nominal chain, regrouped on this one: the exact rank of a tilted axis is 71, of no use
-    nominal = IdentificationModel(tree(lwr4plus.nominal_chain()), models[0].terms)
+@dataclass(frozen=True, eq=False)
+class Plant:
+    """A chain's model of one kind: smooth for searches, sharp for judging, and its true base parameters."""
+
+    smooth: BaseModel
+    sharp: BaseModel
+    values: np.ndarray
+    sigma: np.ndarray  # (rows,) of the noise
+
+
+@cache
+def geometry(name: str) -> Chain:
+    return lwr4plus.nominal_chain() if name == "CAD" else lwr4plus.arm(lwr4plus.table_2()[1])
+
+
+@cache
+def plant(where: str, kind: str) -> Plant:
+    """Return the arm's model; its columns are chosen on the CAD geometry, and regrouped on its own."""
+    known, chain = robots.truth("lwr4plus"), geometry(where)
+    values = np.column_stack([known["drives"][key] for key in robots.SIDED])
+    names = " ".join(robots.SIDED)
+    if kind == "motor":
+        total = [known["drives"][key] for key in ("Ia", "Fv", "Fc")]
+        values = np.column_stack([*total, np.add(known["drives"]["offl"], known["drives"]["offm"])])
+        names = "Ia Fv Fc off"
+    models = [IdentificationModel(tree(chain), drives.standard([names] * 7, v0), kind) for v0 in (0.05, 0.01)]
+    nominal = IdentificationModel(tree(geometry("CAD")), models[0].terms, kind)
     found = base.regroup(base.find(nominal), models[0])
-    chi = found.transform @ np.concatenate([standard_parameters(chain), values.ravel()])
-    return BaseModel(models[0], found), BaseModel(models[1], found), chi
+    amounts = dict(zip([f"{key}{j + 1}" for j in range(7) for key in names.split()], values.ravel()))
+    bodies = np.zeros(0) if kind == "drive" else standard_parameters(chain)
+    own = np.concatenate([bodies, [amounts[one.name] for one in models[0].columns]])
+    effort = np.array([joint.effort for joint in chain.joints])
+    noise = {"link": ["link"], "both": ["link", "motor"], "motor": ["motor"], "drive": ["motor"]}[kind]
+    sigma = np.concatenate([NOISE[one] * effort for one in noise])
+    return Plant(BaseModel(models[0], found), BaseModel(models[1], found), found.transform @ own, sigma)
 
 
-def problem(chain: Chain, period: float) -> Problem:
-    smooth, _, chi = truth(chain)
-    velocity, effort = (np.array([getattr(j, key) for j in chain.joints]) for key in ("velocity", "effort"))
+def torque(where: str, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+    motor = plant(where, "motor")
+    return motor.sharp.regressor(q, v, a) @ motor.values
+
+
+def problem(where: str, kind: str, period: float, which: str) -> Problem:
+    """Return the design problem of trajectory A, B or D."""
+    chain, own, motor = geometry(where), plant(where, kind), plant(where, "motor")
+    velocity, effort = (np.array([getattr(joint, key) for joint in chain.joints]) for key in ("velocity", "effort"))
     tool = Points(chain, (0,), np.zeros((1, 3)))
     limits = (
         *box_limits(chain.lower, chain.upper, velocity),
-        TorqueLimit(smooth.regressor, smooth.regressor_gradient, chi, effort),
+        TorqueLimit(motor.smooth.regressor, motor.smooth.regressor_gradient, motor.values, effort),
         Workspace(tool, tool.product, radius=0.3, lowest=-0.2),
     )
     family = fourier(HARMONICS, period, chain.n, rate=1000.0)
-    return Problem(family, smooth.regressor, smooth.regressor_gradient, constraints=limits)
+    objective = Excitation("logdet", sigmas=own.sigma) if which == "D" else Excitation("cond", "raw")
+    spot = Problem(family, own.smooth.regressor, own.smooth.regressor_gradient, ((objective, 1.0),), limits)
+    if which != "B":
+        return spot
+    rows = len(own.sigma)  # motor torques are the last seven rows
+    slacks = [TorqueSlack((j,), own.values, np.resize(effort, rows)) for j in (rows - 2, rows - 1)]
+    return replace(spot, goals=(Goal(objective, 35.0), *(Goal(one, 0.9) for one in slacks)))
 
 
-def designed(chain: Chain, period: float, which: str, starts: int, seed: int) -> tuple[Motion, dict[str, Any]]:
-    """Return trajectory A or B, verified."""
-    spot, chi = problem(chain, period), truth(chain)[2]
-    effort = np.array([joint.effort for joint in chain.joints])
-    if which == "B":
-        slacks = tuple(Goal(TorqueSlack((j,), chi, effort), 0.9) for j in (5, 6))
-        spot = Problem(**(spot.__dict__ | {"goals": (Goal(Excitation("cond", "raw"), 35.0), *slacks)}))
-    found, proof = ensured(spot, design(spot, starts=starts, seed=seed))
-    motion = dense_motion(spot.family, found.x, period / SAMPLES * np.arange(SAMPLES))
-    return motion, {
-        "feasible": proof.feasible, "seconds": found.seconds, "evaluations": found.evaluations,
-        "margins": {name: one.margin for name, one in proof.worst.items()},
-    }  # fmt: skip
+def designed(where: str, kind: str, period: float, which: str, starts: int, seed: int, evaluations: int) -> Motion:
+    """Return a designed motion, verified between its samples."""
+    spot = problem(where, kind, period, which)
+    found, proof = ensured(spot, design(spot, starts=starts, evaluations=evaluations, seed=seed))
+    assert proof.feasible
+    return dense_motion(spot.family, found.x, np.arange(0.0, period, 1.0 / RATE))
 
 
-def moves(chain: Chain, period: float, shape: str, seed: int, count: int = 20) -> Motion:
-    """Return rest-to-rest moves between random poses of the workspace, cut to the same number of samples.
-
-    The moves keep 90 % of the velocity limits; between the poses the workspace is not kept (random poses do not know).
-    """
-    rng = np.random.default_rng(seed)
-    q = rng.uniform(0.9 * chain.lower, 0.9 * chain.upper, (4000, chain.n))
-    place = forward(chain, q)[:, :3, 3]
-    q = q[(np.hypot(place[:, 0], place[:, 1]) > 0.3) & (place[:, 2] > -0.2)][: count + 1]
-    velocity = np.array([joint.velocity for joint in chain.joints])
-    peak = 1.875 if shape == "minimum jerk" else 1.5  # of the normalised speed
-    times = (np.abs(np.diff(q, axis=0)) * peak / (0.9 * velocity)).max(axis=1)
-    ends = np.concatenate([[0.0], np.cumsum(times)])
-    t = np.linspace(0.0, min(period, ends[-1]), SAMPLES, endpoint=False)
-    k = np.searchsorted(ends, t, side="right") - 1
-    s, width, step = ((t - ends[k]) / times[k])[:, None], times[k][:, None], np.diff(q, axis=0)[k]
-    if shape == "minimum jerk":
-        place_, rate = 10 * s**3 - 15 * s**4 + 6 * s**5, 30 * s**2 * (1 - s) ** 2
-        bend = 60 * s - 180 * s**2 + 120 * s**3
-    else:  # a third each of acceleration, cruise and deceleration
-        rate = np.minimum(1.5, np.minimum(4.5 * s, 4.5 * (1 - s)))
-        place_ = np.where(s < 1 / 3, 2.25 * s**2, np.where(s < 2 / 3, 1.5 * s - 0.25, 1 - 2.25 * (1 - s) ** 2))
-        bend = np.where(s < 1 / 3, 4.5, np.where(s < 2 / 3, 0.0, -4.5))
-    return Motion(t, q[k] + step * place_, step * rate / width, step * bend / width**2, np.zeros_like(step * s))
-
-
-def judged(chain: Chain, motion: Motion, seeds: int = 20) -> dict[str, Any]:
-    """Return what a motion tells: condition numbers, torque shares, RSD, and errors over noise seeds."""
-    _, sharp, chi = truth(chain)
-    effort = np.array([joint.effort for joint in chain.joints])
-    Y = sharp.regressor(motion.q, motion.v, motion.a)
-    tau = Y @ chi
-    W = (Y / (NOISE * effort)[:, None]).transpose(1, 0, 2).reshape(-1, len(chi))
+def judged(where: str, kind: str, motion: Motion) -> dict[str, Any]:
+    """Return what a motion tells: condition numbers, torque shares, RSD and its two factors, errors over seeds."""
+    own = plant(where, kind)
+    Y = own.sharp.regressor(motion.q, motion.v, motion.a)
+    W = (Y / own.sigma[:, None]).transpose(1, 0, 2).reshape(-1, Y.shape[2])
     inverse = np.linalg.pinv(W)
-    rsd = 100 * np.linalg.norm(inverse, axis=1) / np.abs(chi)
-    noise = np.random.default_rng(0).normal(size=(seeds, len(W)))
-    error = 100 * np.sqrt(np.mean((noise @ inverse.T) ** 2, axis=0)) / np.abs(chi)
-    wrist = [k for k, name in enumerate(sharp.names) if name.rstrip("R")[-1] in "67"]
+    sigma, size, scale = np.linalg.norm(inverse, axis=1), np.linalg.norm(W, axis=0), np.abs(own.values)
+    rng = np.random.default_rng(0)
+    white = rng.normal(size=(SEEDS, len(W)))
+    unknown = np.array([_stribeck(where, own, motion, rng) for _ in range(SEEDS)]) / own.sigma[:, None]
+    coloured = white + unknown.reshape(SEEDS, -1)
+    errors = {
+        name: 100 * np.sqrt(np.mean((noise @ inverse.T) ** 2, axis=0)) / scale
+        for name, noise in (("white", white), ("coloured", coloured))
+    }
+    tau = torque(where, motion.q, motion.v, motion.a)
     return {
+        "seconds": len(motion) / RATE,
         "condition_number": condition_numbers(Y),
-        "torque_share": (np.abs(tau).mean(axis=0) / effort).tolist(),
-        "rsd_median": float(np.median(rsd)), "rsd_median_wrist": float(np.median(rsd[wrist])),
-        "parameters_below_10_percent": int((rsd < 10).sum()),
-        "error_median_20_seeds": float(np.median(error)),
-        "rsd": dict(zip(sharp.names, rsd.tolist())),
+        "torque_share": (np.abs(tau).mean(axis=0) / [joint.effort for joint in geometry(where).joints]).tolist(),
+        "rsd": dict(zip(own.sharp.names, (100 * sigma / scale).tolist())),
+        "size": size.tolist(), "separation": (1.0 / (sigma * size)).tolist(),
+        "error": {name: error.tolist() for name, error in errors.items()},
     }  # fmt: skip
 
 
-def study(period: float, starts: int, seed: int) -> dict[str, Any]:
-    nominal, calibrated = lwr4plus.nominal_chain(), lwr4plus.arm(lwr4plus.table_2()[1])
-    rows: dict[str, Any] = {}
-    for name in ("A, cond alone", "B, goal attainment"):
-        motion, search = designed(nominal, period, name[0], starts, seed)
-        # planned with CAD geometry; on the calibrated one the same motion tells the same columns
-        rows[name] = judged(nominal, motion) | {"search": search, "calibrated": judged(calibrated, motion)}
-    for shape in ("minimum jerk", "trapezoidal"):
-        tried = [judged(nominal, moves(nominal, period, shape, seed + k)) for k in range(5)]
-        tried.sort(key=lambda row: row["rsd_median"])
-        rows[f"{shape} moves, 20 random waypoints (median of 5)"] = tried[2]
-    _summarise(list(rows.values()))
-    return {"period": period, "harmonics": HARMONICS, "samples": SAMPLES, "columns": 69, "motions": rows}
+def _stribeck(where: str, own: Plant, motion: Motion, rng: np.random.Generator) -> np.ndarray:
+    """Return friction (rows, N) on the motors' rows that no model knows: b_j Fc_j exp(-(v/v_s)²) sign v."""
+    amount = rng.uniform(0.0, STRIBECK, 7) * np.array(robots.truth("lwr4plus")["drives"]["Fc"])
+    bump = amount * np.exp(-((motion.v / SLOW) ** 2)) * np.tanh(motion.v / 0.01)
+    result = np.zeros((len(own.sigma), len(motion)))
+    if own.smooth.model.kind != "link":
+        result[-7:] = bump.T
+    return result
 
 
-def _summarise(rows: list[dict[str, Any]]) -> None:
-    """Add medians over the parameters that any of the motions tells to 30 %, and σ against the last motion's.
+def baselines(where: str, kind: str, period: float, seed: int, draws: int) -> dict[str, tuple[Motion, dict[str, Any]]]:
+    """Return per kind of moves the draw whose σ are in the middle of all."""
+    found = {}
+    for shape, cut in (("minimum jerk", period), ("trapezoidal", period), ("trapezoidal", None)):
+        tried = []
+        for k in range(draws):
+            motion = moves(geometry(where), lambda *x: torque(where, *x), shape, seed + k, RATE, cut)
+            tried.append((motion, judged(where, kind, motion)))
+        tried.sort(key=lambda one: np.log(list(one[1]["rsd"].values())).mean())
+        name = f"{shape} moves" if cut else f"{shape} moves, all 20"
+        found[name] = tried[draws // 2]
+    return found
 
-    The others are too small to be told by any of them, and would drown the comparison.
-    """
-    rsd = np.array([list(row["rsd"].values()) for row in rows])
-    told = rsd.min(axis=0) < 30.0
-    wrist = told & np.array([name.rstrip("R")[-1] in "67" for name in rows[0]["rsd"]])
-    for row, own in zip(rows, rsd):
+
+def summarised(rows: dict[str, dict[str, Any]], against: str) -> None:
+    """Add medians over the parameters that any of the motions tells, and geometric means of ratios to one of them."""
+    names = list(next(iter(rows.values()))["rsd"])
+    table = {name: np.array(list(row["rsd"].values())) for name, row in rows.items()}
+    told = np.min(list(table.values()), axis=0) < TOLD
+    wrist = told & np.array([name.rstrip("R")[-1] in "67" for name in names])
+    other = rows[against]
+    mean = lambda x: float(np.exp(np.log(x[told]).mean()))  # noqa: E731
+    for name, row in rows.items():
         row["told"] = int(told.sum())
-        row["rsd_median_told"], row["rsd_median_told_wrist"] = float(np.median(own[told])), float(np.median(own[wrist]))
-        row["sigma_against_last"] = float(np.exp(np.log(own / rsd[-1]).mean()))
+        row["median_rsd"], row["median_rsd_wrist"] = (float(np.median(table[name][k])) for k in (told, wrist))
+        row["sigma_ratio"] = mean(table[name] / table[against])
+        for key in ("size", "separation"):
+            row[f"{key}_ratio"] = mean(np.array(row[key]) / np.array(other[key]))
+        row["median_error"] = {key: float(np.median(np.array(x)[told])) for key, x in row["error"].items()}
+
+
+def estimates(motions: dict[str, Motion], kind: str = "both") -> dict[str, Any]:
+    """Identify the calibrated arm from each motion with CAD and with calibrated geometry: relative errors [%]."""
+    truth, rows = plant("ID", kind), dict[str, Any]()
+    for name, motion in motions.items():
+        own = truth.sharp.regressor(motion.q, motion.v, motion.a)
+        y = (own @ truth.values) / truth.sigma
+        noise = np.random.default_rng(0).normal(size=(SEEDS, *y.shape))
+        for where in ("CAD", "ID"):
+            model = plant(where, kind)
+            W = model.sharp.regressor(motion.q, motion.v, motion.a) / truth.sigma[:, None]
+            inverse = np.linalg.pinv(W.reshape(-1, W.shape[2]))
+            found = (y + noise).reshape(SEEDS, -1) @ inverse.T
+            error = 100 * np.sqrt(np.mean((found - model.values) ** 2, axis=0)) / np.abs(model.values)
+            rows[f"{where}, {name}"] = {
+                "estimate": found.mean(axis=0).tolist(), "error": error.tolist(), "truth": model.values.tolist(),
+            }  # fmt: skip
+    return {"names": list(truth.sharp.names), "rows": rows}
+
+
+def study(full: bool, seed: int) -> tuple[dict[str, Any], dict[str, Motion]]:
+    kind, period = ("both", 25.0) if full else ("motor", 25.0)
+    starts, evaluations, draws = (4, 600, 9) if full else (1, 120, 3)
+    motions = {
+        f"{which}, {words}": designed("CAD", kind, period, which, starts, seed, evaluations)
+        for which, words in (("A", "cond"), ("B", "goals"), ("D", "log det"))
+    }
+    plain = baselines("CAD", kind, period, seed, draws)
+    rows = {name: judged("CAD", kind, motion) for name, motion in motions.items()}
+    rows |= {name: row for name, (_, row) in plain.items()}
+    summarised(rows, "trapezoidal moves")
+    found: dict[str, Any] = {"kind": kind, "period": period, "columns": len(plant("CAD", kind).values), "motions": rows}
+    random = next(iter(plain.values()))[0]
+    found["estimates"] = estimates({"random path": random, "optimised": motions["B, goals"]}, kind)
+    if full:
+        found |= swept(seed, motions)
+    return found, motions | {"random path": random}
+
+
+def swept(seed: int, motions: dict[str, Motion]) -> dict[str, Any]:
+    """Return condition numbers over T0, over the models, and of designs on the calibrated geometry."""
+    periods, models, places = dict[str, Any](), dict[str, Any](), dict[str, Any]()
+    for period in (10.0, 15.0, 20.0, 30.0):
+        for which in "AB":
+            row = judged("CAD", "both", designed("CAD", "both", period, which, 2, seed, 400))
+            periods[f"{which}, {period:g} s"] = _short(row)
+            print(f"{which}, {period:g} s: {_short(row)}", flush=True)
+    for name, kind in KINDS.items():
+        for which in "A" if kind in ("link", "drive") else "AB":  # slacks are of motor torques
+            row = judged("CAD", kind, designed("CAD", kind, 25.0, which, 2, seed, 400))
+            models[f"{name}, {which}"] = _short(row) | {"columns": len(row["rsd"])}
+            print(f"{name}, {which}: {models[f'{name}, {which}']}", flush=True)
+    for which, name in (("A", "A, cond"), ("B", "B, goals")):
+        own = designed("ID", "both", 25.0, which, 2, seed, 400)
+        motions[f"{name}, planned on ID"] = own
+        for planned, motion in (("CAD", motions[name]), ("ID", own)):
+            places[f"{which} planned on {planned}, judged on ID"] = _short(judged("ID", "both", motion))
+    return {"periods": periods, "models": models, "geometries": places}
+
+
+def _short(row: dict[str, Any]) -> dict[str, Any]:
+    rsd = np.array(list(row["rsd"].values()))
+    wrist = np.array([name.rstrip("R")[-1] in "67" for name in row["rsd"]])
+    return {
+        **row["condition_number"], "torque_share": row["torque_share"], "told": int((rsd < TOLD).sum()),
+        "told_wrist": int((rsd < TOLD)[wrist].sum()),
+    }  # fmt: skip
+
+
+def printed(found: dict[str, Any]) -> str:
+    """Return the main comparison as text."""
+    rows = found["motions"]
+    lines = [
+        f"{found['columns']} columns, T0 = {found['period']:g} s; medians over the {next(iter(rows.values()))['told']} "
+        f"parameters that any of these motions tells to {TOLD:g} %; ratios against the trapezoidal moves",
+        f"{'motion':26} {'s':>5} {'raw':>7} {'norm.':>6} {'|t6|':>6} {'|t7|':>6} {'RSD %':>6} {'wrist':>6} "
+        f"{'sigma':>6} {'size':>5} {'apart':>5} {'white':>6} {'colour':>6}",
+    ]
+    for name, row in rows.items():
+        cond, share, error = row["condition_number"], row["torque_share"], row["median_error"]
+        lines.append(
+            f"{name:26} {row['seconds']:5.1f} {cond['raw']:7.1f} {cond['normalised']:6.2f} {share[5]:6.3f} "
+            f"{share[6]:6.3f} {row['median_rsd']:6.2f} {row['median_rsd_wrist']:6.2f} {row['sigma_ratio']:6.2f} "
+            f"{row['size_ratio']:5.2f} {row['separation_ratio']:5.2f} {error['white']:6.2f} {error['coloured']:6.2f}"
+        )
+    errors = {name: np.array(row["error"]) for name, row in found["estimates"]["rows"].items()}
+    told = np.min(list(errors.values()), axis=0) < TOLD
+    for name, error in errors.items():
+        lines.append(f"identified with {name:24} median error {np.median(error[told]):6.2f} % of {told.sum()} told")
+    for key in ("periods", "models", "geometries"):
+        for name, row in found.get(key, {}).items():
+            shares = " ".join(f"{x:.3f}" for x in row["torque_share"])
+            lines.append(
+                f"{name:32} {row['raw']:7.1f} {row['normalised']:6.2f}  |tau| {shares}  told {row['told']}, wrist "
+                f"{row['told_wrist']}"
+            )
+    return "\n".join(lines)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--period", type=float, default=25.0)
+    parser.add_argument("--full", action="store_true")
     parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
-    found = study(chosen.period, 1 if chosen.quick else 4, chosen.seed)
+    found, motions = study(chosen.full, chosen.seed)
+    save(figures.paths(geometry("CAD"), motions), chosen.out / "plot_paths.png")
+    save(figures.estimates(found["estimates"]), chosen.out / "plot_estimates.png")
     files.write_json(chosen.out / "metrics.json", found)
-    told = next(iter(found["motions"].values()))["told"]
-    print(f"RSD: medians over the {told} of 69 parameters that any of these motions tells to 30 %")
-    print(f"{'motion':52} cond raw  norm.  |tau6|  |tau7|      RSD    wrist  sigma against the last motion's")
-    for name, row in found["motions"].items():
-        cond, share = row["condition_number"], row["torque_share"]
-        print(
-            f"{name:52} {cond['raw']:8.1f} {cond['normalised']:6.2f} {share[5]:7.3f} {share[6]:7.3f} "
-            f"{row['rsd_median_told']:6.2f} % {row['rsd_median_told_wrist']:6.2f} % {row['sigma_against_last']:6.2f}"
-        )
+    print(printed(found))
 
 
 if __name__ == "__main__":

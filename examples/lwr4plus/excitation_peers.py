@@ -1,0 +1,260 @@
+"""The search for exciting motions against its peers: same robot, same limits, same processor time.
+
+Problem: LWR4+ of the library, 64 base columns (43 inertial, Fv Fc off of seven joints; Coulomb sign smoothed at 0.05
+rad/s), Fourier series of five harmonics at rest at both ends, T0 = 20 s, 200 samples; minimise the mean of log cond
+with raw and with normalised columns; limits of position and velocity (URDF), torque (library inertias, published
+friction), tool 0.3 m from axis 1 and above -0.2 m. Every method keeps its best motion that meets all limits at the samples:
+
+    ours            SLSQP of NLopt, exact gradients, smoothed in three stages, random starts that are repaired
+    differences     the same, every gradient by forward differences over all variables
+    scipy           SLSQP of SciPy, exact gradients of the same smoothed functions (the sharpest stage alone)
+    scipy, 2-point  SLSQP of SciPy with its own finite differences
+    random          feasible ones among random Fourier series, coefficients scaled into the joint limits
+
+    python examples/lwr4plus/excitation_peers.py --out lwr4plus-peers [--seconds 60] [--seed 0]
+
+Some six minutes at 60 s of processor time per method; 2 seconds are enough to see it run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import scipy.optimize
+from matplotlib.figure import Figure
+
+from calib import files
+from calib.dynamics import base, drives
+from calib.dynamics.base import BaseModel
+from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.tree import standard_parameters, tree
+from calib.procedure.drawing import AFTER, BEFORE, INK, MARK, QUIET, WIDE, save, sheet, styled
+from calib.procedure.motion_limits import Points
+from calib.robot.chain import Chain
+from calib.robot.load import load
+from trajectories import search
+from trajectories.constraints import TorqueLimit, box_limits
+from trajectories.fourier import fourier
+from trajectories.objectives import Excitation, condition_numbers
+from trajectories.places import Workspace
+from trajectories.problem import Evaluation, Problem, evaluate
+from trajectories.search import STAGES, Found, Run, one_start
+from trajectories.starts import random_start
+from trajectories.verify import dense_motion, ensured
+
+FC = (11.9, 11.5, 8.98, 8.35, 8.31, 4.72, 6.04)  # [N m], Jubien, Gautier & Janot 2014 as quoted in public code
+FV = (14.4, 15.3, 6.55, 11.0, 4.29, 2.26, 1.6)  # [N m s/rad]
+STEP = 1e-7
+Curve = list[tuple[float, float]]  # processor seconds, and the mean log cond of a motion
+
+
+def problem(chain: Chain, period: float, harmonics: int = 5, friction: tuple | None = (FV, FC)) -> Problem:
+    """Return the problem of a robot; torque is limited where its masses are known."""
+    smooth, values = model(chain, 0.05, friction)
+    velocity, effort = (np.array([getattr(j, key) for j in chain.joints]) for key in ("velocity", "effort"))
+    tool = Points(chain, (0,), np.zeros((1, 3)))
+    limits: list[Any] = [*box_limits(chain.lower, chain.upper, velocity)]
+    if values is not None:
+        limits.append(TorqueLimit(smooth.regressor, smooth.regressor_gradient, values, effort))
+    limits.append(Workspace(tool, tool.product, radius=0.3, lowest=-0.2))
+    objectives = tuple((Excitation("cond", scaling), 0.5) for scaling in ("raw", "normalised"))
+    family = fourier(harmonics, period, chain.n, rate=1000.0)
+    return Problem(family, smooth.regressor, smooth.regressor_gradient, objectives, tuple(limits))
+
+
+def model(chain: Chain, v0: float, friction: tuple | None) -> tuple[BaseModel, np.ndarray | None]:
+    full = IdentificationModel(tree(chain), drives.standard(["Fv Fc off"] * chain.n, v0))
+    found = base.find(full)
+    if chain.inertias is None:
+        return BaseModel(full, found), None
+    own = np.zeros((chain.n, 3))
+    if friction is not None:
+        own[:, 0], own[:, 1] = friction
+    return BaseModel(full, found), found.transform @ np.concatenate([standard_parameters(chain), own.ravel()])
+
+
+def ours(spot: Problem, seconds: float, seed: int, evaluator: Any = evaluate) -> tuple[Curve, np.ndarray | None]:
+    """Search start after start until the time is up; the best motion of all."""
+    began, curve, x, start = time.process_time(), Curve(), None, 0
+
+    def timed(*given: Any) -> Evaluation:
+        if time.process_time() - began > seconds:
+            raise KeyboardInterrupt  # a start hands back the best it has
+        return evaluator(*given)
+
+    with mock.patch.object(search, "evaluate", timed), suppress(KeyboardInterrupt):
+        while True:
+            offset = time.process_time() - began
+            found = one_start(spot, 600, "slsqp", seed, start)
+            start += 1
+            if isinstance(found, Found):
+                x = found.x if not curve or found.merit < min(m for _, m in curve) else x
+                curve += [(offset + t, m) for t, m in zip(found.times, found.history)]
+    return falling(curve), x
+
+
+def differenced(spot: Problem, basis: Any, y: np.ndarray, sharpness: tuple[float, float]) -> Evaluation:
+    """Return what `evaluate` returns, its gradients by forward differences over all variables."""
+    bare = blind(spot)
+    here = evaluate(bare, basis, y, sharpness)
+    slopes, rows = np.empty((len(here.values), len(y))), np.empty((len(here.constraints), len(y)))
+    for k in range(len(y)):
+        moved = y.copy()
+        moved[k] += STEP
+        there = evaluate(bare, basis, moved, sharpness)
+        slopes[:, k], rows[:, k] = (there.values - here.values) / STEP, (there.constraints - here.constraints) / STEP
+    return replace(here, slopes=slopes, rows=rows)
+
+
+def blind(spot: Problem) -> Problem:
+    """Return the problem without derivative products: values cost what values cost."""
+    limits = [replace(c, product=_none) if isinstance(c, TorqueLimit | Workspace) else c for c in spot.constraints]
+    return replace(spot, product=_none, constraints=tuple(limits))
+
+
+def _none(q: np.ndarray, *others: np.ndarray) -> Any:
+    return np.zeros(q.shape) if len(others) == 1 else (np.zeros(q.shape),) * 3
+
+
+def by_scipy(spot: Problem, seconds: float, seed: int, exact: bool) -> tuple[Curve, np.ndarray | None]:
+    """Run SciPy's SLSQP from random starts until the time is up."""
+    given = spot if exact else blind(spot)
+    basis, began, curve, x, start = given.basis(), time.process_time(), Curve(), None, 0
+    while (offset := time.process_time() - began) < seconds:
+        run = Run(given, basis)
+        run.sharpness = STAGES[-1]
+
+        def fun(z: np.ndarray, run: Run = run) -> float:
+            if time.process_time() - began > seconds:
+                raise KeyboardInterrupt
+            return sum(w * float(np.log(v)) for (_, w), v in zip(given.objectives, run.at(z).values))
+
+        def jac(z: np.ndarray, run: Run = run) -> np.ndarray:
+            found = run.at(z)
+            return sum(w * s / v for (_, w), v, s in zip(given.objectives, found.values, found.slopes))
+
+        limits: Any = {"type": "ineq", "fun": lambda z, run=run: -run.at(z).constraints}
+        if exact:
+            limits["jac"] = lambda z, run=run: -run.at(z).rows
+        y = random_start(spot, basis, np.random.default_rng([seed, start]))
+        with suppress(KeyboardInterrupt):
+            scipy.optimize.minimize(
+                fun, y, method="SLSQP", jac=jac if exact else None, constraints=limits,
+                options={"maxiter": 300, "ftol": 1e-6},
+            )  # fmt: skip
+        start += 1
+        if run.best is not None:
+            x = run.best if not curve or run.merit < min(m for _, m in curve) else x
+            curve += [(offset + t, m) for t, m in zip(run.times, run.history)]
+    return falling(curve), x
+
+
+def at_random(spot: Problem, seconds: float, seed: int) -> tuple[Curve, np.ndarray | None]:
+    began, curve, basis = time.process_time(), Curve(), spot.basis()
+    rng, x, least, count, kept = np.random.default_rng(seed), None, np.inf, 0, 0
+    while (now := time.process_time() - began) < seconds:
+        drawn = random_start(spot, basis, rng)
+        motion = basis.motion(drawn)
+        count += 1
+        if any((c.values(motion) > 0).any() for c in spot.constraints):
+            continue
+        kept += 1
+        cond = condition_numbers(spot.regressor(motion.q, motion.v, motion.a))
+        value = 0.5 * float(np.log(cond["raw"]) + np.log(cond["normalised"]))
+        if value < least:
+            x, least = drawn, value
+            curve.append((now, value))
+    print(f"  random: {count} motions, {kept} of them feasible", flush=True)
+    return curve, x
+
+
+def falling(curve: Curve) -> Curve:
+    """Return the best so far over time."""
+    result, least = Curve(), np.inf
+    for point in sorted(curve):
+        if point[1] < least:
+            least = point[1]
+            result.append(point)
+    return result
+
+
+def reached(chain: Chain, spot: Problem, x: np.ndarray, friction: tuple | None = (FV, FC)) -> dict[str, float]:
+    """Return the condition numbers at 1000 samples with a Coulomb sign smoothed at 0.01 rad/s."""
+    period = spot.family.period
+    motion = dense_motion(spot.family, x, period / 1000 * np.arange(1000))
+    return condition_numbers(model(chain, 0.01, friction)[0].regressor(motion.q, motion.v, motion.a))
+
+
+def picture(curves: dict[str, Curve], seconds: float) -> Figure:
+    """Draw the geometric mean of both condition numbers against processor time."""
+    with styled():
+        figure, (axis,) = sheet(width=WIDE, height=3.2)
+        for (name, curve), color, dash in zip(
+            curves.items(), (AFTER, MARK, BEFORE, QUIET, INK), ("-", "-", "-", "--", ":")
+        ):
+            t, merit = [p[0] for p in curve] + [seconds], [p[1] for p in curve] + [curve[-1][1] if curve else np.nan]
+            axis.step(t, np.exp(merit), where="post", color=color, linestyle=dash, linewidth=1.2, label=name)
+        axis.set(xlabel="processor time [s]", ylabel="√(cond raw · cond normalised)", xscale="log", yscale="log")
+        axis.legend(fontsize=7)
+    return figure
+
+
+def compare(seconds: float, seed: int, out: Path) -> dict[str, Any]:
+    chain = load("lwr4plus")
+    spot = problem(chain, 20.0)
+    methods = {
+        "ours": partial(ours, spot, seconds, seed),
+        "differences": partial(ours, spot, seconds, seed, differenced),
+        "scipy": partial(by_scipy, spot, seconds, seed, True),
+        "scipy, 2-point": partial(by_scipy, spot, seconds, seed, False),
+        "random": partial(at_random, spot, seconds, seed),
+    }
+    curves, rows = dict[str, Curve](), dict[str, Any]()
+    for name, method in methods.items():
+        curves[name], x = method()
+        rows[name] = None if x is None else reached(chain, spot, x)
+        said = (
+            "nothing feasible"
+            if x is None
+            else f"{rows[name]['raw']:.1f} raw, {rows[name]['normalised']:.2f} normalised"
+        )
+        print(f"{name:16} {said}", flush=True)
+    save(picture(curves, seconds), out / "plot_peers.png")
+    others = dict[str, Any]()
+    for name in ("panda", "tx40"):
+        chain = load(name)
+        spot = problem(chain, 20.0, friction=None)
+        curve, x = ours(spot, seconds, seed)
+        if x is None:
+            others[name] = None
+            continue
+        found = Found(x, 1.0, curve[-1][1], np.zeros(0), (), 0, 0.0, seconds)
+        found, proof = ensured(spot, found)
+        others[name] = reached(chain, spot, found.x, None) | {
+            "feasible": proof.feasible, "columns": len(model(chain, 0.01, None)[0].names),
+            "limits": sorted(proof.worst),
+        }  # fmt: skip
+        print(f"{name}: {others[name]}", flush=True)
+    return {"seconds": seconds, "reached": rows, "other_robots": others, "curves": curves}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--seed", type=int, default=0)
+    chosen = parser.parse_args()
+    found = compare(chosen.seconds, chosen.seed, chosen.out)
+    files.write_json(chosen.out / "metrics.json", found)
+
+
+if __name__ == "__main__":
+    main()
