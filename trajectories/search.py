@@ -31,11 +31,12 @@ class Found:
         x: variables of the family; `factor` multiplies its period.
         merit: the weighted sum, or γ.
         values: (k,) of the objectives or goals, not smoothed, at the problem's samples.
-        history: merits of the improving feasible iterates, falling; `times`: of them, processor seconds since its start.
+        history: merits of the improving feasible iterates, falling.
         evaluations: of everything, with gradients.
         feasible: share of them that kept all constraints at the samples.
         seconds: it took.
         seed: of its start; `interrupted`: ended by Ctrl-C.
+        times: of the history, processor seconds since its start.
     """
 
     x: np.ndarray

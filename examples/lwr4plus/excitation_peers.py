@@ -3,7 +3,7 @@
 Problem: LWR4+ of the library, 64 base columns (43 inertial, Fv Fc off of seven joints; Coulomb sign smoothed at 0.05
 rad/s), Fourier series of five harmonics at rest at both ends, T0 = 20 s, 200 samples; minimise the mean of log cond
 with raw and with normalised columns; limits of position and velocity (URDF), torque (library inertias, published
-friction), tool 0.3 m from axis 1 and above -0.2 m. Every method keeps its best motion that meets all limits at the samples:
+friction), tool 0.3 m from axis 1 and above -0.2 m. Every method keeps its best motion that meets all limits:
 
     ours            SLSQP of NLopt, exact gradients, smoothed in three stages, random starts that are repaired
     differences     the same, every gradient by forward differences over all variables
