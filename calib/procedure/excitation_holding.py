@@ -17,6 +17,7 @@ from calib.errors import UsageError
 from calib.estimation.columns import split_columns
 from calib.procedure.excitable import Dynamics
 from calib.robot.chain import Chain
+from trajectories.constraints import BoxLimit
 
 INDEPENDENT = 1e-4  # of a column at unit norm that no other one explains (our choice)
 
@@ -37,7 +38,7 @@ class Told:
     notes: tuple[str, ...] = ()
 
 
-def read_held(texts: Sequence[str], chain: Chain, lower: np.ndarray, upper: np.ndarray) -> dict[int, float | None]:
+def read_held(texts: Sequence[str], chain: Chain, limits: BoxLimit) -> dict[int, float | None]:
     """Return the joints that stay: with the value said (``joint4=0.5``, rad or m), or where the search likes it (None).
 
     Raises:
@@ -55,10 +56,10 @@ def read_held(texts: Sequence[str], chain: Chain, lower: np.ndarray, upper: np.n
             value = float(amount) if amount else None
         except ValueError:
             raise UsageError(f"--lock {text}: '{amount}' is not a number") from None
-        if value is not None and not lower[j] <= value <= upper[j]:
+        lower, upper = limits.lower[j], limits.upper[j]
+        if value is not None and not lower <= value <= upper:
             raise UsageError(
-                f"--lock {text}: {chain.joint_names[j]} at {value:g} is beyond its limits {lower[j]:.4g} to "
-                f"{upper[j]:.4g}"
+                f"--lock {text}: {chain.joint_names[j]} at {value:g} is beyond its limits {lower:.4g} to {upper:.4g}"
             )
         found[j] = value
     if len(found) == chain.n:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -22,7 +23,7 @@ from calib.procedure.motion_limits import MotionLimits, read_motion_limits
 from calib.robot.chain import Chain
 from trajectories.basis import Family, aligned_period
 from trajectories.bspline import bspline
-from trajectories.constraints import BoxLimit, Constraint, TorqueLimit
+from trajectories.constraints import Constraint, TorqueLimit
 from trajectories.fourier import fourier
 from trajectories.objectives import Excitation, TorqueSlack, condition_numbers
 from trajectories.optimise import design
@@ -135,7 +136,7 @@ def excite(
     found_limits = read_motion_limits(limits, chain, source)
     dynamics = read_dynamics(chain, model, drives_, found_limits)
     check_playback(repeat, slower, start, chain, found_limits)
-    held = read_held(lock, chain, *_position_limits(found_limits))
+    held = read_held(lock, chain, found_limits.positions)
     motions = _family(family, harmonics, period, held, chain, found_limits, rate)
     search, check, notes = _constraints(dynamics, found_limits)
     before = read_existing(existing, dynamics, chain)
@@ -153,21 +154,17 @@ def excite(
     found, proof = ensured(problem, found, check)
     trade = None
     if front and not found.interrupted:
-        trade = _front(problem, dynamics, chain, found_limits, found, wanted, front, condition, _reporter(say))
+        with suppress(KeyboardInterrupt):  # the motion is there: what comes besides may be cut short
+            trade = _front(problem, dynamics, chain, found_limits, found, wanted, front, condition, _reporter(say))
     reached = condition_of(dynamics, motions, found, columns, before, repeat)
     played = play(motions, found, dynamics, chain, found_limits, rate=rate, start=start, repeat=repeat, slower=slower)
-    cut = ("interrupted before the goals were searched for",) if wanted and not problem.goals else ()
+    cut = ("interrupted before any motion met the goals",) if wanted and not problem.goals else ()
     stays = {j: float(played.run.q[-1, j]) for j in held}
     return Designed(
         chain, dynamics, found_limits, motions, problem, found, proof, reached, _reached(problem, found), trade,
         played, stays, columns, before, rate, family,
         (*found_limits.notes, *dynamics.notes, *notes, *columns.notes, *cut, *played.notes),
     )  # fmt: skip
-
-
-def _position_limits(limits: MotionLimits) -> tuple[np.ndarray, np.ndarray]:
-    box = next(one for one in limits.constraints if isinstance(one, BoxLimit) and one.order == 0)
-    return box.lower, box.upper
 
 
 def _searched(
@@ -187,9 +184,12 @@ def _searched(
     first = search(problem, starts=starts)
     if first.interrupted:
         return first, problem
-    problem = replace(problem, goals=with_conditions(wanted, first, condition))
+    plain, problem = problem, replace(problem, goals=with_conditions(wanted, first, condition))
     say("goal attainment")
-    found = search(problem, starts=max(1, starts // 3), guesses=(first.x,))
+    try:
+        found = search(problem, starts=max(1, starts // 3), guesses=(first.x,))
+    except KeyboardInterrupt:
+        return replace(first, interrupted=True), plain
     spent, seconds = first.evaluations + found.evaluations, first.seconds + found.seconds
     return replace(found, evaluations=spent, seconds=seconds), problem
 

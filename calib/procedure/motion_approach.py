@@ -49,7 +49,7 @@ def approach_to(
 
 def check_start(start: np.ndarray, chain: Chain, known: MotionLimits) -> None:
     """Refuse a pose (n,) that the robot cannot be in."""
-    limits = next(one for one in known.constraints if isinstance(one, BoxLimit) and one.order == 0)
+    limits = known.positions
     if start.shape != (chain.n,):
         raise UsageError(f"--start: expected {chain.n} joint values, found {start.size}")
     for name, value, lower, upper in zip(chain.joint_names, start, limits.lower, limits.upper):

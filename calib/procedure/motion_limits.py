@@ -42,7 +42,7 @@ from calib.robot.kinematics import element_jacobian, joint_frames, joint_jacobia
 from calib.robot.tables import check_keys, load, number, vector
 from poses.space import Constraint as PoseConstraint
 from trajectories.basis import Motion
-from trajectories.constraints import Constraint, box_limits
+from trajectories.constraints import BoxLimit, Constraint, box_limits
 from trajectories.places import Clearance, Workspace
 
 STEP = 1e-6  # [rad or m] of the central differences of collision distances (our choice)
@@ -68,6 +68,13 @@ class MotionLimits:
     friction: np.ndarray | None
     resonance: float | None
     notes: tuple[str, ...]
+
+    @property
+    def positions(self) -> BoxLimit:
+        """The joint limits; infinite where there are none."""
+        free = np.full(len(self.torque), np.inf)
+        own = (one for one in self.constraints if isinstance(one, BoxLimit) and one.order == 0)
+        return next(own, BoxLimit(0, -free, free))
 
 
 def read_motion_limits(path: Path | None, chain: Chain, source: Path | None = None) -> MotionLimits:
