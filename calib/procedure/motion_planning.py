@@ -248,7 +248,7 @@ def _bounds(chain: Chain, known: MotionLimits, law: PathDynamics | None) -> tupl
     torque = known.torque * (1 - margin) if law is not None else free
     if not any(np.isfinite(x).any() for x in (*sizes, torque)):
         raise UsageError(f"robot '{chain.name}' has no limits of speed, acceleration or torque; give --limits")
-    return boxes[0].lower, boxes[0].upper, Limits(sizes[0], sizes[1], torque)
+    return known.positions.lower, known.positions.upper, Limits(sizes[0], sizes[1], torque)
 
 
 def _paths(chain: Chain, points: np.ndarray, lines: bool) -> tuple[list[JointPath], np.ndarray | None]:
