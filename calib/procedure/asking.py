@@ -70,7 +70,7 @@ def _play(session: Session, step: str) -> str:
     return (
         f"Play {motions}{unseen}, {wanted['repeats']} times the motion each, at {wanted['rate']:g} Hz, from rest at "
         "its "
-        "first row; before that rehearsal.csv, slowly, to see that the way is free; log joint positions and torques "
+        "first row, before that at a low override, to see that the way is free; log joint positions and torques "
         "all "
         f"the while.{again if step == 'record' else ''}"
     )

@@ -23,7 +23,6 @@ from calib.robot.load import load
 
 Say = Callable[[str], None]
 SUFFIXES = (".csv", ".npz", ".mcap", ".bag", ".db3")
-SLOWER = 4.0  # of the rehearsal (our choice)
 SHORTER, OTHER = (
     0.8,
     3,
@@ -82,7 +81,7 @@ def excite(session: Session, say: Say) -> list[str]:
             session.path("4-fit"), limits=limits, period=wanted["period"] * (1.0 if first else SHORTER),
             harmonics=wanted["harmonics"], rate=wanted["rate"], starts=wanted["starts"] if first else 1,
             evaluations=wanted["evaluations"] if first else max(20, wanted["evaluations"] // 3),
-            seed=session.settings.seed + (0 if first else OTHER), repeat=wanted["repeats"], slower=SLOWER,
+            seed=session.settings.seed + (0 if first else OTHER), repeat=wanted["repeats"],
             progress=lambda words, name=name: say(f"{name} motion: {words}"),
         )  # fmt: skip
         if designed.found.interrupted:  # a session is resumed, not gone on with half a search

@@ -216,8 +216,8 @@ def open_session(folder: Path) -> Session:
     _check_schema(path, table.get("schema"))
     known = {each.name for each in fields(Settings)}
     for section, values in tomllib.loads(example()).items():
-        if section == "dynamics" and section not in table and table["schema"] == 1:
-            table[section] = values | {"wanted": False}
+        if section == "dynamics" and (table["schema"] == 1 or section in table):
+            table[section] = _with_defaults(values, table.get(section, {"wanted": False}))
         if section not in table:
             raise SessionError(f"{path}: '{section}' is missing")
         if isinstance(values, dict) and isinstance(table[section], dict):
@@ -242,6 +242,8 @@ def _check_schema(path: Path, found: Any) -> None:
         return
     if isinstance(found, int) and found > SCHEMA:
         raise SessionError(f"{path}: schema {found} was made by a newer version; this one reads {SCHEMA}: upgrade")
+    if found is None:
+        raise SessionError(f"{path} states no schema: was it cut short as it was copied? Copy the session again")
     known = " and ".join(map(str, READ))
     raise SessionError(
         f"{path}: schema {found!r} is not known to this version, which reads {known}; make a new session"
@@ -270,6 +272,11 @@ def _check_section(path: Path, section: str, expected: Any, found: Any) -> None:
     unknown = sorted(set(found) - set(expected))
     if unknown:
         raise SessionError(f"{path}: [{section}] has no key '{unknown[0]}'; it has {', '.join(expected)}")
+
+
+def _with_defaults(values: Mapping[str, Any], given: Any) -> Any:
+    """Return the dynamics' keys that were given, and the defaults of the others."""
+    return {**values, **given} if isinstance(given, dict) else given
 
 
 def _check_dynamics(path: Path, found: Mapping[str, Any]) -> None:

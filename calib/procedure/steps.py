@@ -49,7 +49,9 @@ def find(session: Session, name: str) -> Step:
         if name in (step.name, str(number)):
             return step
     if name in (step.name for step in STEPS):
-        raise SessionError(f"this session is about geometry only; for '{name}' set wanted = true under [dynamics]")
+        raise SessionError(
+            f"this session is about geometry only; for '{name}' write wanted = true under [dynamics] in session.toml"
+        )
     raise SessionError(f"no step '{name}'; there are {', '.join(step.name for step in own)}")
 
 
