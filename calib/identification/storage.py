@@ -64,8 +64,17 @@ def to_table(dynamics: Dynamics, base: Base) -> dict[str, Any]:
             for one, value in zip(model.columns, dynamics.values[bodies:])
         ],
         "base": dict(zip(base.names, expressions(base))),
+        "regrouping": regrouping(base),
         "covariance": "covariance.csv",
         "note": NOTE,
+    }
+
+
+def regrouping(base: Base) -> dict[str, dict[str, float]]:
+    """Return, by base parameter, the coefficients of the standard ones it stands for, in full."""
+    return {
+        name: {base.standard[k]: float(row[k]) for k in np.flatnonzero(row)}
+        for name, row in zip(base.names, base.transform)
     }
 
 

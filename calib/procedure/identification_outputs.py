@@ -14,6 +14,7 @@ from calib.errors import UsageError
 from calib.identification.cases import row_labels
 from calib.identification.scores import Part, Score
 from calib.identification.storage import to_table
+from calib.identification.told import information
 from calib.procedure import calibrated, consistency_tables
 from calib.procedure.folders import check_folder, write_staged
 from calib.procedure.identification_loop import loop_table, write_instrumental
@@ -22,7 +23,7 @@ from calib.procedure.identifying import IdentificationOutcome
 from calib.robot import description
 
 OURS = (
-    "robot.toml", "dynamics.json", "estimate.csv", "covariance.csv", "instrumental.csv", "metrics.json",
+    "robot.toml", "dynamics.json", "estimate.csv", "covariance.csv", "information.csv", "instrumental.csv", "metrics.json",
     calibrated.COVARIANCE, consistency_tables.EFFECTS, consistency_tables.SENSITIVITY, consistency_tables.GEOMETRIES,
 )  # fmt: skip
 """Files of an earlier identification that a new one replaces; besides plots, ``plot_*.png``."""
@@ -65,6 +66,9 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     files.write_table(folder / "covariance.csv", ("name", *found.names), rows)
     consistency_tables.write(outcome, folder)
     write_instrumental(found.bias, folder)
+    if found.prior is not None:  # else estimate and covariance say it all
+        triangle = information(found)
+        files.write_table(folder / "information.csv", (*found.names, "target"), triangle.tolist())
     files.write_json(folder / "dynamics.json", to_table(found.dynamics, found.base))
     files.write_json(folder / "metrics.json", metrics(outcome))
 

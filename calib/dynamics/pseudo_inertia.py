@@ -1,0 +1,90 @@
+"""The pseudo-inertia of a body: ten standard parameters as one symmetric matrix, positive definite where possible.
+
+    P = [ Σ   h ]        Σ = ½ tr(I) 1 - I = ∫ x xᵀ dm,    h = ∫ x dm = (MX MY MZ),    m = ∫ dm,
+        [ hᵀ  m ]
+
+about the link frame's origin. P ≻ 0 says that some density of mass ≥ 0 has these ten parameters, no more and no less
+(Wensing, Kim & Slotine 2018, theorem 1): mass above zero, and the triangle inequality of the moments about the centre.
+The map is linear and one to one, so the ten parameters of a body are a point of the cone of 4×4 matrices.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+def from_standard(parameters: np.ndarray) -> np.ndarray:
+    """Return P (…, 4, 4) of standard parameters XX XY XZ YY YZ ZZ MX MY MZ M (…, 10)."""
+    return np.tensordot(np.asarray(parameters, dtype=float), BASIS, axes=1)
+
+
+def to_standard(pseudo: np.ndarray) -> np.ndarray:
+    """Return the standard parameters (…, 10) of P (…, 4, 4): I = tr(Σ) 1 - Σ."""
+    pseudo = np.asarray(pseudo, dtype=float)
+    second = pseudo[..., :3, :3]
+    trace = np.trace(second, axis1=-2, axis2=-1)
+    moments = [(trace if r == s else 0.0) - second[..., r, s] for r, s in SYMMETRIC]
+    return np.stack([*moments, *(pseudo[..., r, 3] for r in range(4))], axis=-1)
+
+
+def margin(parameters: np.ndarray) -> float:
+    """Return by how much a body is possible: the smallest eigenvalue of Σ about its centre, by its mass, as a root.
+
+    A length [m]: the standard deviation of the mass in its thinnest direction (a plate of thickness t has t / √12);
+    negative, the root of what is missing, for a body that cannot be, -inf where its mass is not positive.
+    """
+    pseudo = from_standard(parameters)
+    mass = pseudo[3, 3]
+    if not mass > 0.0:
+        return -np.inf
+    centre = pseudo[:3, 3] / mass
+    least = float(np.linalg.eigvalsh(pseudo[:3, :3] / mass - np.outer(centre, centre))[0])
+    return float(np.copysign(np.sqrt(abs(least)), least))
+
+
+def divergence(pseudo: np.ndarray, reference: np.ndarray) -> float:
+    """Return D(P ‖ P₀) = tr(P₀⁻¹ P) - log det(P₀⁻¹ P) - 4, of -log det (Lee, Wensing & Park 2020).
+
+    Zero at P = P₀ alone, infinite at the border, and the same in any frame and any units.
+    """
+    ratio = np.linalg.solve(reference, pseudo)
+    sign, size = np.linalg.slogdet(ratio)
+    return float(np.trace(ratio) - size - 4.0) if sign > 0 else np.inf
+
+
+def ball(mass: float, radius: float, centre: np.ndarray | None = None) -> np.ndarray:
+    """Return the ten parameters of a homogeneous ball [kg, m] about the link frame."""
+    x = np.zeros(3) if centre is None else np.asarray(centre, dtype=float)
+    pseudo = np.empty((4, 4))
+    pseudo[:3, :3] = mass * (radius**2 / 5.0 * np.eye(3) + np.outer(x, x))
+    pseudo[:3, 3] = pseudo[3, :3] = mass * x
+    pseudo[3, 3] = mass
+    return to_standard(pseudo)
+
+
+def rod(mass: float, end: np.ndarray, radius: float) -> np.ndarray:
+    """Return the ten parameters of mass spread evenly from the origin to `end`, as thick as a ball of `radius`."""
+    x = np.asarray(end, dtype=float)
+    pseudo = from_standard(ball(mass, radius, x / 2.0))
+    pseudo[:3, :3] += mass * np.outer(x, x) / 12.0
+    return to_standard(pseudo)
+
+
+def _basis() -> np.ndarray:
+    """Return (10, 4, 4): P of each unit parameter."""
+    basis = np.zeros((10, 4, 4))
+    for k, (r, s) in enumerate(SYMMETRIC):
+        if r == s:
+            basis[k, :3, :3] += 0.5 * np.eye(3)
+        basis[k, r, s] -= 1.0
+        if r != s:
+            basis[k, s, r] -= 1.0
+    for r in range(3):
+        basis[6 + r, r, 3] = basis[6 + r, 3, r] = 1.0
+    basis[9, 3, 3] = 1.0
+    return basis
+
+
+BASIS = _basis()

@@ -1,0 +1,176 @@
+"""Full standard parameters: of possible bodies, with the torques that were identified."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from calib.dynamics import base as bases
+from calib.dynamics import pseudo_inertia
+from calib.dynamics.idim import IdentificationModel, from_chain
+from calib.identification import consistent
+from calib.identification.nearest import nearest
+from calib.identification.prediction import Dynamics
+from calib.identification.references import find_references
+from calib.identification.told import Told, whitened
+from calib.robot.chain import Chain, Element, Joint
+
+CAD = (pseudo_inertia.rod(4.0, [0.0, 0.0, 0.4], 0.12), pseudo_inertia.rod(3.0, [0.3, 0.05, 0.0], 0.1),
+       pseudo_inertia.ball(1.5, 0.1, np.array([0.02, 0.0, 0.05])))  # fmt: skip
+
+
+def arm(inertias: np.ndarray | None) -> Chain:
+    """Two hinges and a slide."""
+    return Chain(
+        "arm",
+        (Joint("a"), Joint("b"), Joint("c", "prismatic", -0.3, 0.3)),
+        (
+            Element("a", "rz", joint=0),
+            Element("az", "tz", 0.4, owner=1),
+            Element("ax", "rx", 1.2, owner=1),
+            Element("b", "rz", joint=1, owner=1),
+            Element("bx", "tx", 0.3, owner=2),
+            Element("by", "ry", 0.7, owner=2),
+            Element("c", "tz", joint=2, owner=2),
+        ),
+        inertias=inertias,
+    )
+
+
+def planted(seed: int, noise: float = 0.02) -> tuple[np.ndarray, IdentificationModel, bases.Base, Told]:
+    """Return true standard parameters, off the CAD's by a third, and what noisy torques tell of them."""
+    rng = np.random.default_rng(seed)
+    pseudo = pseudo_inertia.from_standard(np.array(CAD))
+    stretch = np.eye(4) + 0.15 * rng.standard_normal((3, 4, 4))
+    true = pseudo_inertia.to_standard(stretch @ pseudo @ stretch.transpose(0, 2, 1)).ravel()
+    chain = arm(np.array(CAD))
+    model = from_chain(chain)
+    truth = np.concatenate([true, np.tile([0.2, 1.0, 2.0, 0.1], 3)])
+    base = bases.find(model)
+    samples = bases.random_samples(model, 200, seed)
+    matrix = model.regressor(samples.q, samples.v, samples.a).reshape(-1, model.p)
+    kept = matrix[:, base.kept]
+    values = np.linalg.lstsq(kept, matrix @ truth + noise * rng.standard_normal(len(matrix)), rcond=None)[0]
+    covariance = noise**2 * np.linalg.inv(kept.T @ kept)
+    return truth, model, base, told(chain, model, base, values, covariance)
+
+
+def told(
+    chain: Chain, model: IdentificationModel, base: bases.Base, values: np.ndarray, covariance: np.ndarray
+) -> Told:
+    dynamics = Dynamics(model, bases.to_standard(base, values))
+    return Told(
+        chain, dynamics, base.names, base.units, values, covariance, base.transform, whitened(values, covariance), False
+    )
+
+
+def test_pseudo_inertia_is_one_to_one_and_knows_possible_bodies():
+    body = np.random.default_rng(1).standard_normal((5, 10))
+    assert np.abs(pseudo_inertia.to_standard(pseudo_inertia.from_standard(body)) - body).max() < 1e-14
+    ball = pseudo_inertia.ball(2.0, 0.5, np.array([1.0, -2.0, 0.3]))
+    assert pseudo_inertia.margin(ball) == pytest.approx(0.5 / np.sqrt(5.0))
+    assert pseudo_inertia.margin(ball - np.array([0.5, 0, 0, 0, 0, 0, 0, 0, 0, 0])) < 0.0, "triangle inequality"
+    rod = pseudo_inertia.rod(3.0, [0.0, 0.0, 2.0], 0.1)
+    assert rod[0] == pytest.approx(3.0 * 4.0 / 3.0 + 0.4 * 3.0 * 0.01), "m l²/3 about its end"
+
+
+def test_the_same_divergence_in_any_frame():
+    rng = np.random.default_rng(2)
+    one, two, turn = (rng.standard_normal((4, 4)) for _ in range(3))
+    one, two = one @ one.T, two @ two.T
+    away = pseudo_inertia.divergence(one, two)
+    assert away > 0.0 and pseudo_inertia.divergence(two, two) == pytest.approx(0.0, abs=1e-9)
+    assert pseudo_inertia.divergence(turn @ one @ turn.T, turn @ two @ turn.T) == pytest.approx(away)
+
+
+def test_planted_robots_come_back_within_their_covariance():
+    """Pooled over seeds, the distance² from the estimate stays within χ²(b), and the truth within the posterior."""
+    inside = 0
+    for seed in range(6):
+        truth, _, base, data = planted(seed)
+        found = consistent.find_consistent(data)
+        assert (found.margins > 1e-3).all() and found.possible and not found.blamed
+        assert found.distance < found.allowed
+        off = base.transform @ (found.dynamics.values - truth)
+        spread = base.transform @ found.covariance @ base.transform.T
+        inside += float(off @ np.linalg.solve(spread, off)) < chi2.ppf(0.99, base.b)
+        drives = found.dynamics.values[30:].reshape(3, 4)[:, :3]
+        assert (drives > 0.0).all()
+    assert inside >= 5
+
+
+def test_with_exact_data_the_torques_are_those_of_the_base_parameters():
+    _, model, _, data = planted(3, noise=1e-5)
+    found = consistent.find_consistent(data)
+    samples = bases.random_samples(model, 50, 9)
+    matrix = model.regressor(samples.q, samples.v, samples.a)
+    wanted = matrix @ data.dynamics.values
+    assert np.abs(matrix @ found.dynamics.values - wanted).max() < 1e-5 * np.abs(wanted).max()
+
+
+def test_an_impossible_base_is_told_with_the_body_and_a_possible_one_is_not():
+    _, model, base, data = planted(4)
+    assert data.distance(nearest(problem_of(data))) < 4.0
+    values = np.array(data.values)
+    place = base.names.index(next(name for name in base.names if name.startswith("ZZ2")))
+    values[place] = -0.5
+    found = consistent.find_consistent(told(data.chain, model, base, values, data.covariance))
+    assert not found.possible and found.nearest > found.allowed
+    assert any("body 2" in name or "body 3" in name for name, _ in found.blamed)
+    assert found.blamed[0][1] < found.nearest
+    assert (found.margins > 0.0).all(), "what is exported is possible all the same"
+
+
+def test_without_a_cad_rods_of_a_mass_the_data_choose_stand_in():
+    _, model, base, data = planted(5)
+    bare = told(arm(None), model, base, data.values, data.covariance)
+    found = consistent.find_consistent(bare)
+    assert "no masses" in found.source and found.possible and found.distance < found.allowed
+    assert 1.0 < found.dynamics.values[[9, 19, 29]].sum() < 100.0
+
+
+def problem_of(data: Told) -> consistent.Problem:
+    return consistent.make_problem(data, next(find_references(data.chain, data.dynamics.model)))
+
+
+def test_slope_and_curvature_are_those_of_the_cost():
+    _, _, _, data = planted(6, noise=1.0)
+    problem = problem_of(data)
+    values = consistent.solve(problem, 30.0)
+    slope, curvature = consistent.derivatives(problem, 30.0, values)
+    scale = 1.0 / np.sqrt(np.diag(curvature))
+    assert np.abs(slope * scale).max() < 1e-3, "optimal"
+    shifted = values + 0.05 * scale * np.random.default_rng(0).standard_normal(len(values))
+    slope, curvature = consistent.derivatives(problem, 30.0, shifted)
+    for k in range(0, len(values), 3):
+        step = np.zeros(len(values))
+        step[k] = 1e-4 * scale[k]
+        ends = [consistent.cost(problem, 30.0, shifted + sign * step) for sign in (1, -1)]
+        slopes = [consistent.derivatives(problem, 30.0, shifted + sign * step)[0] for sign in (1, -1)]
+        assert (ends[0] - ends[1]) / 2e-4 == pytest.approx(slope[k] * scale[k], rel=1e-5, abs=1e-5)
+        bent = (slopes[0] - slopes[1]) / (2 * step[k])
+        assert np.abs((bent - curvature[k]) * scale * scale[k]).max() < 1e-5
+
+
+def test_cvxpy_finds_the_same_optimum():
+    cp = pytest.importorskip("cvxpy")
+    _, _, _, data = planted(7, noise=1.0)
+    problem = problem_of(data)
+    gamma = 50.0
+    values = consistent.solve(problem, gamma)
+    x = cp.Variable(len(values))
+    scale = np.abs(values) + 1e-2
+    chi = cp.multiply(x, scale)
+    parts = [cp.sum_squares(problem.factor[:, :-1] @ chi - problem.factor[:, -1])]
+    for i in range(3):
+        pseudo = sum(chi[10 * i + k] * pseudo_inertia.BASIS[k] for k in range(10))
+        parts.append(gamma * (cp.trace(np.linalg.inv(problem.references[i]) @ pseudo) - cp.log_det(pseudo)))
+    for k, size in enumerate(problem.sizes):
+        term = chi[30 + k]
+        parts.append(term / size - cp.log(term) if problem.positive[k] else cp.square(term / size))
+    cp.Problem(cp.Minimize(0.5 * sum(parts))).solve(solver=cp.CLARABEL)
+    theirs = scale * x.value
+    ours, other = (consistent.cost(problem, gamma, one) for one in (values, theirs))
+    assert ours <= other + 1e-6 * abs(other)
+    assert np.linalg.norm((theirs - values) / scale) < 1e-2
