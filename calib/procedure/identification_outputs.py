@@ -23,8 +23,9 @@ from calib.procedure.identifying import IdentificationOutcome
 from calib.robot import description
 
 OURS = (
-    "robot.toml", "dynamics.json", "estimate.csv", "covariance.csv", "information.csv", "instrumental.csv", "metrics.json",
-    calibrated.COVARIANCE, consistency_tables.EFFECTS, consistency_tables.SENSITIVITY, consistency_tables.GEOMETRIES,
+    "robot.toml", "dynamics.json", "estimate.csv", "covariance.csv", "information.csv", "instrumental.csv",
+    "metrics.json", calibrated.COVARIANCE, consistency_tables.EFFECTS, consistency_tables.SENSITIVITY,
+    consistency_tables.GEOMETRIES,
 )  # fmt: skip
 """Files of an earlier identification that a new one replaces; besides plots, ``plot_*.png``."""
 HEADER = ("name", "expression", "unit", "value", "sigma", "rsd", "essential", "sigma_torque", "sigma_geometry")
