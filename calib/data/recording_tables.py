@@ -44,6 +44,10 @@ def read_log(
     }
     used = {place for columns in found.values() for place in columns}
     unused = [name for place, name in enumerate(table.header) if place not in used]
+    notes = [f"not read: {', '.join(unused)}"] if unused else []
+    for ours, columns in found.items():
+        if len(units := dict.fromkeys(table.units[place] or "no unit" for place in columns)) > 1:
+            notes.append(f"the columns of {ours} differ in their units ({', '.join(units)}): is that meant?")
     names = joints.names if joints is not None and len(joints.names) == n else _joint_names(table, found["q"])
     recording = Recording(
         _stamps(table, found, options),
@@ -52,7 +56,7 @@ def read_log(
         joint_names=named(names, n),
         file=str(path),
         rows=table.rows,
-        notes=(f"not read: {', '.join(unused)}",) if unused else (),
+        notes=tuple(notes),
         **series,
     )
     return recording if ends == (None, None) else cut(recording, *ends)

@@ -72,7 +72,7 @@ def absorb(data: Triangles, matrix: np.ndarray, target: np.ndarray, group: np.nd
     if len(index) and not 0 <= index.min() <= index.max() < data.groups:
         raise CalibError(f"rows belong to groups {index.min()} to {index.max()}, but there are {data.groups} groups")
     factors, rows = np.array(data.factors), np.array(data.rows)
-    for g in np.unique(index):
+    for g in np.flatnonzero(np.bincount(index)):
         own = np.flatnonzero(index == g)
         rows[g] += len(own)
         for start in range(0, len(own), CHUNK):

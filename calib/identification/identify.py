@@ -104,7 +104,9 @@ def identify(
     say("first fit")
     std, tau, values = first_fit(rows)
     first = Dynamics(model, bases.to_standard(base, values))
-    loads = [transmitted(first, case) if settings.kind == "motor" else None for case in cases]
+    friction = "standard" if settings.friction == "auto" and _all_poor(cases) else settings.friction
+    loaded = settings.kind == "motor" and friction not in ("standard", "ripple")
+    loads = [transmitted(first, case) if loaded else None for case in cases]
     prior = _prior(chain, model, base, rows, cases, std, tau, settings)
     known = None if prior is None else prior.rows
     n = chain.n
@@ -112,7 +114,6 @@ def identify(
         cases, rows, loads, decimator, std, tau, np.array(per_joint(settings.v0, n, "v0")),
         np.array([joint.kind == "prismatic" for joint in chain.joints]), known,
     )  # fmt: skip
-    friction = "standard" if settings.friction == "auto" and _all_poor(cases) else settings.friction
     climbed = climb(ground, friction, progress) if settings.kind == "motor" else Climb((), (), ())
     say("estimate")
     full = [

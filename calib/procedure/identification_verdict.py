@@ -28,11 +28,13 @@ def judge(
     validation: Mapping[str, Score],
     repeated: Mapping[str, float],
     excitation: Mapping[str, ExcitationReport],
+    driven: Sequence[int] = (),
 ) -> Verdict:
     """Judge an identification by motion it has not seen; the first rule that holds.
 
     Recordings in which the robot stands are left aside.
 
+    0. friction drives a joint: fail;
     1. the unseen error is above `POOR`: fail;
     2. no unseen motion (or a repeat of the training's only): marginal;
     3. the training motion is too poor to tell parameters apart: marginal;
@@ -43,7 +45,12 @@ def judge(
         fit, validation: scores by file; validation without repeats.
         repeated: validation files that repeat the training motion.
         excitation: of the training files.
+        driven: joints, from 0, see `calib.identification.passivity`.
     """
+    if driven:
+        named = ", ".join(str(joint + 1) for joint in driven)
+        why = "is a torque's sign reversed, are columns swapped, is this the robot?"
+        return Verdict("fail", f"friction drives joint {named} instead of braking it, as in no robot: {why}")
     own = max((found.raw.total for found in fit.values()), default=np.nan)
     standing = [name for name, scored in validation.items() if scored.motion_share < MOVES]
     validation = {name: scored for name, scored in validation.items() if name not in standing}

@@ -21,6 +21,7 @@ from calib.identification.consistency import Propagation, propagate
 from calib.identification.geometries import Comparison, compare
 from calib.identification.identify import Identification, identify
 from calib.identification.options import FileSettings, IdentifyOptions, file_settings
+from calib.identification.passivity import driven
 from calib.identification.prediction import predict
 from calib.identification.scores import Score, score
 from calib.identification.settings import Settings
@@ -154,6 +155,7 @@ def run(inputs: IdentificationInputs, progress: Progress | None = None) -> Ident
     """Identify, predict every recording, and judge."""
     say, settings = progress or (lambda words: None), inputs.options.settings
     found = identify(inputs.chain, inputs.cases, settings, inputs.nominal, progress)
+    wrong = driven(found.dynamics, inputs.cases)
     carried, geometries = carry(inputs, found, say)
     predictions, scores = {}, {}
     for case in (*inputs.cases, *inputs.unseen):
@@ -172,7 +174,7 @@ def run(inputs: IdentificationInputs, progress: Progress | None = None) -> Ident
     validation = {case.name: scores[case.name] for case in inputs.unseen}
     told = warnings(inputs.cases, inputs.unseen, found, validation, repeated, excitation)
     proofs = {name: found_score for name, found_score in validation.items() if name not in repeated}
-    verdict = judge(fit, proofs, repeated, excitation)
+    verdict = judge(fit, proofs, repeated, excitation, wrong)
     return IdentificationOutcome(
         inputs, found, fit, validation, predictions, repeated, excitation, told, verdict, settings.seed,
         carried=carried, geometries=geometries, tracking=tracking,

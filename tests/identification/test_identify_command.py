@@ -129,13 +129,25 @@ def test_input_that_cannot_be_is_refused_and_nothing_written(robot, tmp_path, ca
     assert not (tmp_path / "out").exists() and not list(tmp_path.glob(".out*"))
 
 
-def test_a_reversed_torque_is_no_quiet_success(robot, tmp_path, capsys):
+def test_reversed_torques_are_refused_and_one_reversed_joint_fails(robot, tmp_path, capsys):
     good = planted.series(0)
-    path = tmp_path / "reversed.npz"
-    np.savez(path, t=good["t"], q=good["q"], tau=-good["tau"])
-    code = run(robot, path, "--out", tmp_path / "out", "--friction", "standard")
-    told = capsys.readouterr()
-    assert code == 2 or "sign" in told.out + told.err
+    every, one = tmp_path / "reversed.npz", tmp_path / "one.npz"
+    np.savez(every, t=good["t"], q=good["q"], tau=-good["tau"])
+    np.savez(one, t=good["t"], q=good["q"], tau=good["tau"] * np.array([1.0, 1.0, -1.0]))
+    assert run(robot, every, "--out", tmp_path / "out", "--friction", "standard") == 2
+    assert "sign is reversed" in capsys.readouterr().err and not (tmp_path / "out").exists()
+    assert run(robot, one, "--out", tmp_path / "out", "--friction", "standard") == 1
+    assert "friction drives joint 3" in capsys.readouterr().out
+
+
+def test_columns_in_different_units_are_pointed_at(robot, tmp_path, capsys):
+    good = planted.series(0)
+    path = tmp_path / "mixed.csv"
+    table = np.column_stack([good["t"], np.degrees(good["q"][:, :1]), good["q"][:, 1:], good["tau"]])
+    header = "t,q1 [deg],q2,q3,tau1,tau2,tau3"
+    np.savetxt(path, table, delimiter=",", header=header, comments="")
+    assert run(robot, path, "--out", tmp_path / "out", "--friction", "standard") == 0
+    assert "differ in their units (deg, no unit)" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,56 @@
+"""Friction takes energy out of a robot, at every joint: a model in which it does not belongs to no possible robot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from calib.errors import MeasurementError
+from calib.identification.cases import Case
+from calib.identification.prediction import Dynamics, transmitted
+from calib.identification.rows import term_columns
+
+FRICTION = ("velocity", "sign", "dead", "speed", "cubic", "root", "stribeck", "load", "load_velocity", "stop")
+LEAST = -0.01  # of the energy that a joint moves: noise and what other columns take over stay above (our choice)
+
+
+def dissipated(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
+    """Return the energy that each joint's friction takes, ∫ v_j τ_friction,j dt, as a share of ∫ |v_j τ_j| dt, (n,).
+
+    Joints that do not move have zero.
+    """
+    model = dynamics.model
+    n, first = model.tree.n, 0 if model.kind == "drive" else 10 * model.tree.bodies
+    terms = [
+        (one, value)
+        for one, value in zip(model.columns, dynamics.values[first:])
+        if one.shape in FRICTION and value != 0.0
+    ]
+    taken, moved = np.zeros(n), np.zeros(n)
+    for case in cases:
+        v = case.motion.v
+        load = transmitted(dynamics, case) if any(one.form.loaded for one, _ in terms) else None
+        moved += np.abs(v * case.target[:, -n:]).sum(axis=0)
+        for one, value in terms:
+            for row, values in term_columns(one, case, load):
+                taken[row] += value * float(v[:, row] @ values)
+    return np.where(moved > 0.0, taken / np.where(moved > 0.0, moved, 1.0), 0.0)
+
+
+def driven(dynamics: Dynamics, cases: Sequence[Case]) -> tuple[int, ...]:
+    """Return the joints, from 0, that friction drives: their torque's sign is reversed, or it is another joint's.
+
+    Raises:
+        MeasurementError: where these are most of the joints that move.
+    """
+    share = dissipated(dynamics, cases)
+    found = np.flatnonzero(share < LEAST)
+    if len(found) and 2 * len(found) > np.count_nonzero(share):
+        named = ", ".join(str(joint + 1) for joint in found)
+        raise MeasurementError(
+            f"friction would drive the robot instead of braking it (joints {named}): the torques' sign is reversed, or "
+            "positions and torques are not of the same joints; turn the sign (gains = [-1]), or check the columns",
+            cases[0].motion.file,
+        )
+    return tuple(int(joint) for joint in found)
