@@ -18,6 +18,18 @@ from calib.identification.rows import Rows, pool
 from calib.identification.unseen import estimate
 
 METHODS = ("ols", "wls", "irls", "tls", "iv")
+COLUMN_NOISE = 0.01  # of a column's rms: what filtered derivatives miss (our choice)
+ASSUMES = {
+    "ols": "the torques of all joints are equally noisy, q, v and a exact",
+    "wls": "each joint's torque is as noisy as its own residuals say, q, v and a exact",
+    "irls": "torques are noisy together across joints, and samples that do not fit at all are gated out; q, v, a exact",
+    "tls": (
+        f"columns of W are noisy too: each by {COLUMN_NOISE:.0%} of its rms where a joint's torque is noisy by its "
+        "residuals, all up to one factor that the data tell, independently from row to row; offsets and signs are exact"
+    ),
+    "iv": "the controller and its reference are those of the loop, the model's friction that of the robot",
+}
+"""What an estimate rests on, for the user."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,15 +119,14 @@ def _irls(all_rows: Sequence[Rows], inflated: float) -> LinearFit:
 
 
 def _tls(pooled: Triangles, std: np.ndarray) -> LinearFit:
-    """Return the scaled TLS fit: every column that moves is as noisy, relative to its size, as y is.
+    """Return the scaled TLS fit: columns that move have noise of `COLUMN_NOISE` of their size, y that of its residuals.
 
-    Columns of ones (offsets) and of signs are exact. The common level is the smallest singular value's (our choice:
-    without repeated measurements the ratio of the noises is not known).
+    Columns of ones (offsets) and of signs are exact. The common level is the smallest singular value's; the ratio of
+    the noises, which no single recording tells, is our choice.
     """
     p = pooled.parameters
     stacked = np.sum((pooled.factors / std[:, None, None]) ** 2, axis=(0, 1))
     size = np.sqrt(stacked / max(float(pooled.rows.sum()), 1.0))
     exact = np.array([name.startswith(("off", "Fc")) for name in pooled.names])
-    small = 0.01  # of a column's rms: what filtered derivatives miss (our choice)
-    noise = np.append(np.where(exact, 0.0, small * size[:p]), 1.0)
+    noise = np.append(np.where(exact, 0.0, COLUMN_NOISE * size[:p]), 1.0)
     return tls(pooled, noise, std)

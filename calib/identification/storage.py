@@ -1,7 +1,13 @@
-"""An identified model in a folder: ``robot.toml`` holds the geometry, ``dynamics.json`` the numbers."""
+"""An identified model in a folder: ``robot.toml`` holds the geometry, ``dynamics.json`` the numbers.
+
+``estimate.csv`` has one row per parameter that was estimated, ``covariance.csv`` their covariance (a header, then one
+row per parameter, each beginning with its name): base parameters in the order of the model's columns, then richer
+friction. ZZ1R stands for the combination that ``dynamics.json`` spells out under ``base``.
+"""
 
 from __future__ import annotations
 
+import csv
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -28,15 +34,48 @@ def read_dynamics(folder: str | Path) -> tuple[Chain, Dynamics]:
         RobotError: where the folder holds none, or the two files do not belong together.
     """
     folder = Path(folder)
-    try:
-        table = json.loads((folder / "dynamics.json").read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise RobotError(f"{folder} holds no identified model (dynamics.json): {error}") from error
+    table = read_table(folder)
     chain = description.read(folder / "robot.toml")
     try:
         return chain, from_table(chain, table)
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise RobotError(f"{folder}/dynamics.json is damaged or of another version: {error!r}") from error
+
+
+def read_table(folder: Path) -> dict[str, Any]:
+    """Return the content of ``dynamics.json``, for `from_table`.
+
+    Raises:
+        RobotError: where the folder holds none.
+    """
+    try:
+        found = json.loads((folder / "dynamics.json").read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise RobotError(f"{folder} holds no identified model (dynamics.json): {error}") from error
+    if not isinstance(found, dict):
+        raise RobotError(f"{folder}/dynamics.json is damaged or of another version: it holds no table")
+    return found
+
+
+def read_covariance(folder: Path) -> tuple[tuple[str, ...], np.ndarray] | None:
+    """Return names and covariance (p, p) of the estimated parameters; None without ``covariance.csv``.
+
+    Raises:
+        RobotError: where the file is damaged.
+    """
+    path = folder / "covariance.csv"
+    if not path.is_file():
+        return None
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            header, *rows = list(csv.reader(file))
+        covariance = np.array([row[1:] for row in rows], dtype=float)
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        raise RobotError(f"{path} is damaged ({error}); run calib identify again") from error
+    count = len(header) - 1
+    if covariance.shape != (count, count) or not np.isfinite(covariance).all():
+        raise RobotError(f"{path}: expected {count} rows of finite numbers; run calib identify again")
+    return tuple(header[1:]), covariance
 
 
 def to_table(dynamics: Dynamics, base: Base) -> dict[str, Any]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +16,7 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.shapes import V0
 from calib.dynamics.tree import standard_parameters, tree, with_gravity
 from calib.errors import UsageError
+from calib.identification.storage import from_table, read_covariance, read_table
 from calib.procedure.motion_limits import MotionLimits
 from calib.robot.chain import Chain
 
@@ -69,28 +68,17 @@ def read_dynamics(chain: Chain, folder: Path | None, sets: str, limits: MotionLi
 
 
 def _identified(chain: Chain, folder: Path) -> Dynamics:
-    """Read ``dynamics.json`` and ``covariance.csv`` of an identification."""
+    """Read an identification; payloads are left ashore."""
+    table = read_table(folder)
     try:
-        table = json.loads((folder / "dynamics.json").read_text(encoding="utf-8"))
-        terms = [
-            (
-                Term(
-                    one["name"], one["shape"], tuple((r, tuple((j, w) for j, w in m)) for r, m in one["acts"]),
-                    tuple(float(x) for x in one["settings"]), one["side"], one["linear"],
-                ),
-                float(one["value"]),
-            )
-            for one in table["terms"]
-        ]  # fmt: skip
-        bodies = tree(chain)
-        numbers = [float(table["bodies"][name]) for name in bodies.names]
-        bodies = with_gravity(bodies, np.array(table["gravity"], dtype=float))
-    except FileNotFoundError as error:
-        raise UsageError(
-            f"{folder} holds no {Path(error.filename).name}: give the folder of an identification"
-        ) from None
-    except (KeyError, TypeError, ValueError) as error:
+        found = from_table(chain, table)
+        if found.model.kind == "drive":
+            raise ValueError("rows 'drive' tell nothing of the bodies")
+    except (KeyError, TypeError, ValueError, IndexError) as error:
         raise UsageError(f"{folder}/dynamics.json does not fit robot '{chain.name}': {error!r}") from error
+    bodies = with_gravity(tree(chain), np.asarray(found.model.tree.gravity))
+    numbers = found.values[: 10 * bodies.bodies]
+    terms = list(zip(found.model.columns, found.values[10 * found.model.tree.bodies :]))
     kept = [(one, value) for one, value in terms if one.form.slopes is not None]
     left = [one.name for one, _ in terms if one.form.slopes is None]
     values = np.array([*numbers, *(value for _, value in kept)])
@@ -99,11 +87,11 @@ def _identified(chain: Chain, folder: Path) -> Dynamics:
         raise UsageError(f"{folder}: parameter {names[int(np.argmin(np.isfinite(values)))]} of the model is not finite")
     notes = [f"terms without slopes are left out of the predicted torque: {', '.join(left)}"] if left else []
     model = IdentificationModel(bodies, tuple(one for one, _ in kept))
-    found = _dynamics(model, values, None, any(one.shape == "sign" for one, _ in kept), ())
-    covariance = _covariance(folder / "covariance.csv", found.exact.names)
+    made = _dynamics(model, values, None, any(one.shape == "sign" for one, _ in kept), ())
+    covariance = _covariance(folder, made.exact.names)
     if covariance is None:
         notes.append(f"{folder}/covariance.csv does not fit the design's columns: the torque has no margin from it")
-    return replace(found, covariance=covariance, notes=tuple(notes))
+    return replace(made, covariance=covariance, notes=tuple(notes))
 
 
 def _dynamics(
@@ -119,13 +107,10 @@ def _smoothed(one: Term) -> Term:
     return replace(one, settings=(max(SMOOTH, one.settings[0]),)) if one.shape == "sign" else one
 
 
-def _covariance(path: Path, names: Sequence[str]) -> np.ndarray | None:
+def _covariance(folder: Path, names: Sequence[str]) -> np.ndarray | None:
     """Return the covariance of the named columns; None where the file has others."""
-    if not path.is_file():
+    found = read_covariance(folder)
+    if found is None or not set(names) <= set(found[0]):
         return None
-    with path.open(newline="", encoding="utf-8") as file:
-        header, *rows = list(csv.reader(file))
-    if not set(names) <= set(header[1:]):
-        return None
-    index = [header[1:].index(name) for name in names]
-    return np.array([row[1:] for row in rows], dtype=float)[np.ix_(index, index)]
+    index = [found[0].index(name) for name in names]
+    return found[1][np.ix_(index, index)]

@@ -21,7 +21,10 @@ TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
         "the TOML file of calib identify --options",
         ("calib.identification.options", "calib.identification.loop_settings"),
     ),
-    "identified": ("what calib identify writes of geometry and dynamics", ("calib.procedure.consistency_tables",)),
+    "identified": (
+        "the folder that calib identify writes",
+        ("calib.identification.storage", "calib.procedure.consistency_tables"),
+    ),
     "constraints": ("the TOML file of calib select --constraints", ("calib.procedure.limits",)),
     "mdh": ("a robot as a table of modified Denavit-Hartenberg rows", ("calib.robot.mdh", "calib.robot.tables")),
     "robot": ("robot.toml as calib fit writes it", ("calib.robot.description", "calib.procedure.calibrated")),

@@ -12,6 +12,7 @@ from calib import files
 from calib.dynamics.base import expressions
 from calib.errors import UsageError
 from calib.identification.cases import row_labels
+from calib.identification.estimators import ASSUMES
 from calib.identification.scores import Part, Score
 from calib.identification.storage import to_table
 from calib.identification.told import information
@@ -132,6 +133,7 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
         "condition_number": {"raw": _finite(found.condition[0]), "normalised": _finite(found.condition[1])},
         "friction": found.climb.chosen,
         "method": found.fitted.method,
+        "method_assumes": ASSUMES[found.fitted.method],
         "ladder": [
             {
                 "model": rung.model,

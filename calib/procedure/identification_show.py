@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from calib.identification.cases import row_labels
+from calib.identification.estimators import ASSUMES
 from calib.identification.scores import Score
 from calib.procedure import consistency_tables
 from calib.procedure.identification_loop import loop_lines
@@ -41,6 +42,7 @@ def outcome_lines(outcome: IdentificationOutcome) -> Iterator[RenderableType]:
         words = f"ripple at joint {one.joint + 1}, orders {orders} per turn: explains {100 * one.share:.0f} % of the"
         yield f"{words} fast residual's power on unseen time, at positions it has been to"
     raw, normalised = found.condition
+    yield f"method {found.fitted.method}: takes for granted that {ASSUMES[found.fitted.method]}"
     base = found.base
     words = f"{found.dynamics.model.p} standard parameters: {len(base.without_effect)} without effect, "
     words += f"{len(base.regrouped)} regrouped, {base.b} base; {len(found.climb.terms)} of richer friction; "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from calib.dynamics.idim import IdentificationModel, with_load
 from calib.dynamics.rigid_body import inverse_dynamics
 from calib.errors import UsageError
 from calib.identification.prediction import Dynamics
+from calib.identification.storage import read_covariance
 from trajectories.profile import Sampled
 
 BLOCK = 4000
@@ -53,18 +53,14 @@ class Uncertainty:
 
 def read_uncertainty(folder: Path, dynamics: Dynamics, carried: Sequence[str]) -> Uncertainty | None:
     """Return the uncertainty that ``covariance.csv`` of an identification states; None without the file."""
-    path = folder / "covariance.csv"
-    if not path.is_file():
+    found = read_covariance(folder)
+    if found is None:
         return None
+    names, covariance = found
     try:
-        with path.open(newline="", encoding="utf-8") as file:
-            header, *rows = list(csv.reader(file))
-        covariance = np.array([row[1:] for row in rows], dtype=float)
-        columns = np.array([_column(dynamics.model, name) for name in header[1:]])
-    except (ValueError, IndexError) as error:
-        raise UsageError(f"{path} does not fit dynamics.json beside it: {error}") from error
-    if covariance.shape != (len(columns), len(columns)) or not np.isfinite(covariance).all():
-        raise UsageError(f"{path}: expected {len(columns)} rows of finite numbers; run calib identify again")
+        columns = np.array([_column(dynamics.model, name) for name in names])
+    except ValueError as error:
+        raise UsageError(f"{folder}/covariance.csv does not fit dynamics.json beside it: {error}") from error
     return Uncertainty(dynamics, tuple(carried), columns, covariance)
 
 

@@ -1,0 +1,77 @@
+"""The methods of ``calib identify`` on planted logs: each is right where its assumption holds, and says what it is."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import planted_motion as planted
+import pytest
+
+from calib import cli
+from calib.estimation.triangles import collect
+from calib.identification.estimators import ASSUMES, METHODS, _tls
+
+
+def identify(robot: Path, log: Path, method: str, out: Path) -> dict[str, tuple[float, float]]:
+    """Return value and sigma of the drives' parameters."""
+    (out.parent / "o.toml").write_text("[filter]\ncutoff = 30.0\nband = 8.0\n")
+    arguments = ["identify", str(robot), str(log), "--method", method, "--friction", "standard", "--out", str(out)]
+    assert cli.run([*arguments, "--options", str(out.parent / "o.toml")]) == 0
+    rows = csv.DictReader((out / "estimate.csv").open())
+    return {row["name"]: (float(row["value"]), float(row["sigma"])) for row in rows}
+
+
+def away(found: dict[str, tuple[float, float]], sigma: dict[str, tuple[float, float]]) -> float:
+    """Return rms((x - truth) / σ) of friction and offsets."""
+    truth = {f"{name}{j + 1}": planted.DRIVES[name][j] for name in ("Fv", "Fc", "off") for j in range(3)}
+    return float(np.sqrt(np.mean([((found[name][0] - x) / sigma[name][1]) ** 2 for name, x in truth.items()])))
+
+
+@pytest.mark.parametrize("method", ["ols", "irls", "tls"])
+def test_all_methods_find_the_truth_of_a_clean_log(robot, tmp_path, capsys, method):
+    log = planted.write(tmp_path, "train.npz", 0)
+    found = identify(robot, log, method, tmp_path / "out")
+    assert away(found, found) < 2.0
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert metrics["method"] == method and metrics["method_assumes"] == ASSUMES[method]
+    assert f"method {method}: takes for granted" in capsys.readouterr().out
+
+
+def test_robust_weights_gate_a_sensor_that_hangs(robot, tmp_path):
+    """Torques frozen for a second here and there: least squares is off by many of its clean sigmas, irls by few."""
+    logged = planted.series(0)
+    tau = logged["tau"].copy()
+    for start in (400, 1500, 2300, 3100):
+        tau[start : start + 200] = tau[start] + np.array([25.0, -30.0, 8.0])
+    clean = identify(robot, planted.write(tmp_path, "clean.npz", 0), "wls", tmp_path / "clean")
+    log = planted.write(tmp_path, "hung.npz", 0, tau=tau)
+    off = {method: away(identify(robot, log, method, tmp_path / method), clean) for method in ("wls", "irls")}
+    assert off["irls"] < 0.1 * off["wls"] and off["irls"] < 4.0
+
+
+def test_total_least_squares_is_right_where_columns_are_as_noisy_as_it_says():
+    """Two columns nearly alike, noise of a hundredth of each: least squares shrinks their difference, TLS does not."""
+    rng = np.random.default_rng(0)
+    names, truth = ("ZZ1R", "Fv1", "Fc1", "off1"), np.array([40.0, 20.0, 30.0, 5.0])
+    true = rng.normal(size=(4000, 4)) * [3.0, 1.0, 1.0, 0.0] + [0.0, 0.0, 0.0, 1.0]
+    true[:, 1] = true[:, 0] / 3.0 + 0.1 * true[:, 1]
+    size = np.sqrt(np.mean(true**2, axis=0)) * [0.01, 0.01, 0.0, 0.0]
+    errors = {"tls": [], "ls": []}
+    std = 1.0
+    for _ in range(40):
+        noisy = true + size * rng.normal(size=true.shape)
+        y = true @ truth + std * rng.normal(size=len(true))
+        data = collect(noisy, y, np.zeros(len(y), dtype=int), names, ("",) * 4)
+        found = _tls(data, np.array([std]))
+        errors["tls"].append((found.estimate.values - truth) / found.estimate.sigma)
+        errors["ls"].append((np.linalg.lstsq(noisy, y, rcond=None)[0] - truth) / found.estimate.sigma)
+    mean = {name: np.abs(np.mean(each, axis=0)) * np.sqrt(40) for name, each in errors.items()}
+    assert mean["tls"].max() < 3.5 and mean["ls"].max() > 10.0
+    assert 0.7 < np.std(errors["tls"]) < 1.3
+
+
+def test_every_method_says_what_it_assumes():
+    assert set(ASSUMES) == set(METHODS)
