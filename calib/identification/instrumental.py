@@ -19,6 +19,7 @@ import numpy as np
 from calib.arrays import frozen
 from calib.data.decimation import Decimator
 from calib.data.filtering import curvature, low_pass, slope
+from calib.data.motion import Motion
 from calib.dynamics import base as bases
 from calib.dynamics.base import Base
 from calib.dynamics.drives import standard
@@ -32,14 +33,13 @@ from calib.estimation.triangles import absorb, empty, residual_squares, select
 from calib.estimation.whiteness import inflation
 from calib.identification.cases import Case
 from calib.identification.prediction import carried_columns
-from calib.identification.rows import Rows, observe, segments
+from calib.identification.rows import Rows, observe
 from calib.simulation.closed_loop import Plant, Run, Sensing, inertia_diagonal, simulate, with_parameters
 from calib.simulation.controllers import Controller, scaled
 from calib.simulation.references import Reference
 
 METHODS = ("iv", "didim")
 LIMIT = 10  # iterations; 3 to 6 are usual
-CHUNK = 400  # thinned samples at a time: bounds the memory
 RETREATS = 6  # halvings of a step to parameters that cannot be simulated
 
 
@@ -181,15 +181,15 @@ def identify_instrumental(
     plant, std = _regular(model, cases[0][1], inertia), ordinary.group_std
     before: LinearFit | None = None
     rounds: list[Round] = []
-    runs, retreats = _runs(plant, cases), 0
+    runs, retreats, tau = _runs(plant, cases), 0, 1.0
     for _ in range(limit):
-        found = _estimate_round(task, runs, std)
+        found = _estimate_round(task, runs, std, tau)
         new = _with_values(plant, task.standard(found.fit.estimate.values))
         rounds.append(Round(_change(before, found.fit), found.fit.estimate.residual_std, retreats))
         if before is not None and retreats == 0 and instruments.settled(before, found.fit, tolerance, tolerance):
             return _result(task, found, ordinary, new, rounds, std, runs)
         plant, runs, retreats = _simulate_new(plant, new, cases)
-        before, std = found.fit, found.fit.group_std
+        before, std, tau = found.fit, found.fit.group_std, found.tau
     raise NotConverged(
         f"instruments from simulation: parameters still change by {100 * rounds[-1].change:.3g} % after {limit} "
         "rounds; estimate fewer (essential ones), or look at the controller's gains",
@@ -219,7 +219,7 @@ class _Task:
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """One round's estimate, and the triangles it came from."""
+    """One round's estimate, the triangles it came from, and the inflation that its residuals show."""
 
     problem: Instruments
     fit: LinearFit
@@ -237,26 +237,28 @@ def _task(
     return _Task(model, base, kept, cases, decimator, observed, method, positive)
 
 
-def _estimate_round(task: _Task, runs: Runs, std: np.ndarray) -> _Found:
-    """Return the estimate with the instruments of these runs."""
+def _estimate_round(task: _Task, runs: Runs, std: np.ndarray, tau: float) -> _Found:
+    """Return the estimate with the instruments of these runs; its sigmas with the inflation `tau` of the last."""
+    columns = task.base.kept[task.kept]
     simulated = [
-        _observe_run(task.model, task.base.kept[task.kept], simulated_case(case, run, loop), rows, task.decimator)
-        for rows, ((case, loop), run) in zip(task.observed, runs)
+        observe(task.model, columns, simulated_case(case, run, loop), task.decimator).matrix
+        for (case, loop), run in runs
     ]
     problem = _stack(task.observed, simulated)
-    tau = _inflation(task.observed, _estimate(problem, task.method, std), std)
     fit, bound = _constrain(problem, _estimate(problem, task.method, std, tau), std, task.positive)
-    return _Found(problem, fit, tau, bound)
+    return _Found(problem, fit, _inflation(task.observed, fit), bound)
 
 
 def _result(
     task: _Task, found: _Found, ordinary: LinearFit, plant: Plant, rounds: Sequence[Round], std: np.ndarray, runs: Runs
 ) -> Instrumental:  # fmt: skip
-    """Return the last round with what the tests say of it."""
+    """Return the last round, sigmas with its own inflation, with what the tests say of it."""
+    fit = _estimate(found.problem, task.method, std, found.tau)
+    fit = replace(fit, estimate=replace(fit.estimate, values=found.fit.estimate.values))
     verdict = instruments.exogeneity(found.problem, std, found.tau)
     strength = instruments.strength(found.problem, std)
     return Instrumental(
-        found.fit, ordinary, frozen(task.kept, int), plant, tuple(rounds), strength, verdict, frozen(std), found.tau,
+        fit, ordinary, frozen(task.kept, int), plant, tuple(rounds), strength, verdict, frozen(std), found.tau,
         _distance(runs), found.bound, found.problem,
     )  # fmt: skip
 
@@ -276,12 +278,19 @@ def simulated_case(case: Case, run: Run, loop: Loop) -> Case:
             f"{1 / case.motion.rate:.6g} s, the simulation from {run.t[0]:.6g} s to {run.t[-1]:.6g} s in steps of "
             f"{step:.6g} s: give the whole reference, and `every`"
         )
-    motion, q = case.motion, np.empty_like(run.q)
-    for cutoff in np.unique(motion.cutoff):
-        own = motion.cutoff == cutoff
-        q[:, own] = low_pass(run.q[:, own], motion.rate, float(cutoff))
+    motion = case.motion
+    q = _filtered(run.q, motion)
     v, a = slope(q, motion.rate), curvature(q, motion.rate)
     return replace(case, motion=replace(motion, q=q[index], v=v[index], a=a[index]))
+
+
+def _filtered(q: np.ndarray, motion: Motion) -> np.ndarray:
+    """Return simulated positions through the low-pass of the recorded ones."""
+    result = np.empty_like(q)
+    for cutoff in np.unique(motion.cutoff):
+        own = motion.cutoff == cutoff
+        result[:, own] = low_pass(q[:, own], motion.rate, float(cutoff))
+    return result
 
 
 def _regular(model: IdentificationModel, loop: Loop, inertia: np.ndarray | None) -> Plant:
@@ -329,42 +338,6 @@ def _simulate_new(old: Plant, new: Plant, cases: Sequence[tuple[Case, Loop]]) ->
     raise NotConverged(f"the estimate cannot be simulated, nor anything near: {problem}", new)
 
 
-def _observe_run(
-    model: IdentificationModel, columns: np.ndarray, case: Case, rows: Rows, decimator: Decimator
-) -> np.ndarray:
-    """Return what `observe` returns as matrix, (M, rows, p), from the entries alone that are not zero in W.
-
-    A joint does not feel the links before it: half of the entries of an arm's W are zero.
-    """
-    row, place = np.nonzero(rows.matrix.any(axis=0))
-    out, done = np.zeros(rows.matrix.shape), 0
-    step, reach = decimator.factor, len(decimator.taps)
-    for start, stop in segments(case.motion.segment):
-        count = max(0, (stop - start - reach) // step + 1)
-        for first in range(0, count, CHUNK):
-            last = min(first + CHUNK, count)
-            part = slice(start + first * step, start + (last - 1) * step + reach)
-            states = (case.motion.q[part], case.motion.v[part], case.motion.a[part])
-            full = model.regressor(*states, carried=case.carried).transpose(2, 1, 0)
-            out[done + first : done + last, row, place] = _thin(full[columns[place], row], decimator, last - first).T
-        done += count
-    return out
-
-
-def _thin(series: np.ndarray, decimator: Decimator, count: int) -> np.ndarray:
-    """Return the first `count` samples that `calib.data.decimation.decimate` keeps of series (k, N), as (k, count)."""
-    step = decimator.factor
-    phases = -(-len(decimator.taps) // step)
-    weights = np.zeros(phases * step)
-    weights[: len(decimator.taps)] = decimator.taps
-    padded = np.zeros((len(series), (count + phases - 1) * step))
-    size = min(padded.shape[1], series.shape[1])
-    padded[:, :size] = series[:, :size]
-    sums = padded.reshape(-1, step) @ weights.reshape(phases, step).T
-    sums = sums.reshape(len(series), -1, phases)
-    return np.asarray(sum(sums[:, k : k + count, k] for k in range(phases)))
-
-
 def _stack(observed: Sequence[Rows], simulated: Sequence[np.ndarray]) -> Instruments:
     """Return the triangles of [Z W y], one group per torque row."""
     problem: Instruments | None = None
@@ -399,7 +372,7 @@ def _estimate(problem: Instruments, method: str, std: np.ndarray, tau: float = 1
     return wls(simulated, std, np.full(problem.data.groups, tau))
 
 
-def _inflation(observed: Sequence[Rows], fit: LinearFit, std: np.ndarray) -> float:
+def _inflation(observed: Sequence[Rows], fit: LinearFit) -> float:
     """Return how many rows count as one, the mean over torque rows of the residuals' integrated autocorrelation."""
     series = [rows.target - rows.matrix @ fit.estimate.values for rows in observed]
     longest = max(series, key=len)
@@ -428,6 +401,11 @@ def _change(before: LinearFit | None, now: LinearFit) -> float:
 
 
 def _distance(runs: Runs) -> np.ndarray:
-    case, loop, run = runs[0][0][0], runs[0][0][1], runs[0][1]
-    q, own = case.motion.q, simulated_case(case, run, loop).motion.q
-    return frozen(100.0 * np.linalg.norm(q - own, axis=0) / np.linalg.norm(q - q.mean(axis=0), axis=0))
+    """Return how far the simulated robot is from the recorded one (n,) [%], over all recordings."""
+    away, size = np.zeros((2, runs[0][0][0].motion.n))
+    for (case, loop), run in runs:
+        motion = case.motion
+        index = np.rint((motion.t - loop.reference.t[0]) / (loop.reference.period * loop.every)).astype(int)
+        away += np.sum((motion.q - _filtered(run.q, motion)[index]) ** 2, axis=0)
+        size += np.sum((motion.q - motion.q.mean(axis=0)) ** 2, axis=0)
+    return frozen(100.0 * np.sqrt(away / size))

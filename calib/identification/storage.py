@@ -51,7 +51,9 @@ def read_table(folder: Path) -> dict[str, Any]:
     try:
         found = json.loads((folder / "dynamics.json").read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise RobotError(f"{folder} holds no identified model (dynamics.json): {error}") from error
+        raise RobotError(
+            f"{folder} holds no identified model (dynamics.json): {error}; give the folder of an identification"
+        ) from error
     if not isinstance(found, dict):
         raise RobotError(f"{folder}/dynamics.json is damaged or of another version: it holds no table")
     return found
@@ -120,10 +122,10 @@ def regrouping(base: Base) -> dict[str, dict[str, float]]:
 def from_table(chain: Chain, table: Mapping[str, Any]) -> Dynamics:
     """Return the model of a table that `to_table` made, on the chain it was made for."""
     bodies = with_gravity(tree(chain), np.array(table["gravity"], dtype=float))
-    for label in table["payloads"]:
+    for label in table.get("payloads", ()):
         bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1)
     terms = tuple(_term(entry) for entry in table["terms"])
-    model = IdentificationModel(bodies, terms, table["kind"])
+    model = IdentificationModel(bodies, terms, table.get("kind", "motor"))
     own = table["bodies"]
     standard = [] if model.kind == "drive" else [float(own[name]) for name in bodies.names]
     values = np.array([*standard, *(float(entry["value"]) for entry in table["terms"])])

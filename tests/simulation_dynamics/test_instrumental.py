@@ -182,20 +182,6 @@ def test_what_cannot_be_done_is_said():
     assert instruments.settled(found(case).fit, found(case).fit)
 
 
-def test_instruments_are_filtered_as_the_rows_are():
-    from calib.identification import instrumental
-    from calib.identification.rows import observe
-
-    _, model, base = arm()
-    case = log(1e-4, 1)
-    run = simulate(arm()[0], PD, motion(), Sensing(every=EVERY))
-    own, decimator = instrumental.simulated_case(case, run, Loop(PD, motion(), EVERY)), case.motion.decimator
-    rows = observe(model, base.kept, case, decimator)
-    quick = instrumental._observe_run(model, base.kept, own, rows, decimator)
-    expected = observe(model, base.kept, own, decimator).matrix
-    assert np.abs(quick - expected).max() < 1e-12 * np.abs(expected).max()
-
-
 def test_instruments_that_do_not_excite_a_parameter_are_named():
     still = references.Reference(motion().t, motion().q * [1.0, 0.0], motion().v * [1.0, 0.0], motion().a * [1.0, 0.0])
     run = simulate(arm()[0], PD, still, Sensing(1e-5, every=EVERY))
