@@ -188,3 +188,29 @@ def _go_on(folder: Path, command: str, again: str = "") -> None:
         console.print(line, soft_wrap=True, markup=False)
     if stop.verdict == "fail":
         raise typer.Exit(1)
+
+
+@app.command()
+def view(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="of a fit, a session, an identification, or a motion")],
+    save: Annotated[Path | None, typer.Option(help="write a Rerun recording (.rrd), and open no window")] = None,
+    spawn: Annotated[
+        bool | None, typer.Option("--spawn/--no-spawn", help="open Rerun's window; by default where nothing is saved")
+    ] = None,
+    robot: Annotated[str | None, typer.Option(help="the arm to draw, where the folder does not say")] = None,
+) -> None:
+    """Show in Rerun: the robot, pose errors, poses as they were chosen, motions with their limits, torques."""
+    from calib.errors import UsageError
+    from calib.procedure import viewer
+
+    if save is None and spawn is False:
+        raise UsageError("nothing to do: give --save FILE.rrd, or leave --no-spawn out")
+    console = make_console()
+    scene = viewer.write(folder, save, robot) if save else None
+    if save:
+        size = f"{1e-6 * save.stat().st_size:.1f} MB"
+        console.print(f"{save}: {size}; rerun {save} shows it", soft_wrap=True, markup=False)
+    if spawn or (spawn is None and save is None):
+        scene = viewer.spawn(folder, robot)
+    for note in scene.notes if scene else ():
+        console.print(f"note: {note}", soft_wrap=True, markup=False)

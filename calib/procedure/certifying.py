@@ -9,7 +9,7 @@ from datetime import datetime
 from pathlib import Path
 
 from calib import files
-from calib.procedure import certificate, report
+from calib.procedure import certificate, report, viewer
 from calib.procedure.dynamic_stages import recordings
 from calib.procedure.session import Session, fingerprint, read_state
 from calib.procedure.stages import measured_files, robot_file
@@ -60,7 +60,7 @@ def certify(session: Session, say: Say) -> list[str]:
     )
     files.write(session.path("certificate.html"), certificate.render(page))
     files.write_json(session.path("5-validation/report.json"), asdict(whole))
-    return [*notes, "certificate.html"]
+    return [*notes, "certificate.html", viewer.write_beside(session.folder)]
 
 
 def setup(session: Session, found: report.Report) -> list[tuple[str, str]]:

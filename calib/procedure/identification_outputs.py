@@ -11,7 +11,7 @@ import numpy as np
 from calib import files
 from calib.dynamics.base import expressions
 from calib.errors import UsageError
-from calib.identification.cases import row_labels
+from calib.identification.cases import Case, row_labels
 from calib.identification.estimators import ASSUMES
 from calib.identification.scores import Part, Score
 from calib.identification.storage import to_table
@@ -25,10 +25,11 @@ from calib.robot import description
 
 OURS = (
     "robot.toml", "dynamics.json", "estimate.csv", "covariance.csv", "information.csv", "instrumental.csv",
-    "metrics.json", calibrated.COVARIANCE, consistency_tables.EFFECTS, consistency_tables.SENSITIVITY,
+    "metrics.json", "torques_1.csv", calibrated.COVARIANCE, consistency_tables.EFFECTS, consistency_tables.SENSITIVITY,
     consistency_tables.GEOMETRIES,
 )  # fmt: skip
 """Files of an earlier identification that a new one replaces; besides plots, ``plot_*.png``."""
+TORQUE_RATE = 100.0  # of torques_1.csv [Hz]
 HEADER = ("name", "expression", "unit", "value", "sigma", "rsd", "essential", "sigma_torque", "sigma_geometry")
 
 
@@ -71,8 +72,20 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     if found.prior is not None:  # else estimate and covariance say it all
         triangle = information(found)
         files.write_table(folder / "information.csv", (*found.names, "target"), triangle.tolist())
+    first = (*inputs.unseen, *inputs.cases)[0]
+    write_torques(first, outcome.predictions[first.name], folder / "torques_1.csv")
     files.write_json(folder / "dynamics.json", to_table(found.dynamics, found.base))
     files.write_json(folder / "metrics.json", metrics(outcome))
+
+
+def write_torques(case: Case, predicted: np.ndarray, path: Path) -> Path:
+    """Write measured and predicted torques (N, rows) of a recording and its joints (N, n), at about `TORQUE_RATE`."""
+    motion, rows = case.motion, case.target.shape[1]
+    step = max(1, round(motion.rate / TORQUE_RATE))
+    names = [f"{what}_{j + 1}" for what in ("measured", "predicted") for j in range(rows)]
+    joints = [f"q{j + 1}" for j in range(motion.q.shape[1])]
+    table = np.column_stack([motion.t, case.target, predicted, motion.q])[::step]
+    return files.write_table(path, ["t [s]", *names, *joints], table.tolist())
 
 
 def estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:

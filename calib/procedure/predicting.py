@@ -15,7 +15,7 @@ from calib.identification.cases import Case
 from calib.identification.prediction import predict
 from calib.identification.scores import Score, score
 from calib.identification.storage import read_dynamics
-from calib.procedure.identification_outputs import score_table
+from calib.procedure.identification_outputs import score_table, write_torques
 from calib.procedure.identification_verdict import judge
 from calib.procedure.identifying import REPEAT, IdentificationInputs
 from calib.procedure.verdict import Verdict
@@ -83,11 +83,7 @@ def tolerated(verdict: Verdict, proofs: Mapping[str, Score], tolerance: float) -
 def write(held: Held, folder: Path) -> None:
     """Write ``report.json`` (scores, verdict, curves for the certificate) and a table of unseen torques per file."""
     for number, case in enumerate(held.inputs.unseen, 1):
-        motion, rows = case.motion, case.target.shape[1]
-        step = max(1, round(motion.rate / 100.0))
-        header = ["t [s]", *(f"measured_{j + 1}" for j in range(rows)), *(f"predicted_{j + 1}" for j in range(rows))]
-        table = np.column_stack([motion.t, case.target, held.predictions[case.name]])[::step]
-        files.write_table(folder / f"torques_{number}.csv", header, table.tolist())
+        write_torques(case, held.predictions[case.name], folder / f"torques_{number}.csv")
     files.write_json(folder / "report.json", report(held))
 
 

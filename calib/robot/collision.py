@@ -281,7 +281,7 @@ def _hull(node: Node, folders: Sequence[Path], missing: list[str], place: str) -
     """Return the convex hull of a mesh file, scaled."""
     _, coal = _libraries()
     name = node.attributes.get("filename", "")
-    path = _find(name, folders)
+    path = find_mesh(name, folders)
     if path is None:
         missing.append(name)
         return None
@@ -295,7 +295,7 @@ def _hull(node: Node, folders: Sequence[Path], missing: list[str], place: str) -
         return None
 
 
-def _find(name: str, folders: Sequence[Path]) -> Path | None:
+def find_mesh(name: str, folders: Sequence[Path]) -> Path | None:
     """Return the file a mesh name means: ``package://`` is tried with and without the package's own folder."""
     if name.startswith("file://"):
         name = name.removeprefix("file://")

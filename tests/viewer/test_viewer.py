@@ -1,0 +1,180 @@
+"""What `calib view` records is all that the folder holds: read back from the file, entity by entity."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from collections import Counter
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib import cli
+from calib.errors import UsageError
+from calib.procedure import calibrated, viewer, viewing
+from calib.robot import urdf_write
+from calib.robot.kinematics import forward
+from calib.robot.load import load
+from calib.robot.visuals import visuals
+from calib.simulation.cell import Instrument, measure
+from calib.simulation.cells import perturbed_cell
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory) -> Path:
+    """A fit of 60 poses of a UR5, 15 of them kept aside."""
+    folder = tmp_path_factory.mktemp("viewer")
+    cell = perturbed_cell(load("ur5"), 2, Instrument(position_sigma=3e-5, orientation_sigma=1e-4))
+    q = np.random.default_rng(0).uniform(-2, 2, (60, 6))
+    seen = measure(cell, q, 1)
+    with (folder / "seen.csv").open("w", newline="") as file:
+        head = [*(f"q{k + 1}" for k in range(6)), "x", "y", "z", "qx", "qy", "qz", "qw"]
+        csv.writer(file).writerows([head, *np.hstack([seen.q, seen.position, seen.quaternion]).tolist()])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("calib.procedure.report.write", lambda outcome, folder: None)
+        arguments = ["fit", "ur5", folder / "seen.csv", "--holdout", "0.25", "--model", "geometry"]
+        assert cli.run([*map(str, arguments), "--out", str(folder / "done")]) == 0
+    return folder / "done"
+
+
+@pytest.fixture
+def session(fitted, tmp_path) -> Path:
+    """A folder laid out as a session: the fit, a pose plan, a motion, and torques."""
+    rng, here = np.random.default_rng(5), tmp_path / "session"
+    for name in ("2-poses", "6-excitation/training", "8-dynamics/unseen"):
+        (here / name).mkdir(parents=True)
+    (here / "4-fit").symlink_to(fitted)
+    names = load("ur5").joint_names
+
+    def table(path: str, head: list[str], columns: np.ndarray) -> None:
+        with (here / path).open("w", newline="") as file:
+            csv.writer(file).writerows([head, *columns.tolist()])
+
+    table("2-poses/poses.csv", list(names), rng.uniform(-1, 1, (7, 6)))
+    t = np.arange(0, 2, 0.01)[:, None]
+    wave = np.sin(t + np.arange(6))
+    head = ["t", *(f"{letter}{k + 1}" for letter in "qva" for k in range(6))]
+    table("6-excitation/training/trajectory.csv", head, np.hstack([t, wave, np.cos(t + np.arange(6)), -wave]))
+    head = ["t [s]", *(f"{what}{k + 1}" for what in ("measured_", "predicted_", "q") for k in range(6))]
+    table("8-dynamics/unseen/torques_1.csv", head, np.hstack([t + 0.5, wave, wave - 0.1, wave]))
+    return here
+
+
+def rows(path: Path) -> Counter[str]:
+    """Return how many rows each entity of a recording has, those logged once for all times left out."""
+    chunks = pytest.importorskip("rerun.chunk")
+    found: Counter[str] = Counter()
+    for chunk in chunks.RrdReader(str(path)).store().stream():
+        if not chunk.is_static:
+            found[chunk.entity_path] += chunk.num_rows
+    return found
+
+
+def constant(path: Path) -> set[str]:
+    chunks = pytest.importorskip("rerun.chunk")
+    return {chunk.entity_path for chunk in chunks.RrdReader(str(path)).store().stream() if chunk.is_static}
+
+
+def test_a_fit_shows_every_pose_as_both_arms_see_it(fitted, tmp_path):
+    pytest.importorskip("rerun")
+    scene = viewer.write(fitted, tmp_path / "a.rrd")
+    measured = scene.measured[0]
+    assert (len(measured.q), int(measured.unseen.sum())) == (60, 15)
+    found, still = rows(tmp_path / "a.rrd"), constant(tmp_path / "a.rrd")
+    for name in ("/errors/nominal", "/errors/calibrated", "/errors/unseen", "/world/pose", "/world/robot/lines"):
+        assert found[name] == 60, name
+    scale = viewing.arrow_scale(measured, scene.chain)
+    assert {f"/world/errors_times_{scale:g}/{arm}" for arm in ("nominal", "calibrated")} <= still
+    assert f"{scale:g} times as long as the errors" in viewer.about(scene)
+
+
+def test_the_arrows_are_the_errors_that_the_fit_reports(fitted):
+    measured = viewing.read(fitted).measured[0]
+    with (fitted / "residuals.csv").open(newline="") as file:
+        table = list(csv.DictReader(file))
+    for points, column in ((measured.calibrated, "size [mm]"), (measured.nominal, "nominal size [mm]")):
+        sizes = 1e3 * np.linalg.norm(measured.seen - points, axis=1)
+        assert sizes == pytest.approx([float(row[column]) for row in table], rel=1e-4)
+    tool = calibrated.read(fitted).tools[0]
+    at = (forward(load(fitted), measured.q) @ tool)[:, :3, 3]
+    assert np.abs(at - measured.calibrated).max() < 1e-9  # in the base of the arm that is drawn
+
+
+def test_a_session_plays_poses_motions_and_torques_on_one_clock(session, tmp_path):
+    chunks = pytest.importorskip("rerun.chunk")
+    scene = viewer.write(session, tmp_path / "s.rrd")
+    found = rows(tmp_path / "s.rrd")
+    some = len(viewing.thinned(scene.played[0].t))
+    assert some == 101  # 2 s at 50 Hz
+    assert found["/world/chosen/poses"] == 7
+    assert found["/motion/position/elbow_joint"] == some and found["/limits/velocity/elbow_joint/upper"] == 2
+    assert found["/torques/elbow_joint/measured"] == found["/residuals/elbow_joint"] == 200
+    assert found["/world/robot/lines"] == 7 + 60 + 2 * some
+    clocks = {}
+    for chunk in chunks.RrdReader(str(tmp_path / "s.rrd")).store().stream():
+        if not chunk.is_static and chunk.entity_path[1:].split("/")[0] in ("chosen", "errors", "motion", "torques"):
+            assert "time" in chunk.timeline_names
+            values = chunk.to_record_batch().column("time").to_numpy(zero_copy_only=False).astype("int64")
+            part = chunk.entity_path[1:].split("/")[0]
+            low, high = clocks.get(part, (values[0], values[-1]))
+            clocks[part] = (min(low, *values), max(high, *values))
+    order = [clocks[part] for part in ("chosen", "errors", "motion", "torques")]
+    assert all(before[1] < after[0] for before, after in pairwise(order))
+
+
+def test_links_are_meshes_where_their_files_are_found(session, tmp_path):
+    pytest.importorskip("rerun")
+    mesh = tmp_path / "arm_description" / "meshes" / "a.stl"
+    mesh.parent.mkdir(parents=True)
+    mesh.write_bytes(b"solid a\nendsolid a\n")
+    visual = "<visual><origin xyz='0 0 0.1' rpy='0 0 1'/><geometry><mesh filename='{}'/></geometry></visual>"
+    both = "".join(visual.format(f"package://arm_description/meshes/{name}.stl") for name in "ab")
+    text = urdf_write.write_new(load("ur5"))
+    link = "elbow_joint_link"
+    edited = text.replace(f'<link name="{link}"/>', f'<link name="{link}">{both}</link>')
+    assert edited != text
+    (tmp_path / "arm.urdf").write_text(edited)
+    meshes, missing = visuals(tmp_path / "arm.urdf")
+    assert [(one.link, one.file) for one in meshes] == [(link, mesh)]
+    assert missing == ["package://arm_description/meshes/b.stl"]
+    assert meshes[0].placement[2, 3] == 0.1 and meshes[0].scale.tolist() == [1, 1, 1]
+    folder = session / "6-excitation" / "training"
+    scene = viewer.write(folder, tmp_path / "m.rrd", str(tmp_path / "arm.urdf"))
+    assert rows(tmp_path / "m.rrd")[f"/world/robot/links/{link}"] == 101
+    assert f"/world/robot/links/{link}/mesh_0" in constant(tmp_path / "m.rrd")
+    assert any("b.stl" in note for note in scene.notes)
+
+
+def test_without_rerun_the_command_says_what_to_install_and_a_session_goes_on(fitted, monkeypatch, capsys, tmp_path):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert cli.run(["view", str(fitted), "--save", str(tmp_path / "x.rrd")]) == 2
+    assert "armature-calib[view]" in capsys.readouterr().err
+    assert not (tmp_path / "x.rrd").exists()
+    monkeypatch.setattr(viewer, "available", lambda: False)
+    assert "not installed" in viewer.write_beside(fitted)
+
+
+def test_a_recording_that_fails_stops_nothing(fitted, monkeypatch):
+    def broken(*arguments: object) -> None:
+        raise RuntimeError("no room")
+
+    monkeypatch.setattr(viewer, "available", lambda: True)
+    monkeypatch.setattr(viewer, "write", broken)
+    assert viewer.write_beside(fitted) == "no session.rrd: no room"
+
+
+def test_folders_that_show_nothing_are_refused(tmp_path):
+    with pytest.raises(UsageError, match="nothing to see"):
+        viewing.read(tmp_path)
+    with pytest.raises(UsageError, match="no folder"):
+        viewing.read(tmp_path / "none")
+    assert cli.run(["view", str(tmp_path), "--no-spawn"]) == 2
+
+
+def test_a_motion_alone_needs_to_be_told_its_robot(session):
+    folder = session / "6-excitation" / "training"
+    assert "--robot" in viewing.read(folder).notes[-1]
+    scene = viewing.read(folder, "ur5")
+    assert scene.chain is not None and scene.chain.n == 6 and not scene.notes
