@@ -20,7 +20,7 @@ given = parser.parse_args()
 
 session = begin(
     given.out, given.robot, "cmm", poses=40, validation=20, seed=given.seed, dynamics=not given.geometry_only,
-    period=10.0, starts=2, evaluations=150, repeats=2, torques="motor",
+    period=10.0, starts=2, evaluations=150, repeats=2, torques="both",
 )  # fmt: skip
 with locked(session):
     while waiting := steps.run_next(session, print, lambda words: None, "session_as_script.py"):

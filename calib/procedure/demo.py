@@ -28,7 +28,7 @@ from calib.simulation.moving import MovingArm, moving_arm, play, record
 Say = Callable[[str], None]
 FIT, VALIDATION, AGAIN = 40, 20, 3
 DRIFT = 10e-6  # how far the simulated instrument wanders over a series [m]
-MOTION = {"period": 10.0, "starts": 2, "evaluations": 150, "repeats": 2, "torques": "motor"}  # little effort, for time
+MOTION = {"period": 10.0, "starts": 2, "evaluations": 150, "repeats": 2, "torques": "both"}  # little effort, for time
 LOGS = (("training", 2), ("validation", 3))  # and the numbers of their noise
 
 

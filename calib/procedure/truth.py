@@ -111,9 +111,9 @@ def transmitted_along(dynamics: Dynamics, q: np.ndarray, v: np.ndarray, a: np.nd
 def _parameters(session: Session, model: IdentificationModel, cell: Cell, arm: MovingArm) -> tuple[float, int]:
     """Return the share of estimated base parameters whose truth is within two sigmas, and how many there are."""
     with session.path("8-dynamics/estimate.csv").open(newline="", encoding="utf-8") as file:
-        found = {row["name"]: (float(row["value"]), float(row["sigma"])) for row in csv.DictReader(file)}
+        rows = [(row["name"].removesuffix("R"), float(row["value"]), float(row["sigma"])) for row in csv.DictReader(file)]
     true = true_base(model, cell, arm, session.settings.seed)
-    inside = [abs(value - true[name]) < 2 * sigma for name, (value, sigma) in found.items() if name in true]
+    inside = [abs(value - true[name]) < 2 * sigma for name, value, sigma in rows if name in true]
     return (float(np.mean(inside)) if inside else 0.0), len(inside)
 
 
@@ -129,4 +129,5 @@ def true_base(model: IdentificationModel, cell: Cell, arm: MovingArm, seed: int)
     lower, upper = sampling_limits(arm.chain)
     samples = bases.random_samples(bare[0], seed=seed, lower=lower, upper=upper)
     base = bases.regroup(bases.find(bare[0], samples), bare[1], samples)
-    return dict(zip(base.names, base.transform @ np.array([known[name] for name in bare[1].names])))
+    plain = (name.removesuffix("R") for name in base.names)  # what is regrouped on one geometry need not be on another
+    return dict(zip(plain, base.transform @ np.array([known[name] for name in bare[1].names])))

@@ -115,9 +115,21 @@ def record(arm: MovingArm, reference: Reference, seed: int | np.random.Generator
     slow = replace(reference, a=0.0 * reference.a)
     controller = with_feedforward(arm.gains, feed_forward(arm.believed, slow))
     run = simulate(arm.plant, controller, reference, Sensing(SIGMA_Q), rng)
-    sensed = link_torque(arm, run.q, run.v, run.a) + SIGMA_LINK * arm.effort * rng.normal(size=run.q.shape)
-    motor = run.torque + SIGMA_MOTOR * arm.effort * rng.normal(size=run.q.shape)
+    noise = [sigma * arm.effort * rng.normal(size=run.q.shape) for sigma in (SIGMA_LINK, SIGMA_MOTOR)]
+    sensed = _held(link_torque(arm, run.q, run.v, run.a)) + noise[0]
+    motor = _held(run.torque) + noise[1]
     return Recording(run.t, run.measured, motor, "torque", arm.chain.joint_names, tau_link=sensed)
+
+
+def _held(torque: np.ndarray) -> np.ndarray:
+    """Return the mean of torques (N, n) over the two control periods around each instant.
+
+    The controller's torque is held for a period, so what is commanded at an instant acts half a period later; drives
+    and sensors that integrate over their sampling see this mean, without that lead.
+    """
+    result = torque.copy()
+    result[1:] = 0.5 * (torque[1:] + torque[:-1])
+    return result
 
 
 def true_torque(arm: MovingArm, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
