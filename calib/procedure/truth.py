@@ -111,7 +111,8 @@ def transmitted_along(dynamics: Dynamics, q: np.ndarray, v: np.ndarray, a: np.nd
 def _parameters(session: Session, model: IdentificationModel, cell: Cell, arm: MovingArm) -> tuple[float, int]:
     """Return the share of estimated base parameters whose truth is within two sigmas, and how many there are."""
     with session.path("8-dynamics/estimate.csv").open(newline="", encoding="utf-8") as file:
-        rows = [(row["name"].removesuffix("R"), float(row["value"]), float(row["sigma"])) for row in csv.DictReader(file)]
+        names = csv.DictReader(file)
+        rows = [(row["name"].removesuffix("R"), float(row["value"]), float(row["sigma"])) for row in names]
     true = true_base(model, cell, arm, session.settings.seed)
     inside = [abs(value - true[name]) < 2 * sigma for name, value, sigma in rows if name in true]
     return (float(np.mean(inside)) if inside else 0.0), len(inside)
