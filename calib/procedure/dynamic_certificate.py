@@ -19,6 +19,7 @@ from calib.procedure.predicting import SCHEMA
 
 TOLD = 50.0  # RSD [%] from which on a parameter is not told from zero: two sigmas
 DRAWN = 300  # points per curve of the excitation
+WORDS = 46  # letters of what a parameter holds that are printed
 WHITE = 0.10  # share of autocorrelations beyond the bound below which a residual may be called white (0.05 if it is)
 
 
@@ -95,11 +96,12 @@ def key_figures(found: DynamicReport) -> list[tuple[str, str, str]]:
     """Return four numbers for the head of the stage: label, value, remark."""
     proof, where = proof_of(found)
     raw, band = proof["raw"]["relative_error_percent"], proof["filtered"]["relative_error_percent"]
-    joints = [x for x in raw["joints"] if x is not None]
+    rows = [(x, name, y) for x, name, y in zip(band["joints"], found.unseen["rows"], raw["joints"]) if x is not None]
+    worst, name, recorded = max(rows, default=(None, "torque", None))
     condition, counts = found.metrics["condition_number"], found.metrics["parameters"]
     return [
         (f"torque unexplained on {where}", percent(raw["total"]), f"{percent(band['total'])} below the motion's band"),
-        ("worst torque row", percent(max(joints, default=None)), f"best {percent(min(joints, default=None))}"),
+        (f"worst: {name}, in band", percent(worst), f"{percent(recorded)} as recorded"),
         ("parameters identified", str(counts["base"]), f"{counts['essential']} essential"),
         ("condition number", f"{condition['normalised']:.3g}", f"unit columns; {condition['raw']:.3g} raw"),
     ]
@@ -150,14 +152,15 @@ def judged_figures(found: DynamicReport) -> list[tuple[str, str, bool]]:
     bars = dynamic_plots.errors_by_row(*sides, rows)
     name = next(iter(found.unseen["autocorrelation"]))
     white = found.unseen["autocorrelation"][name]
+    many = len(rows) > dynamic_plots.FEW
     drawn = dynamic_plots.whiteness(white["values"], white["bound"], rows)
     return [
         (
             svg(bars, "errors"),
             f"Share of each torque that the model leaves, on the training motion and on {where}.",
-            False,
+            many,
         ),
-        (svg(drawn, "white"), f"Autocorrelation of what is left below the band on {name}; dashed: white noise.", False),
+        (svg(drawn, "white"), f"Autocorrelation of what is left below the band on {name}; dashed: white noise.", many),
     ]
 
 
@@ -251,7 +254,8 @@ def parameter_table(found: DynamicReport) -> Table:
         rsd = float(row["rsd"]) if row["rsd"] else np.inf
         shown = "" if rsd > 999 else f"{rsd:.0f} %" if rsd >= 10 else f"{rsd:.2g} %"
         sigma = f"{float(row['sigma']):.2g}" if row["sigma"] else ""
-        words = row["expression"] if len(row["expression"]) < 70 else f"{row['expression'][:66]} …"
+        words = row["expression"]
+        words = words if len(words) <= WORDS else f"{words[:WORDS].rsplit(' ', 2)[0]} …"
         rows.append((row["name"], row["unit"], f"{float(row['value']):.4g}", sigma, shown, words))
     note = "R marks parameters into which others are regrouped; in full in 8-dynamics/estimate.csv."
     header = ("parameter", "unit", "value", "σ", "RSD", "what it holds")

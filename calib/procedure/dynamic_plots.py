@@ -10,6 +10,8 @@ from matplotlib.figure import Figure
 
 from calib.procedure.drawing import AFTER, BEFORE, HALF, INK, MARK, QUIET, WIDE, sheet, styled
 
+FEW = 8  # torque rows whose figures fit half a page
+
 
 def torques(curves: Mapping[str, Any], rows: Sequence[str], units: Sequence[str]) -> Figure:
     """Draw measured and predicted torque of every row over time, and what is left."""
@@ -40,7 +42,7 @@ def errors_by_row(fitted: Sequence[float], unseen: Sequence[float], rows: Sequen
     """Draw the relative error of every row, on the training and on unseen motion."""
     place = np.arange(len(rows))
     with styled():
-        figure, (axis,) = sheet(1, 1, HALF, 2.6)
+        figure, (axis,) = sheet(1, 1, WIDE if len(rows) > FEW else HALF, 2.6)
         axis.barh(place - 0.19, fitted, 0.36, color=BEFORE, label="training motion")
         axis.barh(place + 0.19, unseen, 0.36, color=AFTER, label="unseen motion")
         axis.set_yticks(place, rows, fontsize=6.5 if len(rows) > 8 else 7.5)
@@ -53,9 +55,10 @@ def errors_by_row(fitted: Sequence[float], unseen: Sequence[float], rows: Sequen
 def whiteness(values: Sequence[Sequence[float] | None], bounds: Sequence[float | None], rows: Sequence[str]) -> Figure:
     """Draw the autocorrelation of every row's residual, with the bounds of white noise."""
     shown = [j for j in range(len(rows)) if values[j] is not None]
-    columns = min(4, max(1, len(shown)))
+    many = len(rows) > FEW
+    columns = min(7 if many else 4, max(1, len(shown)))
     with styled():
-        figure, axes = sheet(-(-max(1, len(shown)) // columns), columns, HALF, 2.6)
+        figure, axes = sheet(-(-max(1, len(shown)) // columns), columns, WIDE if many else HALF, 2.6)
         for axis in axes[len(shown) :]:
             axis.set_visible(False)
         for j, axis in zip(shown, axes):

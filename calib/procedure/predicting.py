@@ -21,7 +21,7 @@ from calib.procedure.identifying import REPEAT, IdentificationInputs
 from calib.procedure.verdict import Verdict
 
 SCHEMA = 1
-POINTS = 600  # samples per curve of the certificate (our choice)
+POINTS = 400  # samples per curve of the certificate (our choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,8 +114,8 @@ def report(held: Held) -> dict[str, Any]:
 
 def row_names(joints: tuple[str, ...], kind: str) -> list[str]:
     """Return what the torque rows are called."""
-    sensors = [f"{name}, sensor" for name in joints]
-    motors = [f"{name}, motor" for name in joints]
+    sensors = [f"{name} sensor" for name in joints]
+    motors = [f"{name} motor" for name in joints]
     return {"both": sensors + motors, "link": sensors}.get(kind, list(joints))
 
 
