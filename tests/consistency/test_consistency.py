@@ -45,8 +45,14 @@ def test_spreading_is_the_adjoint_of_decimation(factor):
 
 @pytest.mark.parametrize(
     "settings",
-    [PLAIN, replace(PLAIN, method="ols"), replace(PLAIN, friction="asymmetric"), replace(PLAIN, prior="cad")],
-    ids=["wls", "ols", "ridge", "prior"],
+    [
+        PLAIN,
+        replace(PLAIN, method="ols"),
+        replace(PLAIN, friction="asymmetric"),
+        replace(PLAIN, prior="cad"),
+        replace(PLAIN, samples=200),
+    ],
+    ids=["wls", "ols", "ridge", "prior", "thinned"],
 )
 def test_the_sensitivity_is_the_derivative_of_the_estimate(settings):
     arm, case = planted.arm().with_values(MOVED), planted.case("a", 0)
