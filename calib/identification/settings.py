@@ -64,7 +64,7 @@ class Settings:
         payload_values: label → its ten standard parameters in the tip's frame, where they are known from elsewhere;
             they serve for predictions where no recording to learn from carries it.
         gravity: in the base frame [m/s²]; None: the robot's.
-        samples: most rows (per torque) that are held at once; longer recordings are thinned further.
+        samples: most rows (per torque) that are held; of longer recordings every second, third, ... row alone.
         folds: number of time blocks for cross-validation.
         loop: the closed loop that recordings came from, for instrumental variables.
         seed: for random states.

@@ -12,7 +12,7 @@ from calib.errors import CalibError, MeasurementError, UsageError
 from calib.identification.gains import identify_gains
 from calib.identification.identify import common_decimator, find_base, first_fit, identify
 from calib.identification.ladder import Ground, climb
-from calib.identification.prediction import predict
+from calib.identification.prediction import Dynamics, predict
 from calib.identification.rows import observe, pool, triangulate, with_blocks
 from calib.identification.scores import score
 from calib.identification.settings import Payload, Settings, make_model
@@ -132,3 +132,26 @@ def test_a_term_from_the_options_is_found():
     k = found.names.index("Ks2")
     estimate = found.fitted.estimate
     assert estimate.values[k] == pytest.approx(15.0, abs=4 * estimate.sigma[k])
+
+
+def test_a_long_recording_keeps_its_band_and_loses_rows():
+    cases = [planted.case("train", 0)]
+    all_of_them = common_decimator(cases, Settings())
+    few = common_decimator(cases, Settings(samples=100))
+    assert few.band == all_of_them.band and few.factor % all_of_them.factor == 0
+    model = planted.model()
+    base = find_base(planted.arm(), model, Settings(), None, cases)
+    full, part = (observe(model, base.kept, cases[0], one) for one in (all_of_them, few))
+    assert len(part.target) <= 101 < len(full.target)
+    step = few.factor // all_of_them.factor
+    np.testing.assert_allclose(part.matrix, full.matrix[::step], atol=1e-12)
+    np.testing.assert_allclose(part.target, full.target[::step], atol=1e-12)
+
+
+def test_a_prediction_is_the_regressor_times_the_parameters():
+    case, model = planted.case("train", 0), planted.model()
+    values = planted.truth()
+    motion = case.motion
+    np.testing.assert_allclose(
+        predict(Dynamics(model, values), case), model.regressor(motion.q, motion.v, motion.a) @ values, atol=1e-9
+    )

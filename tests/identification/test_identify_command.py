@@ -214,3 +214,36 @@ def test_the_model_comes_back_from_its_folder_and_predicts_the_same(robot, tmp_p
     (out / "dynamics.json").write_text("{}")
     with pytest.raises(CalibError, match="damaged or of another version"):
         read_dynamics(out)
+
+
+@pytest.mark.parametrize("kind", ["mcap", "sqlite3"])
+def test_a_bag_of_two_publishers_tells_what_the_archive_tells(robot, tmp_path, kind):
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    names = ("sensor_msgs/msg/JointState", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+    state, header, stamp = (store.types[name] for name in names)
+    good = planted.series(0)
+    order, joints = [2, 0, 1], ["joint3", "finger", "joint1", "joint2"]
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin[kind.upper()]) as writer:
+        arm, gripper = (
+            writer.add_connection(topic, state.__msgtype__, typestore=store)
+            for topic in ("/joint_states", "/gripper/joint_states")
+        )
+        for k, t in enumerate(good["t"]):
+            ns = round(t * 1e9) + 10**18
+            time = header(stamp=stamp(sec=ns // 10**9, nanosec=ns % 10**9), frame_id="")
+            q, tau = (np.insert(good[name][k, order], 1, 0.1) for name in ("q", "tau"))
+            message = state(header=time, name=joints, position=q, velocity=np.zeros(4), effort=tau)
+            writer.write(arm, ns, store.serialize_cdr(message, state.__msgtype__))
+            alone = state(header=time, name=["finger"], position=q[:1], velocity=q[:1], effort=q[:1])
+            writer.write(arm if k % 7 == 0 else gripper, ns + 10, store.serialize_cdr(alone, state.__msgtype__))
+    np.savez(tmp_path / "same.npz", t=good["t"], q=good["q"], dq=np.zeros_like(good["q"]), tau=good["tau"])
+    found = []
+    for name in ("bag", "same.npz"):
+        assert run(robot, tmp_path / name, "--out", tmp_path / f"out_{name}", "--friction", "standard") == 0
+        rows = list(csv.DictReader((tmp_path / f"out_{name}" / "estimate.csv").open()))
+        found.append([(float(row["value"]), float(row["sigma"])) for row in rows])
+    of_bag, of_archive = np.array(found[0]), np.array(found[1])
+    np.testing.assert_allclose(of_bag[:, 0], of_archive[:, 0], atol=1e-3 * of_archive[:, 1].max())
