@@ -28,7 +28,6 @@ from scipy.interpolate import CubicSpline
 from calib.dynamics.tree import standard_parameters
 from calib.errors import CalibError
 from calib.identification.cases import Case
-from calib.identification.loop_settings import LoopSettings, stated_controller
 from calib.identification.loops import periods_per_sample, take
 from calib.identification.prediction import Dynamics, carried_columns
 from calib.identification.rows import segments
@@ -55,7 +54,7 @@ class Replay:
     Attributes:
         name: of the recording.
         seconds: that were replayed.
-        controller: the feedback; `stated`: whether it is the options'.
+        controller: the feedback; `stated`: whether it is not the default.
         left_out: terms of the model that the simulated robot does not have; what they explain is in the disturbance.
         rms: what is fed forward → (n,) rms of q - q_r [rad or m].
     """
@@ -74,15 +73,17 @@ class Replay:
 
 
 def replay(
-    chain: Chain, dynamics: Dynamics, case: Case, predicted: np.ndarray, loop: LoopSettings | None = None
-) -> Replay:
+    chain: Chain, dynamics: Dynamics, case: Case, predicted: np.ndarray, controller: Controller | None = None,
+    rate: float | None = None,
+) -> Replay:  # fmt: skip
     """Simulate a recording's motion under feedback, with nothing, CAD and the model fed forward.
 
     Args:
         chain: whose inertias are the CAD's, where it has any.
         dynamics: the identified model, of motor torques (or of both).
         predicted: (N, rows) its torques along the case.
-        loop: the controller; one that is to be identified, or None, is replaced by the default.
+        controller: the feedback; None: the default. Torques it adds by itself are not taken.
+        rate: of the controller [Hz]; None: see `calib.identification.loops.periods_per_sample`.
 
     Raises:
         CalibError: where the model belongs to no possible robot, or the loop is unstable.
@@ -93,9 +94,8 @@ def replay(
     part = _stretch(case)
     motion = case.motion
     robot, left_out = _robot(dynamics, case)
-    stated = loop is not None and loop.controller != "identify"
-    reference, every = _reference(take(case, part), loop.rate if stated and loop is not None else None)
-    control = stated_controller(loop, n) if stated and loop is not None else _default(robot, reference)
+    reference, every = _reference(take(case, part), rate)
+    control = _default(robot, reference) if controller is None else replace(controller, ahead=None)
     sampled = np.arange(part.stop - part.start)
 
     def controlled(torque: np.ndarray) -> np.ndarray:
@@ -112,7 +112,9 @@ def replay(
     ahead |= {IDENTIFIED: controlled(predicted), FLOOR: measured}
     push = feed_forward(robot, reference) - measured
     rms = {name: replayed_error(robot, control, reference, one, push) for name, one in ahead.items()}
-    return Replay(case.name, float(motion.t[part.stop - 1] - motion.t[part.start]), control, stated, left_out, rms)
+    return Replay(
+        case.name, float(motion.t[part.stop - 1] - motion.t[part.start]), control, controller is not None, left_out, rms
+    )
 
 
 def _stretch(case: Case) -> slice:

@@ -52,6 +52,7 @@ def loop_table(bias: LoopTest) -> dict[str, Any] | None:
     return {
         "controller": controller_table(loops.controller),
         "controller_explains_percent": None if identified is None else _floats(identified.explained),
+        "instruments": bias.method,
         "rounds": len(found.rounds),
         "retreats": sum(one.retreats for one in found.rounds),
         "durbin_wu_hausman": {

@@ -13,6 +13,7 @@ from rich.table import Table
 from calib.errors import CalibError
 from calib.identification.cases import Case
 from calib.identification.identify import Identification
+from calib.identification.loop_settings import stated_controller
 from calib.identification.replay import CAD, DAMPING, FEEDBACK, FLOOR, FREQUENCY, IDENTIFIED, Replay, replay
 from calib.procedure.identification_loop import controller_table
 from calib.robot.chain import Chain
@@ -43,8 +44,12 @@ def track(
     """Replay unseen recordings (or, without any, one of the fit's own); see `calib.identification.replay`."""
     chosen = list(unseen)[:MOST] or list(cases)[:1]
     loop = found.settings.loop if unit == "N m" else None
+    read = None if loop is None or found.bias.loops is None else found.bias.loops.controller
     try:
-        replays = tuple(replay(chain, found.dynamics, case, predictions[case.name], loop) for case in chosen)
+        if loop is not None and loop.controller != "identify":
+            read = stated_controller(loop, chain.n)
+        rate = None if read is None or loop is None else loop.rate
+        replays = tuple(replay(chain, found.dynamics, case, predictions[case.name], read, rate) for case in chosen)
     except CalibError as error:
         return Tracking(unseen=bool(unseen), failure=str(error))
     return Tracking(replays, bool(unseen))
@@ -67,7 +72,7 @@ def tracking_lines(tracking: Tracking, chain: Chain) -> Iterator[Table | str]:
     yield table
     first = tracking.replays[0]
     control = (
-        "the stated controller" if first.stated else f"a PD of {FREQUENCY:g} Hz, damping {DAMPING:g} (our default)"
+        "the controller of [loop]" if first.stated else f"a PD of {FREQUENCY:g} Hz, damping {DAMPING:g} (our default)"
     )
     motion = "motion the fit has not seen" if tracking.unseen else "the motion of the fit itself, which flatters"
     yield (

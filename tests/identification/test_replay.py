@@ -15,15 +15,12 @@ from calib.data.recording import Recording
 from calib.errors import CalibError
 from calib.identification import replay as replays
 from calib.identification.cases import Case, make_case
-from calib.identification.loop_settings import LoopSettings
 from calib.identification.prediction import Dynamics, predict
 from calib.simulation import controllers, references
 from calib.simulation.closed_loop import Plant, simulate
 from calib.simulation.tracking import replayed_error
 
-KP, KD = (900.0, 700.0, 120.0), (80.0, 60.0, 10.0)
-PD = controllers.pd(np.array(KP), np.array(KD))
-LOOP = LoopSettings("pd", kp=KP, kd=KD, rate=1000.0)
+PD = controllers.pd(np.array([900.0, 700.0, 120.0]), np.array([80.0, 60.0, 10.0]))
 
 
 def plant() -> Plant:
@@ -52,7 +49,7 @@ def test_the_replay_tells_how_the_true_robot_would_track(share):
                    for x, one in zip(values[30:], planted.model().terms)]  # fmt: skip
     dynamics = Dynamics(planted.model(), values)
     predicted = predict(dynamics, case)
-    found = replays.replay(planted.arm(), dynamics, case, predicted, LOOP)
+    found = replays.replay(planted.arm(), dynamics, case, predicted, PD)
     motion = case.motion
     start = round(motion.t[0] * 1000)
     followed = references.Reference(motion.t, motion.q, motion.v, motion.a)
@@ -68,7 +65,7 @@ def test_better_models_track_better_and_cad_knows_no_friction():
     errors = []
     for factor in (0.5, 0.8, 1.0):
         dynamics = Dynamics(planted.model(), factor * planted.truth())
-        found = replays.replay(planted.arm(), dynamics, case, predict(dynamics, case), LOOP)
+        found = replays.replay(planted.arm(), dynamics, case, predict(dynamics, case), PD)
         errors.append(np.mean(found.rms[replays.IDENTIFIED] / found.rms[replays.FEEDBACK]))
         assert (found.rms[replays.CAD] > found.rms[replays.IDENTIFIED]).all() or factor < 1.0
     assert errors[0] > errors[1] > errors[2]
