@@ -71,6 +71,12 @@ def tracking_lines(tracking: Tracking, chain: Chain) -> Iterator[Table | str]:
             table.add_row(escape(one.name), name, *(f"{1e3 * x:.3g}" for x in rms))
     yield table
     first = tracking.replays[0]
+    if first.added.any():
+        shown = " ".join(f"{x:.2g}" for x in first.added)
+        yield (
+            f"the identified model is no possible robot: it is simulated with motor inertia added, {shown} kg m² (kg); "
+            "compare the rows, do not trust their size"
+        )
     control = (
         "the controller of [loop]" if first.stated else f"a PD of {FREQUENCY:g} Hz, damping {DAMPING:g} (our default)"
     )
@@ -95,6 +101,7 @@ def tracking_table(tracking: Tracking) -> dict[str, Any] | None:
             "seconds": one.seconds,
             "controller": controller_table(one.controller) | {"stated": one.stated},
             "terms_left_out": list(one.left_out),
+            "inertia_added": [float(x) for x in one.added],
         }
         for one in tracking.replays
     }
