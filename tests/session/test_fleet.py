@@ -71,6 +71,6 @@ def test_exit_codes_by_error() -> None:
 @pytest.mark.slow
 def test_a_session_as_a_script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     given = ["--out", str(tmp_path / "cell"), "--geometry-only", "--robot", "ur5"]
-    monkeypatch.setattr(sys, "argv", ["session_as_script.py", *given])
-    runpy.run_path(str(ROOT / "examples/session_as_script.py"), run_name="__main__")
+    monkeypatch.setattr(sys, "argv", ["03_session_as_script.py", *given])
+    runpy.run_path(str(ROOT / "examples/03_session_as_script.py"), run_name="__main__")
     assert (tmp_path / "cell/certificate.html").exists()

@@ -1,6 +1,6 @@
 """A guided session as a script: `calib demo` line by line, a simulated cell standing for yours.
 
-python examples/session_as_script.py --out session [--robot lwr4plus] [--seed 0]
+python examples/03_session_as_script.py --out session [--robot lwr4plus] [--seed 0]
 """
 
 import argparse
@@ -23,7 +23,7 @@ session = begin(
     period=10.0, starts=2, evaluations=150, repeats=2, torques="both",
 )  # fmt: skip
 with locked(session):
-    while waiting := steps.run_next(session, print, lambda words: None, "session_as_script.py"):
+    while waiting := steps.run_next(session, print, lambda words: None, "03_session_as_script.py"):
         print(*asking.asks(session, waiting), sep="\n")  # what an engineer would now do at the robot, and bring
         demo.bring_for(session, waiting.step.name, print)  # your script would copy files into 3-measured, 7-recorded
 print(f"{verdict_of(session)}: {session.path('certificate.html')}, {session.path(session.export) / 'robot.urdf'}")

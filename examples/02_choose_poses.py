@@ -1,0 +1,21 @@
+"""Choose the poses at which a robot's geometry shows best, under its joint limits, and compare with random ones.
+
+python examples/02_choose_poses.py [FOLDER]
+"""
+
+import sys
+from pathlib import Path
+
+from calib.procedure import selecting
+
+folder = Path(sys.argv[1] if len(sys.argv) > 1 else "example-02")
+folder.mkdir(parents=True, exist_ok=True)
+
+# from a tracker that sees one reflector at a time: three of them on the tool tell its orientation, too
+targets = [[0.05, 0.0, 0.1], [-0.05, 0.0, 0.1], [0.0, 0.05, 0.15]]
+chosen = selecting.choose("ur5", 20, kind="position", tools=targets, index="O1", candidates=500, seed=0)
+
+for words, number in selecting.table(chosen):
+    print(f"{words:38} {number}")
+selecting.write(chosen, folder / "poses.csv")
+print(f"written to {folder / 'poses.csv'}: joint values in rad, for the robot program")

@@ -1,0 +1,34 @@
+"""Plan the fastest motion through waypoints, on the identified model: its torques, its friction, its uncertainty.
+
+python examples/07_plan_on_identified_model.py [FOLDER]
+"""
+
+import sys
+from pathlib import Path
+
+from calib.data.plans import write_poses
+from calib.procedure import identification_outputs, identifying, motion_outputs, motion_planning
+from calib.robot.load import load
+from calib.simulation import brought
+from calib.simulation.cells import virtual_cell
+from calib.simulation.moving import moving_arm, record
+from calib.simulation.references import random_fourier
+
+folder = Path(sys.argv[1] if len(sys.argv) > 1 else "example-07")
+folder.mkdir(parents=True, exist_ok=True)
+
+# an identified model, as in example 06
+arm, chain = moving_arm(virtual_cell("tx40", 0), "tx40", 0), load("tx40")
+speeds = [0.5 * joint.velocity for joint in chain.joints]
+reference = random_fourier(chain.lower, chain.upper, speeds, 10.0, 500.0, acceleration=15.0, seed=1)
+brought.write_log(record(arm, reference, 1), folder / "training.csv")
+inputs = identifying.gather("tx40", [str(folder / "training.csv")], friction="standard")
+identification_outputs.write_folder(identifying.run(inputs), folder / "model")
+
+corners = [[0.0, 0.3, 1.2, 0.0, 0.5, 0.0], [1.2, 0.8, 0.6, 0.5, 0.9, 0.8], [0.4, 0.2, 1.5, -0.5, 0.2, -0.6]]
+write_poses(folder / "waypoints.csv", corners, chain.joint_names)
+for words, model in (("the maker's model", None), ("the identified model", folder / "model")):
+    planned = motion_planning.plan("tx40", folder / "waypoints.csv", model=model)
+    print(f"on {words}: {planned.track.duration:.3f} s")
+motion_outputs.write_folder(planned, folder / "motion")
+print(f"motion.csv and trajectory.yaml are in {folder / 'motion'}")

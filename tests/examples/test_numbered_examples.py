@@ -1,0 +1,86 @@
+"""The numbered examples: short, complete, and they do what their first line says."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+NUMBERED = sorted(EXAMPLES.glob("0*.py"))
+
+
+def run(name: str, *arguments: object) -> str:
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(EXAMPLES.parent)}
+    command = [sys.executable, str(EXAMPLES / name), *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def figures(pattern: str, said: str) -> list[float]:
+    return [float(each) for each in re.findall(pattern, said)]
+
+
+def test_there_are_eight_and_each_is_read_in_a_minute():
+    assert [path.name[:2] for path in NUMBERED] == [f"0{k}" for k in range(1, 9)]
+    for path in NUMBERED:
+        lines = path.read_text(encoding="utf-8").splitlines()
+        assert len(lines) <= 40 and lines[0].startswith('"""') and path.name in "\n".join(lines[:5]), path.name
+
+
+def test_01_fit_geometry(tmp_path):
+    before, after = figures(r"(?:nominal|calibrated): ([\d.]+) mm", run("01_fit_geometry.py", tmp_path))
+    assert after < 0.3 * before
+    assert (tmp_path / "fit/robot.urdf").is_file()
+
+
+def test_02_choose_poses(tmp_path):
+    (share,) = figures(r"efficiency .*? ([\d.]+) \(", run("02_choose_poses.py", tmp_path))
+    assert share > 0.9
+    assert len((tmp_path / "poses.csv").read_text().splitlines()) == 21
+
+
+def test_04_compensate(tmp_path):
+    nominal, commands = figures(r"off by ([\d.]+) mm", run("04_compensate.py", tmp_path))
+    assert commands < 0.2 * nominal
+
+
+@pytest.mark.slow
+def test_03_session_as_script(tmp_path):
+    said = run("03_session_as_script.py", "--out", tmp_path / "cell", "--robot", "ur5", "--geometry-only")
+    assert "pass: " in said
+    assert (tmp_path / "cell/certificate.html").is_file()
+
+
+@pytest.mark.slow
+def test_05_design_excitation(tmp_path):
+    raw, _ = figures(r"([\d.]+) (?:raw|normalised)", said := run("05_design_excitation.py", tmp_path))
+    assert raw < 200 and "every limit is kept" in said
+    assert (tmp_path / "trajectory.yaml").is_file()
+
+
+@pytest.mark.slow
+def test_06_identify_dynamics(tmp_path):
+    (unexplained,) = figures(
+        r"unseen: ([\d.]+) % of the torque unexplained\n", run("06_identify_dynamics.py", tmp_path)
+    )
+    assert unexplained < 8.0
+
+
+@pytest.mark.slow
+def test_07_plan_on_the_identified_model(tmp_path):
+    maker, identified = figures(r"model: ([\d.]+) s", run("07_plan_on_identified_model.py", tmp_path))
+    assert 0.1 < maker < identified  # friction, and a margin for what is not known
+    assert (tmp_path / "motion/motion.csv").is_file()
+
+
+@pytest.mark.slow
+def test_08_certificate_and_fleet(tmp_path):
+    said = run("08_certificate_and_fleet.py", tmp_path)
+    assert said.count("waits") >= 2 and said.count("done, pass") == 2
+    assert all((tmp_path / f"cell{k}/certificate.html").is_file() for k in (1, 2))
