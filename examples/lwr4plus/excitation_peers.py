@@ -204,9 +204,16 @@ def picture(curves: dict[str, Curve], seconds: float) -> Figure:
         for (name, curve), color, dash in zip(
             curves.items(), (AFTER, MARK, BEFORE, QUIET, INK), ("-", "-", "-", "--", ":")
         ):
-            t, merit = [p[0] for p in curve] + [seconds], [p[1] for p in curve] + [curve[-1][1] if curve else np.nan]
+            seen = [point for point in curve if point[0] <= seconds] or [(seconds, np.nan)]
+            t, merit = [*(p[0] for p in seen), seconds], [*(p[1] for p in seen), seen[-1][1]]
             axis.step(t, np.exp(merit), where="post", color=color, linestyle=dash, linewidth=1.2, label=name)
-        axis.set(xlabel="processor time [s]", ylabel="√(cond raw · cond normalised)", xscale="log", yscale="log")
+        axis.set(
+            xlabel="processor time [s]",
+            ylabel="√(cond raw · cond normalised)",
+            xscale="log",
+            yscale="log",
+            xlim=(min(0.1, seconds / 10), seconds),
+        )
         axis.legend(fontsize=7)
     return figure
 
