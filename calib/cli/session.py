@@ -135,7 +135,6 @@ def demo(
     with told() as (console, say, progress):
         if bring is not None:
             demonstration.bring_what_waits(bring, say)
-            say(f"next: calib next {bring}")
             return
         found = demonstration.run(
             out, robot, seed, say, progress, dynamics=not geometry_only, guided=guided,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import resource
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -87,8 +88,13 @@ def run(
             raise SessionError(f"the demonstration stopped at {waiting.step.name}: {waiting.words}")
         return Found(session, "", (), time.perf_counter() - started, stopped(session, waiting))
     before, after = told_truth(session, cell, say)
-    seconds, memory = time.perf_counter() - started, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
-    return Found(session, verdict_of(session), results(session), seconds, (), before, after, memory)
+    seconds = time.perf_counter() - started
+    return Found(session, verdict_of(session), results(session), seconds, (), before, after, largest_memory())
+
+
+def largest_memory() -> float:
+    """Return the largest resident set of this process so far [MB]; Linux counts it in kB, macOS in bytes."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2.0**20 if sys.platform == "darwin" else 2.0**10)
 
 
 def stopped(session: Session, waiting: steps.State) -> tuple[str, ...]:
@@ -131,8 +137,7 @@ def told_truth(session: Session, cell: Cell, say: Say) -> tuple[float, float]:
         lines.append(
             f"hidden truth, on a motion nobody has seen: noise-free torques are predicted to {found.identified:.2f} % "
             f"({found.nominal:.1f} % behind the gears by the nominal masses, with the true friction); of "
-            f"{found.count} base "
-            f"parameters {found.within:.0%} are within two sigmas of the truth"
+            f"{found.count} base parameters {found.within:.0%} are within two sigmas of the truth"
         )
     files.write(session.path("truth.txt"), "\n".join([*notes, *lines]) + "\n")
     for line in lines:
@@ -141,7 +146,7 @@ def told_truth(session: Session, cell: Cell, say: Say) -> tuple[float, float]:
 
 
 def bring_what_waits(folder: Path, say: Say) -> None:
-    """Let the simulated cell bring what the session in `folder` waits for.
+    """Let the simulated cell bring what the session in `folder` waits for; compare a finished one with the truth.
 
     Raises:
         UsageError: where nothing is waited for, or the session's robot is none of the library.
@@ -154,9 +159,13 @@ def bring_what_waits(folder: Path, say: Say) -> None:
         )
     with locked(session, say):
         waiting = next((state for state in steps.states(session) if state.kind not in (steps.DONE, steps.KEPT)), None)
-        if waiting is None or waiting.kind != steps.WAITING:
+        if waiting is None:
+            told_truth(session, virtual_cell(session.settings.robot["given"], session.settings.seed), say)
+            return
+        if waiting.kind != steps.WAITING:
             raise UsageError(f"{folder} waits for nothing; next: calib next {folder}")
         bring_for(session, waiting.step.name, say)
+    say(f"next: calib next {folder}")
 
 
 def bring_for(session: Session, step: str, say: Say) -> None:

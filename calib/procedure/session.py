@@ -88,11 +88,11 @@ rate = {rate}                          # of the controller [Hz]
 repeats = {repeats}                            # how often the robot plays each motion
 starts = {starts}                             # random starts of the search for a motion
 evaluations = {evaluations}                      # most per start
-limits = "{limits}"                            # a TOML file beside this one: speeds, torques, workspace, friction
+limits = "{limits}"                            # a TOML file beside this one; see `calib formats limits`
 torques = "{torques}"                      # motor, link, or both: sensors behind the gears beside the motors' torques
 friction = "auto"                      # or standard, or one rung of the ladder; see calib identify --friction
 method = "wls"                         # or ols, irls, tls
-options = ""                           # a TOML file beside this one, as of calib identify --options
+options = ""                           # a TOML file beside this one; see `calib formats identify-options`
 tolerance_percent = 0.0                # largest torque error on unseen motion that is good enough; 0: none
 
 [dynamics.payloads]                    # label = mass [kg] of bodies at the flange: loaded = 3.28

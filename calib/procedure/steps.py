@@ -170,6 +170,7 @@ def _run(session: Session, step: Step, say: Say, progress: Say, command: str) ->
         "finished": datetime.now().astimezone().isoformat(timespec="seconds"),
         "seconds": round(time.perf_counter() - started, 2),
         "command": command,
+        "seed": session.settings.seed,
         "toolkit": certificate.versions(),
         "inputs": inputs,
         "outputs": {str(path.relative_to(session.folder)): fingerprint(path) for path in produced},

@@ -1,0 +1,73 @@
+"""What arrives says of itself whether joints were read back, and whether anything moved while it was measured."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.data.measurements import take
+from calib.errors import UsageError
+from calib.procedure import arrival
+from calib.procedure.answers import QUESTIONS, Answers, checked, with_answer
+from calib.procedure.dynamic_stages import options_of
+from calib.procedure.guided import begin
+from calib.robot.chain import random_joints
+from calib.simulation.cell import measure, wandering
+from calib.simulation.cells import virtual_cell
+
+CELL = virtual_cell("lwr4plus")
+Q = random_joints(CELL.nominal, 30, 3)
+
+
+def repeated(drift: float, seed: int) -> list[str]:
+    first = wandering(measure(CELL, Q, seed), drift, seed)
+    again = wandering(measure(CELL, Q[:4], seed + 100), drift, seed, begin=1.0)
+    return arrival.drift(CELL.nominal, [first], [replace(again, file="drift.csv")], 60e-6)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_drift_is_told_from_noise(seed: int) -> None:
+    assert "as noise alone would" in repeated(0.0, seed)[0]
+    assert "did base, tool or instrument move" in repeated(1e-3, seed)[0]
+
+
+def test_a_pose_measured_twice_in_one_file_counts() -> None:
+    found = measure(CELL, np.concatenate([Q, Q[:3]]), 1)
+    assert "measured more than once, 3 poses" in arrival.drift(CELL.nominal, [found], [], 60e-6)[0]
+    assert arrival.drift(CELL.nominal, [take(found, range(20))], [], 60e-6) == []
+
+
+def test_commanded_joints_in_place_of_read_ones_are_noticed() -> None:
+    found = measure(CELL, Q, 1)
+    assert "0.0091 mrad rms" in arrival.readback(Q, found)[0]
+    assert "log what the encoders read" in arrival.readback(Q, replace(found, q=Q))[0]
+
+
+def test_a_recording_named_after_a_payload_carries_it(tmp_path) -> None:
+    session = begin(
+        tmp_path / "cell", "lwr4plus", "cmm", poses=5, validation=0, seed=0, payloads={"loaded": 3.28}, torques="both"
+    )
+    for name in ("training.csv", "training_loaded.csv"):
+        session.path(f"7-recorded/{name}").write_text("t\n")
+    found = options_of(session)
+    assert found.settings.payloads["loaded"].mass == 3.28 and found.settings.kind == "both"
+    assert {name: one.payload for name, one in found.files.items()} == {"training_loaded.csv": ("loaded",)}
+
+
+def test_answers_are_checked_as_they_come() -> None:
+    ask = {question.name: question for question in QUESTIONS}
+    given = with_answer(Answers(), ask["robot"], "lwr4plus")
+    given = with_answer(given, ask["instrument"], "cmm")
+    with pytest.raises(UsageError, match="look like mm"):
+        with_answer(given, ask["tool"], "50,0,50")
+    given = with_answer(given, ask["tool"], "0.05,0,0.05")
+    with pytest.raises(UsageError, match="label=kg"):
+        with_answer(given, ask["payloads"], "3.28")
+    given = with_answer(with_answer(given, ask["payloads"], "loaded=3.28"), ask["dynamics"], "yes")
+    assert not ask["payloads"].open(given) and ask["torques"].open(given)
+    found = checked(with_answer(given, ask["torques"], "both"))
+    assert found["payloads"] == {"loaded": 3.28} and found["tool"] == (0.05, 0.0, 0.05) and found["dynamics"]
+    with pytest.raises(UsageError, match="geometry-only"):
+        checked(Answers("ur5", "cmm", dynamics=False, torques="both"))
