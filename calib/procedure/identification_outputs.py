@@ -160,7 +160,11 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
             for rung in found.rungs
         ],
         "ripple": [
-            {"joint": one.joint + 1, "orders_per_turn": list(one.orders), "explained_share_on_unseen_blocks": one.share}
+            {
+                "joint": one.joint + 1,
+                "waves": [{"gear": source + 1, "order_per_turn": order} for source, order in one.waves],
+                "explained_share_on_unseen_blocks": one.share,
+            }
             for one in found.ripples
         ],
         "elimination": elimination_table(outcome),

@@ -38,9 +38,9 @@ def outcome_lines(outcome: IdentificationOutcome) -> Iterator[RenderableType]:
     if found.rungs:
         yield ladder_table(outcome)
     for one in found.ripples:
-        orders = ", ".join(f"{order:g}" for order in one.orders)
-        words = f"ripple at joint {one.joint + 1}, orders {orders} per turn: explains {100 * one.share:.0f} % of the"
-        yield f"{words} fast residual's power on unseen time, at positions it has been to"
+        waves = (f"{k}" if source == one.joint else f"{k} of joint {source + 1}" for source, k in one.waves)
+        words = f"ripple at joint {one.joint + 1}, orders {', '.join(waves)} per turn: explains {100 * one.share:.0f} %"
+        yield f"{words} of the fast residual's power on time blocks left out; not part of the covariance"
     raw, normalised = found.condition
     yield f"method {found.fitted.method}: takes for granted that {ASSUMES[found.fitted.method]}"
     base = found.base
