@@ -44,15 +44,6 @@ def load_dependent(joint: int, v0: float = V0, viscous: bool = False) -> tuple[T
     return (first, term(f"Fvt{joint + 1}", "load_velocity", joint)) if viscous else (first,)
 
 
-def gain(joint: int) -> tuple[Term, ...]:
-    """Return ``Kg``: tau += Kg load, by which share of the transmitted torque a joint's torques are scaled wrong.
-
-    No friction, but found like it: torque sensors and motors' torque constants differ by some per cent from what they
-    are said to be, and joints that share a link's mass tell (only relative to each other, the rest is the masses').
-    """
-    return (term(f"Kg{joint + 1}", "transmitted", joint),)
-
-
 def presliding(joint: int, widths: Sequence[float], v0: float = V0) -> tuple[Term, ...]:
     """Return ``Fp3.1 Fp3.2 …``: friction at rest that depends on the past, one stop operator z per width [rad or m].
 

@@ -128,7 +128,6 @@ SHAPES: dict[str, Shape] = {
         lambda m, s: np.abs(_given(m.load)) * smooth_sign(m.v, s[0]), None, "", "", ("v0",), loaded=True
     ),
     "load_velocity": Shape(lambda m, s: np.abs(_given(m.load)) * m.v, None, "s/rad", "s/m", loaded=True),
-    "transmitted": Shape(lambda m, s: _given(m.load), None, "", "", loaded=True),
     "stop": Shape(lambda m, s: _given(m.state), None, "N m", "N", ("width",), remembers=True),
     "presliding": Shape(
         lambda m, s: _given(m.state) - smooth_sign(m.v, s[1]), None, "N m", "N", ("width", "v0"), remembers=True

@@ -1,6 +1,6 @@
 """A ladder of friction, climbed joint by joint as far as unseen time rewards it.
 
-    standard → + gain → + load → + presliding → + stribeck → + asymmetric → + root → + cubic → + ripple
+    standard → + load → + presliding → + stribeck → + asymmetric → + root → + cubic → + ripple
 
 Every rung is tried on top of those taken: all joints get its terms, every time block is predicted by a fit to the
 others, and the terms stay at the joints whose error on unseen time falls by `GAIN`. Terms of a rung have a ridge per
@@ -25,7 +25,7 @@ from calib.identification.unseen import Bench
 GAIN = 0.02  # a rung has to lower a joint's rms error on unseen time by this share (our choice)
 WIDTHS = (0.0005, 0.002, 0.008, 0.03)  # of presliding, shares of a joint's travel (our choice)
 WINS = 0.6  # and on this share of the blocks
-RUNGS = ("gain", "load", "presliding", "stribeck", "asymmetric", "root", "cubic")
+RUNGS = ("load", "presliding", "stribeck", "asymmetric", "root", "cubic")
 NAMES = ("auto", "standard", *RUNGS, "ripple")
 
 Progress = Callable[[str], None]
@@ -187,7 +187,6 @@ def _terms(ground: Ground, name: str) -> list[Term]:
         travel = float(np.ptp(np.concatenate([case.motion.q[:, j] for case in ground.cases])))
         v0 = float(ground.v0[j])
         terms = {
-            "gain": lambda: friction.gain(j),  # noqa: B023
             "load": lambda: friction.load_dependent(j, v0, viscous=True),  # noqa: B023
             "presliding": lambda: friction.presliding(j, [travel * x for x in WIDTHS], v0),  # noqa: B023
             "stribeck": lambda: (

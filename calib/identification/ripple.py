@@ -45,6 +45,7 @@ RIDGES = (0.03, 0.1, 0.3, 1.0)  # of the mean information of a column
 LEAST = 0.1  # [rad] that a joint must travel
 BLOCKS = 8
 PAYS = 0.015  # of the fast residual's power on left-out blocks, per step of the search in families
+WORTH = 0.03  # in all: 1.5 % of its rms
 FREE = 0.04  # and where no family pays: 2 % of its rms (our choices)
 PAIRS = 3  # of free orders, at most
 SAMPLES = 4_000  # of the search
@@ -151,7 +152,7 @@ def family(turns: int) -> tuple[tuple[int, ...], ...]:
     """Return the orders per turn at which a gear shows, in the sets that are offered together."""
     n = turns
     return tuple(
-        one for one in ((2 * n, 2 * n + 2), (n,), (4 * n, 4 * n + 2, 4 * n + 4)) if one[-1] <= HIGHEST
+        one for one in ((2 * n, 2 * n + 2), (n,), (3 * n,), (4 * n, 4 * n + 2, 4 * n + 4)) if one[-1] <= HIGHEST
     )  # fmt: skip
 
 
@@ -267,7 +268,7 @@ def _climb(
             break
         taken, best, ridge = waves, share, level
         rest = bench.fit(taken, COARSE, ridge)[0]
-    return taken, best, ridge
+    return (taken, best, ridge) if best >= WORTH else ((), 0.0, ridge)
 
 
 def _free(track: Track, joint: int, rest: np.ndarray) -> list[tuple[Wave, ...]]:

@@ -1,0 +1,68 @@
+"""Gear ripple: found by its family, also where another gear's is felt, and not where there is none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib.dynamics.shapes import Joined
+from calib.identification import ripple
+from calib.identification.ripple import Track
+
+RATE, TURNS = 500.0, 100
+
+
+def track(seed: int, seconds: float = 12.0) -> Track:
+    """Return two joints on sums of sines."""
+    random = np.random.default_rng(seed)
+    t = np.arange(0.0, seconds, 1.0 / RATE)
+    f, phase = 0.1 * np.arange(1, 6)[:, None], random.uniform(0.0, 2.0 * np.pi, (2, 5, 1))
+    w = 2.0 * np.pi * f
+    q = np.array([np.sum(0.25 * np.sin(w * t + own), axis=0) for own in phase]).T
+    v = np.array([np.sum(0.25 * w * np.cos(w * t + own), axis=0) for own in phase]).T
+    return Track(q, v, np.arange(len(t)) * 8 // len(t), (0, 1))
+
+
+def planted(where: Track) -> np.ndarray:
+    """Return torques (N, 2): gear 1's ripple in both joints, growing with speed."""
+    q, v = where.q[:, 0], np.abs(where.v[:, 0])
+    wave = v * (np.sin(2 * TURNS * q + 0.3) + 0.7 * np.cos((2 * TURNS + 2) * q) + 0.5 * np.sin(TURNS * q))
+    return np.stack([wave, -0.6 * wave], axis=1)
+
+
+def explained(one: ripple.Ripple, where: Track, torque: np.ndarray) -> float:
+    predicted = np.zeros(len(torque))
+    for own, value in zip(one.terms, one.values):
+        source = own.acts[0][1][0][0]
+        q, v = where.q[:, source], where.v[:, source]
+        predicted += value * own.form.values(Joined(q, v, np.zeros_like(q)), own.settings)
+    return 1.0 - float(np.sum((torque - predicted) ** 2) / np.sum(torque**2))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_family_is_found_and_predicts_other_motion(seed):
+    learnt, other = track(seed), track(seed + 100)
+    noise = np.random.default_rng(seed).normal(scale=0.2, size=learnt.q.shape)
+    torque = planted(learnt) + noise
+    turns = ripple.find_turns(learnt, torque)
+    assert turns[0] == TURNS
+    for joint in (0, 1):
+        one = ripple.find(joint, learnt, torque[:, joint], turns)
+        assert {(0, TURNS), (0, 2 * TURNS), (0, 2 * TURNS + 2)} <= set(one.waves)
+        assert explained(one, other, planted(other)[:, joint]) > 0.8
+        assert all(own.acts[0][0] == joint for own in one.terms)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_has_no_ripple(seed):
+    learnt = track(seed)
+    noise = np.random.default_rng(seed).normal(size=learnt.q.shape)
+    turns = ripple.find_turns(learnt, noise)
+    assert [ripple.find(joint, learnt, noise[:, joint], turns) for joint in (0, 1)] == [None, None]
+
+
+def test_a_single_loud_moment_has_no_coherence():
+    learnt = track(0)
+    burst = np.where(learnt.block == 3, np.sin(200.0 * learnt.q[:, 0]), 0.0)
+    steady = np.sin(200.0 * learnt.q[:, 0])
+    assert ripple.coherence(learnt, 0, burst).max() < 1e-6 * ripple.coherence(learnt, 0, steady).max()
