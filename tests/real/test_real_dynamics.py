@@ -35,12 +35,32 @@ def values(out: Path) -> dict[str, float]:
 
 
 @pytest.mark.slow
-def test_panda_on_the_rest_of_its_record(data, tmp_path):
+@pytest.mark.parametrize(
+    ("train", "unseen", "most", "plain"),
+    [("@0:9.387", "@9.387:", 3.25, 3.55), ("@3.13:", "@0:3.13", 3.65, 4.2)],
+)
+def test_panda_on_the_rest_of_its_record(data, tmp_path, train, unseen, most, plain):
+    """Measured 3.16 and 3.53 %; our model without ripple and richer friction 3.44 and about 4.0 %; published model 3.66 %.
+
+    The issue's plain 2.8 % and published 3.7 % belong to another stretch: plain WLS left-out second by second over all
+    12.5 s gives 2.93 beside the published model's 3.76. Its goal of 2.3 is not met here.
+    """
     folder = data / "franka_panda_inria"
     log = folder / "traj1_first60pct.npz"
-    found = identify(tmp_path / "out", folder / "model.urdf", f"{log}@0:9.387", "--validate", f"{log}@9.387:")
-    assert total(found, "traj1_first60pct.npz@9.387:") < 3.66, "the published model's error on the same samples"
-    assert found["verdict"] == "pass"
+    found = identify(tmp_path / "out", folder / "model.urdf", f"{log}{train}", "--validate", f"{log}{unseen}")
+    assert total(found, f"traj1_first60pct.npz{unseen}") < most
+    bare = identify(
+        tmp_path / "bare",
+        folder / "model.urdf",
+        f"{log}{train}",
+        "--validate",
+        f"{log}{unseen}",
+        "--friction",
+        "standard",
+    )
+    assert total(found, f"traj1_first60pct.npz{unseen}") < total(bare, f"traj1_first60pct.npz{unseen}") < plain
+    lobes = {(wave["gear"], wave["order_per_turn"]) for one in found["ripple"] for wave in one["waves"]}
+    assert {(1, 240), (1, 242), (4, 240), (4, 242)} <= lobes
 
 
 UR10E = """
@@ -62,7 +82,8 @@ def test_ur10e_currents_become_torques_and_friction_pays(data, tmp_path):
     arguments = (folder / "model.urdf", train, "--validate", *unseen)
     found = identify(tmp_path / "out", *arguments, options=UR10E)
     for path in unseen:
-        assert total(found, path.name) < 4.3
+        assert total(found, path.name) < 3.8, "measured 3.61 and 3.24; the goal is 4.3"
+    assert all(wave["order_per_turn"] in (100, 200, 202) for one in found["ripple"] for wave in one["waves"])
     kept = [rung["model"] for rung in found["ladder"] if rung["kept"]]
     assert {"+ load", "+ presliding"} <= set(kept)
     plain = identify(tmp_path / "plain", *arguments, "--friction", "standard", options=UR10E)
