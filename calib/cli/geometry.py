@@ -126,23 +126,43 @@ def select(
 
 @app.command()
 def export(
-    folder: Annotated[Path, typer.Argument(help="the folder of a fit")],
+    folder: Annotated[Path, typer.Argument(help="the folder of a fit, or of an identification")],
     urdf: Annotated[
         Path | None, typer.Option(help="the URDF to put the calibrated geometry into (it stays as it is)")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="the URDF to write")] = None,
     ur_kinematics: Annotated[Path | None, typer.Option(help="write ur_description's kinematics YAML")] = None,
     offsets: Annotated[Path | None, typer.Option(help="write a CSV of joint offsets")] = None,
+    into: Annotated[
+        Path | None, typer.Option(help="folder for all forms of an identified robot: calib formats exports")
+    ] = None,
     for_corrections: Annotated[
         bool, typer.Option("--for-corrections", help="the URDF that joint_corrections.csv belongs to, worse without it")
     ] = False,
 ) -> None:
-    """Write the calibrated geometry for other programs."""
+    """Write the calibrated geometry, and with --into the identified dynamics, for other programs."""
     from calib.errors import UsageError
     from calib.procedure import exporting
 
+    if into:
+        from calib.procedure import exporting_dynamics
+
+        if out or ur_kinematics or offsets:
+            raise UsageError("--into writes all files into one folder; leave --out, --ur-kinematics and --offsets out")
+        exporting_dynamics.check_identified(folder)
+        exporting.check_targets(urdf, [into / name for name in exporting_dynamics.WRITTEN])
+        console = make_console()
+        with progress() as say:
+            say("all parameters, and each file read back")
+            lines = exporting_dynamics.deliver_dynamics(folder, urdf, into)
+        for line in lines:
+            console.print(line, soft_wrap=True, markup=False)
+        console.print(f"written to {into}", soft_wrap=True, markup=False)
+        return
     if (urdf is None) != (out is None) or not (urdf or ur_kinematics or offsets):
-        raise UsageError("nothing to write: give --urdf SOURCE.urdf --out FILE.urdf, --ur-kinematics or --offsets")
+        raise UsageError(
+            "nothing to write: give --urdf SOURCE.urdf --out FILE.urdf, --ur-kinematics, --offsets or --into"
+        )
     found = exporting.read(folder)
     exporting.check_targets(urdf, [path for path in (out, ur_kinematics, offsets) if path])
     console = make_console()

@@ -25,6 +25,10 @@ TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
         "the folder that calib identify writes",
         ("calib.identification.storage", "calib.procedure.consistency_tables"),
     ),
+    "exports": (
+        "what calib export --into writes of an identified robot",
+        ("calib.procedure.exporting_dynamics", "calib.identification.consistent"),
+    ),
     "constraints": ("the TOML file of calib select --constraints", ("calib.procedure.limits",)),
     "mdh": ("a robot as a table of modified Denavit-Hartenberg rows", ("calib.robot.mdh", "calib.robot.tables")),
     "robot": ("robot.toml as calib fit writes it", ("calib.robot.description", "calib.procedure.calibrated")),

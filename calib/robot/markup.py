@@ -101,10 +101,12 @@ def set_attributes(source: str, node: Node, values: dict[str, str]) -> list[tupl
 
 
 def insert_child(source: str, node: Node, child: str) -> list[tuple[int, int, str]]:
-    """Return the change that puts a new first child into a node, indented as what follows its start tag."""
+    """Return the change that puts a new first child into a node (an empty one is opened), indented as what follows."""
     data = source.encode("utf-8")
     last = max([match.end() for match in _attributes(data, node)], default=node.start)
     place = data.index(b">", last) + 1
+    if data[place - 2 : place] == b"/>":
+        return [(place - 2, place, f">{child}</{node.tag}>")]
     indent = _BLANK.match(data, place)
     return [(place, place, (indent[0].decode() if indent else "") + child)]
 
