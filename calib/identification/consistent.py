@@ -17,7 +17,7 @@ degrees of freedom (our observation), so γ has a marginal likelihood,
 
 Laplace's approximation, J the cost and H its curvature at the optimum: the weight is where that is largest (our choice;
 blocks of one poor motion repeat each other, so that cross-validation on them wants no prior at all). γ is not let below
-`LEAST`, where masses may be wrong by √(2/γ), a third: what no model explains must not pass for a wrong CAD;
+`LEAST`, where masses may be wrong by √(2/γ), a third (10 for rods, where Laplace still holds): what no model explains must not pass for a wrong CAD;
 but where a possible robot is within the estimate's covariance, γ is lowered until the result is.
 
 Where even the nearest possible robot, whatever its CAD, is d > √b standard deviations from the estimate, the data's
@@ -174,7 +174,7 @@ def _candidates(
 ) -> Iterator[tuple[float, float, Problem, np.ndarray, References]]:
     """Yield the optimum of each weight with its evidence, the data's sigmas widened by `doubt`."""
     doubted = replace(problem, factor=problem.factor / doubt)
-    usual = [g for g in WEIGHTS if g >= LEAST] if references.cad else WEIGHTS[::3]
+    usual = [g for g in WEIGHTS if g >= LEAST] if references.cad else WEIGHTS[4::3]
     for gamma in usual if weight is None else [weight]:
         values = solve(doubted, gamma)
         yield evidence(doubted, gamma, values), gamma, doubted, values, references
