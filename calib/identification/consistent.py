@@ -17,8 +17,9 @@ degrees of freedom (our observation), so γ has a marginal likelihood,
 
 Laplace's approximation, J the cost and H its curvature at the optimum: the weight is where that is largest (our choice;
 blocks of one poor motion repeat each other, so that cross-validation on them wants no prior at all). γ is not let below
-`LEAST`, where masses may be wrong by √(2/γ), a third (10 for rods, where Laplace still holds): what no model explains must not pass for a wrong CAD;
-but where a possible robot is within the estimate's covariance, γ is lowered until the result is.
+`LEAST`, where masses may be wrong by √(2/γ), a third (10 for rods, below which Laplace's approximation fails): what no
+model explains must not pass for a wrong CAD. Only where a possible robot is within the estimate's covariance and the
+result is not, γ is lowered until it is.
 
 Where even the nearest possible robot, whatever its CAD, is d > √b standard deviations from the estimate, the data's
 sigmas do not tell the errors of the model, and count d / √b times (Birge 1932): poor motion with a small residual would
