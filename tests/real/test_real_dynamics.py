@@ -42,8 +42,8 @@ def values(out: Path) -> dict[str, float]:
 def test_panda_on_the_rest_of_its_record(data, tmp_path, train, unseen, most, plain):
     """Measured 3.16 and 3.53 %; without richer friction and ripple 3.44 and about 4.0 %; published model 3.66 %.
 
-    The issue's plain 2.8 % was not reproduced here (another stretch, most likely): plain WLS left-out second by second over all
-    12.5 s gives 2.93 beside the published model's 3.76. Its goal of 2.3 is not met here.
+    The issue's plain 2.8 % was not reproduced (another stretch, most likely): plain WLS left out second by second over
+    all 12.5 s gives 2.93 beside the published model's 3.76. Its goal of 2.3 is not met here.
     """
     folder = data / "franka_panda_inria"
     log = folder / "traj1_first60pct.npz"
