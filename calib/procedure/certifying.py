@@ -47,9 +47,9 @@ def certify(session: Session, say: Say) -> list[str]:
     notes = [f"geometry {outside['verdict']}: {outside['reason']}"]
     if session.dynamic:
         dynamics = dynamic_certificate.read(session.path("8-dynamics"))
-        judged.append(
-            dynamic_certificate.dynamics_stage(dynamics, session.path("8-dynamics"), session.path("6-excitation"))
-        )
+        exported = read_state(session)["steps"].get("export", {}).get("notes", [])
+        folders = session.path("8-dynamics"), session.path("6-excitation")
+        judged.append(dynamic_certificate.dynamics_stage(dynamics, *folders, exported))
         notes.append(f"dynamics {dynamics.verdict}: {dynamics.reason}")
     page = certificate.Page(
         f"Calibration of {session.settings.name}",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -59,12 +59,13 @@ def read(folder: Path) -> DynamicReport:
     return DynamicReport(unseen["verdict"], unseen["reason"], metrics, estimate, unseen)
 
 
-def dynamics_stage(found: DynamicReport, folder: Path, excitation: Path) -> Stage:
+def dynamics_stage(found: DynamicReport, folder: Path, excitation: Path, exported: Sequence[str] = ()) -> Stage:
     """Return the stage of the dynamics: errors on unseen motion, torques, excitation, parameters, what is not told.
 
     Args:
         folder: of the identification.
         excitation: folder with ``training/trajectory.csv`` and its ``metrics.json``, if one was planned.
+        exported: what the export had to say.
     """
     blocks: list[Block] = [error_table(found), Pictures("", judged_figures(found))]
     for number, curves in enumerate(found.unseen["curves"]):
@@ -78,6 +79,8 @@ def dynamics_stage(found: DynamicReport, folder: Path, excitation: Path) -> Stag
     blocks.append(Text("What the motion can tell", identifiability(found)))
     blocks += consistency(folder)
     blocks += [Pictures("Dynamic parameters", [significance(found)]), parameter_table(found)]
+    if exported:
+        blocks.append(Text("What was exported", exported))
     notes = [*found.metrics["warnings"], *(w for w in found.unseen["warnings"] if w not in found.metrics["warnings"])]
     if notes:
         blocks.append(Text("Notes on the dynamics", notes))

@@ -237,7 +237,14 @@ def export(session: Session, say: Say) -> list[str]:
     """Put the calibrated robot into the forms others read."""
     from calib.procedure.delivery import deliver
 
-    return deliver(session.path("4-fit"), robot_file(session), session.path(session.export))
+    source, out = robot_file(session), session.path(session.export)
+    notes = deliver(session.path("4-fit"), source, out)
+    if not session.dynamic:
+        return notes
+    from calib.procedure.exporting_dynamics import deliver_dynamics
+
+    say("masses of possible bodies, each file read back")
+    return notes + deliver_dynamics(session.path("8-dynamics"), source if source.suffix == ".urdf" else None, out)
 
 
 def clear_staging(session: Session) -> None:

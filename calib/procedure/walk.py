@@ -102,7 +102,8 @@ def files_of(paths: list[Path]) -> list[Path]:
 
 def _exported(session: Session) -> list[Path]:
     own = [*_robot(session), session.path("4-fit/robot.toml"), session.path("4-fit/robot.urdf")]
-    return own + ([session.path("8-dynamics/dynamics.json")] if session.dynamic else [])
+    identified = [session.path(f"8-dynamics/{name}") for name in ("dynamics.json", "estimate.csv", "covariance.csv")]
+    return own + (identified if session.dynamic else [])
 
 
 def _certified(session: Session) -> list[Path]:

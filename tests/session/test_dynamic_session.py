@@ -111,6 +111,8 @@ def test_it_ends_in_one_certificate_of_both(whole: Session) -> None:
         assert words in page
     found = json.loads(whole.path("8-dynamics/unseen/report.json").read_text())
     own = found["validation"]["validation.csv"]
+    assert "<inertia " in whole.path("9-export/robot.urdf").read_text() and whole.path("9-export/robot.xml").exists()
+    assert "What was exported" in page
     assert own["evidence"] and own["raw"]["relative_error_percent"]["total"] < 10.0
     assert own["filtered"]["relative_error_percent"]["total"] < 3.0
 
