@@ -294,7 +294,8 @@ def _link_bodies(given: Exported, tree: Tree, own: Chain) -> tuple[dict[str, np.
         if not pseudo_inertia.margin(links[joint.child]) > 0.0:
             raise RobotError(
                 f"{tree.where}: link '{joint.child}' would have to be no possible body, since what hangs on it "
-                f"({', '.join(loose)}) is heavier than what was identified; correct those masses, or take them out"
+                f"({', '.join(loose)}) is heavier than what was identified: are the drives' gains "
+                "known? Correct those masses, or leave --urdf out for all other files"
             )
     return links, notes
 

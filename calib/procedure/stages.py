@@ -12,6 +12,7 @@ import numpy as np
 from calib import files
 from calib.data.options import FileOptions, FitOptions, read_options
 from calib.data.plans import check_against, read_poses, write_poses
+from calib.errors import RobotError, UsageError
 from calib.geometry.fit import polish_frames
 from calib.geometry.weighing import Settings as FitSettings
 from calib.geometry.weighing import combine
@@ -238,13 +239,18 @@ def export(session: Session, say: Say) -> list[str]:
     from calib.procedure.delivery import deliver
 
     source, out = robot_file(session), session.path(session.export)
-    notes = deliver(session.path("4-fit"), source, out)
+    lines = deliver(session.path("4-fit"), source, out)
     if not session.dynamic:
-        return notes
+        return lines
     from calib.procedure.exporting_dynamics import deliver_dynamics
 
-    say("masses of possible bodies, each file read back")
-    return notes + deliver_dynamics(session.path("8-dynamics"), source if source.suffix == ".urdf" else None, out)
+    say("all parameters of possible bodies")
+    given = source if source.suffix == ".urdf" else None
+    try:
+        found = deliver_dynamics(session.path("8-dynamics"), given, out / "dynamics")
+    except (RobotError, UsageError) as error:  # the geometry stands by itself
+        return [*lines, f"the dynamics were not exported: {error}"]
+    return [*lines, *(f"dynamics/{line}" if line[:6] in ("robot.", "drives") else line for line in found)]
 
 
 def clear_staging(session: Session) -> None:

@@ -153,7 +153,10 @@ STEPS = (
         (*_keys(f"plan validation repeats tolerance_percent {MODEL}"), "seed"), _predicted, dynamic_stages.predict,
         ("8-dynamics/unseen/*",), True,
     ),
-    Step("export", "write the calibrated robot", ("robot",), _exported, stages.export, ("6-export/*", "9-export/*")),
+    Step(
+        "export", "write the calibrated robot", ("robot",), _exported, stages.export,
+        ("6-export/*", "9-export/*", "9-export/dynamics/*"),
+    ),
     Step(
         "certificate", "print the certificate",
         ("name", "created", "instrument", "poses", "fit", *_keys("torques payloads tolerance_percent")), _certified,

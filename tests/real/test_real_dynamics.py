@@ -142,6 +142,34 @@ def test_lwr_with_one_sine_says_what_it_cannot_tell(data, tmp_path):
     assert all(own[name] >= 0.0 for name in own if name[:2] in ("Ia", "Fv", "Fc"))
 
 
+def test_lwr_full_parameters_hold_where_it_has_not_been(data, tmp_path):
+    """Half of the one closed curve learnt, the other half predicted: plain least squares is worse than the CAD."""
+    from calib.dynamics.tree import standard_parameters
+    from calib.identification import consistent, prediction, told
+    from calib.procedure import identifying
+
+    folder = data / "kuka_lwr4plus_iit"
+    log = folder / "measurements_1.npz"
+    arguments = (folder / "model.urdf", f"{log}@2.5:8.75", "--validate", f"{log}@8.75:15")
+    bare = identify(tmp_path / "bare", *arguments, options='prior = "none"')
+    identify(tmp_path / "drawn", *arguments, options='prior = "cad"')
+    data_alone = told.read(tmp_path / "drawn")
+    found = consistent.find_consistent(data_alone)
+    assert data_alone.rests_on_prior and (found.margins > 0.0).all()
+    inputs = identifying.gather(arguments[0], [str(arguments[1])], [str(arguments[3])])
+    case = inputs.unseen[0]
+
+    def error(dynamics: prediction.Dynamics) -> float:
+        rest = prediction.predict(dynamics, case) - case.target
+        return 100.0 * float(np.linalg.norm(rest) / np.linalg.norm(case.target))
+
+    cad = np.zeros(found.dynamics.model.p)
+    own = standard_parameters(data_alone.chain)
+    cad[: len(own)] = own
+    drawn, untouched = (error(one) for one in (found.dynamics, prediction.Dynamics(found.dynamics.model, cad)))
+    assert drawn < untouched < total(bare, "measurements_1.npz@8.75:15"), "7.1, 7.4 and 35 % as measured"
+
+
 @pytest.mark.slow
 def test_kr300_needs_the_prior_on_other_motion(data, tmp_path):
     folder = data / "kuka_kr300_tuk"
