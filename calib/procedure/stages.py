@@ -245,12 +245,17 @@ def export(session: Session, say: Say) -> list[str]:
     from calib.procedure.exporting_dynamics import deliver_dynamics
 
     say("all parameters of possible bodies")
-    given = source if source.suffix == ".urdf" else None
+    corrected = (out / "robot_for_corrections.urdf").exists()  # identified on another geometry than robot.urdf's
+    place = out / "dynamics" if corrected else out
     try:
-        found = deliver_dynamics(session.path("8-dynamics"), given, out / "dynamics")
+        found = deliver_dynamics(session.path("8-dynamics"), source if source.suffix == ".urdf" else None, place)
     except (RobotError, UsageError) as error:  # the geometry stands by itself
         return [*lines, f"the dynamics were not exported: {error}"]
-    return [*lines, *(f"dynamics/{line}" if line[:6] in ("robot.", "drives") else line for line in found)]
+    return [
+        *lines,
+        *([f"in {place.name}, on the geometry that joint corrections belong to:"] if corrected else []),
+        *found,
+    ]
 
 
 def clear_staging(session: Session) -> None:
