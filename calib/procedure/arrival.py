@@ -66,7 +66,7 @@ def _pairs(
     q = np.array([block.q[k] for block, k in first])
     result = []
     for place, (block, k) in enumerate(later):
-        near = np.flatnonzero(np.abs(q - block.q[k]).max(axis=1) < SAME)
+        near = [int(i) for i in np.flatnonzero(np.abs(q - block.q[k]).max(axis=1) < SAME)]
         near = [i for i in near if first is not later or i < place]
         near = [i for i in near if first[i][0].tool[first[i][1]] == block.tool[k]]
         if not near:

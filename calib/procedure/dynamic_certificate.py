@@ -152,7 +152,7 @@ def judged_figures(found: DynamicReport) -> list[tuple[str, str, bool]]:
     own = next(iter(found.unseen["fit"].values()))
     sides = [[x or 0.0 for x in one["raw"]["relative_error_percent"]["joints"]] for one in (own, proof)]
     rows = found.unseen["rows"]
-    bars = dynamic_plots.errors_by_row(*sides, rows)
+    bars = dynamic_plots.errors_by_row(sides[0], sides[1], rows)
     name = next(iter(found.unseen["autocorrelation"]))
     white = found.unseen["autocorrelation"][name]
     many = len(rows) > dynamic_plots.FEW

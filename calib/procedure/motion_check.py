@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -193,16 +192,21 @@ def _against_masses(recording: Recording, chain: Chain) -> tuple[np.ndarray, np.
     Least squares of τ_j on [τ_nominal,j, v_j, sign(v_j), 1]; how surely is the partial correlation with the first.
     """
     grid = np.arange(recording.t[0], recording.t[-1], STEP)
-    smooth = partial(savgol_filter, window_length=2 * SMOOTH + 1, polyorder=3, axis=0)
-    q, torque = (_sampled(recording.t, x, grid) for x in (recording.q, recording.effort))
-    q, v, a = smooth(q), smooth(q, deriv=1, delta=STEP), smooth(q, deriv=2, delta=STEP)
+    place = _sampled(recording.t, recording.q, grid)
+    q, v, a = (_smooth(place, order) for order in range(3))
+    torque = _smooth(_sampled(recording.t, recording.effort, grid))
     rigid = inverse_dynamics(tree(chain), standard_parameters(chain), q, v, a)
     limit = np.array([joint.effort for joint in chain.joints])
     share, alike = np.zeros(chain.n), np.zeros(chain.n)
     for j in range(chain.n):
         others = np.column_stack([v[:, j], np.tanh(v[:, j] / 0.05), np.ones(len(q))])
-        left = [x - others @ np.linalg.lstsq(others, x, rcond=None)[0] for x in (rigid[:, j], smooth(torque)[:, j])]
+        left = [x - others @ np.linalg.lstsq(others, x, rcond=None)[0] for x in (rigid[:, j], torque[:, j])]
         power = left[0] @ left[0]
         share[j] = left[0] @ left[1] / max(power, 1e-12)
         alike[j] = abs(left[0] @ left[1]) / max(np.sqrt(power * (left[1] @ left[1])), 1e-12)
     return share, alike, rigid.std(axis=0) > HEAVY * np.where(np.isfinite(limit), limit, 100.0)
+
+
+def _smooth(values: np.ndarray, order: int = 0) -> np.ndarray:
+    """Return values (N, n) on the coarse grid, or their derivatives, by cubics over a moving window."""
+    return np.asarray(savgol_filter(values, 2 * SMOOTH + 1, 3, deriv=order, delta=STEP, axis=0))
