@@ -11,8 +11,8 @@ friction), tool 0.3 m from axis 1 and above -0.2 m. Every method keeps its best 
     scipy, 2-point  SLSQP of SciPy with its own finite differences
     random          feasible ones among random Fourier series, coefficients scaled into the joint limits
 
-and ours on the Panda and the TX40, T0 = 20 s, same columns and limits (the Panda's masses are not in the library, so
-its torque is not limited).
+and ours on the Panda and the TX40, T0 = 20 s, with the same kinds of columns and limits, the tool above the mounting
+plane (the Panda's masses are not in the library, so its torque is not limited).
 
     python examples/lwr4plus/excitation_peers.py --out lwr4plus-peers [--seconds 60] [--alone] [--seed 0]
 
@@ -60,7 +60,9 @@ STEP = 1e-7
 Curve = list[tuple[float, float]]  # processor seconds, and the mean log cond of a motion
 
 
-def problem(chain: Chain, period: float, harmonics: int = 5, friction: tuple | None = (FV, FC)) -> Problem:
+def problem(
+    chain: Chain, period: float, friction: tuple | None = (FV, FC), radius: float | None = 0.3, lowest: float = -0.2
+) -> Problem:
     """Return the problem of a robot; torque is limited where its masses are known."""
     smooth, values = model(chain, 0.05, friction)
     velocity, effort = (np.array([getattr(j, key) for j in chain.joints]) for key in ("velocity", "effort"))
@@ -68,9 +70,9 @@ def problem(chain: Chain, period: float, harmonics: int = 5, friction: tuple | N
     limits: list[Any] = [*box_limits(chain.lower, chain.upper, velocity)]
     if values is not None:
         limits.append(TorqueLimit(smooth.regressor, smooth.regressor_gradient, values, effort))
-    limits.append(Workspace(tool, tool.product, radius=0.3, lowest=-0.2))
+    limits.append(Workspace(tool, tool.product, radius=radius, lowest=lowest))
     objectives = tuple((Excitation("cond", scaling), 0.5) for scaling in ("raw", "normalised"))
-    family = fourier(harmonics, period, chain.n, rate=1000.0)
+    family = fourier(5, period, chain.n, rate=1000.0)
     return Problem(family, smooth.regressor, smooth.regressor_gradient, objectives, tuple(limits))
 
 
@@ -242,7 +244,7 @@ def compare(seconds: float, seed: int, out: Path, robots: Sequence[str]) -> dict
     others = dict[str, Any]()
     for name in robots:
         chain = load(name)
-        spot = problem(chain, 20.0, friction=None)
+        spot = problem(chain, 20.0, None, None, 0.0)
         curve, x = ours(spot, seconds, seed)
         if x is None:
             others[name] = None
