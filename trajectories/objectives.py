@@ -224,7 +224,7 @@ def condition_numbers(
         columns: (c,) which columns count; None: all.
     """
     W = _stacked(regressor if sigmas is None else regressor / sigmas[:, None])
-    triangle = np.linalg.qr(W, mode="r")
+    triangle = np.asarray(np.linalg.qr(W, mode="r"))
     if existing is not None:
         values, V = np.linalg.eigh(existing)
         triangle = np.concatenate([triangle, np.sqrt(np.maximum(values, 0.0))[:, None] * V.T])

@@ -102,7 +102,7 @@ def repeats(training: Motion, other: Motion) -> float:
 
 def _lines(q: np.ndarray, rate: float) -> tuple[int, float, float]:
     """Return the number of lines of a series (N,), the best sine's frequency [Hz], and the variance it explains."""
-    window, size = np.asarray(get_window("hann", len(q))), next_fast_len(4 * len(q), real=True)
+    window, size = np.asarray(get_window("hann", len(q))), int(next_fast_len(4 * len(q), real=True) or 0)
     power = np.abs(np.fft.rfft(window * (q - window @ q / window.sum()), size)) ** 2
     peaks, _ = find_peaks(power, height=LINE * power.max(), distance=8, prominence=0.5 * LINE * power.max())
     best, frequency = max((_one_sine(q, f, rate), f) for f in _about(int(np.argmax(power)), rate, size))

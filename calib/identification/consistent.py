@@ -36,7 +36,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
-from scipy.special import multigammaln
+from scipy.special import multigammaln  # type: ignore[attr-defined]
 
 from calib.arrays import frozen
 from calib.dynamics import pseudo_inertia

@@ -86,7 +86,7 @@ class Ground:
 
     cases: Sequence[Case]
     rows: Sequence[Rows]
-    loads: Sequence[np.ndarray]
+    loads: Sequence[np.ndarray | None]
     decimator: Decimator
     std: np.ndarray
     inflation: np.ndarray

@@ -58,11 +58,11 @@ def nearest(problem: Problem, spared: int | None = None) -> np.ndarray:
         with warnings.catch_warnings():  # a reduced accuracy (1e-5) does for a distance in sigmas
             warnings.filterwarnings("ignore", message="Solution may be inaccurate")
             task.solve(solver=cp.CLARABEL)
-    except cvxpy.error.SolverError as error:
+    except cp.SolverError as error:
         raise NotConverged(f"the nearest possible robot was not found: {error}") from error
     if unknowns.value is None:
         raise NotConverged(f"the nearest possible robot was not found: Clarabel says '{task.status}'")
-    result = matrix @ unknowns.value
+    result = np.asarray(matrix @ unknowns.value)
     result[10 * problem.bodies :] += given
     return result
 
@@ -87,4 +87,4 @@ def _coordinates(problem: Problem) -> np.ndarray:
         root = np.linalg.cholesky(known)
         units = root @ np.eye(16).reshape(16, 4, 4) @ root.T
         blocks.append(pseudo_inertia.to_standard(0.5 * (units + units.transpose(0, 2, 1))).T)
-    return scipy.linalg.block_diag(*blocks, np.diag(problem.sizes))
+    return np.asarray(scipy.linalg.block_diag(*blocks, np.diag(problem.sizes)))

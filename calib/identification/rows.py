@@ -171,7 +171,8 @@ def _live(model: IdentificationModel, columns: np.ndarray) -> tuple[np.ndarray, 
         entries[:first] = (rigid_body.regressor(model.tree, *state) != 0.0).any(axis=0).T
     for k, one in enumerate(model.columns):
         entries[first + k, [row for row, _ in one.acts]] = True
-    return np.nonzero(entries[columns])
+    column, row = np.nonzero(entries[columns])
+    return column, row
 
 
 def _block(

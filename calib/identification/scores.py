@@ -66,8 +66,12 @@ def score(case: Case, predicted: np.ndarray, slow: float | tuple[float, ...] | N
     rows = [_row(case, np.asarray(predicted)[:, k], k, known, moves[:, k % motion.n]) for k in range(count)]
     every = motion.decimator.factor
     residual = np.stack([row.low for row in rows], axis=1)
+    raw, filtered, moved, stood = (_together([row.sums[k] for row in rows]) for k in range(4))
     return Score(
-        *(_together([row.sums[k] for row in rows]) for k in range(4)),
+        raw,
+        filtered,
+        moved,
+        stood,
         np.array([row.above for row in rows]),
         np.array([row.r_squared for row in rows]),
         _whiteness(residual, motion.segment[::every]),

@@ -94,9 +94,8 @@ def write(recollection: Recollection, out: Path) -> Path:
     arrays = {called[name]: one.mean for name, one in averages.items()}
     arrays |= {f"variance_{called[name]}": one.variance for name, one in averages.items()}
     buffer = io.BytesIO()
-    np.savez_compressed(
-        buffer, t=t, joint_names=np.array(names), periods=np.array(recollection.found.periods), **arrays
-    )  # type: ignore[arg-type]
+    arrays |= {"t": t, "joint_names": np.array(names), "periods": np.array(recollection.found.periods)}
+    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
     return files.write(out, buffer.getvalue())
 
 

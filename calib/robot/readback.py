@@ -97,7 +97,7 @@ def motion_torques(
             torques[row, element.joint] += element.ratio * tau[joint.idx_v]
             frames[number, row] = data.oMi[joint.id].homogeneous
     main = [joints[number].idx_v for number, (k, _) in enumerate(moved) if k in chain.moving]
-    order = [element.joint for k, element in moved if k in chain.moving]
+    order = [element.joint for k, element in moved if k in chain.moving and element.joint is not None]
     damping, friction = np.zeros(chain.n), np.zeros(chain.n)
     damping[order], friction[order] = model.damping[main], model.friction[main]
     return torques, frames, damping, friction

@@ -65,7 +65,7 @@ def centred(body: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
 def _inertial(source: str, link: Node, body: np.ndarray) -> list[tuple[int, int, str]]:
     mass, centre, moments = centred(body)
     place = {"xyz": " ".join(repr(float(x)) for x in centre), "rpy": ZERO}
-    values = dict(zip(MOMENTS, (repr(float(x)) for x in moments)))
+    values: dict[str, str] = {name: repr(float(x)) for name, x in zip(MOMENTS, moments)}
     node = link.first("inertial")
     if node is None:
         parts = "".join(
