@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calib.data.motion import moving
 from calib.identification.cases import Case
 from calib.identification.identify import Identification, common_decimator
-from calib.identification.rows import Rows, observe
+from calib.identification.rows import Rows, observe, thinned
 from calib.identification.settings import make_model
 from calib.robot.chain import Chain
 
@@ -65,6 +66,16 @@ def rows_on(found: Identification, chain: Chain, cases: Sequence[Case]) -> list[
         matrix = np.concatenate([own.matrix, part.matrix[:, :, found.base.b :]], axis=2)
         result.append(replace(part, matrix=matrix))
     return result
+
+
+def standstill_shift(found: Identification, cases: Sequence[Case]) -> np.ndarray:
+    """Return by how much φ (p,) changes where rows of nearly standing joints are left out; for one row per joint."""
+    how, decimator = estimator(found), common_decimator(cases, found.settings)
+    faster = [
+        replace(part, present=part.present & thinned(moving(case.motion), case.motion.segment, decimator))
+        for part, case in zip(found.rows, cases)
+    ]
+    return estimate(how, faster)[0] - estimate(how, found.rows)[0]
 
 
 def cut(rows: Rows, own: slice) -> Rows:

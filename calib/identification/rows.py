@@ -193,9 +193,13 @@ def _block(
 
 def _rows(names: Sequence[str], units: Sequence[str], matrix: np.ndarray, case: Case, decimator: Decimator) -> Rows:
     segment = case.motion.segment
-    index = kept(segment, decimator)
     target = decimate(case.target, decimator, segment)
-    share = decimate(case.present.astype(float), decimator, segment)
-    present = (share > 0.5) & case.present[index] if len(decimator.taps) == 1 else share > 0.5
+    present = thinned(case.present, segment, decimator)
     rate = case.motion.rate / decimator.factor
-    return Rows(tuple(names), tuple(units), matrix, target, present, np.zeros(len(index), dtype=int), rate)
+    return Rows(tuple(names), tuple(units), matrix, target, present, np.zeros(len(target), dtype=int), rate)
+
+
+def thinned(mask: np.ndarray, segment: np.ndarray, decimator: Decimator) -> np.ndarray:
+    """Return which thinned rows (M, rows) stand for samples of a mask (N, rows) by more than half."""
+    share = decimate(mask.astype(float), decimator, segment)
+    return (share > 0.5) & mask[kept(segment, decimator)] if len(decimator.taps) == 1 else share > 0.5

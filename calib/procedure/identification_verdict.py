@@ -11,6 +11,7 @@ from calib.data.motion import moving
 from calib.identification.cases import Case
 from calib.identification.identify import Identification
 from calib.identification.prior import resting
+from calib.identification.refit import standstill_shift
 from calib.identification.scores import Score
 from calib.procedure.verdict import Verdict
 
@@ -147,8 +148,33 @@ def _slow_bias(cases: Sequence[Case], found: Identification) -> list[str]:
     share = total / max(size, 1)
     slow = [j for j in np.flatnonzero(share > SLOW_SHARE) if f"Fc{j + 1}" in found.names]
     if not slow:
-        return []
+        return _coulomb_shift(cases, found)
     shown = ", ".join(f"{100 * share[j]:.0f} % at joint {j + 1}" for j in slow)
     return [
         f"rows of nearly standing joints are in the fit ({shown}): they draw Coulomb friction down; set cut_slow = true"
+    ]
+
+
+def _coulomb_shift(cases: Sequence[Case], found: Identification) -> list[str]:
+    """Notice that the few rows near standstill move Coulomb friction by more than its sigma.
+
+    Where a joint's friction is richer, they are modelled, not cut.
+    """
+    if found.settings.kind != "motor":
+        return []
+    richer = {joint for one in found.climb.terms for joint, _ in one.acts}
+    index = {j: found.names.index(f"Fc{j + 1}") for j in range(cases[0].motion.n) if f"Fc{j + 1}" in found.names}
+    estimate = found.fitted.estimate
+    unit = 0.01 * np.abs(estimate.values)
+    shift, sigma = standstill_shift(found, cases) / unit, estimate.sigma / unit
+    moved = [
+        f"Fc{j + 1} {shift[k]:+.1f} % (sigma {sigma[k]:.1f} %)"
+        for j, k in index.items()
+        if j not in richer and abs(shift[k]) > sigma[k]
+    ]
+    if not moved:
+        return []
+    return [
+        f"the few rows of nearly standing joints move Coulomb friction by more than its sigma; without them: "
+        f"{', '.join(moved)}; for its value set cut_slow = true, or choose a friction with presliding"
     ]

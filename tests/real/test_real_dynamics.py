@@ -106,6 +106,12 @@ band = 20.0
 
 
 def test_tx40_its_coupled_wrist_and_coulomb_friction(data, tmp_path):
+    """Friction at speed within 2.5 % of the reference; Fc itself is where a line meets standstill, and less certain.
+
+    It depends on which speeds are cut (joint 1: -7 % with none, -0.4 at 1 % of the peak speed, +6 at 3 %), and the
+    reference saw 9 s of which these are 5.4: estimates of the two differ by some sqrt(1 - 5.4/9) = 0.63 of our sigma
+    (4.2, 2.4, 3.0, 5.5, 12.4 %), by 1.5 to 8 %, however well both are made. A goal of 2.5 % cannot be held to that.
+    """
     folder = data / "staubli_tx40"
     log = folder / "tx40_first_5p4s.npz"
     found = identify(tmp_path / "out", folder / "model.urdf", log, options=TX40)
@@ -113,9 +119,24 @@ def test_tx40_its_coupled_wrist_and_coulomb_friction(data, tmp_path):
     with (folder / "reference_base_params.csv").open() as file:
         reference = {row[0].split()[0]: float(row[3]) for row in csv.reader(file)}
     own = values(tmp_path / "out")
-    off = [own[f"Fc{j}"] / reference[f"fs{j}"] - 1.0 for j in range(1, 6)]
-    assert np.abs(off).max() < 0.06, "5.4 s of the 9 s the reference was fitted on; its own RSD is 1.6 to 3.3 %"
-    assert total(found, log.name, "filtered") < 6.0
+    fc, fv = (np.array([own[f"{name}{j}"] for j in range(1, 6)]) for name in ("Fc", "Fv"))
+    fc_there, fv_there = (np.array([reference[f"{name}{j}"] for j in range(1, 6)]) for name in ("fs", "fv"))
+    off = np.abs(fc / fc_there - 1.0)
+    assert off[:4].max() < 0.035 and off[4] < 0.06, "measured -0.4, 2.4, -3.2, -1.4 and 5.3 %"
+    for share in (0.25, 0.5, 0.75):
+        v = share * 100.0 * np.array([0.05, 0.05, 0.075, 0.072, 0.056])
+        assert np.abs((fc + fv * v) / (fc_there + fv_there * v) - 1.0).max() < 0.025, "what friction does at speed"
+    assert total(found, log.name, "filtered") < 5.3, "measured 5.06"
+    assert not [line for line in found["warnings"] if "Coulomb" in line]
+
+
+def test_tx40_standstill_in_the_fit_is_noticed(data, tmp_path):
+    """Measured: Fc2 and Fc3 are 5 % lower with the rows of nearly standing joints, under 10 % of them all."""
+    folder = data / "staubli_tx40"
+    options = TX40.replace("cut_slow = true", "cut_slow = false")
+    found = identify(tmp_path / "out", folder / "model.urdf", folder / "tx40_first_5p4s.npz", options=options)
+    told = " ".join(line for line in found["warnings"] if "Coulomb" in line)
+    assert "Fc3 +" in told and "cut_slow" in told
 
 
 @pytest.mark.slow
