@@ -13,6 +13,7 @@ from calib.identification.gains import identify_gains
 from calib.identification.identify import common_decimator, find_base, first_fit, identify
 from calib.identification.ladder import Ground, climb
 from calib.identification.prediction import Dynamics, predict
+from calib.identification.refit import standstill_shift
 from calib.identification.rows import observe, pool, triangulate, with_blocks
 from calib.identification.scores import score
 from calib.identification.settings import Payload, Settings, make_model
@@ -65,6 +66,17 @@ def test_the_ladder_takes_what_is_planted_and_only_there(name, terms, size):
     plain = identify(planted.arm(), [planted.case("a", 0, terms=terms, values=values)], PLAIN)
     one, two = (score(other, predict(model.dynamics, other)).filtered.total for model in (plain, found))
     assert two < 0.8 * one
+
+
+@pytest.mark.parametrize(("soft", "told"), [(0.0, []), (2.0, [1])])
+def test_friction_that_fades_near_standstill_shows_where_slow_rows_are_left_out(soft, told):
+    """Most of joint 2's true sign is ten times softer than the model's."""
+    terms = (term("soft", "sign", 1, 0.1), term("hard", "sign", 1, 0.01))
+    cases = [planted.case("a", 0, terms=terms, values={"soft": soft, "hard": -soft})]
+    found = identify(planted.arm(), cases, PLAIN)
+    index = [found.names.index(f"Fc{j}") for j in (1, 2, 3)]
+    shift = (standstill_shift(found, cases) / found.fitted.estimate.sigma)[index]
+    assert np.flatnonzero(shift > 1.0).tolist() == told and (shift > -1.0).all()
 
 
 def test_a_named_rung_is_taken_at_all_joints_whatever_it_brings():
