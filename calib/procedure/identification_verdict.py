@@ -165,12 +165,11 @@ def _coulomb_shift(cases: Sequence[Case], found: Identification) -> list[str]:
     richer = {joint for one in found.climb.terms for joint, _ in one.acts}
     index = {j: found.names.index(f"Fc{j + 1}") for j in range(cases[0].motion.n) if f"Fc{j + 1}" in found.names}
     estimate = found.fitted.estimate
-    unit = 0.01 * np.abs(estimate.values)
-    shift, sigma = standstill_shift(found, cases) / unit, estimate.sigma / unit
+    shift, sigma, percent = standstill_shift(found, cases), estimate.sigma, 0.01 * np.abs(estimate.values)
     moved = [
-        f"Fc{j + 1} {shift[k]:+.1f} % (sigma {sigma[k]:.1f} %)"
+        f"Fc{j + 1} {shift[k] / percent[k]:+.1f} % (sigma {sigma[k] / percent[k]:.1f} %)"
         for j, k in index.items()
-        if j not in richer and abs(shift[k]) > sigma[k]
+        if j not in richer and abs(shift[k]) > sigma[k] and percent[k] > 0.0
     ]
     if not moved:
         return []
