@@ -45,7 +45,7 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     name = "Ks2"
     shape = "sine"                   # see calib.dynamics.shapes
     joint = 2
-    settings = [1.0, inf]
+    settings = [1.0, inf]            # order 1 is gravity's own shape: only wide and fast motion tells them apart
     [payload.tool]                   # a body at the flange
     mass = 2.805                     # known mass [kg]
     com = [0.0, 0.0, 0.05]           # known centre of mass in the tip's frame [m]

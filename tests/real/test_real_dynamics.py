@@ -242,6 +242,12 @@ def test_lwr_full_parameters_hold_where_it_has_not_been(data, tmp_path):
 
 @pytest.mark.slow
 def test_kr300_needs_the_prior_on_other_motion(data, tmp_path):
+    """Measured: A → B 21.8 % drawn, 43.0 bare with standard friction; B → A 24.4 and 46.0; fitted together 16.3, 17.1.
+
+    That is what a rigid model can do here: joint 2 moves over ranges that barely overlap, and the joints bend by
+    0.5 to 0.7 mrad rms. A counterbalance as a term at joint 2 does not help on the other record: sine and cosine of
+    order 1 give 24.5 and 47.4 %, of order 2 34.9 and 47.1, a linear spring 21.6 and 27.1.
+    """
     folder = data / "kuka_kr300_tuk"
     robot, train, other = folder / "model.urdf", folder / "traj_A.npz", folder / "traj_B.npz"
     drawn = identify(tmp_path / "out", robot, train, "--validate", other)
