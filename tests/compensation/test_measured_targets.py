@@ -29,6 +29,7 @@ CASES = [  # folder, robot, file, held-out share, goal [mm]
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("folder", "robot", "file", "share", "goal"), CASES)
 def test_commands_for_measured_poses_are_the_joints_they_were_measured_at(
     data, tmp_path, monkeypatch, capsys, folder, robot, file, share, goal

@@ -13,6 +13,7 @@ import pytest
 STUDIES = Path(__file__).parents[2] / "examples/lwr4plus"
 
 
+@pytest.mark.slow
 def test_designs_are_better_conditioned_and_the_decomposition_holds(tmp_path: Path) -> None:
     script = STUDIES / "excitation.py"
     subprocess.run([sys.executable, script, "--out", tmp_path], check=True, capture_output=True)
@@ -31,6 +32,7 @@ def test_designs_are_better_conditioned_and_the_decomposition_holds(tmp_path: Pa
     assert {path.name for path in tmp_path.glob("*.png")} == {"plot_paths.png", "plot_estimates.png"}
 
 
+@pytest.mark.slow
 def test_exact_gradients_beat_differences_and_chance_in_the_same_time(tmp_path: Path) -> None:
     script = STUDIES / "excitation_peers.py"
     words = [sys.executable, script, "--out", tmp_path, "--seconds", "1", "--alone"]

@@ -6,6 +6,7 @@ import re
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from calib import cli
@@ -15,6 +16,8 @@ from calib.robot.load import load
 from calib.simulation import brought
 from calib.simulation.cell import measure
 from calib.simulation.cells import virtual_cell
+from calib.simulation.moving import moving_arm, record
+from calib.simulation.references import random_fourier
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
@@ -30,26 +33,32 @@ def commands(block: str) -> list[list[str]]:
 @pytest.fixture
 def at_a_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with the files the README speaks of."""
-    cell = virtual_cell("ur5", 1)
-    q = random_joints(load("ur5"), 60, 1)
-    (tmp_path / "robot.urdf").write_text(urdf_write.write_new(load("ur5")))
-    brought.write(measure(cell, q, 2), tmp_path / "measured.csv")
+    cell, arm = virtual_cell("lwr4plus", 1), load("lwr4plus")
+    (tmp_path / "robot.urdf").write_text(urdf_write.write_new(arm))
+    brought.write(measure(cell, random_joints(arm, 60, 1), 2), tmp_path / "measured.csv")
+    joints = ",".join(f"{name} [rad]" for name in arm.joint_names)
+    np.savetxt(tmp_path / "targets.csv", 0.5 * random_joints(arm, 5, 2), delimiter=",", header=joints, comments="")
+    moves, speed = moving_arm(cell, "lwr4plus", 1), np.array([joint.velocity for joint in arm.joints])
+    for seed, name in enumerate(("log", "other")):
+        motion = random_fourier(0.6 * arm.lower, 0.6 * arm.upper, 0.6 * speed, 15.0, 1000.0, seed=seed)
+        brought.write_log(record(moves, motion, seed), tmp_path / f"{name}.csv")
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
 def test_blocks_are_found_and_short() -> None:
     assert len(README.split()) < 600 and len(BLOCKS) == 4
-    assert [len(commands(block)) for block in BLOCKS] == [0, 0, 3, 3]
+    assert [len(commands(block)) for block in BLOCKS] == [0, 0, 3, 6]
     assert "calib demo" in BLOCKS[0] and "pytest" in BLOCKS[1]
 
 
-@pytest.mark.parametrize("number", [2, 3])
+@pytest.mark.parametrize("number", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_its_commands_run(number: int, at_a_cell: Path, capsys: pytest.CaptureFixture) -> None:
     for arguments in commands(BLOCKS[number]):
         assert cli.run(arguments) == 0, (arguments, capsys.readouterr())
     if number == 3:
-        assert (at_a_cell / "calibrated.urdf").exists() and (at_a_cell / "fit/certificate.html").exists()
+        made = ("fit/certificate.html", "motion/trajectory.csv", "calibrated/robot.urdf", "commands.csv")
+        assert all((at_a_cell / name).exists() for name in made)
 
 
 def test_what_it_points_to_is_there() -> None:

@@ -7,9 +7,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 SCRIPT = Path(__file__).parents[2] / "examples/lwr4plus/planning.py"
 
 
+@pytest.mark.slow
 def test_the_identified_model_plans_what_the_robot_can_follow(tmp_path):
     words = [sys.executable, SCRIPT, "--out", tmp_path, "--paths", "3"]
     done = subprocess.run(words, capture_output=True, text=True, check=True)

@@ -97,6 +97,7 @@ def test_two_lines_say_what_to_play_and_what_to_log(waiting: Session) -> None:
     assert "7-recorded/training.csv" in second and "q_joint1 [deg]" in second and "tau_joint7 [Nm]" in second
 
 
+@pytest.mark.slow
 def test_it_ends_in_one_certificate_of_both(whole: Session) -> None:
     assert set(kinds(whole).values()) == {steps.DONE}
     given = {path.name for folder in ("9-export", "9-export/dynamics") for path in whole.path(folder).glob("*")}
