@@ -16,7 +16,7 @@ from calib.data.recording_files import read_recording
 from calib.data.reference_files import with_reference
 from calib.data.resampling import Resampled
 from calib.errors import UsageError
-from calib.identification.cases import Case, case_names, make_case
+from calib.identification.cases import Case, case_names, make_case, row_labels
 from calib.identification.consistency import Propagation, propagate
 from calib.identification.geometries import Comparison, compare
 from calib.identification.identify import Identification, identify
@@ -28,7 +28,7 @@ from calib.identification.settings import Settings
 from calib.procedure import calibrated
 from calib.procedure.identification_gains import FoundGains, find_gains
 from calib.procedure.identification_tracking import Tracking, track
-from calib.procedure.identification_verdict import judge, warnings
+from calib.procedure.identification_verdict import judge, warnings, with_prior
 from calib.procedure.inputs import joint_kinds
 from calib.procedure.verdict import Verdict
 from calib.robot import description
@@ -172,9 +172,10 @@ def run(inputs: IdentificationInputs, progress: Progress | None = None) -> Ident
     excitation = {case.name: report_excitation(case.motion) for case in inputs.cases}
     fit = {case.name: scores[case.name] for case in inputs.cases}
     validation = {case.name: scores[case.name] for case in inputs.unseen}
-    told = warnings(inputs.cases, inputs.unseen, found, validation, repeated, excitation)
+    told = warnings(inputs.cases, inputs.unseen, found, validation, repeated, excitation, inputs.chain)
     proofs = {name: found_score for name, found_score in validation.items() if name not in repeated}
-    verdict = judge(fit, proofs, repeated, excitation, wrong)
+    labels = row_labels(settings.kind, inputs.chain.n)
+    verdict = with_prior(judge(fit, proofs, repeated, excitation, wrong, labels), found)
     return IdentificationOutcome(
         inputs, found, fit, validation, predictions, repeated, excitation, told, verdict, settings.seed,
         carried=carried, geometries=geometries, tracking=tracking,

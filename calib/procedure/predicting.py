@@ -11,7 +11,7 @@ import numpy as np
 
 from calib import files
 from calib.data.excitation import repeats, report_excitation
-from calib.identification.cases import Case
+from calib.identification.cases import Case, row_labels
 from calib.identification.prediction import predict
 from calib.identification.scores import Score, score
 from calib.identification.storage import read_dynamics
@@ -64,7 +64,8 @@ def hold(inputs: IdentificationInputs, folder: Path, tolerance: float = 0.0) -> 
     validation = {case.name: scores[case.name] for case in inputs.unseen}
     proofs = {name: one for name, one in validation.items() if name not in repeated}
     excitation = {case.name: report_excitation(case.motion) for case in inputs.cases}
-    verdict = tolerated(judge(fit, proofs, repeated, excitation), proofs, tolerance)
+    labels = row_labels(inputs.options.settings.kind, inputs.chain.n)
+    verdict = tolerated(judge(fit, proofs, repeated, excitation, rows=labels), proofs, tolerance)
     told = tuple(
         f"{name}: {100 * share:.0f} % of its states were met in training: a repeat proves nothing, it is no evidence"
         for name, share in repeated.items()

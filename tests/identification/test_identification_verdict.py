@@ -1,0 +1,77 @@
+"""What a verdict says of single joints, of motion beyond the robot's limits, of parameters that motion does not tell."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import planted_motion as planted
+import pytest
+
+from calib.data.excitation import report_excitation
+from calib.identification.scores import Part, Score
+from calib.procedure import identification_verdict
+from calib.procedure.identification_verdict import judge, with_prior
+from calib.procedure.verdict import Verdict
+
+TORQUE = np.array([10.0, 100.0, 0.5])  # rms of each joint: the third does not matter
+
+
+def scored(joints, moving=None, total=5.0, share=1.0) -> Score:
+    """Return a score of which `joints` [%] are unexplained in the band."""
+    joints = np.asarray(joints, dtype=float)
+    part = Part(total, joints, joints * TORQUE / 100.0, 300)
+    moved = part if moving is None else replace(part, joints=np.asarray(moving, dtype=float))
+    return Score(part, part, moved, part, 0.0 * joints, 1.0 - joints / 100.0, (None,) * 3, 20.0, share)
+
+
+def judged(unseen: Score | None, own: Score | None = None) -> Verdict:
+    motion = planted.case("train", 0).motion
+    validation = {} if unseen is None else {"other": unseen}
+    return judge({"train": own or scored([4, 4, 4])}, validation, {}, {"train": report_excitation(motion)})
+
+
+@pytest.mark.parametrize(
+    "joints, moving, level, named",
+    [
+        ([5, 5, 49], None, "pass", ""),
+        ([5, 5, 51], None, "marginal", "joint 3 (51 %"),
+        ([5, 5, 102], None, "marginal", "joint 3 (102 %"),
+        ([94, 5, 5], None, "marginal", "joint 1 (94 %"),
+        ([96, 5, 60], None, "fail", "joint 1 (96 % unexplained), joint 3 (60 %"),
+        ([96, 5, 5], [20, 5, 5], "pass", ""),  # wrong at rest only
+        ([96, 5, 5], [np.nan, 5, 5], "pass", ""),  # never moves
+    ],
+)
+def test_a_joint_without_a_model_is_named_and_fails_where_its_torque_matters(joints, moving, level, named):
+    found = judged(scored(joints, moving))
+    assert found.level == level
+    assert named in found.reason and bool(named) == ("does not hold" in found.reason)
+
+
+def test_the_total_says_which_criterion_was_missed():
+    assert "up to 10 % passes" in judged(scored([11, 11, 11], total=11.0)).reason
+    assert "up to 2 times" in judged(scored([9, 9, 9], total=9.0), scored([4, 4, 4], total=4.0)).reason
+    assert judged(scored([31, 31, 31], total=31.0)).level == "fail"
+    assert "joint 2 (70 %" in judged(None, scored([4, 70, 4])).reason, "without unseen motion the fit's own counts"
+
+
+def test_motion_far_beyond_the_limits_is_a_warning():
+    case, chain = planted.case("train", 0), planted.arm()
+    assert identification_verdict.beyond(case, chain) == []
+    reach = float(np.abs(case.motion.q[:, 1]).max())
+    tight = tuple(replace(one, lower=-0.8 * reach, upper=0.8 * reach) if j == 1 else one
+                  for j, one in enumerate(chain.joints))  # fmt: skip
+    (told,) = identification_verdict.beyond(case, replace(chain, joints=tight))
+    assert "joint2 by" in told and "joint1" not in told and "is this the robot" in told
+
+
+@pytest.mark.parametrize("drawn, told", [(5, False), (6, True)])
+def test_most_parameters_from_the_cad_are_told_in_the_reason(monkeypatch, drawn, told):
+    names = [f"p{k}" for k in range(drawn)]
+    monkeypatch.setattr(identification_verdict, "resting_names", lambda found: names)
+    found = SimpleNamespace(base=SimpleNamespace(b=10), prior=SimpleNamespace(source="cad"))
+    reason = with_prior(Verdict("marginal", "why"), found).reason
+    assert (reason == f"why; {drawn} of 10 parameters are the CAD's: this motion does not tell them") == told
+    assert told or reason == "why"
