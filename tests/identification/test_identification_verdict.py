@@ -1,4 +1,4 @@
-"""What a verdict says of single joints, of motion beyond the robot's limits, of parameters that motion does not tell."""
+"""What a verdict says of single joints, of motion beyond the limits, of parameters that motion does not tell."""
 
 from __future__ import annotations
 
