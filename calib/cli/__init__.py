@@ -15,7 +15,8 @@ from calib.cli import dynamics, geometry, motion, session
 for _pool in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_pool, "1")
 
-INTERRUPTED = "interrupted; nothing was left half-written, and the same command goes on from here"
+INTERRUPTED = "interrupted; nothing was left half-written"
+RESUMED = ("next", "redo", "demo")  # keep what they have done; every other command starts over
 
 app = typer.Typer(
     add_completion=False,
@@ -47,17 +48,17 @@ def main(arguments: list[str] | None = None) -> None:
 
 def run(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code; errors become one message on stderr."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        given = list(sys.argv[1:] if arguments is None else arguments)
         code = int(app(args=_spread(given), standalone_mode=False) or 0)
-        return _complain(INTERRUPTED, 130) if code == 130 else code  # Typer turns Ctrl-C into this code
+        return _interrupted(given) if code == 130 else code  # Typer turns Ctrl-C into this code
     except typer.Exit as stop:
         return stop.exit_code
     except _USAGE as error:
         error.show()
         return 2
     except (KeyboardInterrupt, typer.Abort):
-        return _complain(INTERRUPTED, 130)
+        return _interrupted(given)
     except Exception as error:
         from calib.errors import exit_code
 
@@ -87,6 +88,11 @@ def _spread(arguments: list[str]) -> list[str]:
             positionals += 1
         result.append(word)
     return result if {"fit", "identify"} & set(arguments[:2]) else arguments
+
+
+def _interrupted(given: list[str]) -> int:
+    resumed = bool(set(RESUMED) & set(given[:2]))
+    return _complain(f"{INTERRUPTED}; the same command {'goes on from here' if resumed else 'starts over'}", 130)
 
 
 def _complain(message: str, code: int) -> int:

@@ -86,7 +86,10 @@ def _asked(given: Answers) -> Answers:
 def formats(
     topic: Annotated[
         str | None,
-        typer.Argument(help="measurements, targets, options, constraints, mdh, robot, session or recordings"),
+        typer.Argument(
+            help="measurements, targets, options, identify-options, identified, exports, constraints, mdh, robot, "
+            "session, limits, waypoints, excitation or recordings"
+        ),
     ] = None,
 ) -> None:
     """Print what the files of this toolkit hold: columns, keys, units."""

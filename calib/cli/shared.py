@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Annotated, Any
 
 import typer
+
+PIPED = 160  # columns of tables that no terminal bounds
 
 Robot = Annotated[str, typer.Argument(help="a .urdf, an MDH .toml, a library name, or the folder of an earlier fit")]
 Base = Annotated[str | None, typer.Option(help="URDF: the link the arm starts at")]
@@ -17,6 +21,9 @@ Seed = Annotated[int, typer.Option(help="reproduces everything random")]
 def make_console(**options: Any) -> Any:
     from rich.console import Console
 
+    stream = sys.stderr if options.get("stderr") else sys.stdout
+    if not stream.isatty() and "COLUMNS" not in os.environ:
+        options.setdefault("width", PIPED)  # rich takes 80, and cuts the files' names
     return Console(highlight=False, **options)
 
 

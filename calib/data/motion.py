@@ -253,7 +253,14 @@ def _per_joint(cutoff: float | tuple[float, ...], recording: Recording) -> np.nd
     return np.broadcast_to(values, (recording.n,))
 
 
+def _hertz(value: float | tuple[float, ...]) -> str:
+    return " ".join(f"{one:.4g}" for one in np.atleast_1d(value))
+
+
 def _told(cutoffs: Cutoffs, options: FilterOptions) -> tuple[str, ...]:
     stated = [name for name in ("cutoff", "band") if getattr(options, name) is not None]
-    lines = [f"{name} = {getattr(options, name)} Hz as stated" for name in stated]
+    lines = [
+        f"{name} = {_hertz(getattr(options, name))} Hz, not from this recording: stated, or the training's"
+        for name in stated
+    ]
     return (*lines, *cutoffs.reasons) if len(stated) < 2 else tuple(lines)

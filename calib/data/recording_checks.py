@@ -16,6 +16,8 @@ from calib.errors import MeasurementError
 FEWEST = 100  # samples; filters at both ends eat some 50
 SLOWEST, FASTEST = 5.0, 50e3  # sampling rates that occur [Hz]
 MOVES = 1e-3  # a joint that goes less far has not moved [rad or m]: above encoder noise
+POSES = 300  # of a recording, among which two alike are looked for
+BACK = 0.05  # of each joint's travel by which two poses may differ to be one
 NEEDED = ("t", "q", "effort", "v", "tau_link", "tau_motor")
 
 
@@ -73,6 +75,8 @@ def check_time(t: np.ndarray, rows: np.ndarray, file: str) -> None:
     step = np.diff(t)
     if (step < 0).any():
         i = int(np.argmax(step < 0))
+        if (step < 0).all():
+            raise MeasurementError("time runs backwards in every row: turn the rows around, last one first", file)
         message = (
             f"time goes back from {t[i]:.6g} s to {t[i + 1]:.6g} s ({int((step < 0).sum())} times): were two"
             f" logs joined, or was the clock set? Cut the file there (@{t[0]:g}:{t[i]:g})"
@@ -184,15 +188,31 @@ def _limit_notes(recording: Recording, joints: Joints | None) -> list[str]:
 
 
 def _work_notes(recording: Recording) -> list[str]:
-    """Note torques that take energy out of the robot: over a long motion, drives pay for friction, ∫τᵀ dq > 0."""
-    if recording.kind != "torque":
+    """Note torques that take energy out of the robot: from a pose back to it drives pay for friction, ∫τᵀ dq > 0.
+
+    Between different poses gravity pays too, an arm that comes down gives energy back: there nothing is said.
+    """
+    rows = _round_trip(recording.q) if recording.kind == "torque" else None
+    if rows is None:
         return []
-    work = (recording.effort[1:] + recording.effort[:-1]) / 2 * np.diff(recording.q, axis=0)
+    work = ((recording.effort[1:] + recording.effort[:-1]) / 2 * np.diff(recording.q, axis=0))[rows]
     share = float(work.sum() / max(np.abs(work).sum(), 1e-300))
     if share > -0.05:
         return []
     message = "the torques take energy out of the robot (work {:.0%} of the energy moved): is their sign reversed?"
     return [message.format(share)]
+
+
+def _round_trip(q: np.ndarray) -> slice | None:
+    """Return the steps between two rows of nearly one pose, far apart; None where the motion does not come back."""
+    every = max(1, len(q) // POSES)
+    poses = q[::every] / np.maximum(np.ptp(q, axis=0), MOVES)
+    apart = np.abs(poses[:, None] - poses[None]).max(axis=2)
+    first, last = np.nonzero(apart < BACK)
+    longest = int(np.argmax(last - first))
+    if last[longest] - first[longest] < len(poses) // 2:
+        return None
+    return slice(first[longest] * every, last[longest] * every)
 
 
 def _noted(recording: Recording, *notes: str) -> Recording:

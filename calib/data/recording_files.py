@@ -55,9 +55,12 @@ def _reader(path: Path) -> Reader:
         with open(path, "rb") as file:
             head = file.read(1 << 16)
     except OSError as error:
-        raise MeasurementError(f"cannot be read: {error.strerror}", path) from error
+        hint = "; a cut is written log.npz@0:9.4, in seconds" if "@" in path.name else ""
+        raise MeasurementError(f"cannot be read: {error.strerror}{hint}", path) from error
     if head[:2] == b"PK":
         return read_archive
+    if head and path.suffix == ".npz":
+        raise MeasurementError("is no NumPy archive, whatever its name says: was it written by np.savez?", path)
     if not head or b"\0" in head:
         found = "is empty" if not head else "is neither a NumPy archive, a bag nor text"
         raise MeasurementError(f"{found}: expected .npz, .csv, .mcap, .bag or a ROS 2 bag's folder", path)

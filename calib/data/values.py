@@ -20,7 +20,8 @@ def known(table: Mapping[str, Any], keys: set[str], place: str) -> None:
     for key in table:
         if key not in keys:
             message = f"{place}: there is no key '{key}'{nearest(key, sorted(keys))}"
-            raise UsageError(f"{message}; the keys are {', '.join(sorted(keys))}")
+            there = f"the keys are {', '.join(sorted(keys))}" if keys else "there are none"
+            raise UsageError(f"{message}; {there}")
 
 
 def refuse(value: Any, place: str, expected: str) -> UsageError:

@@ -155,9 +155,16 @@ def _pack(
     left = data.rows - tau * leverage(data, std, inverse)
     dof = int(np.round(np.sum(left / tau), 6))
     if dof <= 0 or left.sum() <= 0:
+        independent = float(np.sum(data.rows / tau))
+        advice = "record longer or estimate fewer"
+        if independent > data.parameters:  # the rows would do: what is left of them is no noise
+            advice = (
+                "the residuals of neighbouring rows are nearly one motion, as where the model is not this robot's or "
+                "columns are swapped: check both, then record longer"
+            )
         raise Unidentifiable(
-            f"{int(data.rows.sum())} rows ({np.sum(data.rows / tau):.0f} independent ones) for {data.parameters} "
-            "parameters leave nothing to judge them by; record longer or estimate fewer",
+            f"{int(data.rows.sum())} rows ({independent:.0f} independent ones) for {data.parameters} "
+            f"parameters leave nothing to judge them by; {advice}",
             data.names,
         )
     residual_std = float(np.sqrt(np.sum(squares / std**2) / left.sum()))

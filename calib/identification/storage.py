@@ -3,6 +3,24 @@
 ``estimate.csv`` has one row per parameter that was estimated, ``covariance.csv`` their covariance (a header, then one
 row per parameter, each beginning with its name): base parameters in the order of the model's columns, then richer
 friction. ZZ1R stands for the combination that ``dynamics.json`` spells out under ``base``.
+
+``torques_N.csv``: ``t [s]``, then measured_1 ... predicted_1 ... of each torque row [N m or N] and the joints q1 ...
+[rad or m], thinned to about 100 Hz. ``calib identify`` writes ``torques_1.csv`` alone, of the first validation
+recording (without one, of the first to learn from); a session writes one per validation recording.
+
+``metrics.json``: errors by file under ``identification`` (learnt from) and ``validation`` (``evidence`` false: it
+repeats the training). Each has ``raw`` (torque as recorded, full rate), ``filtered`` (both sides low-passed to the
+identification band f_p), ``moving`` and ``standing`` (raw, samples at which the joint is above or below ``slow``),
+with ``relative_error_percent`` 100 |tau - predicted| / |tau| in ``total`` and by ``joints`` (in the order of
+``rows``) and ``rms`` [N m or N]; ``above_band_percent``: share of the torque above f_p (noise, ripple, elasticity),
+which no model in the band explains; ``whiteness`` of the residuals; ``motion_share``: part of the samples at which
+joints move. Then ``parameters`` (standard, base, essential), ``condition_number`` (raw, and with columns of unit
+norm), ``friction`` and its ``ladder``, ``elimination``, ``loop``, ``tracking``, ``filters`` by file, ``geometry``,
+``warnings``, ``verdict``, its ``reason``, ``seed``.
+
+Figures: ``plot_torque_N.png`` of every file in the order given, training first (measured, predicted, residual);
+``plot_residuals.png`` (autocorrelation; dashed: white noise), ``plot_friction.png`` (over velocity), and, where the
+geometry's uncertainty is known, what it adds to sigma.
 """
 
 from __future__ import annotations

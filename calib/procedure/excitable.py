@@ -18,6 +18,7 @@ from calib.dynamics.tree import standard_parameters, tree, with_gravity
 from calib.errors import UsageError
 from calib.identification.storage import from_table, read_covariance, read_table
 from calib.procedure.motion_limits import MotionLimits
+from calib.robot import description
 from calib.robot.chain import Chain
 
 SMOOTH = 0.05  # [rad/s or m/s] of the Coulomb sign while searching; the figures reported have the model's own
@@ -75,6 +76,10 @@ def _identified(chain: Chain, folder: Path) -> Dynamics:
         if found.model.kind == "drive":
             raise ValueError("rows 'drive' tell nothing of the bodies")
     except (KeyError, TypeError, ValueError, IndexError) as error:
+        theirs = description.read(folder / "robot.toml")
+        if theirs.n != chain.n:
+            message = f"{folder} is of a robot with {theirs.n} joints ({theirs.name}), {chain.name} has {chain.n}"
+            raise UsageError(message) from error
         raise UsageError(f"{folder}/dynamics.json does not fit robot '{chain.name}': {error!r}") from error
     bodies = with_gravity(tree(chain), np.asarray(found.model.tree.gravity))
     numbers = found.values[: 10 * bodies.bodies]

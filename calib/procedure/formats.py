@@ -23,7 +23,11 @@ TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     ),
     "identified": (
         "the folder that calib identify writes",
-        ("calib.identification.storage", "calib.procedure.consistency_tables"),
+        (
+            "calib.identification.storage",
+            "calib.procedure.identification_verdict",
+            "calib.procedure.consistency_tables",
+        ),
     ),
     "exports": (
         "what calib export --into writes of an identified robot",

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.identification.bias import LoopTest
+from calib.identification.bias import SMALL, LoopTest
 from calib.identification.instrumental import Instrumental
 from calib.simulation.controllers import Controller
 
@@ -33,6 +33,8 @@ def loop_lines(bias: LoopTest) -> Iterator[str]:
         f"least share of a column explained {100 * strength.partial_r2.min():.3g} %"
     )
     said = "least squares is biased" if verdict.biased() else "no bias of least squares is seen"
+    if verdict.biased() and found.shift.max() < SMALL:
+        said = "least squares is biased, surely but by little"
     if not found.valid:
         said += ", but these instruments are not to be trusted"
     p = f"p = {verdict.p:.2g}" if verdict.p > 0.0 else "p < 1e-300"

@@ -28,8 +28,10 @@ def read_lines(inputs: IdentificationInputs) -> Iterator[RenderableType]:
         motion = case.motion
         role = "unseen" if any(case is other for other in inputs.unseen) else "to learn from"
         load = f", carrying {', '.join(case.carried)}" if case.carried else ""
-        yield escape(f"{case.name}: {case.duration:.1f} s at {motion.rate:.4g} Hz, {motion.kind}{load}, {role}")
-    yield from (f"  {escape(note)}" for note in inputs.notes)
+        yield escape(
+            f"{case.name.rstrip(':')}: {case.duration:.1f} s at {motion.rate:.4g} Hz, {motion.kind}{load}, {role}"
+        )
+    yield from (f"  {_plain(note)}" for note in inputs.notes)
 
 
 def outcome_lines(outcome: IdentificationOutcome) -> Iterator[RenderableType]:
@@ -55,9 +57,14 @@ def outcome_lines(outcome: IdentificationOutcome) -> Iterator[RenderableType]:
     yield error_table(outcome)
     yield from tracking_lines(outcome.tracking, outcome.inputs.chain)
     for line in outcome.warnings:
-        yield f"[yellow]note[/]: {escape(line)}"
+        yield f"[yellow]note[/]: {_plain(line)}"
     verdict = outcome.verdict
     yield f"verdict: [bold {COLOURS[verdict.level]}]{verdict.level}[/]: {escape(verdict.reason)}"
+
+
+def _plain(note: str) -> str:
+    """Return a note for rich to print; a cut that is open at its end has a colon of its own."""
+    return escape(note.replace(":: ", ": "))
 
 
 def elimination_lines(outcome: IdentificationOutcome) -> Iterator[str]:

@@ -81,7 +81,7 @@ def tracking_lines(tracking: Tracking, chain: Chain) -> Iterator[Table | str]:
         "the controller of [loop]" if first.stated else f"a PD of {FREQUENCY:g} Hz, damping {DAMPING:g} (our default)"
     )
     motion = "motion the fit has not seen" if tracking.unseen else "the motion of the fit itself, which flatters"
-    yield (
+    yield escape(
         f"the simulated robot is the identified model, disturbed by the torque it left unexplained; {control}; "
         f"{motion}: feeding the model forward divides the tracking error by {first.gain:.3g}"
     )

@@ -1,4 +1,13 @@
-"""May one trust an identified model? What a user is told; all thresholds are our choice."""
+"""May one trust an identified model? What a user is told; all thresholds are our choice.
+
+The verdict of calib identify (exit code 0 for pass and marginal, 1 for fail) judges the raw total of the worst
+validation recording in which the robot moves and which does not repeat the training: above 30 % unexplained it fails;
+it passes up to 10 % and up to 2 times the training's own error; between, it is marginal. It is marginal as well
+without such a recording, or where the training motion is too poor to tell parameters apart. A joint of which 50 % or
+more is unexplained (in the band, and while it moves) is named and allows no pass; from 95 % on it fails the model
+where its rms torque is 10 % or more of the greatest joint's. Friction that drives a joint fails. The reason says
+which of these held.
+"""
 
 from __future__ import annotations
 
@@ -114,7 +123,9 @@ def _held_by_joint(verdict: Verdict, scores: Mapping[str, Score], rows: Sequence
         return verdict
     named = ", ".join(f"joint {rows[k] if rows else k + 1} ({lost[k]:.0f} % unexplained)" for k in sorted(lost))
     level = "fail" if failed or verdict.level == "fail" else "marginal"
-    return Verdict(level, f"{verdict.reason}; the model does not hold for {named}: is this the robot, are its columns?")
+    return Verdict(
+        level, f"{verdict.reason}; the model does not hold for {named}: is this the robot, are the columns in order?"
+    )
 
 
 def with_prior(verdict: Verdict, found: Identification) -> Verdict:

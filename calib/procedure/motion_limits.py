@@ -107,7 +107,15 @@ def read_motion_limits(path: Path | None, chain: Chain, source: Path | None = No
     constraints += _places(table, found, points, where)
     if found.collision is not None:
         constraints.append(_clearance(found))
-    return MotionLimits(tuple(constraints), torque, margin, deviations, friction, resonance, found.notes)
+    notes = found.notes if found.collision is not None else (*found.notes, _unchecked(path))
+    return MotionLimits(tuple(constraints), torque, margin, deviations, friction, resonance, notes)
+
+
+def _unchecked(path: Path | None) -> str:
+    """Return what nothing keeps the motion from."""
+    if path is None:
+        return "collisions and floor are NOT checked, the tool may pass the table: name them with --limits"
+    return f"collisions are NOT checked: {path} has no [collision] (its floor = … keeps off the floor)"
 
 
 @dataclass(frozen=True, eq=False)

@@ -249,6 +249,7 @@ def _failure(status: int, time: float) -> CalibError:
             "smooth the sign over a larger velocity, or give the joint its motor inertia"
         )
     return NotConverged(
-        f"the loop diverged at {time:.4g} s: these gains do not hold this robot at this rate; lower kd, or the delay",
+        f"the loop diverged at {time:.4g} s: these gains do not hold this robot at this rate; lower kp and kd "
+        "(are they in the unit of the torque?), or the delay",
         None,
     )

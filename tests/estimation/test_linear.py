@@ -163,3 +163,9 @@ def test_an_ill_conditioned_but_regular_problem_is_solved_to_qr_accuracy():
     stacked = np.vstack([matrix] * 5)
     fit = ols(collect(stacked, stacked @ np.ones(6)))  # the normal equations would keep no digit
     assert fit.estimate.values == pytest.approx(np.ones(6), abs=1e-7)
+
+
+def test_correlated_residuals_ask_for_another_model_not_for_more_rows():
+    data = collect(*noisy(3, np.ones(3)))
+    with pytest.raises(Unidentifiable, match="columns are swapped"):
+        wls(data, inflation=np.array([400.0, 1.0, 1.0]))

@@ -50,6 +50,16 @@ def test_a_joint_without_a_model_is_named_and_fails_where_its_torque_matters(joi
     assert named in found.reason and bool(named) == ("does not hold" in found.reason)
 
 
+def test_the_documented_thresholds_are_those_that_judge():
+    own = identification_verdict
+    words = " ".join((own.__doc__ or "").split())
+    told = (
+        f"above {own.POOR:g} %", f"up to {own.GOOD:g} %", f"up to {own.TRANSFER:g} times", f"{own.LOST:g} % or more",
+        f"from {own.NOTHING:g} %", f"{100 * own.MATTERS:g} % or more",
+    )  # fmt: skip
+    assert [text for text in told if text not in words] == []
+
+
 def test_the_total_says_which_criterion_was_missed():
     assert "up to 10 % passes" in judged(scored([11, 11, 11], total=11.0)).reason
     assert "up to 2 times" in judged(scored([9, 9, 9], total=9.0), scored([4, 4, 4], total=4.0)).reason

@@ -92,9 +92,10 @@ def test_an_identified_model_is_planned_with(room, capsys):
 def test_model_and_stated_drives_plan_the_same_motion(room):
     one = motion_planning.plan("lwr4plus", room / "way.csv", model=room / "model")
     two = motion_planning.plan("lwr4plus", room / "way.csv", drives_file=room / "drives.toml")
-    assert one.track.duration == two.track.duration and "no covariance" in one.notes[0]
+    assert one.track.duration == two.track.duration and "no covariance" in one.notes[1]
+    assert "collisions and floor are NOT checked" in one.notes[0]
     bare = motion_planning.plan("lwr4plus", room / "way.csv")
-    assert bare.track.duration < one.track.duration and "friction not known" in bare.notes[0]
+    assert bare.track.duration < one.track.duration and "friction not known" in bare.notes[1]
 
 
 def test_lines_and_shapes(room):

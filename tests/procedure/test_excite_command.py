@@ -56,6 +56,7 @@ def test_the_motion_keeps_its_limits_and_is_written_for_a_controller(cell, calib
     played = ("--start", stands, "--repeat", 2, "--slower", 3)
     code, out, err = calib("excite", "lwr4plus", "--limits", "limits.toml", "--out", "e", *QUICK, *played)
     assert code == 0, err
+    assert "collisions are NOT checked: limits.toml has no [collision]" in out
     assert "64 columns" in out and "every limit is kept" in out and "the approach and 2 periods" in out
     metrics = json.loads(Path("e/metrics.json").read_text())
     assert {"condition_number", "objective", "feasible", "margins", "seconds", "evaluations", "history"} <= set(metrics)

@@ -17,6 +17,8 @@ def test_every_format_has_its_documentation(calib):
         code, out, _ = calib("formats", topic)
         assert code == 0 and len(out) > 400 and "``" not in out and ">>>" not in out
     assert calib("formats", "poems")[0] == 2
+    helped = calib("formats", "--help")[1]
+    assert all(topic in helped for topic in TOPICS)
 
 
 @pytest.mark.parametrize(
@@ -27,6 +29,10 @@ def test_every_format_has_its_documentation(calib):
         ("constraints", ("[target]", "sight", "[[obstacle]]")),
         ("mdh", ("[[joint]]", "alpha", "90 deg")),
         ("robot", ("[[element]]", "[[station]]", "[deflection]")),
+        (
+            "identified",
+            ("metrics.json", "torques_N.csv", "above_band_percent", "standing", "up to 10 %"),
+        ),
         ("recordings", ("measured_torque", "JointState", "use_range")),
     ],
 )
