@@ -156,21 +156,18 @@ def _best_order(q: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.nd
     return order, np.where(likeness[0, rows, order] >= likeness[1, rows, order], 1.0, -1.0)
 
 
-def check_torques(recording: Recording, chain: Chain) -> list[str]:
+def check_torques(recording: Recording, chain: Chain) -> None:
     """Hold torques against those of the nominal masses, friction left free: reversed signs, other units.
 
-    Returns:
-        Notes.
-
     Raises:
-        MeasurementError: where the torques of all joints that carry much are reversed, or of another size.
+        MeasurementError: where the torques of joints that carry much are reversed, or of another size.
     """
     if chain.inertias is None or recording.kind != "torque":
-        return []
+        return
     share, alike, heavy = _against_masses(recording, chain)
     sure = [j for j in np.flatnonzero(heavy) if alike[j] > SURE]
     if not sure:
-        return []
+        return
     names = ", ".join(recording.joint_names[j] for j in sure)
     size = np.abs(share[sure])
     if (size > SCALE).all() or (size < 1 / SCALE).all():
@@ -182,8 +179,13 @@ def check_torques(recording: Recording, chain: Chain) -> list[str]:
     if all(share[j] < 0 for j in sure):
         words = f"the torques of {names} push the wrong way for the nominal masses: reverse their sign"
         raise MeasurementError(words, recording.file)
-    turned = [recording.joint_names[j] for j in sure if share[j] < 0]
-    return [f"torque of {', '.join(turned)} seems to have the wrong sign"] if turned else []
+    if turned := [recording.joint_names[j] for j in sure if share[j] < 0]:
+        named, column = ", ".join(turned), f"column{'s' if len(turned) > 1 else ''}"
+        raise MeasurementError(
+            f"torque of {named} seems to have the wrong sign: it pushes against what the nominal masses ask for, where "
+            f"the other joints' do not; negate the {column} of {named} in the log (or correct the nominal masses)",
+            recording.file,
+        )
 
 
 def _against_masses(recording: Recording, chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -171,6 +171,11 @@ def reversed_torques(table: np.ndarray, header: list[str]) -> np.ndarray:
     return table
 
 
+def reversed_torque_of_joint4(table: np.ndarray, header: list[str]) -> np.ndarray:
+    table[:, [name.startswith("tau_joint4") for name in header]] *= -1.0
+    return table
+
+
 def small(table: np.ndarray, header: list[str]) -> np.ndarray:
     table[:, [name.startswith("tau_joint") for name in header]] *= 1e-2
     return table
@@ -189,12 +194,13 @@ def another(table: np.ndarray, header: list[str]) -> np.ndarray:
         (reheaded(swapped), r"columns are swapped \(the column of joint3 holds joint2, .*joint2 holds joint3"),
         (numbers(slowed), "0.5 times its speed"),
         (numbers(reversed_torques), "reverse their sign"),
+        (numbers(reversed_torque_of_joint4), "training.csv: torque of joint4 .* negate the column of joint4"),
         (numbers(small), "times what the nominal masses ask for"),
         (numbers(another), "another motion than the one designed"),
         (numbers(lambda table, header: table[:1000]), "shorter than one period"),
         (reheaded(lambda header: [name.replace("q_joint4", "x4") for name in header]), "joint"),
     ],
-    ids=["rad", "swapped", "rehearsal", "sign", "unit", "another", "stopped", "missing"],
+    ids=["rad", "swapped", "rehearsal", "sign", "one sign", "unit", "another", "stopped", "missing"],
 )
 def test_a_wrong_recording_is_said(recorded: Session, change: Callable[[str], str], message: str) -> None:
     path = recorded.path("7-recorded/training.csv")
