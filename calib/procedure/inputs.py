@@ -13,12 +13,14 @@ from calib.data.options import FitOptions, check_files
 from calib.data.pose_files import joint_columns, read_measurements
 from calib.errors import MeasurementError, UsageError
 from calib.geometry.deflection import Deflection
+from calib.geometry.first_guess import check_scale
 from calib.geometry.repeatability import repeated_rows
 from calib.procedure import calibrated
 from calib.procedure.plausible_frames import check_orientations
 from calib.procedure.repeats import repeated
 from calib.robot import description
 from calib.robot.chain import Chain, Joint
+from calib.robot.kinematics import forward
 from calib.robot.load import load, resolve
 from calib.robot.markup import text
 from calib.robot.tree import read as read_tree
@@ -145,10 +147,11 @@ def load_robot(
 
 
 def read_file(path: Path, chain: Chain, options: FitOptions) -> list[PoseMeasurements]:
-    """Read one measurement file for a chain, held against its limits and its orientations."""
+    """Read one measurement file for a chain, held against its limits, its size and its orientations."""
     limits, kinds = (chain.lower, chain.upper), joint_kinds(chain)
     blocks = read_measurements(path, chain.joint_names, options.for_file(path), kinds=kinds, limits=limits)
     for block in blocks:
+        check_scale(block, forward(chain, block.q))  # unseen files, too: the fit looks at its own only
         check_orientations(chain, block)
     return blocks
 

@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 
 from calib.data.measurements import take
-from calib.errors import UsageError
-from calib.procedure import arrival
+from calib.data.options import FitOptions
+from calib.errors import MeasurementError, UsageError
+from calib.procedure import arrival, inputs
 from calib.procedure.answers import QUESTIONS, Answers, checked, with_answer
 from calib.procedure.dynamic_stages import options_of
 from calib.procedure.guided import begin
+from calib.procedure.session import Session
+from calib.procedure.stages import chain_of, check_file
 from calib.robot.chain import random_joints
 from calib.simulation.cell import measure, wandering
 from calib.simulation.cells import virtual_cell
@@ -71,3 +74,15 @@ def test_answers_are_checked_as_they_come() -> None:
     assert found["payloads"] == {"loaded": 3.28} and found["tool"] == (0.05, 0.0, 0.05) and found["dynamics"]
     with pytest.raises(UsageError, match="geometry-only"):
         checked(Answers("ur5", "cmm", dynamics=False, torques="both"))
+
+
+def test_metres_under_a_header_of_millimetres_are_refused_in_validation_files_too(measured: Session) -> None:
+    path = measured.path("3-measured/validation.csv")
+    head, *lines = path.read_text().strip().split("\n")
+    columns = [k for k, name in enumerate(head.split(",")) if name in ("x [mm]", "y [mm]", "z [mm]")]
+    table = np.array([line.split(",") for line in lines], dtype=float)
+    assert len(columns) == 3 and inputs.read_file(path, CELL.nominal, FitOptions())
+    table[:, columns] *= 1e-3
+    path.write_text("\n".join([head, *(",".join(map(str, row)) for row in table)]) + "\n")
+    with pytest.raises(MeasurementError, match=r"validation.csv: .*are they m under a header that says mm"):
+        check_file(measured, chain_of(measured), path, None)
