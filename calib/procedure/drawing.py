@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -56,6 +56,14 @@ def sheet(rows: int = 1, columns: int = 1, width: float = HALF, height: float = 
     figure = Figure(figsize=(width, height))
     axes = figure.subplots(rows, columns, squeeze=False)
     return figure, list(axes.ravel())
+
+
+def motion_units(kinds: Iterable[str]) -> tuple[str, str, str, str]:
+    """Return the units of position, velocity, acceleration and torque of joints of these kinds."""
+    found = set(kinds)
+    first = "rad" if "prismatic" not in found else "m" if found == {"prismatic"} else "rad, m"
+    torque = {"rad": "N m", "m": "N"}.get(first, "N m, N")
+    return first, f"{first}/s", f"{first}/s²", torque
 
 
 def save(figure: Figure, path: str | Path, dpi: int = 150) -> Path:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from calib.procedure.drawing import AFTER, BEFORE, HALF, MARK, QUIET, WIDE, sheet, styled
+from calib.procedure.drawing import AFTER, BEFORE, HALF, MARK, QUIET, WIDE, motion_units, sheet, styled
 from calib.procedure.exciting import Designed
 from calib.robot.kinematics import sweep
 from trajectories.constraints import BoxLimit
@@ -21,7 +21,7 @@ TITLES = ("position", "velocity", "acceleration", "torque")
 def motion_figure(designed: Designed) -> Figure:
     """Draw q, v, a and τ of every joint over one period, with their limits dashed."""
     motion = _motion(designed)
-    n = designed.chain.n
+    n, units = designed.chain.n, motion_units(joint.kind for joint in designed.chain.joints)
     rows = [motion.q, motion.v, motion.a]
     limits = [_limits(designed, order) for order in range(3)]
     values = designed.dynamics.values
@@ -38,7 +38,7 @@ def motion_figure(designed: Designed) -> Figure:
                     if np.isfinite(bound):
                         axis.axhline(bound, color=MARK, linewidth=0.6, linestyle="--")
                 if j == 0:
-                    axis.set_title(f"{TITLES[k]} [{_unit(designed, k)}]")
+                    axis.set_title(f"{TITLES[k]} [{units[k]}]")
                 if k == 0:
                     axis.set_ylabel(designed.chain.joint_names[j], fontsize=7)
         for axis in axes[-len(rows) :]:
@@ -97,9 +97,3 @@ def _limits(designed: Designed, order: int) -> tuple[np.ndarray, np.ndarray]:
             return limit.lower, limit.upper
     none = np.full(designed.chain.n, np.inf)
     return -none, none
-
-
-def _unit(designed: Designed, k: int) -> str:
-    kinds = {joint.kind for joint in designed.chain.joints}
-    first = "rad" if kinds == {"revolute"} else "m" if kinds == {"prismatic"} else "rad, m"
-    return (first, f"{first}/s", f"{first}/s²", "N m" if kinds == {"revolute"} else "N m, N")[k]

@@ -32,7 +32,10 @@ def torques(case: Case, predicted: np.ndarray, outcome: IdentificationOutcome) -
     rows = case.target.shape[1]
     step = max(1, len(case.target) // MOST)
     t = case.motion.t[::step]
-    labels = row_labels(outcome.found.settings.kind, case.motion.n)
+    labels = [
+        f"joint {label}\n[{unit}]"
+        for label, unit in zip(row_labels(outcome.found.settings.kind, case.motion.n), _units(outcome, rows))
+    ]
     kind = "fitted" if case.name in outcome.fit else "repeat" if case.name in outcome.repeated else "unseen"
     with styled():
         figure, axes = sheet(rows, 1, WIDE, 1.15 * rows + 0.5)
@@ -42,8 +45,8 @@ def torques(case: Case, predicted: np.ndarray, outcome: IdentificationOutcome) -
             axis.plot(t, model, color=AFTER, linewidth=0.8, label="predicted")
             axis.plot(t, target - model, color=QUIET, linewidth=0.5, label="residual")
             axis.set_ylabel(labels[j])
-        axes[0].legend(ncols=3, loc="upper right", fontsize=7)
         axes[0].set_title(f"{case.name} ({kind}): torque of each joint")
+        figure.legend(*axes[0].get_legend_handles_labels(), ncols=3, loc="outside lower right", fontsize=7)
         axes[-1].set_xlabel("time [s]")
     return figure
 
@@ -64,6 +67,7 @@ def autocorrelations(found: Score, name: str) -> Figure:
             for bound in (-white.bound, white.bound):
                 axis.axhline(bound, color=MARK, linewidth=0.7, linestyle="--")
             axis.set(ylim=(-1, 1), title=f"joint {j + 1}")
+            axis.set_xlabel("lag [samples]")
         figure.suptitle(f"{name}: autocorrelation of the residuals at {found.rate:.3g} Hz", fontsize=8.5, color=INK)
     return figure
 
@@ -76,6 +80,7 @@ def friction(outcome: IdentificationOutcome) -> Figure:
     n, rows = case.motion.n, case.target.shape[1]
     columns = min(n, 4)
     shown = {"velocity", "sign", "one", "speed", "cubic", "root", "stribeck"}
+    units, prismatic = _units(outcome, rows), [joint.kind == "prismatic" for joint in outcome.inputs.chain.joints]
     residual = case.target - outcome.predictions[case.name]
     with styled():
         figure, axes = sheet(-(-n // columns), columns, WIDE, 1.8 * -(-n // columns))
@@ -98,6 +103,16 @@ def friction(outcome: IdentificationOutcome) -> Figure:
             step = max(1, len(v) // MOST)
             axis.plot(v[::step], (along + residual[:, rows - n + j])[::step], ".", color=BEFORE, markersize=0.8)
             axis.plot(grid, curve, color=AFTER, linewidth=1.2)
-            axis.set(title=f"joint {j + 1}", xlabel="velocity")
+            speed = "m/s" if prismatic[j] else "rad/s"
+            axis.set(title=f"joint {j + 1}", xlabel=f"velocity [{speed}]", ylabel=f"friction [{units[rows - n + j]}]")
         figure.suptitle("friction over velocity: model, and model + residual", fontsize=8.5, color=INK)
     return figure
+
+
+def _units(outcome: IdentificationOutcome, rows: int) -> list[str]:
+    """Return the unit of each torque row: N at prismatic joints; A where the model is of currents."""
+    own = outcome.inputs.unit
+    if own != "N m":
+        return [own] * rows
+    joints = outcome.inputs.chain.joints
+    return ["N" if joints[k % len(joints)].kind == "prismatic" else "N m" for k in range(rows)]

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from calib import files
 from calib.procedure import motion_files
-from calib.procedure.drawing import AFTER, BEFORE, MARK, QUIET, WIDE, save, sheet, styled
+from calib.procedure.drawing import AFTER, BEFORE, MARK, QUIET, WIDE, motion_units, save, sheet, styled
 from calib.procedure.motion_planning import Planned
 from trajectories.timing import ACTIVE
 
@@ -99,6 +99,7 @@ def motion_figure(planned: Planned) -> Figure:
     rows.append((track.a, -limits.acceleration, limits.acceleration, "acceleration"))
     if track.tau is not None:
         rows.append((track.tau, -limits.torque, limits.torque, "torque"))
+    units = motion_units(joint.kind for joint in planned.chain.joints)
     with styled():
         figure, axes = sheet(n, len(rows), WIDE, 0.85 * n + 0.5)
         for j, k in np.ndindex(n, len(rows)):
@@ -109,7 +110,7 @@ def motion_figure(planned: Planned) -> Figure:
                 if np.isfinite(bound):
                     axis.axhline(bound, color=MARK, linewidth=0.6, linestyle="--")
             if j == 0:
-                axis.set_title(title)
+                axis.set_title(f"{title} [{units[k]}]")
             if k == 0:
                 axis.set_ylabel(planned.chain.joint_names[j], fontsize=7)
         for axis in axes[-len(rows) :]:
