@@ -11,7 +11,7 @@ from pathlib import Path
 from calib import files
 from calib.procedure import certificate, report, viewer
 from calib.procedure.dynamic_stages import recordings
-from calib.procedure.session import Session, fingerprint, read_state
+from calib.procedure.session import MARK, Session, fingerprint, read_state
 from calib.procedure.stages import measured_files, robot_file
 
 Say = Callable[[str], None]
@@ -51,9 +51,10 @@ def certify(session: Session, say: Say) -> list[str]:
         folders = session.path("8-dynamics"), session.path("6-excitation")
         judged.append(dynamic_certificate.dynamics_stage(dynamics, *folders, exported))
         notes.append(f"dynamics {dynamics.verdict}: {dynamics.reason}")
+    told = simulated(session)
     page = certificate.Page(
-        f"Calibration of {session.settings.name}",
-        f"{session.settings.instrument['name']}, {session.settings.created[:10]}",
+        f"{'Simulated calibration' if told else 'Calibration'} of {session.settings.name}",
+        f"{'SIMULATED: ' if told else ''}{session.settings.instrument['name']}, {session.settings.created[:10]}",
         setup(session, whole),
         judged,
         listed(session),
@@ -63,6 +64,13 @@ def certify(session: Session, say: Say) -> list[str]:
     return [*notes, "certificate.html", viewer.write_beside(session.folder)]
 
 
+def simulated(session: Session) -> list[tuple[str, str]]:
+    """Return lines under Setup of a session whose files a simulated cell brought; none of a real one."""
+    path = session.path(MARK)
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    return [("simulated", line) for line in lines if line.strip()]
+
+
 def setup(session: Session, found: report.Report) -> list[tuple[str, str]]:
     """Return what stands under Setup on the certificate."""
     settings, fitted = session.settings, measured_files(session)
@@ -70,6 +78,7 @@ def setup(session: Session, found: report.Report) -> list[tuple[str, str]]:
     stated = f", σ {1e6 * instrument['sigma_position']:g} µm" if instrument["sigma_position"] else ", σ estimated"
     turning = f", {1e3 * instrument['sigma_orientation']:g} mrad" if instrument["sigma_orientation"] else ""
     return [
+        *simulated(session),
         ("robot", f"{found.robot}, {found.base} to {found.tip}, {len(found.joints)} joints"),
         ("description", settings.robot["given"]),
         ("instrument", f"{instrument['name']}, measures {instrument['measures']}{stated}{turning}"),

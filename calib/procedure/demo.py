@@ -17,7 +17,7 @@ from calib.errors import SessionError, UsageError
 from calib.procedure import dynamic_stages, steps
 from calib.procedure.certifying import verdict_of
 from calib.procedure.guided import begin
-from calib.procedure.session import Session, locked, open_session
+from calib.procedure.session import MARK, Session, locked, open_session
 from calib.procedure.truth import TRUTH, against_truth, torques_against_truth
 from calib.robot import library
 from calib.robot.load import load
@@ -30,6 +30,7 @@ Say = Callable[[str], None]
 FIT, VALIDATION, AGAIN = 40, 20, 3
 DRIFT = 10e-6  # how far the simulated instrument wanders over a series [m]
 MOTION = {"period": 10.0, "starts": 2, "evaluations": 150, "repeats": 2, "torques": "both"}  # little effort, for time
+SIMULATED = "simulated cell: {note}; nothing was measured on a robot"
 LOGS = (("training", 2), ("validation", 3))  # and the numbers of their noise
 
 
@@ -189,6 +190,7 @@ def arm_of(session: Session, cell: Cell) -> MovingArm:
 
 def bring(session: Session, cell: Cell, seed: int) -> None:
     """Let the simulated cell measure the planned poses, and three of them once more at the end; the CMM wanders."""
+    mark(session, cell.note)
     kinds = [joint.kind for joint in cell.nominal.joints]
     for number, (plan, name) in enumerate((("poses", "measured"), ("validation", "validation"))):
         q = read_poses(session.path(f"2-poses/{plan}.csv"), cell.nominal.joint_names, kinds=kinds)
@@ -199,8 +201,16 @@ def bring(session: Session, cell: Cell, seed: int) -> None:
             brought.write(wandering(again, DRIFT, seed, begin=1.0), session.path("3-measured/drift.csv"))
 
 
+def mark(session: Session, note: str) -> None:
+    """Write down in the session that its files are a simulated cell's; the certificate says so."""
+    path, line = session.path(MARK), SIMULATED.format(note=note)
+    known = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    files.write(path, "\n".join([*known, *([line] if line not in known else [])]) + "\n")
+
+
 def bring_logs(session: Session, arm: MovingArm, seed: int) -> None:
     """Let the simulated arm play the designed motions, and log them."""
+    mark(session, arm.note)
     motions = dynamic_stages.designed_motions(session)
     for name, number in LOGS:
         if name not in motions:

@@ -14,6 +14,7 @@ session.toml     what is to be calibrated, with what, how; written by `calib new
 9-export/  certificate.html
                  Without dynamics there are no 6 to 8, and the export is 6-export.
 state.json       which step was made from which files (SHA-256), when, by which version; written whole or not at all
+simulated.txt    there where a simulated cell brought files (calib demo); the certificate then says that it is simulated
 session.lock     there while a command works on the session
 """
 
@@ -40,6 +41,7 @@ READ = (1, SCHEMA)  # a session of schema 1 knows no dynamics; it goes on as geo
 FOLDERS = ("1-robot", "2-poses", "3-measured", "4-fit", "5-validation")
 DYNAMIC = ("6-excitation", "7-recorded", "8-dynamics")
 EXPORT = {False: "6-export", True: "9-export"}  # without, with dynamics
+MARK = "simulated.txt"
 TORQUES = ("motor", "link", "both")
 _HEAD = """# A calibration session; see `calib status` and `calib next`. Lengths in m, angles in rad.
 # Change what you like: steps made from something that changed are shown as stale and made again.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calib.procedure import certifying, dynamic_stages, stages
-from calib.procedure.session import Session
+from calib.procedure.session import MARK, Session
 
 Say = Callable[[str], None]
 
@@ -110,7 +110,8 @@ def _certified(session: Session) -> list[Path]:
     names = ["4-fit/report.json", "5-validation/metrics.json", f"{session.export}/robot.urdf", "2-poses/selection.json"]
     if session.dynamic:
         names += ["8-dynamics/metrics.json", "8-dynamics/estimate.csv", "8-dynamics/unseen/report.json"]
-    return [session.path(name) for name in names]
+    marked = [session.path(MARK)] if session.path(MARK).exists() else []
+    return [*(session.path(name) for name in names), *marked]
 
 
 PLAN = "plan validation period harmonics rate starts evaluations limits"

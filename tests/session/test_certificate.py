@@ -15,6 +15,9 @@ from matplotlib.figure import Figure
 
 from calib.errors import CalibError
 from calib.procedure import certificate, drawing, figures, plots, report
+from calib.procedure.session import Session
+
+from .conftest import go_on
 
 
 class References(HTMLParser):
@@ -62,6 +65,14 @@ def test_it_says_what_a_professional_signs(page: str, finished_folder: Path) -> 
     assert len(digest) == len(set(digest)) >= 6
     for name in ("theta2", "d4", "alpha7", "kept at their nominal values: alpha1"):
         assert name in text
+
+
+def test_a_simulated_session_says_that_it_is_and_another_does_not(page: str, finished: Session, plain: None) -> None:
+    assert "<h1>Simulated calibration of" in page and "SIMULATED: optical CMM" in page
+    assert "simulated cell: " in page and "nothing was measured on a robot" in page
+    finished.path("simulated.txt").unlink()
+    assert go_on(finished) is None
+    assert "imulated" not in finished.path("certificate.html").read_text()
 
 
 def test_ids_of_figures_do_not_meet(page: str) -> None:
