@@ -269,9 +269,17 @@ def _essential(fitted: Fitted, settings: Settings, prior: Prior | None, bias: Lo
         data = instruments.testable(bias.found.problem, bias.found.fit, bias.found.std)
         std, inflation = np.ones(1), np.array([bias.found.inflation])
     return eliminate(
-        data, Rule(settings.essential), ratio=settings.ratio, level=settings.level, keep=settings.keep,
-        drop=settings.drop, std=std, inflation=inflation,
+        data, Rule(settings.essential), ratio=settings.ratio, level=settings.level,
+        keep=_base_names(settings.keep, data.names), drop=_base_names(settings.drop, data.names),
+        std=std, inflation=inflation,
     )  # fmt: skip
+
+
+def _base_names(chosen: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
+    """Return names of columns; ``ZZ1R``, as the files call what others are regrouped in, is column ``ZZ1``."""
+    return tuple(
+        name[:-1] if name.endswith("R") and name[:-1] in names and name not in names else name for name in chosen
+    )
 
 
 def _require_motion(cases: Sequence[Case]) -> None:

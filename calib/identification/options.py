@@ -174,7 +174,10 @@ def _file(table: Mapping[str, Any], base: FileSettings, settings: Settings, plac
     if "filter" in table:
         result = replace(result, filter=_filter(table["filter"], base.filter, f"{place}: filter"))
     if "gains" in table:
-        result = replace(result, gains=_numbers(table["gains"], f"{place}: gains"))
+        gains = _numbers(table["gains"], f"{place}: gains")
+        if not all(np.isfinite(x) and x != 0.0 for x in gains):
+            raise values.refuse(table["gains"], f"{place}: gains", "finite numbers, none of them zero")
+        result = replace(result, gains=gains)
     if "reference" in table:
         result = replace(result, reference=values.text(table["reference"], f"{place}: reference"))
     if isinstance(table.get("payload"), list):

@@ -99,6 +99,7 @@ def make_model(chain: Chain, settings: Settings) -> IdentificationModel:
         bodies = with_gravity(bodies, np.array(settings.gravity))
     for label in settings.payloads:
         bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1)
+    _check_joints(chain.n, settings)
     linear = [joint.kind == "prismatic" for joint in chain.joints]
     sets = per_joint(settings.sets or (DRIVES[settings.kind],), chain.n, "drives")
     v0 = per_joint(settings.v0, chain.n, "v0")
@@ -107,6 +108,20 @@ def make_model(chain: Chain, settings: Settings) -> IdentificationModel:
         own += drives.coupled(*coupling.joints, v0=v0[coupling.joints[1]], label=coupling.label or None)
     own += [replace(one, linear=linear[one.acts[0][0]]) if one.acts else one for one in settings.terms]
     return IdentificationModel(bodies, tuple(own), settings.kind)
+
+
+def _check_joints(n: int, settings: Settings) -> None:
+    """Refuse couplings and terms of joints that the robot does not have, and a joint coupled with itself."""
+    named = [(f"coupling: joints {[j + 1 for j in one.joints]}", one.joints) for one in settings.couplings]
+    for one in settings.terms:
+        joints = [j for row, motion in one.acts for j in (row, *(k for k, _ in motion))]
+        named.append((f"term '{one.name}': joint {max(joints, default=0) + 1}", tuple(joints)))
+    for place, joints in named:
+        if max(joints, default=0) >= n:
+            raise UsageError(f"{place}: the robot has joints 1 to {n}")
+    for coupling in settings.couplings:
+        if coupling.joints[0] == coupling.joints[1]:
+            raise UsageError(f"coupling: joint {coupling.joints[0] + 1} is coupled with itself; name two joints")
 
 
 def per_joint(values: Sequence[T], n: int, name: str) -> tuple[T, ...]:

@@ -37,11 +37,12 @@ from calib.dynamics.base import Base, expressions
 from calib.dynamics.drives import Term
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.tree import tree, with_gravity, with_payload
-from calib.errors import RobotError
+from calib.errors import RobotError, UsageError
 from calib.identification.prediction import Dynamics
 from calib.robot import description
 from calib.robot.chain import Chain
 
+TORQUE = "N m"
 NOTE = "regrouped parameters hold base values, the others are zero: torques are right, single ones need not be"
 
 
@@ -77,6 +78,22 @@ def read_table(folder: Path) -> dict[str, Any]:
     return found
 
 
+def refuse_currents(folder: Path, task: str) -> None:
+    """Refuse a model in amperes (of currents without gains) for a task that needs torques.
+
+    Raises:
+        UsageError: for a model whose unit is not newton metres.
+        RobotError: where the folder holds no model.
+    """
+    unit = read_table(folder).get("unit", TORQUE)
+    if unit != TORQUE:
+        raise UsageError(
+            f"{folder}: this model is in {unit}, identified from currents without drive gains; {task} needs N m: state "
+            "gains = [...] (N m/A) in the options file, or identify them with [gain_identification] (runs without and "
+            "with a load of known mass), and run calib identify again"
+        )
+
+
 def read_covariance(folder: Path) -> tuple[tuple[str, ...], np.ndarray] | None:
     """Return names and covariance (p, p) of the estimated parameters; None without ``covariance.csv``.
 
@@ -98,14 +115,15 @@ def read_covariance(folder: Path) -> tuple[tuple[str, ...], np.ndarray] | None:
     return tuple(header[1:]), covariance
 
 
-def to_table(dynamics: Dynamics, base: Base) -> dict[str, Any]:
-    """Return the model as what JSON can hold."""
+def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, Any]:
+    """Return the model as what JSON can hold; `unit` is that of its torques."""
     model = dynamics.model
     bodies = 10 * model.tree.bodies if model.kind != "drive" else 0
     payloads = [label for label, coordinate in zip(model.tree.labels, model.tree.coordinates) if coordinate < 0]
     return {
         "robot": "robot.toml",
         "kind": model.kind,
+        "unit": unit,
         "gravity": model.tree.gravity.tolist(),
         "payloads": payloads,
         "bodies": dict(zip(model.names[:bodies], dynamics.values[:bodies].tolist())),
@@ -118,7 +136,7 @@ def to_table(dynamics: Dynamics, base: Base) -> dict[str, Any]:
                 "side": one.side,
                 "linear": one.linear,
                 "value": float(value),
-                "unit": one.unit,
+                "unit": in_unit(one.unit, unit),
             }
             for one, value in zip(model.columns, dynamics.values[bodies:])
         ],
@@ -127,6 +145,16 @@ def to_table(dynamics: Dynamics, base: Base) -> dict[str, Any]:
         "covariance": "covariance.csv",
         "note": NOTE,
     }
+
+
+def in_unit(own: str, unit: str) -> str:
+    """Return a parameter's unit in a model whose torques are in `unit`: of amperes, all are divided by a gain [N m/A].
+
+    ``N m s/rad`` becomes ``A s/rad``, ``kg m²`` becomes ``kg m² A/(N m)``.
+    """
+    if unit == TORQUE:
+        return own
+    return own.replace("N m", "A") if "N m" in own else f"{own} A/(N m)"
 
 
 def regrouping(base: Base) -> dict[str, dict[str, float]]:

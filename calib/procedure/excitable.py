@@ -16,7 +16,7 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.shapes import V0
 from calib.dynamics.tree import standard_parameters, tree, with_gravity
 from calib.errors import UsageError
-from calib.identification.storage import from_table, read_covariance, read_table
+from calib.identification.storage import from_table, read_covariance, read_table, refuse_currents
 from calib.procedure.motion_limits import MotionLimits
 from calib.robot import description
 from calib.robot.chain import Chain
@@ -70,6 +70,7 @@ def read_dynamics(chain: Chain, folder: Path | None, sets: str, limits: MotionLi
 
 def _identified(chain: Chain, folder: Path) -> Dynamics:
     """Read an identification; payloads are left ashore."""
+    refuse_currents(folder, "an excitation within torque limits")
     table = read_table(folder)
     try:
         found = from_table(chain, table)

@@ -37,6 +37,7 @@ from calib.dynamics.tree import tree as bodies_of
 from calib.dynamics.tree import with_gravity
 from calib.errors import RobotError, UsageError
 from calib.identification.consistent import Consistent, find_consistent
+from calib.identification.storage import refuse_currents
 from calib.identification.told import Told
 from calib.identification.told import read as read_told
 from calib.procedure import calibrated, exporting
@@ -89,6 +90,7 @@ def is_identified(folder: Path) -> bool:
 
 def read(folder: Path) -> Exported:
     """Return what an identification left, with all parameters made those of possible bodies."""
+    refuse_currents(folder, "an export of masses")
     told = read_told(folder)
     found = find_consistent(told)
     own = bodies_of(told.chain).bodies

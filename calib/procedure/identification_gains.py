@@ -18,6 +18,7 @@ from calib.identification.identify import common_decimator, find_base, first_fit
 from calib.identification.options import FileSettings, IdentifyOptions, file_settings
 from calib.identification.rows import observe, pool, triangulate, with_blocks
 from calib.identification.settings import Settings, make_model
+from calib.identification.storage import TORQUE
 from calib.robot.chain import Chain
 
 
@@ -65,7 +66,13 @@ def find_gains(
         return _from_pair(chain, options, motions)
     bare = [path for path in currents if path not in stated and motions[path].drive_gain is None]
     if not bare:
-        return FoundGains(options, None, None, "N m", ())
+        return FoundGains(options, None, None, TORQUE, ())
+    if len(bare) < len(motions):
+        rest = [path for path in motions if path not in bare]
+        raise UsageError(
+            f"{bare[0]} holds currents without gains, {rest[0]} torques (or currents with gains): amperes and N m do "
+            "not go into one model; state gains for all of them"
+        )
     say("relative drive gains")
     return _relative(chain, options, [(path, motions[path]) for path in training if path in bare])
 
@@ -100,7 +107,7 @@ def _from_pair(chain: Chain, options: IdentifyOptions, motions: Mapping[str, Mot
     ]
     notes += _unsure(found)
     chosen = replace(options, settings=replace(settings, payload_values=loads))
-    return FoundGains(chosen, found.gains, found, "N m", tuple(notes))
+    return FoundGains(chosen, found.gains, found, TORQUE, tuple(notes))
 
 
 def _relative(chain: Chain, options: IdentifyOptions, currents: Sequence[tuple[str, Motion]]) -> FoundGains:
@@ -117,6 +124,16 @@ def _relative(chain: Chain, options: IdentifyOptions, currents: Sequence[tuple[s
         "for N m give gains, or [gain_identification] with a payload of known mass"
     )
     return FoundGains(options, found.gains, found, f"A of joint {reference + 1}", (note, *_unsure(found)))
+
+
+def relative_warnings(unit: str) -> tuple[str, ...]:
+    """Say what a model is whose torques are not in newton metres; nothing for one whose are."""
+    if unit == TORQUE:
+        return ()
+    return (
+        f"the model is in {unit}, not in N m: no masses, no URDF, no motion planning; the robot's own inertias do not "
+        "compare with it: state gains, or identify them with a load",
+    )
 
 
 def _identify(

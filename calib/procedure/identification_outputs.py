@@ -13,8 +13,9 @@ from calib.dynamics.base import expressions
 from calib.errors import UsageError
 from calib.identification.cases import Case, row_labels
 from calib.identification.estimators import ASSUMES
+from calib.identification.gains import DriveGains
 from calib.identification.scores import Part, Score
-from calib.identification.storage import to_table
+from calib.identification.storage import in_unit, to_table
 from calib.identification.told import information
 from calib.procedure import calibrated, consistency_tables
 from calib.procedure.folders import check_folder, write_staged
@@ -25,7 +26,8 @@ from calib.robot import description
 
 OURS = (
     "robot.toml", "dynamics.json", "estimate.csv", "covariance.csv", "information.csv", "instrumental.csv",
-    "metrics.json", "torques_1.csv", calibrated.COVARIANCE, consistency_tables.EFFECTS, consistency_tables.SENSITIVITY,
+    "metrics.json", "drive_gains.csv",
+    "torques_1.csv", calibrated.COVARIANCE, consistency_tables.EFFECTS, consistency_tables.SENSITIVITY,
     consistency_tables.GEOMETRIES,
 )  # fmt: skip
 """Files of an earlier identification that a new one replaces; besides plots, ``plot_*.png``."""
@@ -74,7 +76,11 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
         files.write_table(folder / "information.csv", (*found.names, "target"), triangle.tolist())
     first = (*inputs.unseen, *inputs.cases)[0]
     write_torques(first, outcome.predictions[first.name], folder / "torques_1.csv")
-    files.write_json(folder / "dynamics.json", to_table(found.dynamics, found.base))
+    table = to_table(found.dynamics, found.base, inputs.unit) | {"drive_gains": gain_table(inputs.gains, inputs.unit)}
+    files.write_json(folder / "dynamics.json", table)
+    if inputs.gains is not None:
+        columns = (inputs.chain.joint_names, inputs.gains.gains.tolist(), inputs.gains.sigma.tolist())
+        files.write_table(folder / "drive_gains.csv", ("joint", f"gain [{inputs.unit} per A]", "sigma"), zip(*columns))
     files.write_json(folder / "metrics.json", metrics(outcome))
 
 
@@ -110,7 +116,7 @@ def estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:
         (
             name,
             expression,
-            unit,
+            in_unit(unit, outcome.inputs.unit),
             float(value),
             float(sigma),
             _finite(rsd),
@@ -142,6 +148,8 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
             "essential": essential,
         },
         "counts": {"without_effect": len(found.base.without_effect), "regrouped": len(found.base.regrouped)},
+        "unit": outcome.inputs.unit,
+        "drive_gains": gain_table(outcome.inputs.gains, outcome.inputs.unit),
         "rows": list(row_labels(found.settings.kind, outcome.inputs.chain.n)),
         "condition_number": {"raw": _finite(found.condition[0]), "normalised": _finite(found.condition[1])},
         "friction": found.climb.chosen,
@@ -177,6 +185,19 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
         "verdict": outcome.verdict.level,
         "reason": outcome.verdict.reason,
         "seed": outcome.seed,
+    }
+
+
+def gain_table(found: DriveGains | None, unit: str) -> dict[str, Any] | None:
+    """Return gains as identified, by joint: torque = gain · current; None where none were."""
+    if found is None:
+        return None
+    return {
+        "values": [float(x) for x in found.gains],
+        "sigma": [float(x) for x in found.sigma],
+        "covariance": found.covariance.tolist(),
+        "unit": f"{unit} per A",
+        "scale": found.scale,
     }
 
 

@@ -18,6 +18,7 @@ from calib.data.resampling import Resampled
 from calib.errors import UsageError
 from calib.identification.cases import Case, case_names, make_case, row_labels
 from calib.identification.consistency import Propagation, propagate
+from calib.identification.gains import DriveGains
 from calib.identification.geometries import Comparison, compare
 from calib.identification.identify import Identification, identify
 from calib.identification.options import FileSettings, IdentifyOptions, file_settings
@@ -26,7 +27,7 @@ from calib.identification.prediction import predict
 from calib.identification.scores import Score, score
 from calib.identification.settings import Settings
 from calib.procedure import calibrated
-from calib.procedure.identification_gains import FoundGains, find_gains
+from calib.procedure.identification_gains import FoundGains, find_gains, relative_warnings
 from calib.procedure.identification_tracking import Tracking, track
 from calib.procedure.identification_verdict import judge, warnings, with_prior
 from calib.procedure.inputs import joint_kinds
@@ -57,6 +58,7 @@ class IdentificationInputs:
         options: the options file's content, the command's choices put in.
         notes: what a user should know about how the files were understood.
         unit: of the torques.
+        gains: drive gains that were identified; None where none were.
     """
 
     chain: Chain
@@ -68,6 +70,7 @@ class IdentificationInputs:
     notes: tuple[str, ...] = ()
     unit: str = "N m"
     geometry: np.ndarray | None = None
+    gains: DriveGains | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +150,7 @@ def gather(
     cases = [read_case(path, name, motion, options, found) for name, path, motion in zip(names, paths, motions)]
     return IdentificationInputs(
         chain, nominal, source, tuple(cases[:count]), tuple(cases[count:]), options, (*notes, *found.notes), found.unit,
-        calibrated.chain_covariance(source, chain) if source.suffix == ".toml" else None,
+        calibrated.chain_covariance(source, chain) if source.suffix == ".toml" else None, found.found,
     )  # fmt: skip
 
 
@@ -163,7 +166,11 @@ def run(inputs: IdentificationInputs, progress: Progress | None = None) -> Ident
         predictions[case.name] = predict(found.dynamics, case)
         scores[case.name] = score(case, predictions[case.name], inputs.options.slow)
     say("tracking with the model fed forward")
-    tracking = track(inputs.chain, found, inputs.cases, inputs.unseen, predictions, inputs.unit)
+    amperes = relative_warnings(inputs.unit)
+    tracking = (
+        Tracking(unseen=bool(inputs.unseen), failure=amperes[0]) if amperes
+        else track(inputs.chain, found, inputs.cases, inputs.unseen, predictions, inputs.unit)
+    )  # fmt: skip
     say("judging")
     shares = {
         case.name: max(repeats(own.motion, case.motion) for own in inputs.cases) for case in inputs.unseen
@@ -172,7 +179,9 @@ def run(inputs: IdentificationInputs, progress: Progress | None = None) -> Ident
     excitation = {case.name: report_excitation(case.motion) for case in inputs.cases}
     fit = {case.name: scores[case.name] for case in inputs.cases}
     validation = {case.name: scores[case.name] for case in inputs.unseen}
-    told = warnings(inputs.cases, inputs.unseen, found, validation, repeated, excitation, inputs.chain)
+    told = (
+        *amperes, *warnings(inputs.cases, inputs.unseen, found, validation, repeated, excitation, inputs.chain)
+    )  # fmt: skip
     proofs = {name: found_score for name, found_score in validation.items() if name not in repeated}
     labels = row_labels(settings.kind, inputs.chain.n)
     verdict = with_prior(judge(fit, proofs, repeated, excitation, wrong, labels), found)

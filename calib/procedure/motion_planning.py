@@ -16,7 +16,7 @@ from calib.dynamics.path_dynamics import PathDynamics, of_standard
 from calib.dynamics.tree import standard_parameters, tree
 from calib.errors import RobotError, UsageError
 from calib.identification.prediction import Dynamics, carried_columns
-from calib.identification.storage import read_dynamics
+from calib.identification.storage import read_dynamics, refuse_currents
 from calib.procedure.inputs import load_robot
 from calib.procedure.motion_approach import approach_to
 from calib.procedure.motion_limits import MotionLimits, read_motion_limits
@@ -212,6 +212,7 @@ def _law(
 
 def _identified(chain: Chain, folder: Path, payloads: Sequence[str]) -> tuple[PathDynamics, Uncertainty | None]:
     """Return an identified model with the payloads that are on board, and its uncertainty."""
+    refuse_currents(folder, "a motion plan")
     arm, dynamics = read_dynamics(folder)
     if arm.n != chain.n:
         raise UsageError(f"{folder} is of a robot with {arm.n} joints, {chain.name} has {chain.n}")
