@@ -43,13 +43,14 @@ def certify(session: Session, say: Say) -> list[str]:
     sets = [*found.sets, *(json.loads(rows.read_text()) if rows.exists() and outside["validation"] else [])]
     whole = replace(found, metrics=found.metrics | merged, sets=sets)
     drawn = figures.draw(whole)
-    judged = [certificate.geometry_stage(whole, drawn)]
+    judged = [with_arrival(certificate.geometry_stage(whole, drawn), noticed(session, "3-measured", "validate"))]
     notes = [f"geometry {outside['verdict']}: {outside['reason']}"]
     if session.dynamic:
         dynamics = dynamic_certificate.read(session.path("8-dynamics"))
         exported = read_state(session)["steps"].get("export", {}).get("notes", [])
         folders = session.path("8-dynamics"), session.path("6-excitation")
-        judged.append(dynamic_certificate.dynamics_stage(dynamics, *folders, exported))
+        stage = dynamic_certificate.dynamics_stage(dynamics, *folders, exported)
+        judged.append(with_arrival(stage, noticed(session, "7-recorded", "predict")))
         notes.append(f"dynamics {dynamics.verdict}: {dynamics.reason}")
     told = simulated(session)
     page = certificate.Page(
@@ -62,6 +63,23 @@ def certify(session: Session, say: Say) -> list[str]:
     files.write(session.path("certificate.html"), certificate.render(page))
     files.write_json(session.path("5-validation/report.json"), asdict(whole))
     return [*notes, "certificate.html", viewer.write_beside(session.folder)]
+
+
+def noticed(session: Session, place: str, unseen: str) -> list[str]:
+    """Return what was said of files as they came: those to learn from, and those that the step `unseen` looked at."""
+    path = session.path(f"{place}/checked.txt")
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    files_there = measured_files(session)[1] if place == "3-measured" else recordings(session)[1]
+    said = read_state(session)["steps"].get(unseen, {}).get("notes", [])
+    names = tuple(f"{each.name}: " for each in files_there)
+    return [line for line in (*lines, *(note for note in said if names and note.startswith(names))) if line.strip()]
+
+
+def with_arrival(stage: certificate.Stage, lines: list[str]) -> certificate.Stage:
+    """Return a stage with what was noticed when its files came."""
+    if not lines:
+        return stage
+    return replace(stage, blocks=[*stage.blocks, certificate.Text("What was noticed when the files came", lines)])
 
 
 def simulated(session: Session) -> list[tuple[str, str]]:

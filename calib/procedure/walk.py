@@ -108,7 +108,9 @@ def _exported(session: Session) -> list[Path]:
 
 def _certified(session: Session) -> list[Path]:
     names = ["4-fit/report.json", "5-validation/metrics.json", f"{session.export}/robot.urdf", "2-poses/selection.json"]
+    names.append("3-measured/checked.txt")
     if session.dynamic:
+        names += ["7-recorded/checked.txt"]
         names += ["8-dynamics/metrics.json", "8-dynamics/estimate.csv", "8-dynamics/unseen/report.json"]
     marked = [session.path(MARK)] if session.path(MARK).exists() else []
     return [*(session.path(name) for name in names), *marked]

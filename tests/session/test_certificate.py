@@ -75,6 +75,16 @@ def test_a_simulated_session_says_that_it_is_and_another_does_not(page: str, fin
     assert "imulated" not in finished.path("certificate.html").read_text()
 
 
+def test_what_was_noticed_on_arrival_stands_on_it(page: str, finished_folder: Path) -> None:
+    found = References()
+    found.feed(page)
+    text = " ".join(found.text)
+    lines = (finished_folder / "3-measured/checked.txt").read_text().splitlines()
+    assert "What was noticed when the files came" in text
+    assert all(line in text for line in lines) and any("drift.csv: measured again" in line for line in lines)
+    assert "validation.csv: joints read back are off" in text and "measured.csv: joints read back are off" in text
+
+
 def test_ids_of_figures_do_not_meet(page: str) -> None:
     ids = re.findall(r"<svg.*?</svg>", page, flags=re.DOTALL)
     sets = [set(re.findall(r'\bid="([^"]+)"', svg)) for svg in ids]
