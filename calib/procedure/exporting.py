@@ -147,7 +147,7 @@ def export_offsets(found: Calibration, out: Path) -> Path:
 def _sigmas(folder: Path) -> dict[str, float]:
     try:
         with (folder / "estimate.csv").open(encoding="utf-8", newline="") as file:
-            return {row["name"]: float(row["sigma"]) for row in csv.DictReader(file)}
+            return {row["name"]: float(row["sigma"]) for row in csv.DictReader(file) if row["sigma"]}
     except (OSError, KeyError, ValueError) as error:
         raise UsageError(f"{folder}/estimate.csv cannot be read: {error}") from error
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,7 @@ OURS = (
 )  # fmt: skip
 """Files of an earlier identification that a new one replaces; besides plots, ``plot_*.png``."""
 TORQUE_RATE = 100.0  # of torques_1.csv [Hz]
+OFF = 1e-9  # σ of a friction term below which it is the ridge's floor, not a measurement [N m] (our choice)
 HEADER = ("name", "expression", "unit", "value", "sigma", "rsd", "essential", "sigma_torque", "sigma_geometry")
 
 
@@ -97,12 +98,14 @@ def write_torques(case: Case, predicted: np.ndarray, path: Path) -> Path:
 def estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:
     """Return name, expression, unit, value, σ, RSD [%] and the essential value of each parameter, then σ's two parts.
 
-    σ is the total; the geometry's part is left out where the geometry is taken as exact.
+    σ is the total; the geometry's part is left out where the geometry is taken as exact. Terms that the evidence
+    switched off have no σ: nobody measured them.
     """
     found = outcome.found
     estimate = found.fitted.estimate
     words = [line.split(" = ", 1)[1] for line in expressions(found.base)]
-    words += [one.shape for one in found.climb.terms]
+    off = switched_off(found.names, found.base.b, estimate.sigma)
+    words += [f"{one.shape}, switched off: not measured" if one.name in off else one.shape for one in found.climb.terms]
     carried = outcome.carried
     sigmas = estimate.sigma if carried is None else carried.sigma
     parts = [None] * len(sigmas) if carried is None or carried.geometry is None else carried.sigma_geometry.tolist()
@@ -118,16 +121,24 @@ def estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:
             expression,
             in_unit(unit, outcome.inputs.unit),
             float(value),
-            float(sigma),
-            _finite(rsd),
+            None if name in off else float(sigma),
+            None if name in off else _finite(rsd),
             _number(essential.get(own)),
-            float(noise),
-            part,
+            None if name in off else float(noise),
+            None if name in off else part,
         )
         for name, own, expression, unit, value, sigma, rsd, noise, part in zip(
             found.names, estimate.names, words, estimate.units, estimate.values, sigmas, relative, estimate.sigma, parts
         )
     ]
+
+
+def switched_off(names: Sequence[str], base: int, sigma: np.ndarray) -> tuple[str, ...]:
+    """Return terms of richer friction (behind `base` columns) that the ridge holds at zero: their σ is its floor.
+
+    Their rows of ``covariance.csv`` hold that floor, so that the model's other σ are those without the terms.
+    """
+    return tuple(name for name, own in zip(names[base:], sigma[base:]) if own < OFF)
 
 
 def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
@@ -153,6 +164,7 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
         "rows": list(row_labels(found.settings.kind, outcome.inputs.chain.n)),
         "condition_number": {"raw": _finite(found.condition[0]), "normalised": _finite(found.condition[1])},
         "friction": found.climb.chosen,
+        "switched_off": list(switched_off(found.names, found.base.b, found.fitted.estimate.sigma)),
         "method": found.fitted.method,
         "method_assumes": ASSUMES[found.fitted.method],
         "ladder": [

@@ -112,7 +112,9 @@ def _parameters(session: Session, model: IdentificationModel, cell: Cell, arm: M
     """Return the share of estimated base parameters whose truth is within two sigmas, and how many there are."""
     with session.path("8-dynamics/estimate.csv").open(newline="", encoding="utf-8") as file:
         names = csv.DictReader(file)
-        rows = [(row["name"].removesuffix("R"), float(row["value"]), float(row["sigma"])) for row in names]
+        rows = [
+            (row["name"].removesuffix("R"), float(row["value"]), float(row["sigma"])) for row in names if row["sigma"]
+        ]
     true = true_base(model, cell, arm, session.settings.seed)
     inside = [abs(value - true[name]) < 2 * sigma for name, value, sigma in rows if name in true]
     return (float(np.mean(inside)) if inside else 0.0), len(inside)
