@@ -2,8 +2,10 @@
 
 Beside the names of `recording_options` an archive may hold ``joint_names`` (n texts), ``drive_gain`` (n) and
 ``use_range`` (first row, end row; from 0), which is followed unless the path has a cut of its own or the options say
-otherwise. Members are decompressed one after the other and only the rows asked for are kept: a compressed member
-cannot be mapped into memory, so time grows with the file (some 200 MB/s) and memory with the cut.
+otherwise. An average over repeats (`calib recall`) says how noisy it is: ``variance_tau`` (or the effort's name; N, n)
+of a single sample, and the number of ``periods`` averaged. Members are decompressed one after the other and only the
+rows asked for are kept: a compressed member cannot be mapped into memory, so time grows with the file (some 200 MB/s)
+and memory with the cut.
 """
 
 from __future__ import annotations
@@ -69,18 +71,38 @@ def _from_archive(
             raise MeasurementError(message, path, column=theirs)
         series["effort" if ours == kind else ours] = _arrange(values, order, scale(ours, options.units.get(ours, "")))
     gain = _optional(archive, members, "drive_gain", path, None)
-    unused = [name for name in members if name not in (*found.values(), *OWN, *RATES)]
+    factor = scale(kind, options.units.get(kind, ""))
+    variance = f"variance_{found.get(kind, '')}"
+    unused = [name for name in members if name not in (*found.values(), *OWN, *RATES, "periods", variance)]
     return Recording(
         t[rows],
         _arrange(q, order, scale("q", options.units.get("q", ""))),
         kind=kind,
         joint_names=names,
         drive_gain=None if gain is None else np.asarray(gain, dtype=float)[order],
+        effort_variance=_variance(archive, members, variance, path, q.shape, rows, order, factor),
         file=str(path),
         rows=np.arange(rows.start, rows.stop) + 1,
         notes=(*notes, *([f"not read: {', '.join(sorted(unused))}"] if unused else [])),
         **series,
     )
+
+
+def _variance(
+    archive: zipfile.ZipFile, members: Mapping[str, str], name: str, path: Path, shape: tuple[int, ...], rows: slice,
+    order: list[int], factor: float,
+) -> np.ndarray | None:  # fmt: skip
+    """Return the mean variance (n,) of the averaged effort: that of one sample over the number of periods."""
+    if name not in members or "periods" not in members:
+        return None
+    values = _member(archive, members[name], path, rows)
+    if values.shape != shape:
+        raise MeasurementError(f"has shape {values.shape}, expected {shape} (samples, joints)", path, column=name)
+    periods = float(np.ravel(_member(archive, members["periods"], path))[0])
+    if not (periods >= 1 and np.isfinite(values).all() and (values >= 0).all()):
+        message = f"expected variances, finite and not negative, over one period or more; periods is {periods:g}"
+        raise MeasurementError(message, path, column=name)
+    return np.asarray(values.mean(axis=0)[order] * factor**2 / periods)
 
 
 def _stamps(

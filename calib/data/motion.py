@@ -65,7 +65,7 @@ class Motion:
         band: f_p, the identification band [Hz].
         cutoff: (n,) f_q [Hz].
         decimator: the filter of the parallel decimation to that band.
-        joint_names, kind, file, drive_gain: the recording's.
+        joint_names, kind, file, drive_gain, effort_variance: the recording's.
         tau_link, tau_motor, q_link, q_ref, tau_ff, v_measured: (N, n) the recording's others on the grid, not
             filtered; or None.
         sampling, cutoffs: what was found; notes: what a user should be told.
@@ -95,6 +95,7 @@ class Motion:
     tau_ff: np.ndarray | None = None
     v_measured: np.ndarray | None = None
     drive_gain: np.ndarray | None = None
+    effort_variance: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.t)
@@ -149,6 +150,7 @@ def make_motion(recording: Recording, options: FilterOptions | None = None, samp
         cutoffs=cutoffs,
         notes=(*recording.notes, *sampled.report.lines(), *_told(cutoffs, options)),
         drive_gain=recording.drive_gain,
+        effort_variance=recording.effort_variance,
         v_measured=v_measured,
         **others,
     )

@@ -64,6 +64,7 @@ class Recording:
         q_ref: (N, n) positions that were asked for [rad or m]; tau_ff: (N, n) torque the controller added open loop,
             as torques; None where not recorded.
         drive_gain: (n,) torque per current that the file states [N·m/A or N/A]; None where it states none.
+        effort_variance: (n,) mean variance of the effort's samples, from repeats [its unit²]; None where not known.
         file: where it came from.
         rows: (N,) number of each sample in the file, counted from 1.
         notes: what is odd but was accepted, for the message.
@@ -81,6 +82,7 @@ class Recording:
     q_ref: np.ndarray | None = None
     tau_ff: np.ndarray | None = None
     drive_gain: np.ndarray | None = None
+    effort_variance: np.ndarray | None = None
     file: str = ""
     rows: np.ndarray = None  # type: ignore[assignment]  # set below
     notes: tuple[str, ...] = ()
@@ -100,8 +102,9 @@ class Recording:
         object.__setattr__(self, "joint_names", tuple(self.joint_names))
         rows = np.arange(1, shape[0] + 1) if self.rows is None else self.rows
         object.__setattr__(self, "rows", frozen(rows, int))
-        if self.drive_gain is not None:
-            object.__setattr__(self, "drive_gain", frozen(self.drive_gain))
+        for name in ("drive_gain", "effort_variance"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, frozen(getattr(self, name)))
 
     def __len__(self) -> int:
         return len(self.t)

@@ -24,6 +24,7 @@ class Case:
         target: (N, rows) what the model's rows have to explain, unfiltered [N m or N; A where no gain is known].
         carried: labels of the payloads on board.
         present: (N, rows) which rows may be learnt from: no lost samples, and no slow ones where they are cut.
+        noise: (rows,) standard deviation of the targets' samples, as repeats of the motion told it; None: not known.
     """
 
     name: str
@@ -31,6 +32,7 @@ class Case:
     target: np.ndarray
     carried: tuple[str, ...]
     present: np.ndarray
+    noise: np.ndarray | None = None
 
     @property
     def duration(self) -> float:
@@ -69,7 +71,10 @@ def make_case(
     if slow is not None:
         known &= moving(motion, slow)
     present = np.hstack([known, known]) if kind == "both" else known
-    return Case(name, motion, frozen(target), tuple(carried), frozen(present, bool))
+    noise = None
+    if motion.effort_variance is not None and kind == "motor":
+        noise = frozen(np.sqrt(motion.effort_variance) * (1.0 if gains is None else np.abs(gains)))
+    return Case(name, motion, frozen(target), tuple(carried), frozen(present, bool), noise)
 
 
 def row_labels(kind: str, n: int) -> tuple[str, ...]:

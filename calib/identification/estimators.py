@@ -39,7 +39,7 @@ class Fitted:
     Attributes:
         fit: the estimate and what it rests on.
         pooled: triangles of all rows, one group per row.
-        std: (rows,) standard deviation of the residuals of each row.
+        std: (rows,) standard deviation that each row is weighed with: that of its residuals, unless stated.
         inflation: (rows,) how many rows count as one, from the residuals' autocorrelation.
         method: one of `METHODS`.
     """
@@ -55,7 +55,13 @@ class Fitted:
         return self.fit.estimate
 
 
-def fit_rows(all_rows: Sequence[Rows], data: Triangles, method: str = "wls", exact: bool = True) -> Fitted:
+def fit_rows(
+    all_rows: Sequence[Rows],
+    data: Triangles,
+    method: str = "wls",
+    exact: bool = True,
+    noise: np.ndarray | None = None,
+) -> Fitted:
     """Estimate the columns' parameters, with a covariance that knows that residuals are correlated in time.
 
     Args:
@@ -64,14 +70,15 @@ def fit_rows(all_rows: Sequence[Rows], data: Triangles, method: str = "wls", exa
         exact: False where a prior will decide on what the data leave open.
         method: ``ols``, ``wls``, ``irls`` (across joints, with a gate) or ``tls`` (noise in the columns
             in proportion to their size).
+        noise: (rows,) where it is known from elsewhere, up to a common factor (`scaled`); None: from the residuals.
     """
     if method not in METHODS:
         raise UsageError(f"method '{method}' is none of {', '.join(METHODS)}")
     rows = all_rows[0].target.shape[1]
     pooled = pool(data, rows)
     if not exact:
-        return _least_norm(all_rows, pooled, method)
-    std = settled_std(pooled)
+        return _least_norm(all_rows, pooled, method, noise)
+    std = settled_std(pooled) if noise is None else noise * wls(pooled, noise).estimate.residual_std
     first = wls(pooled, std)
     tau = residual_inflation(all_rows, first.estimate.values)
     if method == "ols":
@@ -85,14 +92,24 @@ def fit_rows(all_rows: Sequence[Rows], data: Triangles, method: str = "wls", exa
     return Fitted(fit, pooled, std, tau, method)
 
 
-def _least_norm(all_rows: Sequence[Rows], pooled: Triangles, method: str) -> Fitted:
+def scaled(noise: np.ndarray | None, std: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Return the rows' noise times one factor, that of the residuals' `std` (rows,) of `counts` samples; None: `std`.
+
+    Relative between joints, with a common scale (our choice): the variance over repeats does not see what every period
+    has alike, so as it stands it would promise too much; and the decimation filter's gain for white noise, one number
+    for all joints, drops out.
+    """
+    return std if noise is None else noise * np.sqrt(np.average((std / noise) ** 2, weights=np.maximum(counts, 1)))
+
+
+def _least_norm(all_rows: Sequence[Rows], pooled: Triangles, method: str, noise: np.ndarray | None) -> Fitted:
     """Return a fit whose values serve for its residuals alone: a prior will decide what the data leave open."""
     std, tau = np.ones(pooled.groups), np.ones(pooled.groups)
     values = np.zeros(pooled.parameters)
     for _ in range(4):
         values = estimate(pooled, std, tau, np.full(pooled.parameters, -1))[0]
         std = np.sqrt(residual_squares(pooled, values) / np.maximum(pooled.rows, 1))
-        std = np.maximum(std, 1e-9 * max(float(std.max()), 1e-300))
+        std = scaled(noise, np.maximum(std, 1e-9 * max(float(std.max()), 1e-300)), pooled.rows)
     covariance = np.zeros((pooled.parameters, pooled.parameters))
     holder = Estimate(pooled.names, pooled.units, values, covariance, 1.0, int(pooled.rows.sum()))
     tau = residual_inflation(all_rows, values)

@@ -19,7 +19,7 @@ from calib.estimation.linear import LinearFit, ridge
 from calib.estimation.triangles import Triangles, combine, condition_numbers, retriangulate
 from calib.identification.bias import LoopTest, require_loop, try_loop
 from calib.identification.cases import Case
-from calib.identification.estimators import Fitted, fit_rows, residual_inflation
+from calib.identification.estimators import Fitted, fit_rows, residual_inflation, scaled
 from calib.identification.ladder import Climb, Ground, Rung, climb
 from calib.identification.prediction import Dynamics, predict, transmitted
 from calib.identification.prior import Prior, bounded, find_prior
@@ -95,6 +95,7 @@ def identify(
     settings = require_loop(settings) if settings.method == "iv" else settings
     model = make_model(chain, settings)
     _require_motion(cases)
+    noise = repeats_noise(cases, settings)
     say("base parameters")
     base = find_base(chain, model, settings, nominal, cases)
     decimator = common_decimator(cases, settings)
@@ -102,7 +103,7 @@ def identify(
     rows = with_blocks([observe(model, base.kept, case, decimator) for case in cases], settings.folds)
     _require_enough(rows, base)
     say("first fit")
-    std, tau, values = first_fit(rows)
+    std, tau, values = first_fit(rows, noise)
     first = Dynamics(model, bases.to_standard(base, values))
     friction = "standard" if settings.friction == "auto" and _all_poor(cases) else settings.friction
     loaded = settings.kind == "motor" and friction not in ("standard", "ripple")
@@ -121,7 +122,7 @@ def identify(
         for part, case, load in zip(rows, cases, loads)
     ]
     plain = replace(settings, method="wls") if settings.method == "iv" else settings
-    fitted, condition = _estimate(full, climbed, plain, prior)
+    fitted, condition = _estimate(full, climbed, plain, prior, noise)
     if settings.loop is not None:
         say("simulating the closed loop")
     bias = try_loop(chain, model, base, cases, decimator, settings)
@@ -189,7 +190,37 @@ def common_decimator(cases: Sequence[Case], settings: Settings) -> Decimator:
     return replace(widest, factor=one_in * widest.factor)
 
 
-def first_fit(rows: Sequence[Rows]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def repeats_noise(cases: Sequence[Case], settings: Settings) -> np.ndarray | None:
+    """Return the noise (rows,) that repeats of the motion told, its mean square over cases by length; None: not asked.
+
+    Raises:
+        UsageError: for another method than WLS, or rows with torques that no variance is read for.
+        MeasurementError: for a recording without variances, or with a joint of none.
+    """
+    if settings.weights == "residuals":
+        return None
+    if settings.method != "wls" or settings.kind != "motor":
+        raise UsageError(
+            f'weights = "repeats" goes with method wls and rows motor, found {settings.method} and {settings.kind}'
+        )
+    for case in cases:
+        if case.noise is None:
+            raise MeasurementError(
+                'has no variances of its torques (variance_tau and periods), which weights = "repeats" needs: average '
+                'repeats with calib recall DIR LOG --out avg.npz, or take weights = "residuals"',
+                case.motion.file,
+            )
+        if not (case.noise > 0).all():
+            silent = case.motion.joint_names[int(np.argmin(case.noise))]
+            raise MeasurementError(
+                f'joint {silent} has no variance over the periods: it cannot be weighed; take weights = "residuals"',
+                case.motion.file,
+            )
+    squares = np.array([case.noise**2 for case in cases if case.noise is not None])
+    return np.asarray(np.sqrt(np.average(squares, axis=0, weights=[len(case.motion) for case in cases])))
+
+
+def first_fit(rows: Sequence[Rows], noise: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return standard deviation and inflation of the residuals (rows,), and values (b,) of a fit that always exists."""
     count = rows[0].target.shape[1]
     data = pool(triangulate(rows), count)
@@ -200,7 +231,7 @@ def first_fit(rows: Sequence[Rows]) -> tuple[np.ndarray, np.ndarray, np.ndarray]
         residuals = np.concatenate([np.where(part.present, part.target - part.matrix @ values, 0.0) for part in rows])
         used = np.concatenate([part.present for part in rows]).sum(axis=0)
         std = np.sqrt((residuals**2).sum(axis=0) / np.maximum(used, 1))
-        std = np.maximum(std, 1e-9 * max(float(std.max()), 1e-300))
+        std = scaled(noise, np.maximum(std, 1e-9 * max(float(std.max()), 1e-300)), used)
     return std, residual_inflation(rows, values), values
 
 
@@ -219,11 +250,11 @@ def _prior(
 
 
 def _estimate(
-    rows: Sequence[Rows], climbed: Climb, settings: Settings, prior: Prior | None
+    rows: Sequence[Rows], climbed: Climb, settings: Settings, prior: Prior | None, noise: np.ndarray | None
 ) -> tuple[Fitted, tuple[float, float]]:
     """Return the final fit; richer friction keeps the ridge that the evidence chose."""
     data = triangulate(rows)
-    fitted = fit_rows(rows, data, settings.method, exact=prior is None)
+    fitted = fit_rows(rows, data, settings.method, prior is None, noise)
     more = len(climbed.terms)
     own = data.parameters - more
     condition = condition_numbers(fitted.pooled.factors.reshape(-1, data.parameters + 1)[:, :own])

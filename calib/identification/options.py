@@ -5,6 +5,8 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     friction = "auto"                # auto, standard, or a rung: load, presliding, stribeck, asymmetric, root, cubic,
                                      # ripple
     method = "wls"                   # ols, wls, irls, tls, iv
+    weights = "residuals"            # of the joints' rows in wls: from their residuals; repeats: from the variance over
+                                     # the periods that `calib recall` averaged, relative between joints
     drives = "Ia Fv Fc off"          # a text for all joints, or one per joint; default by rows: motor as here, link
                                      # Fvl Fcl offl, drive Ia Fvm Fcm offm, both all seven
     v0 = 0.01                        # smoothing of the Coulomb sign [rad/s or m/s], or one per joint
@@ -80,7 +82,7 @@ from calib.errors import CalibError, UsageError
 from calib.identification.estimators import METHODS
 from calib.identification.ladder import NAMES
 from calib.identification.loop_settings import parse_loop
-from calib.identification.settings import PRIORS, RULES, Coupling, Payload, Settings
+from calib.identification.settings import PRIORS, RULES, WEIGHTS, Coupling, Payload, Settings
 
 
 @dataclass(frozen=True)
@@ -320,6 +322,7 @@ _FIELD = {"drives": "sets", "rows": "kind"}
 _SETTINGS: dict[str, Callable[[Any, str], Any]] = {
     "friction": values.one_of(*NAMES),
     "method": values.one_of(*METHODS),
+    "weights": values.one_of(*WEIGHTS),
     "drives": _text_or_texts,
     "v0": _as_tuple,
     "rows": values.one_of(*KINDS),

@@ -20,6 +20,7 @@ from calib.robot.chain import Chain
 T = TypeVar("T")
 RULES = ("none", "rsd", "f", "both")
 PRIORS = ("auto", "none", "cad")
+WEIGHTS = ("residuals", "repeats")
 DRIVES = {
     "motor": "Ia Fv Fc off",
     "link": "Fvl Fcl offl",
@@ -56,6 +57,7 @@ class Settings:
         couplings, terms: what a joint-by-joint model lacks.
         friction: ``auto``, ``standard`` or a rung (`calib.identification.ladder`).
         method: see `calib.identification.estimators`.
+        weights: what weighs the joints' rows in WLS, one of `WEIGHTS`: their residuals, or the variance over repeats.
         essential: when to stop leaving out, one of `RULES`.
         ratio, level: r_σ of the RSD rule, level of the F rule.
         keep, drop: parameters never, or first, left out.
@@ -77,6 +79,7 @@ class Settings:
     terms: tuple[Term, ...] = ()
     friction: str = "auto"
     method: str = "wls"
+    weights: str = "residuals"
     essential: str = "both"
     ratio: float = 20.0
     level: float = 0.05
