@@ -15,19 +15,11 @@ from calib.procedure.session import MARK, Session, fingerprint, read_state
 from calib.procedure.stages import measured_files, robot_file
 
 Say = Callable[[str], None]
-ORDER = ("pass", "marginal", "fail")
 ROLES = {
     "1-robot": "nominal robot", "3-measured": "measured", "4-fit": "fit", "6-excitation": "motion to record",
     "7-recorded": "recorded", "8-dynamics": "identified model", "6-export": "calibrated robot",
     "9-export": "calibrated robot",
 }  # fmt: skip
-
-
-def verdict_of(session: Session) -> str:
-    """Return the worse of the stages' verdicts."""
-    places = ["5-validation/metrics.json", *(["8-dynamics/unseen/report.json"] if session.dynamic else [])]
-    found = [json.loads(session.path(place).read_text(encoding="utf-8"))["verdict"] for place in places]
-    return max(found, key=ORDER.index)
 
 
 def certify(session: Session, say: Say) -> list[str]:

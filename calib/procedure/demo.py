@@ -15,8 +15,8 @@ from calib import files
 from calib.data.plans import read_poses
 from calib.errors import SessionError, UsageError
 from calib.procedure import dynamic_stages, steps
-from calib.procedure.certifying import verdict_of
 from calib.procedure.guided import begin
+from calib.procedure.judged import verdict_of
 from calib.procedure.session import MARK, Session, locked, open_session
 from calib.procedure.truth import TRUTH, against_truth, torques_against_truth
 from calib.robot import library

@@ -19,7 +19,7 @@ from rich.table import Table
 from calib import files
 from calib.errors import CalibError, UsageError, exit_code
 from calib.procedure import asking, steps
-from calib.procedure.certifying import verdict_of
+from calib.procedure.judged import verdict_of
 from calib.procedure.session import locked, open_session
 
 LOG = "run.log"

@@ -13,8 +13,8 @@ from rich.table import Table
 
 from calib.errors import UsageError
 from calib.procedure import asking, steps
-from calib.procedure.certifying import verdict_of
 from calib.procedure.instruments import instrument as instrument_named
+from calib.procedure.judged import verdict_of
 from calib.procedure.motion_limits import read_motion_limits
 from calib.procedure.session import Session, create, locked, open_session
 from calib.robot.load import load, resolve
@@ -81,12 +81,15 @@ def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "") 
         state = steps.run_next(session, say, progress, command)
     if state is not None:
         return Stop(("", *asking.asks(session, state)))
-    lines = (
-        "",
-        f"done; certificate: {session.path('certificate.html')}",
-        f"robot: {session.path(f'{session.export}/robot.urdf')}",
-    )
-    return Stop(lines, verdict_of(session))
+    return Stop(ending(session), verdict_of(session))
+
+
+def ending(session: Session) -> tuple[str, ...]:
+    """Return what is said of a session that has come to its end: a failed one's robot is for inspection only."""
+    page, robot = session.path("certificate.html"), session.path(f"{session.export}/robot.urdf")
+    if verdict_of(session) == "fail":
+        return ("", f"certificate: {page}", f"verdict fail: exported for inspection only, do not use: {robot}")
+    return ("", f"done; certificate: {page}", f"robot: {robot}")
 
 
 def status_lines(folder: Path) -> Iterator[RenderableType]:

@@ -17,6 +17,7 @@ from calib.geometry.fit import polish_frames
 from calib.geometry.weighing import Settings as FitSettings
 from calib.geometry.weighing import combine
 from calib.procedure import arrival, calibrated, comparing, fitting, inputs, outputs, proof, report
+from calib.procedure.judged import mark_failed
 from calib.procedure.session import Session
 from calib.procedure.verdict import judge
 from calib.robot.chain import Chain
@@ -235,10 +236,16 @@ def _verdict(metrics: dict, validation: dict) -> dict:
 
 
 def export(session: Session, say: Say) -> list[str]:
-    """Put the calibrated robot into the forms others read."""
+    """Put the calibrated robot into the forms others read; of a failed one the files say so."""
+    out = session.path(session.export)
+    lines = _exported(session, out, say)
+    return [*mark_failed(session, out), *lines]
+
+
+def _exported(session: Session, out: Path, say: Say) -> list[str]:
     from calib.procedure.delivery import deliver
 
-    source, out = robot_file(session), session.path(session.export)
+    source = robot_file(session)
     lines = deliver(session.path("4-fit"), source, out)
     if not session.dynamic:
         return lines

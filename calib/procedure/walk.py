@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calib.procedure import certifying, dynamic_stages, stages
+from calib.procedure.judged import PLACES
 from calib.procedure.session import MARK, Session
 
 Say = Callable[[str], None]
@@ -103,7 +104,8 @@ def files_of(paths: list[Path]) -> list[Path]:
 def _exported(session: Session) -> list[Path]:
     own = [*_robot(session), session.path("4-fit/robot.toml"), session.path("4-fit/robot.urdf")]
     identified = [session.path(f"8-dynamics/{name}") for name in ("dynamics.json", "estimate.csv", "covariance.csv")]
-    return own + (identified if session.dynamic else [])
+    judged = [session.path(place) for place in PLACES.values()]  # a failed robot's files say so
+    return own + judged[:1] + ([*identified, *judged[1:]] if session.dynamic else [])
 
 
 def _certified(session: Session) -> list[Path]:

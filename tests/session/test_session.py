@@ -9,13 +9,15 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
 from calib import cli
 from calib.errors import CalibError, MeasurementError, SessionError
-from calib.procedure import asking, certifying, steps
+from calib.procedure import asking, certifying, judged, steps
 from calib.procedure.session import Session, locked, open_session, read_state
+from calib.robot.load import load
 
 from .conftest import edit, go_on, quiet
 
@@ -220,6 +222,28 @@ def test_a_tolerance_of_the_session_decides_and_stands_on_the_certificate(finish
     found = json.loads(finished.path("5-validation/metrics.json").read_text())
     assert found["verdict"] == "fail" and "above the tolerance of 0.01 mm" in found["reason"]
     assert "0.01 mm rms on unseen poses" in finished.path("certificate.html").read_text()
+
+
+def test_a_failed_robots_files_say_so_until_it_does_not_fail(finished: Session, capsys: pytest.CaptureFixture) -> None:
+    place, settings = finished.path("6-export"), finished.path("session.toml")
+    before = (place / "robot.urdf").read_bytes()
+    edit(settings, "tolerance_mm = 0.0", "tolerance_mm = 0.001")
+    assert cli.run(["next", str(finished.folder)]) == 1
+    said = capsys.readouterr().out.strip().split("\n")[-1]
+    assert said.startswith("verdict fail: exported for inspection only") and "done; " not in said
+    head = (place / "robot.urdf").read_text().split("<robot", 1)[0]
+    assert "<!-- verdict fail: geometry: " in head and "do not use -->" in head
+    assert (place / "README.txt").read_text().startswith("verdict fail: geometry: ")
+    load(place / "robot.urdf")
+    edit(settings, "tolerance_mm = 0.001", "tolerance_mm = 0.0")
+    assert cli.run(["next", str(finished.folder)]) == 0
+    assert (place / "robot.urdf").read_bytes() == before and not (place / "README.txt").exists()
+
+
+@pytest.mark.parametrize("head", [b"", b"\xef\xbb\xbf", b'<?xml version="1.0"?>', b'\xef\xbb\xbf<?xml version="1.0"?>'])
+def test_a_comment_goes_behind_what_xml_wants_first(head: bytes) -> None:
+    found = ElementTree.fromstring(judged.headed(head + b"<robot name='a'/>", "off by 3 µm --- too much"))
+    assert found.tag == "robot" and found.get("name") == "a"
 
 
 def test_a_session_made_before_tolerances_is_read(planned: Session) -> None:
