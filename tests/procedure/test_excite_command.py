@@ -176,7 +176,8 @@ def test_a_motion_is_recalled_from_a_log_and_read_by_identify(earlier, tmp_path,
     assert np.allclose(found["q"], q[:1600], atol=1e-6)
     assert np.sqrt(found["variance_tau"].mean()) == pytest.approx(sigma, rel=0.05)
     assert (found["tau"] - np.cos(q[:1600])).std() == pytest.approx(sigma / np.sqrt(3), rel=0.05)
-    assert len(read_recording(tmp_path / "a.npz")) == 1600
+    averaged = read_recording(tmp_path / "a.npz")
+    assert len(averaged) == 1600 and averaged.effort_variance == pytest.approx(sigma**2 / 3, rel=0.1)
     assert calib("recall", earlier, tmp_path / "log.npz", "--out", tmp_path / "a.csv")[0] == 0
     table = read_recording(tmp_path / "a.csv")
     assert np.allclose(table.q, q[:1600], atol=1e-6) and table.kind == "torque"
