@@ -115,7 +115,9 @@ def make_model(chain: Chain, settings: Settings) -> IdentificationModel:
 
 def _check_joints(n: int, settings: Settings) -> None:
     """Refuse couplings and terms of joints that the robot does not have, and a joint coupled with itself."""
-    named = [(f"coupling: joints {[j + 1 for j in one.joints]}", one.joints) for one in settings.couplings]
+    named: list[tuple[str, tuple[int, ...]]] = [
+        (f"coupling: joints {[j + 1 for j in one.joints]}", one.joints) for one in settings.couplings
+    ]
     for one in settings.terms:
         joints = [j for row, motion in one.acts for j in (row, *(k for k, _ in motion))]
         named.append((f"term '{one.name}': joint {max(joints, default=0) + 1}", tuple(joints)))
