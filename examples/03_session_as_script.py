@@ -7,8 +7,8 @@ import argparse
 from pathlib import Path
 
 from calib.procedure import asking, demo, steps
-from calib.procedure.certifying import verdict_of
 from calib.procedure.guided import begin
+from calib.procedure.judged import verdict_of
 from calib.procedure.session import locked
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
