@@ -5,12 +5,13 @@ from __future__ import annotations
 import base64
 import io
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import matplotlib
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -64,6 +65,36 @@ def motion_units(kinds: Iterable[str]) -> tuple[str, str, str, str]:
     first = "rad" if "prismatic" not in found else "m" if found == {"prismatic"} else "rad, m"
     torque = {"rad": "N m", "m": "N"}.get(first, "N m, N")
     return first, f"{first}/s", f"{first}/s²", torque
+
+
+def motion_sheet(
+    times: np.ndarray, rows: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray, str]], units: Sequence[str],
+    names: Sequence[str],
+) -> Figure:  # fmt: skip
+    """Draw series of every joint, a line per joint and a column per series, with their limits dashed.
+
+    Args:
+        times: (N,) [s].
+        rows: values (N, n), lower and upper limit (n,), title.
+        units: of each series.
+        names: of the n joints.
+    """
+    with styled():
+        figure, axes = sheet(len(names), len(rows), WIDE, 0.85 * len(names) + 0.5)
+        for j, k in np.ndindex(len(names), len(rows)):
+            values, lower, upper, title = rows[k]
+            axis = axes[j * len(rows) + k]
+            axis.plot(times, values[:, j], color=AFTER, linewidth=0.8)
+            for bound in (lower[j], upper[j]):
+                if np.isfinite(bound):
+                    axis.axhline(bound, color=MARK, linewidth=0.6, linestyle="--")
+            if j == 0:
+                axis.set_title(f"{title} [{units[k]}]")
+            if k == 0:
+                axis.set_ylabel(names[j], fontsize=7)
+        for axis in axes[-len(rows) :]:
+            axis.set_xlabel("time [s]")
+    return figure
 
 
 def save(figure: Figure, path: str | Path, dpi: int = 150) -> Path:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from calib.procedure.drawing import AFTER, BEFORE, HALF, MARK, QUIET, WIDE, motion_units, sheet, styled
+from calib.procedure.drawing import AFTER, BEFORE, HALF, MARK, QUIET, WIDE, motion_sheet, motion_units, sheet, styled
 from calib.procedure.exciting import Designed
 from calib.robot.kinematics import sweep
 from trajectories.constraints import BoxLimit
@@ -21,29 +21,14 @@ TITLES = ("position", "velocity", "acceleration", "torque")
 def motion_figure(designed: Designed) -> Figure:
     """Draw q, v, a and τ of every joint over one period, with their limits dashed."""
     motion = _motion(designed)
-    n, units = designed.chain.n, motion_units(joint.kind for joint in designed.chain.joints)
-    rows = [motion.q, motion.v, motion.a]
-    limits = [_limits(designed, order) for order in range(3)]
+    states = zip((motion.q, motion.v, motion.a), (_limits(designed, order) for order in range(3)), TITLES)
+    rows = [(values, lower, upper, title) for values, (lower, upper), title in states]
     values = designed.dynamics.values
     if values is not None:
-        rows.append(designed.dynamics.exact.regressor(motion.q, motion.v, motion.a) @ values)
-        limits.append((-designed.limits.torque, designed.limits.torque))
-    with styled():
-        figure, axes = sheet(n, len(rows), WIDE, 0.85 * n + 0.5)
-        for j in range(n):
-            for k, (x, (lower, upper)) in enumerate(zip(rows, limits)):
-                axis = axes[j * len(rows) + k]
-                axis.plot(motion.times, x[:, j], color=AFTER, linewidth=0.8)
-                for bound in (lower[j], upper[j]):
-                    if np.isfinite(bound):
-                        axis.axhline(bound, color=MARK, linewidth=0.6, linestyle="--")
-                if j == 0:
-                    axis.set_title(f"{TITLES[k]} [{units[k]}]")
-                if k == 0:
-                    axis.set_ylabel(designed.chain.joint_names[j], fontsize=7)
-        for axis in axes[-len(rows) :]:
-            axis.set_xlabel("time [s]")
-    return figure
+        torque = designed.dynamics.exact.regressor(motion.q, motion.v, motion.a) @ values
+        rows.append((torque, -designed.limits.torque, designed.limits.torque, TITLES[3]))
+    units = motion_units(joint.kind for joint in designed.chain.joints)
+    return motion_sheet(motion.times, rows, units, designed.chain.joint_names)
 
 
 def path_figure(designed: Designed) -> Figure:

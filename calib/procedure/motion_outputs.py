@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from calib import files
 from calib.procedure import motion_files
-from calib.procedure.drawing import AFTER, BEFORE, MARK, QUIET, WIDE, motion_units, save, sheet, styled
+from calib.procedure.drawing import AFTER, BEFORE, MARK, QUIET, WIDE, motion_sheet, motion_units, save, sheet, styled
 from calib.procedure.motion_planning import Planned
 from trajectories.timing import ACTIVE
 
@@ -91,7 +91,7 @@ def lines(planned: Planned) -> list[str]:
 
 def motion_figure(planned: Planned) -> Figure:
     """Draw q, v, a and τ of every joint with their limits dashed."""
-    track, limits, n = planned.track, planned.limits, planned.chain.n
+    track, limits = planned.track, planned.limits
     rows = [
         (track.q, planned.lower, planned.upper, "position"),
         (track.v, -limits.velocity, limits.velocity, "velocity"),
@@ -100,22 +100,7 @@ def motion_figure(planned: Planned) -> Figure:
     if track.tau is not None:
         rows.append((track.tau, -limits.torque, limits.torque, "torque"))
     units = motion_units(joint.kind for joint in planned.chain.joints)
-    with styled():
-        figure, axes = sheet(n, len(rows), WIDE, 0.85 * n + 0.5)
-        for j, k in np.ndindex(n, len(rows)):
-            x, lower, upper, title = rows[k]
-            axis = axes[j * len(rows) + k]
-            axis.plot(track.times, x[:, j], color=AFTER, linewidth=0.8)
-            for bound in (lower[j], upper[j]):
-                if np.isfinite(bound):
-                    axis.axhline(bound, color=MARK, linewidth=0.6, linestyle="--")
-            if j == 0:
-                axis.set_title(f"{title} [{units[k]}]")
-            if k == 0:
-                axis.set_ylabel(planned.chain.joint_names[j], fontsize=7)
-        for axis in axes[-len(rows) :]:
-            axis.set_xlabel("time [s]")
-    return figure
+    return motion_sheet(track.times, rows, units, planned.chain.joint_names)
 
 
 def profile_figure(planned: Planned) -> Figure:
