@@ -2,7 +2,12 @@
 
 ``estimate.csv`` has one row per parameter that was estimated, ``covariance.csv`` their covariance (a header, then one
 row per parameter, each beginning with its name): base parameters in the order of the model's columns, then richer
-friction. ZZ1R stands for the combination that ``dynamics.json`` spells out under ``base``.
+friction. ZZ1R stands for the combination that ``dynamics.json`` spells out under ``base``. A richer term that the
+evidence switched off has no sigma, and is named under ``switched_off`` in ``metrics.json``.
+
+``unit`` in ``dynamics.json`` and ``metrics.json`` is "N m", or "A of joint 2" where currents had no gains: export,
+plan and excite refuse such a model. Gains that were identified stand in ``drive_gains.csv`` (joint, gain [N m per A],
+sigma) and under ``drive_gains`` in both; state them as ``gains`` to use them again.
 
 ``torques_N.csv``: ``t [s]``, then measured_1 ... predicted_1 ... of each torque row [N m or N] and the joints q1 ...
 [rad or m], thinned to about 100 Hz. ``calib identify`` writes ``torques_1.csv`` alone, of the first validation
