@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.procedure import fitting, inputs, outputs
+from calib.procedure.kinematic_stage import fit, inputs
+from calib.procedure.kinematic_stage import folder as outputs
 from calib.robot.load import load
-from calib.simulation import brought
-from calib.simulation.cell import measure
-from calib.simulation.cells import perturbed_cell
+from calib.simulation.cells import measured_files
+from calib.simulation.cells.cell import measure
+from calib.simulation.cells.virtual_cells import perturbed_cell
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "example-01")
 folder.mkdir(parents=True, exist_ok=True)
@@ -20,10 +21,10 @@ folder.mkdir(parents=True, exist_ok=True)
 # yours: a CSV from the tracker; here a UR5 whose true geometry is a little off its nominal one
 cell = perturbed_cell(load("ur5"), seed=1)
 q = np.random.default_rng(0).uniform(-2.0, 2.0, (80, cell.nominal.n))
-brought.write(measure(cell, q, seed=2), folder / "measured.csv")
+measured_files.write(measure(cell, q, seed=2), folder / "measured.csv")
 
 found = inputs.gather("ur5", [folder / "measured.csv"], holdout=0.25)
-outcome = fitting.run(found, model="geometry")
+outcome = fit.run(found, model="geometry")
 outputs.write_folder(outcome, folder / "fit")
 
 for name, unseen in outcome.validation.items():

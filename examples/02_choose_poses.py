@@ -6,16 +6,16 @@ python examples/02_choose_poses.py [FOLDER]
 import sys
 from pathlib import Path
 
-from calib.procedure import selecting
+from calib.procedure.kinematic_stage import selection
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "example-02")
 folder.mkdir(parents=True, exist_ok=True)
 
 # from a tracker that sees one reflector at a time: three of them on the tool tell its orientation, too
 targets = [[0.05, 0.0, 0.1], [-0.05, 0.0, 0.1], [0.0, 0.05, 0.15]]
-chosen = selecting.choose("ur5", 20, kind="position", tools=targets, index="O1", candidates=500, seed=0)
+chosen = selection.choose("ur5", 20, kind="position", tools=targets, index="O1", candidates=500, seed=0)
 
-for words, number in selecting.table(chosen):
+for words, number in selection.table(chosen):
     print(f"{words:38} {number}")
-selecting.write(chosen, folder / "poses.csv")
+selection.write(chosen, folder / "poses.csv")
 print(f"written to {folder / 'poses.csv'}: joint values in rad, for the robot program")

@@ -6,10 +6,10 @@ python examples/03_session_as_script.py --out session [--robot lwr4plus] [--seed
 import argparse
 from pathlib import Path
 
-from calib.procedure import asking, demo, steps
-from calib.procedure.guided import begin
-from calib.procedure.judged import verdict_of
-from calib.procedure.session import locked
+from calib.procedure.session import demo, instructions, steps
+from calib.procedure.session.commands import begin
+from calib.procedure.session.folder import locked
+from calib.procedure.session.outcome import verdict_of
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--out", type=Path, required=True)
@@ -24,6 +24,6 @@ session = begin(
 )  # fmt: skip
 with locked(session):
     while waiting := steps.run_next(session, print, lambda words: None, "03_session_as_script.py"):
-        print(*asking.asks(session, waiting), sep="\n")  # what an engineer would now do at the robot, and bring
+        print(*instructions.asks(session, waiting), sep="\n")  # what an engineer would now do at the robot, and bring
         demo.bring_for(session, waiting.step.name, print)  # your script would copy files into 3-measured, 7-recorded
 print(f"{verdict_of(session)}: {session.path('certificate.html')}, {session.path(session.export) / 'robot.urdf'}")

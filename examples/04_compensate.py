@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.data.target_files import Targets
-from calib.procedure import compensating, fitting, inputs, outputs
+from calib.data.poses.target_files import Targets
+from calib.procedure.kinematic_stage import compensation, fit, inputs
+from calib.procedure.kinematic_stage import folder as outputs
 from calib.robot.load import load
-from calib.simulation import brought
-from calib.simulation.cell import measure, true_poses
-from calib.simulation.cells import perturbed_cell
+from calib.simulation.cells import measured_files
+from calib.simulation.cells.cell import measure, true_poses
+from calib.simulation.cells.virtual_cells import perturbed_cell
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "example-04")
 folder.mkdir(parents=True, exist_ok=True)
@@ -21,15 +22,15 @@ folder.mkdir(parents=True, exist_ok=True)
 # a calibrated robot, as in example 01
 cell = perturbed_cell(load("ur5"), seed=1)
 q = np.random.default_rng(0).uniform(-2.0, 2.0, (80, 6))
-brought.write(measure(cell, q, seed=2), folder / "measured.csv")
+measured_files.write(measure(cell, q, seed=2), folder / "measured.csv")
 found = inputs.gather("ur5", [folder / "measured.csv"], holdout=0.25)
-outputs.write_folder(fitting.run(found, model="geometry"), folder / "fit")
+outputs.write_folder(fit.run(found, model="geometry"), folder / "fit")
 
 # targets: places of the measured tool in the instrument's frame, and the configuration to reach them in
 near = np.array([0.3, -1.2, 1.6, -1.1, -1.4, 0.5]) + np.random.default_rng(3).uniform(-0.4, 0.4, (50, 6))
 wanted = true_poses(cell, near)
 targets = Targets(near, wanted[:, :3, 3], wanted[:, :3, :3])
-commands = compensating.compensate(compensating.read(folder / "fit"), targets, frame="measured", tool="tool")
+commands = compensation.compensate(compensation.read(folder / "fit"), targets, frame="measured", tool="tool")
 
 for words, joints in (("nominal joints", commands.nominal), ("commands", commands.q)):
     off = np.linalg.norm(true_poses(cell, joints)[:, :3, 3] - wanted[:, :3, 3], axis=1)

@@ -6,12 +6,13 @@ python examples/06_identify_dynamics.py [FOLDER]
 import sys
 from pathlib import Path
 
-from calib.procedure import identification_outputs, identifying
+from calib.procedure.dynamic_stage import folder as identification_outputs
+from calib.procedure.dynamic_stage import identify
 from calib.robot.load import load
-from calib.simulation import brought
-from calib.simulation.cells import virtual_cell
-from calib.simulation.moving import moving_arm, record
-from calib.simulation.references import random_fourier
+from calib.simulation.cells import measured_files
+from calib.simulation.cells.virtual_arm import moving_arm, record
+from calib.simulation.cells.virtual_cells import virtual_cell
+from calib.simulation.loop.references import random_fourier
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "example-06")
 folder.mkdir(parents=True, exist_ok=True)
@@ -22,10 +23,10 @@ chain = load("tx40")
 for name, seed in (("training", 1), ("other", 2)):
     speeds = [0.5 * joint.velocity for joint in chain.joints]
     reference = random_fourier(chain.lower, chain.upper, speeds, 10.0, 500.0, acceleration=15.0, seed=seed)
-    brought.write_log(record(arm, reference, seed), folder / f"{name}.csv")
+    measured_files.write_log(record(arm, reference, seed), folder / f"{name}.csv")
 
-inputs = identifying.gather("tx40", [str(folder / "training.csv")], [str(folder / "other.csv")], friction="standard")
-outcome = identifying.run(inputs)
+inputs = identify.gather("tx40", [str(folder / "training.csv")], [str(folder / "other.csv")], friction="standard")
+outcome = identify.run(inputs)
 identification_outputs.write_folder(outcome, folder / "model")
 for name, score in outcome.validation.items():
     print(f"{name}, unseen: {score.raw.total:.1f} % of the torque unexplained")

@@ -6,8 +6,8 @@ python examples/08_certificate_and_fleet.py [FOLDER]
 import sys
 from pathlib import Path
 
-from calib.procedure import demo, fleet
-from calib.procedure.guided import begin
+from calib.procedure.session import demo, fleet
+from calib.procedure.session.commands import begin
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "example-08")
 

@@ -14,6 +14,9 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = [name for name in ("calib", "poses", "trajectories") if (ROOT / name).is_dir()]
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 
+# rooms of the procedure, from the roof down
+ROOMS = ["session", "report", "export", "excitation", "dynamic_stage", "kinematic_stage"]
+
 # room -> what it must not import (a prefix of the module's name)
 FORBIDDEN = {
     "poses": ["calib", "trajectories"],
@@ -38,19 +41,24 @@ FORBIDDEN = {
     "calib.mechanism": ["calib.procedure"],
     "calib.identification": ["calib.procedure"],
     "calib": ["calib.cli"],
+    "calib.procedure.kinematic_stage": [f"calib.procedure.{room}" for room in ROOMS[:5]],
+    "calib.procedure.dynamic_stage": [f"calib.procedure.{room}" for room in ROOMS[:4]],
+    "calib.procedure.excitation": [f"calib.procedure.{room}" for room in ROOMS[:3]],
+    "calib.procedure.export": ["calib.procedure.session", "calib.procedure.report"],
+    "calib.procedure.report": ["calib.procedure.session", "calib.procedure.export"],
 }  # fmt: skip
 
 # heavy dependency -> the only modules that may import it (a trailing dot: all of that package)
 HOMES = {
-    "pinocchio": ["calib.dynamics.model", "calib.robot.collision", "calib.robot.readback"],
+    "pinocchio": ["calib.dynamics.model", "calib.robot.collision", "calib.robot.formats.readback"],
     "coal": ["calib.robot.collision"],
-    "numba": ["calib.dynamics.kernels", "calib.simulation.kernels"],
-    "yourdfpy": ["calib.robot.urdf"],
+    "numba": ["calib.dynamics.kernels", "calib.simulation.loop.loop_kernels"],
+    "yourdfpy": ["calib.robot.formats.urdf"],
     "cv2": ["calib.data.camera"],
     "mcap": ["calib.data."],
     "rosbags": ["calib.data."],
     "pandas": [],
-    "rerun": ["calib.procedure.viewer"],
+    "rerun": ["calib.procedure.report.viewer"],
     "nlopt": ["poses.", "trajectories."],
     "toppra": ["trajectories."],
     "ruckig": ["trajectories."],
@@ -118,12 +126,28 @@ def test_the_walker_sees_every_form_of_import():
     assert {"calib.cli", "poses.select", "calib.robot", "calib.robot.chain", "calib.estimation.columns"} <= names
 
 
-def test_every_package_is_listed_for_installation():
-    import tomllib
+def test_every_folder_with_modules_is_a_package():
+    """Installation finds packages by their ``__init__.py``: a folder without one would be left out."""
+    folders = {path.parent for path in SOURCES}
+    assert [str(folder) for folder in folders if not (folder / "__init__.py").exists()] == []
 
-    listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
-    present = {module_of(path) for path in SOURCES if path.name == "__init__.py"}
-    assert present == set(listed)
+
+def test_no_import_runs_in_a_circle():
+    """Strongly connected modules, imports inside functions included, by Tarjan's algorithm (SciPy's)."""
+    import numpy as np
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    known = {module_of(path): k for k, path in enumerate(SOURCES)}
+    arrows = {
+        (known[module_of(path)], known[name]) for path in SOURCES for name, _ in imports(path)
+        if name in known and name != module_of(path)
+    }  # fmt: skip
+    rows, columns = np.array(sorted(arrows)).T
+    graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(len(known), len(known)))
+    _, groups = connected_components(graph, directed=True, connection="strong")
+    circles = [sorted(m for m, k in known.items() if groups[k] == g) for g in np.flatnonzero(np.bincount(groups) > 1)]
+    assert circles == []
 
 
 def test_the_command_line_starts_light():

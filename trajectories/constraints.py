@@ -7,7 +7,7 @@ function,
 
     c_r = (1/ρ) log Σ_{i, k in r} exp(ρ g_ik / scale_k)  ≥  max g / scale      (Kreisselmeier & Steinhauser 1979)
 
-so a feasible c means feasible samples; what happens between the samples is `trajectories.verify`'s.
+so a feasible c means feasible samples; what happens between the samples is `trajectories.design.verify`'s.
 """
 
 from __future__ import annotations

@@ -30,25 +30,26 @@ def identify_dynamics(
     seed: Seed = 0,
 ) -> None:
     """Identify the dynamics of ROBOT from recordings, and say how well it predicts other motion."""
-    from calib.identification.options import read_options
-    from calib.procedure import identification_outputs, identification_plots, identification_show, identifying
+    from calib.identification.identify_options import read_options
+    from calib.procedure.dynamic_stage import folder, identify
+    from calib.procedure.report import identification_console, identification_figures
 
     chosen = read_options(options)
-    identification_outputs.check_target(out)
+    folder.check_target(out)
     console = make_console()
     with progress() as say:
-        found = identifying.gather(
+        found = identify.gather(
             robot, recordings, validate or [], options=chosen, method=method, friction=friction, base=base, tip=tip,
             seed=seed, progress=say,
         )  # fmt: skip
-        identification_outputs.check_target(out, found.source)
-    for line in identification_show.read_lines(found):
+        folder.check_target(out, found.source)
+    for line in identification_console.read_lines(found):
         console.print(line, soft_wrap=True)
     with progress() as say:
-        outcome = identifying.run(found, progress=say)
+        outcome = identify.run(found, progress=say)
         say("writing")
-        identification_outputs.write_folder(outcome, out, identification_plots.write)
-    for line in identification_show.outcome_lines(outcome):
+        folder.write_folder(outcome, out, identification_figures.write)
+    for line in identification_console.outcome_lines(outcome):
         console.print(line, soft_wrap=True)
     console.print(f"written to {out}", soft_wrap=True, markup=False)
     if outcome.verdict.level == "fail":

@@ -48,10 +48,13 @@ def fit(
     Pass means that on poses it has not seen the calibrated arm is better than the nominal one, or that there is nothing
     to gain; that it is good enough is said only with --tolerance.
     """
-    from calib.data.options import read_options
+    from calib.data.poses.fit_options import read_options
     from calib.errors import UsageError
-    from calib.geometry.effects import MODELS
-    from calib.procedure import fitting, inputs, outputs, report, show
+    from calib.geometry.model_choice.effects import MODELS
+    from calib.procedure.kinematic_stage import fit as fitting
+    from calib.procedure.kinematic_stage import folder as outputs
+    from calib.procedure.kinematic_stage import inputs
+    from calib.procedure.report import fit_certificate, fit_console
 
     if model not in (None, "auto", *MODELS):
         raise UsageError(f"--model {model}: expected auto, {', '.join(MODELS)}")
@@ -65,7 +68,7 @@ def fit(
     )  # fmt: skip
     outputs.check_target(out, found.source)
     console = make_console()
-    for line in show.read_lines(found):
+    for line in fit_console.read_lines(found):
         console.print(line, soft_wrap=True)
     with progress() as say:
         outcome = fitting.run(
@@ -73,8 +76,8 @@ def fit(
             seed=seed, progress=say,
         )  # fmt: skip
         say("writing")
-        outputs.write_folder(outcome, out, report.write)
-    for line in show.outcome_lines(outcome):
+        outputs.write_folder(outcome, out, fit_certificate.write)
+    for line in fit_console.outcome_lines(outcome):
         console.print(line, soft_wrap=True)
     console.print(f"written to {out}", soft_wrap=True, markup=False)
     if outcome.verdict.level == "fail":
@@ -105,19 +108,19 @@ def select(
 ) -> None:
     """Choose the poses at which the geometry of ROBOT shows best."""
     from calib import workers as work
-    from calib.procedure import selecting
+    from calib.procedure.kinematic_stage import selection
 
     targets = [numbers(text, 3, "--tool") for text in tool or []]
     sigmas = None if sigma is None else numbers(sigma, 2, "--sigma")
     with work.workers(workers) as mapped, progress() as say:
-        chosen = selecting.choose(
+        chosen = selection.choose(
             robot, m, kind=kind, tools=targets, index=index, method=method, constraints=constraints, existing=existing,
             candidates=candidates, sigmas=(sigmas[0], sigmas[1]) if sigmas else None, base=base, tip=tip, seed=seed,
             map=mapped, progress=lambda done, total, what: say(f"{what} ({done} of {total})"),
         )  # fmt: skip
-    selecting.write(chosen, out)
+    selection.write(chosen, out)
     console = make_console()
-    for words, number in selecting.table(chosen):
+    for words, number in selection.table(chosen):
         console.print(f"{words:38} {number}", soft_wrap=True, markup=False)
     for note in chosen.notes:
         console.print(f"note: {note}", soft_wrap=True, markup=False)
@@ -142,19 +145,19 @@ def export(
 ) -> None:
     """Write the calibrated geometry, and with --into the identified dynamics, for other programs."""
     from calib.errors import UsageError
-    from calib.procedure import exporting
+    from calib.procedure.export import geometry
 
     if into:
-        from calib.procedure import exporting_dynamics
+        from calib.procedure.export import dynamics
 
         if out or ur_kinematics or offsets:
             raise UsageError("--into writes all files into one folder; leave --out, --ur-kinematics and --offsets out")
-        exporting_dynamics.check_identified(folder)
-        exporting.check_targets(urdf, [into / name for name in exporting_dynamics.WRITTEN])
+        dynamics.check_identified(folder)
+        geometry.check_targets(urdf, [into / name for name in dynamics.WRITTEN])
         console = make_console()
         with progress() as say:
             say("all parameters, and each file read back")
-            lines = exporting_dynamics.deliver_dynamics(folder, urdf, into)
+            lines = dynamics.deliver_dynamics(folder, urdf, into)
         for line in lines:
             console.print(line, soft_wrap=True, markup=False)
         console.print(f"written to {into}", soft_wrap=True, markup=False)
@@ -163,22 +166,22 @@ def export(
         raise UsageError(
             "nothing to write: give --urdf SOURCE.urdf --out FILE.urdf, --ur-kinematics, --offsets or --into"
         )
-    found = exporting.read(folder)
-    exporting.check_targets(urdf, [path for path in (out, ur_kinematics, offsets) if path])
+    found = geometry.read(folder)
+    geometry.check_targets(urdf, [path for path in (out, ur_kinematics, offsets) if path])
     console = make_console()
     if urdf and out:
-        exporting.export_urdf(found, urdf, out, for_corrections)
+        geometry.export_urdf(found, urdf, out, for_corrections)
         console.print(
             f"{out}: joint origins of {urdf} calibrated, all else kept; base link and flange stay where the source has "
             "them; Pinocchio reads the same poses to 1e-9", soft_wrap=True, markup=False,
         )  # fmt: skip
     if ur_kinematics:
-        exporting.export_ur_kinematics(found, ur_kinematics)
+        geometry.export_ur_kinematics(found, ur_kinematics)
         console.print(f"{ur_kinematics}: for kinematics_params_file of ur_description", soft_wrap=True, markup=False)
-        if note := exporting.flange_note(found):
+        if note := geometry.flange_note(found):
             console.print(f"note: {note}", soft_wrap=True, markup=False)
     if offsets:
-        exporting.export_offsets(found, offsets)
+        geometry.export_offsets(found, offsets)
         console.print(
             f"{offsets}: offset of each joint, the rest of the geometry left out; --model offsets fits the best ones",
             soft_wrap=True, markup=False,
@@ -215,23 +218,23 @@ def compensate(
     seed: Seed = 0,
 ) -> None:
     """Turn nominal targets into the joint commands that put the real tool there."""
-    from calib.data.target_files import read_targets
-    from calib.procedure import compensating, compensation_outputs
-    from calib.procedure.inputs import joint_kinds
+    from calib.data.poses.target_files import read_targets
+    from calib.procedure.kinematic_stage import compensation, compensation_file
+    from calib.procedure.kinematic_stage.inputs import joint_kinds
 
-    fitted = compensating.read(folder)
+    fitted = compensation.read(folder)
     chain = fitted.nominal.chain
     given = read_targets(targets, chain.joint_names, kinds=joint_kinds(chain), limits=(chain.lower, chain.upper))
     may = numbers(tolerance, 2, "--tolerance")
-    compensation_outputs.check_out(out, targets, fitted)
+    compensation_file.check_out(out, targets, fitted)
     with progress() as say:
-        found = compensating.compensate(
+        found = compensation.compensate(
             fitted, given, frame=frame, tool=tool, dof=dof, tolerance=(1e-3 * may[0], 1e-3 * may[1]), seed=seed,
             start=numbers(start, chain.n, "--start") if start else None, progress=say,
         )  # fmt: skip
-    compensation_outputs.write(found, fitted, given, out, partial)
+    compensation_file.write(found, fitted, given, out, partial)
     console = make_console()
-    for line in compensation_outputs.lines(found, given, fitted):
+    for line in compensation_file.lines(found, given, fitted):
         console.print(line, soft_wrap=True, markup=False)
     console.print(
         f"{int(found.reached.sum())} of {len(found.q)} commands written to {out}", soft_wrap=True, markup=False

@@ -46,21 +46,22 @@ def excite(
 ) -> None:
     """Design a motion that excites the dynamics of ROBOT within its limits."""
     from calib import workers as work
-    from calib.procedure import excitation_outputs, exciting
+    from calib.procedure.excitation import design, design_folder
+    from calib.procedure.report import motion_figures
 
-    excitation_outputs.check_target(out)
+    design_folder.check_target(out)
     stands = None if start is None else numbers(start, start.count(",") + 1, "--start")
     with work.workers(workers) as mapped, progress() as say:
-        designed = exciting.excite(
+        designed = design.excite(
             robot, model=model, limits=limits, goals=goal or [], hard=hard or [], period=period, harmonics=harmonics,
             family=family, drives_=drives, rate=rate, starts=starts, evaluations=evaluations, front=front, start=stands,
             repeat=repeat, slower=slower, existing=existing or [], lock=lock or [], base=base, tip=tip, seed=seed,
             map=mapped, progress=say,
         )  # fmt: skip
         say("writing")
-        excitation_outputs.write_folder(designed, out)
+        design_folder.write_folder(designed, out, motion_figures.write_design)
     console = make_console()
-    for line in excitation_outputs.lines(designed):
+    for line in design_folder.lines(designed):
         console.print(line, soft_wrap=True, markup=False)
     console.print(f"written to {out}", soft_wrap=True, markup=False)
 
@@ -73,7 +74,7 @@ def recall(
     skip: Annotated[int, typer.Option(help="whole periods to leave out at the beginning")] = 0,
 ) -> None:
     """Find a designed motion in a log, and average its periods to a recording for calib identify."""
-    from calib.procedure import excitation_recall
+    from calib.procedure.excitation import recall as excitation_recall
 
     excitation_recall.check_target(out)
     found = excitation_recall.find(folder, log, skip)
@@ -105,19 +106,20 @@ def plan(
     tip: Tip = None,
 ) -> None:
     """Plan the fastest motion of ROBOT through waypoints, within its speeds and torques."""
-    from calib.procedure import motion_outputs, motion_planning
+    from calib.procedure.excitation import plan_folder, planning
+    from calib.procedure.report import motion_figures
 
-    motion_outputs.check_target(out)
+    plan_folder.check_target(out)
     stands = None if start is None else numbers(start, start.count(",") + 1, "--start")
     with progress() as say:
-        planned = motion_planning.plan(
+        planned = planning.plan(
             robot, waypoints, model=model, payloads=payload or [], limits=limits, drives_file=drives, lines=line,
             rate=rate, evaluations=shorten, stray=stray, start=stands, slower=slower, base=base, tip=tip,
             progress=say,
         )  # fmt: skip
         say("writing")
-        motion_outputs.write_folder(planned, out)
+        plan_folder.write_folder(planned, out, motion_figures.write_plan)
     console = make_console()
-    for words in motion_outputs.lines(planned):
+    for words in plan_folder.lines(planned):
         console.print(words, soft_wrap=True, markup=False)
     console.print(f"written to {out}", soft_wrap=True, markup=False)

@@ -10,7 +10,7 @@ import typer
 from calib.cli.shared import Base, Seed, Tip, make_console, told
 
 if TYPE_CHECKING:
-    from calib.procedure.answers import Answers
+    from calib.procedure.session.questions import Answers
 
 app = typer.Typer()
 
@@ -49,13 +49,13 @@ def new(
     FOLDER/7-recorded (calib formats recordings); how the session goes on is said in FOLDER/session.toml (calib formats
     session). Without --robot or --instrument, at a terminal, it asks.
     """
-    from calib.procedure import guided
-    from calib.procedure.answers import Answers, checked
+    from calib.procedure.session import commands
+    from calib.procedure.session.questions import Answers, checked
 
     given = Answers(robot, instrument, tool, limits, dynamics, tuple(payload or ()), torques)
     if robot is None or instrument is None:
         given = _asked(given)
-    made = guided.begin(
+    made = commands.begin(
         folder, poses=poses, validation=validation, base=base or "", tip=tip or "", seed=seed, **checked(given)
     )
     make_console().print(f"made {made.folder}; next: calib next {made.folder}", soft_wrap=True, markup=False)
@@ -66,7 +66,7 @@ def _asked(given: Answers) -> Answers:
     import sys
 
     from calib.errors import CalibError, UsageError
-    from calib.procedure.answers import QUESTIONS, with_answer
+    from calib.procedure.session.questions import QUESTIONS, with_answer
 
     if not sys.stdin.isatty():
         missing = "--robot" if given.robot is None else "--instrument"
@@ -116,10 +116,10 @@ def redo(
 @app.command()
 def status(folder: Folder) -> None:
     """Show how far a session is, and what is stale because something changed."""
-    from calib.procedure import guided
+    from calib.procedure.session import commands
 
     console = make_console()
-    for renderable in guided.status_lines(folder):
+    for renderable in commands.status_lines(folder):
         console.print(renderable, soft_wrap=True)
 
 
@@ -133,7 +133,7 @@ def demo(
     seed: Seed = 0,
 ) -> None:
     """Calibrate a simulated robot with simulated instruments, and compare with the hidden truth."""
-    from calib.procedure import demo as demonstration
+    from calib.procedure.session import demo as demonstration
 
     with told() as (console, say, progress):
         if bring is not None:
@@ -164,7 +164,7 @@ def run_sessions(
     import time
 
     from calib import workers as work
-    from calib.procedure import fleet
+    from calib.procedure.session import fleet
 
     folders, started, outcomes = fleet.folders_of(sessions), time.perf_counter(), []
     with told() as (console, say, progress), work.workers(workers) as mapped:
@@ -182,10 +182,10 @@ def run_sessions(
 
 
 def _go_on(folder: Path, command: str, again: str = "") -> None:
-    from calib.procedure import guided
+    from calib.procedure.session import commands
 
     with told() as (console, say, progress):
-        stop = guided.go_on(folder, say, progress, command, again)
+        stop = commands.go_on(folder, say, progress, command, again)
     for line in stop.lines:
         console.print(line, soft_wrap=True, markup=False)
     if stop.verdict == "fail":
@@ -203,7 +203,7 @@ def view(
 ) -> None:
     """Show in Rerun: the robot, pose errors, poses as they were chosen, motions with their limits, torques."""
     from calib.errors import UsageError
-    from calib.procedure import viewer
+    from calib.procedure.report import viewer
 
     if save is None and spawn is False:
         raise UsageError("nothing to do: give --save FILE.rrd, or leave --no-spawn out")

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from calib.data.tables import ANGLES, LENGTHS, nearest
+from calib.data.csv_table import ANGLES, LENGTHS, nearest
 from calib.errors import UsageError
 
 Own = TypeVar("Own")

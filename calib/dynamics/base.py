@@ -18,10 +18,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.arrays import frozen, shaped
+from calib.dynamics.bodies import FIXED, PRISMATIC
 from calib.dynamics.idim import IdentificationModel, friction_states
-from calib.dynamics.tree import FIXED, PRISMATIC
 from calib.errors import CalibError
-from calib.estimation.columns import ColumnSplit, split_columns
+from calib.estimation.base_columns import ColumnSplit, split_columns
 from calib.estimation.triangles import retriangulate
 
 SAMPLES = 500

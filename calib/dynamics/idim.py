@@ -19,9 +19,9 @@ import numpy as np
 
 from calib.arrays import shaped
 from calib.dynamics import drives, rigid_body
+from calib.dynamics.bodies import Tree, tree, with_payload
 from calib.dynamics.drives import Term
 from calib.dynamics.shapes import V0
-from calib.dynamics.tree import Tree, tree, with_payload
 from calib.errors import CalibError
 from calib.robot.chain import Chain
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from calib.arrays import shaped
-from calib.dynamics.tree import PRISMATIC, Tree, tree
+from calib.dynamics.bodies import PRISMATIC, Tree, tree
 from calib.errors import RobotError
 from calib.robot.chain import Chain
 

@@ -19,9 +19,9 @@ import numpy as np
 from calib.arrays import frozen, shaped
 from calib.dynamics import drives, rigid_body
 from calib.dynamics.base import BaseModel, to_standard
+from calib.dynamics.bodies import Tree
 from calib.dynamics.drives import Term
 from calib.dynamics.idim import IdentificationModel
-from calib.dynamics.tree import Tree
 from calib.errors import CalibError
 
 AFFINE = ("acceleration", "one", "position")  # shapes that Proposition 1 holds for; all others are friction

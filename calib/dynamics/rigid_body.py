@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib.arrays import shaped
-from calib.dynamics.tree import REVOLUTE, Tree
+from calib.dynamics.bodies import REVOLUTE, Tree
 from calib.errors import CalibError
 
 

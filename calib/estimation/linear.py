@@ -16,7 +16,7 @@ import scipy.linalg
 
 from calib.arrays import frozen, shaped
 from calib.errors import CalibError, NotConverged, Unidentifiable
-from calib.estimation.columns import split_columns
+from calib.estimation.base_columns import split_columns
 from calib.estimation.estimate import Estimate
 from calib.estimation.triangles import Triangles, combine, residual_squares, retriangulate, solve_triangle
 

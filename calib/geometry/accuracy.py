@@ -17,7 +17,7 @@ from itertools import combinations
 
 import numpy as np
 
-from calib.data.measurements import PoseMeasurements
+from calib.data.poses.measurements import PoseMeasurements
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, observe, predict, prepare
 from calib.geometry.residuals import Part

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.data.measurements import PoseMeasurements, take
+from calib.data.poses.measurements import PoseMeasurements, take
 from calib.errors import MeasurementError
 from calib.geometry.deflection import Deflection
 from calib.geometry.installation import Installation

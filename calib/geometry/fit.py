@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.data.measurements import PoseMeasurements
+from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import MeasurementError
-from calib.estimation.columns import ColumnSplit
+from calib.estimation.base_columns import ColumnSplit
 from calib.estimation.nonlinear import covariance, solve
 from calib.estimation.relevance import gram, relevance
 from calib.geometry.identifiability import base_columns

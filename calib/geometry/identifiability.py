@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calib.estimation.columns import ColumnSplit, split_columns
+from calib.estimation.base_columns import ColumnSplit, split_columns
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, observe
 from calib.geometry.parameters import layout

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.data.measurements import PoseMeasurements
+from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import UsageError
 from calib.geometry import deflection
 from calib.geometry.installation import Installation, Seen, see

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.data.measurements import PoseMeasurements
+from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import MeasurementError
 from calib.geometry.installation import Seen
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.estimation import robust
-from calib.estimation.columns import ColumnSplit
+from calib.estimation.base_columns import ColumnSplit
 from calib.estimation.estimate import Estimate
 from calib.estimation.nonlinear import Solution
 from calib.geometry.installation import Installation

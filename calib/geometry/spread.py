@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.data.measurements import PoseMeasurements
+from calib.data.poses.measurements import PoseMeasurements
 from calib.geometry.deflection import evaluate
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, predict, target_jacobian

@@ -25,7 +25,8 @@ class Settings:
 
     Attributes:
         loss: ``none``, ``huber`` or ``cauchy``, on the size of each row's whitened residual; ``auto`` is for the
-            ladder, which takes ``cauchy`` where rows are grossly wrong (`calib.geometry.ladder`), and else is ``none``.
+            ladder, which takes ``cauchy`` where rows are grossly wrong (`calib.geometry.model_choice.ladder`), and
+            else is ``none``.
         loss_scale: the loss's constant, in sigmas; None for its usual one.
         damping: first λ of Levenberg–Marquardt; 0 for the iterative linear least squares of eq. 11.
         tolerance: relative size of a column that counts as dependent.

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.arrays import frozen
-from calib.data.motion import Motion, moving
+from calib.data.signals.motion import Motion, moving
 from calib.errors import MeasurementError, UsageError
 
 FULL = 20  # of a recording's length, the filter of the parallel decimation may eat one part in so many (our choice)
@@ -99,6 +99,6 @@ def case_names(paths: Sequence[str]) -> tuple[str, ...]:
 
 
 def _file(path: str) -> str:
-    from calib.data.recording import parse_cut
+    from calib.data.recordings.recording import parse_cut
 
     return parse_cut(path)[0].replace("\\", "/").rstrip("/").rsplit("/", 1)[-1]

@@ -7,26 +7,26 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from calib.data.decimation import Decimator, design_decimator
-from calib.data.excitation import report_excitation
+from calib.data.signals.decimation import Decimator, design_decimator
+from calib.data.signals.persistency import report_excitation
 from calib.dynamics import base as bases
 from calib.dynamics.base import Base
 from calib.dynamics.idim import IdentificationModel, with_terms
 from calib.errors import MeasurementError, UsageError
-from calib.estimation import instruments
+from calib.estimation import instrumental_variables
 from calib.estimation.essential import Elimination, Rule, eliminate
 from calib.estimation.linear import LinearFit, ridge
 from calib.estimation.triangles import Triangles, combine, condition_numbers, retriangulate
-from calib.identification.bias import LoopTest, require_loop, try_loop
 from calib.identification.cases import Case
-from calib.identification.estimators import Fitted, fit_rows, residual_inflation, scaled
-from calib.identification.ladder import Climb, Ground, Rung, climb
+from calib.identification.friction.friction_ladder import Climb, Ground, Rung, climb
+from calib.identification.friction.ripple import Ripple, find_all
+from calib.identification.friction.time_folds import estimate
+from calib.identification.loop.bias import LoopTest, require_loop, try_loop
+from calib.identification.methods.least_squares import Fitted, fit_rows, residual_inflation, scaled
 from calib.identification.prediction import Dynamics, predict, transmitted
 from calib.identification.prior import Prior, bounded, find_prior
-from calib.identification.ripple import Ripple, find_all
 from calib.identification.rows import Rows, extend, observe, observe_terms, pool, triangulate, with_blocks
 from calib.identification.settings import Settings, make_model, per_joint
-from calib.identification.unseen import estimate
 from calib.robot.chain import Chain, sampling_limits
 
 CONDITION = 150.0  # of the observation matrix, unit columns, from which on the prior is used
@@ -297,7 +297,7 @@ def _essential(fitted: Fitted, settings: Settings, prior: Prior | None, bias: Lo
         return None
     data, std, inflation = fitted.pooled, fitted.std, fitted.inflation
     if fitted.method == "iv" and bias.found is not None:
-        data = instruments.testable(bias.found.problem, bias.found.fit, bias.found.std)
+        data = instrumental_variables.testable(bias.found.problem, bias.found.fit, bias.found.std)
         std, inflation = np.ones(1), np.array([bias.found.inflation])
     return eliminate(
         data, Rule(settings.essential), ratio=settings.ratio, level=settings.level,

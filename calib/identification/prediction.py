@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.arrays import frozen
+from calib.dynamics.bodies import FIXED
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.rigid_body import inverse_dynamics
-from calib.dynamics.tree import FIXED
 from calib.identification.cases import Case
 from calib.identification.rows import BLOCK, term_columns
 

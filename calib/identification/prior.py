@@ -23,8 +23,8 @@ import scipy.optimize
 
 from calib.arrays import frozen
 from calib.dynamics.base import Base
+from calib.dynamics.bodies import standard_parameters
 from calib.dynamics.idim import IdentificationModel
-from calib.dynamics.tree import standard_parameters
 from calib.errors import UsageError
 from calib.estimation.triangles import Triangles, retriangulate
 from calib.robot.chain import Chain

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from calib.data.decimation import Decimator, decimate, decimate_blocks, kept
+from calib.data.signals.decimation import Decimator, decimate, decimate_blocks, kept
 from calib.dynamics import drives, rigid_body
 from calib.dynamics.drives import Term
 from calib.dynamics.idim import IdentificationModel

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.data.motion import in_band, moving
+from calib.data.signals.motion import in_band, moving
 from calib.estimation.whiteness import Whiteness, examine, r_squared
 from calib.identification.cases import Case
 from calib.identification.rows import segments

@@ -9,12 +9,12 @@ from typing import TypeVar
 import numpy as np
 
 from calib.dynamics import drives
+from calib.dynamics.bodies import tree, with_gravity, with_payload
 from calib.dynamics.drives import Term
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.shapes import V0
-from calib.dynamics.tree import tree, with_gravity, with_payload
 from calib.errors import UsageError
-from calib.identification.loop_settings import LoopSettings
+from calib.identification.loop.loop_settings import LoopSettings
 from calib.robot.chain import Chain
 
 T = TypeVar("T")
@@ -55,8 +55,8 @@ class Settings:
         v0: smoothing of the Coulomb sign [rad/s or m/s], one per joint, or one for all.
         kind: of the rows, `calib.dynamics.idim.KINDS`.
         couplings, terms: what a joint-by-joint model lacks.
-        friction: ``auto``, ``standard`` or a rung (`calib.identification.ladder`).
-        method: see `calib.identification.estimators`.
+        friction: ``auto``, ``standard`` or a rung (`calib.identification.friction.friction_ladder`).
+        method: see `calib.identification.methods.least_squares`.
         weights: what weighs the joints' rows in WLS, one of `WEIGHTS`: their residuals, or the variance over repeats.
         essential: when to stop leaving out, one of `RULES`.
         ratio, level: r_σ of the RSD rule, level of the F rule.

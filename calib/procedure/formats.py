@@ -10,45 +10,53 @@ from calib.errors import UsageError
 TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "measurements": (
         "CSV files of measured poses, positions, distances",
-        ("calib.data.pose_files", "calib.data.robodk"),
+        ("calib.data.poses.pose_files", "calib.data.poses.robodk"),
     ),
     "targets": (
         "targets of calib compensate, and the commands it writes",
-        ("calib.data.target_files", "calib.procedure.compensating"),
+        ("calib.data.poses.target_files", "calib.procedure.kinematic_stage.compensation"),
     ),
-    "options": ("the TOML file of calib fit --options", ("calib.data.options",)),
+    "options": ("the TOML file of calib fit --options", ("calib.data.poses.fit_options",)),
     "identify-options": (
         "the TOML file of calib identify --options",
-        ("calib.identification.options", "calib.identification.loop_settings"),
+        ("calib.identification.identify_options", "calib.identification.loop.loop_settings"),
     ),
     "identified": (
         "the folder that calib identify writes",
         (
-            "calib.identification.storage",
-            "calib.procedure.identification_verdict",
-            "calib.procedure.consistency_tables",
+            "calib.identification.model_file",
+            "calib.procedure.dynamic_stage.verdict",
+            "calib.procedure.dynamic_stage.geometry_tables",
         ),
     ),
     "exports": (
         "what calib export --into writes of an identified robot",
-        ("calib.procedure.exporting_dynamics", "calib.identification.consistent"),
+        ("calib.procedure.export.dynamics", "calib.identification.possible.solve"),
     ),
-    "constraints": ("the TOML file of calib select --constraints", ("calib.procedure.limits",)),
+    "constraints": ("the TOML file of calib select --constraints", ("calib.procedure.kinematic_stage.pose_limits",)),
     "mdh": ("a robot as a table of modified Denavit-Hartenberg rows", ("calib.robot.mdh", "calib.robot.tables")),
-    "robot": ("robot.toml as calib fit writes it", ("calib.robot.description", "calib.procedure.calibrated")),
-    "session": ("a session's folder and its session.toml", ("calib.procedure.session",)),
+    "robot": (
+        "robot.toml as calib fit writes it",
+        ("calib.robot.description", "calib.procedure.kinematic_stage.robot_file"),
+    ),
+    "session": ("a session's folder and its session.toml", ("calib.procedure.session.folder",)),
     "limits": (
         "the TOML file of calib excite --limits and calib plan --limits",
-        ("calib.procedure.motion_limits",),
+        ("calib.procedure.excitation.limits",),
     ),
-    "waypoints": ("the CSV of calib plan --waypoints", ("calib.procedure.motion_waypoints",)),
+    "waypoints": ("the CSV of calib plan --waypoints", ("calib.procedure.excitation.waypoints",)),
     "excitation": (
         "trajectory.toml of calib excite, and what calib recall writes",
-        ("calib.procedure.excitation_table", "calib.procedure.excitation_recall"),
+        ("calib.procedure.excitation.coefficients", "calib.procedure.excitation.recall"),
     ),
     "recordings": (
         "recordings of motion, for calib identify",
-        ("calib.data.recording_options", "calib.data.recording_tables", "calib.data.archives", "calib.data.bags"),
+        (
+            "calib.data.recordings.recording_options",
+            "calib.data.recordings.csv_logs",
+            "calib.data.recordings.archives",
+            "calib.data.recordings.bags",
+        ),
     ),
 }
 
@@ -68,7 +76,7 @@ def describe(topic: str) -> str:
         raise UsageError(f"no format '{topic}'; there are {', '.join(TOPICS)}")
     parts = [_plain(import_module(name).__doc__ or "") for name in TOPICS[topic][1]]
     if topic == "session":
-        from calib.procedure.session import example
+        from calib.procedure.session.folder import example
 
         parts.append(f"session.toml, as calib new writes it:\n\n{example()}")
     return "\n\n".join(part.strip() for part in parts) + "\n"

@@ -20,12 +20,12 @@ from scipy.spatial.transform import Rotation
 
 from calib.arrays import shaped
 from calib.errors import RobotError
-from calib.robot import urdf
 from calib.robot.chain import Chain, random_joints
-from calib.robot.markup import Node, parse, text
-from calib.robot.tree import origin
-from calib.robot.tree import read as read_tree
-from calib.robot.urdf_write import write_new
+from calib.robot.formats import urdf
+from calib.robot.formats.markup import Node, parse, text
+from calib.robot.formats.urdf_tree import origin
+from calib.robot.formats.urdf_tree import read as read_tree
+from calib.robot.formats.urdf_write import write_new
 from calib.transforms import pose
 
 ALWAYS = 0.95
@@ -105,7 +105,7 @@ def from_urdf(
 
     Args:
         path: the URDF.
-        base, tip: see `calib.robot.urdf.ends`.
+        base, tip: see `calib.robot.formats.urdf.ends`.
         floor: height of a floor in the base frame [m]; None for no floor.
         obstacles: in the base frame.
         mesh_folders: where ``package://name/...`` is looked for, besides the URDF's folder and the ones above it.

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from calib.errors import RobotError
-from calib.robot import description, library, urdf
+from calib.robot import description, library
 from calib.robot.chain import Chain
+from calib.robot.formats import urdf
 from calib.robot.tables import nearest
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.arrays import frozen
 from calib.robot.collision import find_mesh
-from calib.robot.markup import Node, parse, text
+from calib.robot.formats.markup import Node, parse, text
 from calib.transforms import from_xyz_rpy
 
 KINDS = (".stl", ".obj", ".dae", ".glb", ".gltf")

@@ -25,21 +25,21 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.data.decimation import decimate
-from calib.data.motion import FilterOptions, make_motion
-from calib.data.recording import Recording
-from calib.dynamics.tree import standard_parameters
+from calib.data.recordings.recording import Recording
+from calib.data.signals.decimation import decimate
+from calib.data.signals.motion import FilterOptions, make_motion
+from calib.dynamics.bodies import standard_parameters
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit
-from calib.identification import consistency, refit
+from calib.identification import geometry_uncertainty, reweighted
 from calib.identification.cases import Case, make_case
 from calib.identification.identify import Identification, common_decimator, find_base, identify
 from calib.identification.settings import Payload, Settings, make_model
 from calib.robot.chain import Chain, random_joints
-from calib.simulation import robots
-from calib.simulation.cell import Cell, Instrument, measure
-from calib.simulation.cells import lwr4plus_cell
-from calib.simulation.references import Reference, random_fourier
+from calib.simulation.cells import known_robots
+from calib.simulation.cells.cell import Cell, Instrument, measure
+from calib.simulation.cells.virtual_cells import lwr4plus_cell
+from calib.simulation.loop.references import Reference, random_fourier
 from calib.workers import workers
 
 PAYLOAD = "8"
@@ -108,14 +108,14 @@ def world(setup: Setup, kind: str, seed: int) -> World:
     values, clean = true_torques(true, settings, motion)
     cases = cases_of(motion, clean, kind, np.zeros(true.n), 0)
     base = find_base(true, make_model(true, settings), settings, cell.nominal, cases)
-    noise = robots.truth("lwr4plus")["noise"]["sigma_tau_l" if kind == "link" else "sigma_tau_m"] * LIMIT
+    noise = known_robots.truth("lwr4plus")["noise"]["sigma_tau_l" if kind == "link" else "sigma_tau_m"] * LIMIT
     poses = random_joints(cell.nominal, setup.poses, [seed, setup.poses])
     return World(cell, settings, motion, clean, base.names, base.transform @ values, noise, poses)
 
 
 def true_torques(true: Chain, settings: Settings, motion: Reference) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return the true standard parameters, and the torques without and with the payload (N, n)."""
-    known, model = robots.truth("lwr4plus"), make_model(true, settings)
+    known, model = known_robots.truth("lwr4plus"), make_model(true, settings)
     drives = [drive_values(known)[name] for name in model.names[10 * model.tree.bodies :]]
     values = np.concatenate([standard_parameters(true), known["payload"]["inertia"], drives])
     loads = ((), (PAYLOAD,))
@@ -165,7 +165,7 @@ def once(given: World, seed: list[int]) -> np.ndarray:
     chain, covariance = calibrate(given, seed)
     cases = cases_of(given.motion, given.clean, given.settings.kind, given.noise, [*seed, 2], 1e-5)
     found = identify(chain, cases, given.settings, given.cell.nominal)
-    carried = consistency.propagate(found, chain, cases, covariance)
+    carried = geometry_uncertainty.propagate(found, chain, cases, covariance)
     off = found.fitted.estimate.values - given.base
     return np.stack([off, carried.sigma_torque, carried.sigma_geometry])
 
@@ -195,9 +195,9 @@ def coverage(setup: Setup, kind: str, runs: int, seed: int, where: str | None) -
             "largest_without": _mean(without[:, over].mean(axis=0).max(initial=0.0) if over.any() else np.zeros(0)),
         },
         "unchanged": {
-            "parameters": [name for name, x in zip(names, grows) if x <= consistency.NOTHING],
-            "with": _mean(with_it[:, grows <= consistency.NOTHING]),
-            "without": _mean(without[:, grows <= consistency.NOTHING]),
+            "parameters": [name for name, x in zip(names, grows) if x <= geometry_uncertainty.NOTHING],
+            "with": _mean(with_it[:, grows <= geometry_uncertainty.NOTHING]),
+            "without": _mean(without[:, grows <= geometry_uncertainty.NOTHING]),
         },
         "by_parameter": [
             {"name": name, "sigma_geometry_over_torque": float(s), "with": float(a), "without": float(b)}
@@ -245,15 +245,15 @@ def judged(given: World, found: Identification, chain: Chain, cases: list[Case],
 
     The torque's error is that of the noisy estimate, against noise-free torque; the bias that of noise-free torques.
     """
-    how = refit.estimator(found)
-    rows = refit.rows_on(found, chain, cases)
-    noisy, _ = refit.estimate(how, rows)
+    how = reweighted.estimator(found)
+    rows = reweighted.rows_on(found, chain, cases)
+    noisy, _ = reweighted.estimate(how, rows)
     decimator = common_decimator(cases, given.settings)
     exact = [
         replace(part, target=decimate(tau, decimator)[: len(part.target)])
         for part, tau in zip(rows, _cut(given, cases))
     ]
-    biased, _ = refit.estimate(how, exact)
+    biased, _ = reweighted.estimate(how, exact)
     size = (biased - given.base) / found.fitted.estimate.sigma
     model, error, torque = make_model(chain, given.settings), [], []
     for case in other:

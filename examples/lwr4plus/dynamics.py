@@ -24,24 +24,24 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.data.motion import FilterOptions, make_motion
-from calib.data.recording import Recording
+from calib.data.recordings.recording import Recording
+from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics import base as bases
 from calib.dynamics import drives
 from calib.dynamics.base import Base
+from calib.dynamics.bodies import standard_parameters, tree, with_gravity, with_payload
 from calib.dynamics.idim import MODELS, IdentificationModel
-from calib.dynamics.tree import standard_parameters, tree, with_gravity, with_payload
 from calib.estimation.essential import Elimination, Rule, eliminate
 from calib.estimation.linear import LinearFit, settled_std, wls
 from calib.estimation.triangles import Triangles, absorb, empty
 from calib.identification.cases import Case, make_case
 from calib.identification.rows import observe
 from calib.robot.chain import Chain
-from calib.simulation import lwr4plus, robots
-from calib.simulation.closed_loop import Plant, Sensing, inertia_diagonal, simulate
-from calib.simulation.controllers import Controller, pd, with_feedforward
-from calib.simulation.references import Reference, random_fourier
-from calib.simulation.tracking import feed_forward, tracking_error
+from calib.simulation.cells import known_robots, lwr4plus
+from calib.simulation.loop.closed_loop import Plant, Sensing, inertia_diagonal, simulate
+from calib.simulation.loop.controllers import Controller, pd, with_feedforward
+from calib.simulation.loop.references import Reference, random_fourier
+from calib.simulation.loop.tracking import feed_forward, tracking_error
 from calib.transforms import pose
 
 PAYLOAD = "8"
@@ -79,16 +79,18 @@ class Data:
 
 def model(chain: Chain, kind: str, gravity: np.ndarray | None = None) -> IdentificationModel:
     """Return the study's model: seven links and a payload, seven drive terms each; the payload's move nothing."""
-    bodies = with_payload(tree(chain), pose(position=np.array([0.0, 0.0, robots.truth("lwr4plus")["payload"]["r"]])))
+    bodies = with_payload(
+        tree(chain), pose(position=np.array([0.0, 0.0, known_robots.truth("lwr4plus")["payload"]["r"]]))
+    )
     bodies = bodies if gravity is None else with_gravity(bodies, gravity)
-    terms = drives.standard([" ".join(robots.SIDED)] * chain.n)
+    terms = drives.standard([" ".join(known_robots.SIDED)] * chain.n)
     return IdentificationModel(bodies, (*terms, *drives.without_effect(PAYLOAD)), kind)
 
 
 def true_parameters(chain: Chain) -> np.ndarray:
     """Return the standard parameters (136,) of the simulated arm, in the order of `model` of kind ``both``."""
-    known = robots.truth("lwr4plus")
-    sided = [known["drives"][name][joint] for joint in range(chain.n) for name in robots.SIDED]
+    known = known_robots.truth("lwr4plus")
+    sided = [known["drives"][name][joint] for joint in range(chain.n) for name in known_robots.SIDED]
     return np.concatenate([standard_parameters(chain), known["payload"]["inertia"], sided, np.zeros(7)])
 
 
@@ -135,7 +137,7 @@ def record(chain: Chain, reference: Reference, seed: list[int]) -> Data:
 
 
 def _record(chain: Chain, reference: Reference, loaded: bool, seed: list[int]) -> Recording:
-    noise, values = robots.truth("lwr4plus")["noise"], true_parameters(chain)
+    noise, values = known_robots.truth("lwr4plus")["noise"], true_parameters(chain)
     whole = model(chain, "motor")
     if not loaded:
         values[10 * chain.n : 10 * (chain.n + 1)] = 0.0

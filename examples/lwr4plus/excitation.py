@@ -32,20 +32,20 @@ from excitation_moves import moves
 from calib import files
 from calib.dynamics import base, drives
 from calib.dynamics.base import BaseModel
+from calib.dynamics.bodies import standard_parameters, tree
 from calib.dynamics.idim import MODELS, IdentificationModel
-from calib.dynamics.tree import standard_parameters, tree
-from calib.procedure.drawing import save
-from calib.procedure.motion_limits import Points
+from calib.procedure.excitation.limits import Points
+from calib.procedure.report.style import save
 from calib.robot.chain import Chain
-from calib.simulation import lwr4plus, robots
+from calib.simulation.cells import known_robots, lwr4plus
 from trajectories.basis import Motion
 from trajectories.constraints import TorqueLimit, box_limits
+from trajectories.design.objectives import Excitation, TorqueSlack, condition_numbers
+from trajectories.design.optimise import design
+from trajectories.design.problem import Goal, Problem
+from trajectories.design.verify import dense_motion, ensured
 from trajectories.fourier import fourier
-from trajectories.objectives import Excitation, TorqueSlack, condition_numbers
-from trajectories.optimise import design
 from trajectories.places import Workspace
-from trajectories.problem import Goal, Problem
-from trajectories.verify import dense_motion, ensured
 
 HARMONICS, RATE, SEEDS = 5, 20.0, 20
 NOISE = {"link": 0.003, "motor": 0.015}  # of the torque limits
@@ -72,9 +72,9 @@ def geometry(name: str) -> Chain:
 @cache
 def plant(where: str, kind: str) -> Plant:
     """Return the arm's model; its columns are chosen on the CAD geometry, and regrouped on its own."""
-    known, chain = robots.truth("lwr4plus"), geometry(where)
-    values = np.column_stack([known["drives"][key] for key in robots.SIDED])
-    names = " ".join(robots.SIDED)
+    known, chain = known_robots.truth("lwr4plus"), geometry(where)
+    values = np.column_stack([known["drives"][key] for key in known_robots.SIDED])
+    names = " ".join(known_robots.SIDED)
     if kind == "motor":
         total = [known["drives"][key] for key in ("Ia", "Fv", "Fc")]
         values = np.column_stack([*total, np.add(known["drives"]["offl"], known["drives"]["offm"])])
@@ -155,7 +155,7 @@ def judged(where: str, kind: str, motion: Motion) -> dict[str, Any]:
 
 def _stribeck(where: str, own: Plant, motion: Motion, rng: np.random.Generator) -> np.ndarray:
     """Return friction (rows, N) on the motors' rows that no model knows: b_j Fc_j exp(-(v/v_s)²) sign v."""
-    amount = rng.uniform(0.0, STRIBECK, 7) * np.array(robots.truth("lwr4plus")["drives"]["Fc"])
+    amount = rng.uniform(0.0, STRIBECK, 7) * np.array(known_robots.truth("lwr4plus")["drives"]["Fc"])
     bump = amount * np.exp(-((motion.v / SLOW) ** 2)) * np.tanh(motion.v / 0.01)
     result = np.zeros((len(own.sigma), len(motion)))
     if own.smooth.model.kind != "link":

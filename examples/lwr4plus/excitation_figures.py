@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from calib.procedure.drawing import AFTER, BEFORE, MARK, QUIET, WIDE, sheet, styled
+from calib.procedure.report.style import AFTER, BEFORE, MARK, QUIET, WIDE, sheet, styled
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from trajectories.basis import Motion

@@ -38,21 +38,21 @@ from matplotlib.figure import Figure
 from calib import files
 from calib.dynamics import base, drives
 from calib.dynamics.base import BaseModel
+from calib.dynamics.bodies import standard_parameters, tree
 from calib.dynamics.idim import IdentificationModel
-from calib.dynamics.tree import standard_parameters, tree
-from calib.procedure.drawing import AFTER, BEFORE, INK, MARK, QUIET, WIDE, save, sheet, styled
-from calib.procedure.motion_limits import Points
+from calib.procedure.excitation.limits import Points
+from calib.procedure.report.style import AFTER, BEFORE, INK, MARK, QUIET, WIDE, save, sheet, styled
 from calib.robot.chain import Chain
 from calib.robot.load import load
-from trajectories import search
 from trajectories.constraints import TorqueLimit, box_limits
+from trajectories.design import search
+from trajectories.design.objectives import Excitation, condition_numbers
+from trajectories.design.problem import Evaluation, Problem, evaluate
+from trajectories.design.search import STAGES, Found, Run, one_start
+from trajectories.design.starts import random_start
+from trajectories.design.verify import dense_motion, ensured
 from trajectories.fourier import fourier
-from trajectories.objectives import Excitation, condition_numbers
 from trajectories.places import Workspace
-from trajectories.problem import Evaluation, Problem, evaluate
-from trajectories.search import STAGES, Found, Run, one_start
-from trajectories.starts import random_start
-from trajectories.verify import dense_motion, ensured
 
 FC = (11.9, 11.5, 8.98, 8.35, 8.31, 4.72, 6.04)  # [N m], Jubien, Gautier & Janot 2014 as quoted in public code
 FV = (14.4, 15.3, 6.55, 11.0, 4.29, 2.26, 1.6)  # [N m s/rad]

@@ -27,9 +27,9 @@ from calib.geometry.observation import prepare
 from calib.robot import mdh
 from calib.robot.chain import Chain, element_index, random_joints
 from calib.robot.kinematics import jacobian
-from calib.simulation import lwr4plus
-from calib.simulation.cell import Instrument, measure, true_poses
-from calib.simulation.cells import lwr4plus_cell, rigid
+from calib.simulation.cells import lwr4plus
+from calib.simulation.cells.cell import Instrument, measure, true_poses
+from calib.simulation.cells.virtual_cells import lwr4plus_cell, rigid
 from calib.transforms import invert
 from poses.candidates import draw_candidates
 from poses.indices import observability

@@ -22,18 +22,19 @@ import numpy as np
 from calib import files
 from calib.dynamics import base, drives
 from calib.dynamics.base import BaseModel
+from calib.dynamics.bodies import standard_parameters, tree
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.path_dynamics import PathDynamics, of_base, of_standard
-from calib.dynamics.tree import standard_parameters, tree
 from calib.robot import description, library
 from calib.robot.chain import Chain, random_joints
-from calib.simulation.robots import truth
+from calib.simulation.cells.known_robots import truth
 from trajectories.errors import BadInput
-from trajectories.path import Path as JointPath
-from trajectories.path import check_within, spline
-from trajectories.profile import dense
-from trajectories.shape import shorten
-from trajectories.timing import Limits, Timing, time_optimal
+from trajectories.timing.limits import Limits
+from trajectories.timing.path import Path as JointPath
+from trajectories.timing.path import check_within, spline
+from trajectories.timing.profile import dense
+from trajectories.timing.shape import shorten
+from trajectories.timing.time_scaling import Timing, time_optimal
 
 REACH = 0.7  # of the joint limits, for waypoints
 SIGMAS = 3.0  # of the predicted torque, kept free of its limit

@@ -30,8 +30,8 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.data.motion import FilterOptions, make_motion
-from calib.data.recording import Recording
+from calib.data.recordings.recording import Recording
+from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics import base as bases
 from calib.dynamics.base import Base
 from calib.dynamics.idim import IdentificationModel
@@ -40,13 +40,13 @@ from calib.estimation.essential import Rule, eliminate
 from calib.estimation.linear import LinearFit, subsystem_std
 from calib.estimation.triangles import collect
 from calib.identification.cases import Case, make_case
-from calib.identification.controller import identify_controller
-from calib.identification.instrumental import Instrumental, Loop, Round, identify_instrumental, simulated_case
+from calib.identification.loop.controller import identify_controller
+from calib.identification.methods.instrumental import Instrumental, Loop, Round, identify_instrumental, simulated_case
 from calib.identification.rows import observe
-from calib.simulation import robots
-from calib.simulation.closed_loop import Plant, Run, Sensing, simulate
-from calib.simulation.controllers import Controller, pd, slower
-from calib.simulation.references import Reference, random_fourier, trapezoidal
+from calib.simulation.cells import known_robots
+from calib.simulation.loop.closed_loop import Plant, Run, Sensing, simulate
+from calib.simulation.loop.controllers import Controller, pd, slower
+from calib.simulation.loop.references import Reference, random_fourier, trapezoidal
 
 RATE, EVERY = 5000.0, 5
 FILTERS = FilterOptions(cutoff=50.0, band=20.0, clock="stamps")
@@ -95,7 +95,7 @@ class Study:
 
 def references(quick: bool, seed: int) -> tuple[Reference, list[Reference]]:
     """Return the training motion, the best of a few random ones by condition number, and three others."""
-    model = robots.model(robots.plant("tx40", coupled=True, offset=OFFSETS))
+    model = known_robots.model(known_robots.plant("tx40", coupled=True, offset=OFFSETS))
     kept = bases.find(model).kept
     duration = 8.0 if quick else 10.0
 
@@ -220,7 +220,8 @@ def estimate(
     return identify_instrumental(
         study.model, study.base, [(log.case, Loop(controller, log.reference, EVERY))], log.case.motion.decimator,
         method="didim" if method == "DIDIM" else "iv", columns=columns, limit=20,
-        inertia=np.array(robots.truth("tx40")["drives"]["Ia"]), positive=signs(names) if method == "PC-IV" else (),
+        inertia=np.array(known_robots.truth("tx40")["drives"]["Ia"]),
+        positive=signs(names) if method == "PC-IV" else (),
     )  # fmt: skip
 
 
@@ -249,9 +250,9 @@ def controllers(study: Study, log: Log) -> dict[str, Controller]:
 
 def run(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
     """Run the study; write and return the metrics."""
-    plant = robots.plant("tx40", coupled=True, offset=OFFSETS)
-    model = robots.model(plant)
-    study = Study(plant, model, bases.find(model), robots.controller("tx40"), seed)
+    plant = known_robots.plant("tx40", coupled=True, offset=OFFSETS)
+    model = known_robots.model(plant)
+    study = Study(plant, model, bases.find(model), known_robots.controller("tx40"), seed)
     training, others = references(quick, seed)
     metrics: dict[str, Any] = {
         "parameters": {"standard": model.p, "base": study.base.b},

@@ -10,10 +10,10 @@ import shutil
 import time
 from pathlib import Path
 
-from calib.procedure import demo, fleet, steps
-from calib.procedure.guided import begin
-from calib.procedure.session import locked
-from calib.simulation.cells import virtual_cell
+from calib.procedure.session import demo, fleet, steps
+from calib.procedure.session.commands import begin
+from calib.procedure.session.folder import locked
+from calib.simulation.cells.virtual_cells import virtual_cell
 from calib.workers import workers
 
 ROBOTS = ("ur5", "ur10e", "panda", "tx40")

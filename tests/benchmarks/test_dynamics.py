@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from calib.dynamics import base, drives, model, rigid_body
+from calib.dynamics.bodies import standard_parameters, tree
 from calib.dynamics.idim import IdentificationModel
-from calib.dynamics.tree import standard_parameters, tree
 from calib.robot.load import load
 
 COUNT = 10_000

@@ -16,20 +16,20 @@ import numpy as np
 import pytest
 
 from calib.dynamics import base, drives
+from calib.dynamics.bodies import standard_parameters, tree
 from calib.dynamics.idim import IdentificationModel
-from calib.dynamics.tree import standard_parameters, tree
-from calib.procedure.motion_limits import Points
+from calib.procedure.excitation.limits import Points
 from calib.robot import library, mdh
 from calib.robot.chain import Chain
 from calib.robot.load import load
 from trajectories.constraints import TorqueLimit, box_limits
+from trajectories.design.objectives import Excitation, condition_numbers
+from trajectories.design.optimise import design
+from trajectories.design.problem import Goal, Problem, evaluate
+from trajectories.design.starts import random_start
+from trajectories.design.verify import dense_motion, ensured
 from trajectories.fourier import fourier
-from trajectories.objectives import Excitation, condition_numbers
-from trajectories.optimise import design
 from trajectories.places import Workspace
-from trajectories.problem import Goal, Problem, evaluate
-from trajectories.starts import random_start
-from trajectories.verify import dense_motion, ensured
 
 CHAIN = load("lwr4plus")
 FC = (11.9, 11.5, 8.98, 8.35, 8.31, 4.72, 6.04)

@@ -20,11 +20,11 @@ from planted import cell, load, measure, perturb, random_joints
 
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit, fit_with_prior, polish_frames
-from calib.geometry.ladder import climb
+from calib.geometry.model_choice.ladder import climb
 from calib.geometry.observation import observe, predict, prepare
 from calib.geometry.parameters import step
-from calib.robot import urdf, urdf_write
 from calib.robot.chain import AXES, Chain
+from calib.robot.formats import urdf, urdf_write
 from calib.robot.kinematics import forward, jacobian
 
 POSES = 1000

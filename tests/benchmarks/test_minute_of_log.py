@@ -12,17 +12,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.data.motion import make_motion
-from calib.data.recording_files import read_recording
+from calib.data.recordings.recording_files import read_recording
+from calib.data.signals.motion import make_motion
+from calib.dynamics.bodies import standard_parameters, tree
 from calib.dynamics.rigid_body import inverse_dynamics
-from calib.dynamics.tree import standard_parameters, tree
 from calib.identification.cases import make_case
 from calib.identification.identify import identify
 from calib.identification.prediction import predict
 from calib.identification.scores import score
 from calib.identification.settings import Settings
 from calib.robot.load import load
-from calib.simulation.references import random_fourier
+from calib.simulation.loop.references import random_fourier
 
 CHAIN = load("lwr4plus")
 N, RATE, SECONDS = 7, 1000.0, 60.0

@@ -12,17 +12,17 @@ from functools import cache
 import numpy as np
 import pytest
 
-from calib.data.motion import FilterOptions, make_motion
-from calib.data.recording import Recording
+from calib.data.recordings.recording import Recording
+from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics import base as bases
 from calib.dynamics import model, rigid_body
-from calib.dynamics.tree import standard_parameters, tree
+from calib.dynamics.bodies import standard_parameters, tree
 from calib.identification.cases import Case, make_case
-from calib.identification.instrumental import Loop, identify_instrumental
+from calib.identification.methods.instrumental import Loop, identify_instrumental
 from calib.robot import description, library
-from calib.simulation import robots
-from calib.simulation.closed_loop import Plant, Sensing, forward_dynamics, simulate
-from calib.simulation.references import Reference, random_fourier
+from calib.simulation.cells import known_robots
+from calib.simulation.loop.closed_loop import Plant, Sensing, forward_dynamics, simulate
+from calib.simulation.loop.references import Reference, random_fourier
 
 STATES = 20_000
 REACH = np.array([2.8, 1.8, 2.0, 3.5, 1.9, 4.0])
@@ -31,7 +31,7 @@ SPEED = 0.8 * np.deg2rad([287.0, 287.0, 430.0, 410.0, 320.0, 700.0])
 
 @cache
 def setting() -> tuple[Plant, Reference]:
-    plant = robots.plant("tx40", coupled=True, offset=np.full(6, 0.1))
+    plant = known_robots.plant("tx40", coupled=True, offset=np.full(6, 0.1))
     return plant, random_fourier(-REACH, REACH, SPEED, 10.0, 5000.0, 20, acceleration=40.0, seed=1)
 
 
@@ -43,7 +43,7 @@ def states() -> np.ndarray:
 @cache
 def log() -> Case:
     plant, reference = setting()
-    run = simulate(plant, robots.controller("tx40"), reference, Sensing(1e-6, sigma_tau=0.05, every=5))
+    run = simulate(plant, known_robots.controller("tx40"), reference, Sensing(1e-6, sigma_tau=0.05, every=5))
     recording = Recording(run.t, run.measured, run.tau, "torque", tuple(f"joint_{j + 1}" for j in range(6)))
     return make_case("log", make_motion(recording, FilterOptions(cutoff=50.0, band=20.0, clock="stamps")))
 
@@ -52,7 +52,7 @@ def log() -> Case:
 @pytest.mark.parametrize("what", ["ours", "plain Python loop, a tenth of the time"])
 def test_closed_loop(benchmark, what):
     plant, reference = setting()
-    controller = robots.controller("tx40")
+    controller = known_robots.controller("tx40")
     if what == "ours":
         simulate(plant, controller, reference)
         run = benchmark.pedantic(simulate, (plant, controller, reference), rounds=7)
@@ -120,10 +120,10 @@ def test_forward_dynamics(benchmark, what):
 @pytest.mark.parametrize("what", ["IDIM-IV to convergence", "as many simulations alone"])
 def test_instrumental(benchmark, what):
     plant, reference = setting()
-    identification = robots.model(plant)
+    identification = known_robots.model(plant)
     base, case = bases.find(identification), log()
-    loop = Loop(robots.controller("tx40"), reference, 5)
-    inertia = np.array(robots.truth("tx40")["drives"]["Ia"])
+    loop = Loop(known_robots.controller("tx40"), reference, 5)
+    inertia = np.array(known_robots.truth("tx40")["drives"]["Ia"])
 
     def identify():
         return identify_instrumental(identification, base, [(case, loop)], case.motion.decimator, inertia=inertia)

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from calib import cli
-from calib.data.target_files import read_targets
+from calib.data.poses.target_files import read_targets
 from calib.geometry import inverse
 from calib.geometry.installation import Installation
 from calib.geometry.inverse import Goal
-from calib.procedure import compensating
+from calib.procedure.kinematic_stage import compensation
 from calib.robot.kinematics import forward
 from calib.robot.load import load
-from calib.simulation.cell import Cell, Instrument, measure, true_poses
-from calib.simulation.cells import perturbed_cell
+from calib.simulation.cells.cell import Cell, Instrument, measure, true_poses
+from calib.simulation.cells.virtual_cells import perturbed_cell
 from calib.transforms import from_xyz_rpy, rotation_vector, to_quaternion
 
 SIGMA = 20e-6
@@ -51,7 +51,7 @@ def fitted(cell, tmp_path_factory) -> Path:
     names = [*(f"q{k + 1}" for k in range(6)), "x", "y", "z", "qx", "qy", "qz", "qw"]
     write(folder / "seen.csv", names, np.hstack([seen.q, seen.position, seen.quaternion]))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("calib.procedure.report.write", lambda outcome, folder: None)
+        patch.setattr("calib.procedure.report.fit_certificate.write", lambda outcome, folder: None)
         code = cli.run(["fit", "ur5", str(folder / "seen.csv"), "--holdout", "0.25", "--out", str(folder / "done")])
     assert code == 0
     return folder / "done"
@@ -122,8 +122,8 @@ def test_joint_targets_are_the_nominal_robots_poses(cell, fitted, here, calib):
     assert code == 0, err
     assert "calibrated robot's base" in out and "the flange" in out
     sent = np.deg2rad(numbers(commands(), [f"q{k + 1} [deg]" for k in range(6)]))
-    found = compensating.read(fitted)
-    goal = Goal(compensating.placements(found)[1], torques=compensating.torques_of(found))
+    found = compensation.read(fitted)
+    goal = Goal(compensation.placements(found)[1], torques=compensation.torques_of(found))
     at = inverse.seen_at(goal, sent).poses()
     position, turn = off(at, forward(cell.nominal, q))
     assert position < 1e-7 and turn < 1e-7

@@ -13,7 +13,7 @@ from calib.geometry import inverse
 from calib.geometry.inverse import Goal
 from calib.robot.chain import sampling_limits
 from calib.robot.load import load
-from calib.simulation.cells import lwr4plus_cell, perturbed_cell, rigid
+from calib.simulation.cells.virtual_cells import lwr4plus_cell, perturbed_cell, rigid
 
 ROBOTS = ("ur5", "lwr4plus", "tx40", "rv2sq", "panda")
 

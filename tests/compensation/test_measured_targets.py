@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 from calib import cli
-from calib.data.options import FitOptions
-from calib.data.target_files import Targets
+from calib.data.poses.fit_options import FitOptions
+from calib.data.poses.target_files import Targets
 from calib.geometry import inverse
 from calib.geometry.inverse import Goal
-from calib.procedure import compensating, inputs
+from calib.procedure.kinematic_stage import compensation, inputs
 from calib.transforms import from_quaternion
 
 CASES = [  # folder, robot, file, held-out share, goal [mm]
@@ -34,18 +34,18 @@ CASES = [  # folder, robot, file, held-out share, goal [mm]
 def test_commands_for_measured_poses_are_the_joints_they_were_measured_at(
     data, tmp_path, monkeypatch, capsys, folder, robot, file, share, goal
 ):
-    monkeypatch.setattr("calib.procedure.report.write", lambda outcome, folder: None)
+    monkeypatch.setattr("calib.procedure.report.fit_certificate.write", lambda outcome, folder: None)
     robot, file = data / folder / robot, data / folder / file
     arguments = ["fit", robot, file, "--holdout", share, "--out", tmp_path / "done"]
     assert cli.run([str(each) for each in arguments]) in (0, 1)
     unseen = inputs.gather(robot, [file], options=FitOptions(), holdout=share).unseen[file.name].block
-    fitted = compensating.read(tmp_path / "done")
+    fitted = compensation.read(tmp_path / "done")
     turns = None if unseen.quaternion is None else from_quaternion(unseen.position, unseen.quaternion)[:, :3, :3]
     targets = Targets(unseen.q, unseen.position, turns, file=file.name)
-    found = compensating.compensate(
+    found = compensation.compensate(
         fitted, targets, frame=unseen.station, tool=unseen.tool_names[0], tolerance=(1e-6, 1e-5)
     )
-    arms = compensating.placements(fitted, unseen.station, unseen.tool_names[0])
+    arms = compensation.placements(fitted, unseen.station, unseen.tool_names[0])
     ruler = Goal(replace(arms[0], tools=arms[1].tools))
     stood = inverse.seen_at(ruler, unseen.q).poses()
     off = {

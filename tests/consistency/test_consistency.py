@@ -16,16 +16,17 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "identification"))
 import planted_motion as planted
 
 from calib import cli, files
-from calib.data.decimation import decimate, design_decimator, spread
-from calib.data.measurements import PoseMeasurements
+from calib.data.poses.measurements import PoseMeasurements
+from calib.data.signals.decimation import decimate, design_decimator, spread
 from calib.dynamics import base as bases
 from calib.dynamics import rigid_body
-from calib.dynamics.tree import tree
+from calib.dynamics.bodies import tree
 from calib.errors import RobotError
-from calib.identification import consistency, refit
+from calib.identification import geometry_uncertainty, reweighted
 from calib.identification.identify import identify
 from calib.identification.settings import Settings
-from calib.procedure import calibrated, consistency_tables
+from calib.procedure.dynamic_stage import geometry_tables
+from calib.procedure.kinematic_stage import robot_file
 from calib.robot import description
 from calib.robot.chain import Chain, Joint
 
@@ -57,13 +58,13 @@ def test_spreading_is_the_adjoint_of_decimation(factor):
 def test_the_sensitivity_is_the_derivative_of_the_estimate(settings):
     arm, case = planted.arm().with_values(MOVED), planted.case("a", 0)
     found = identify(arm, [case], settings, planted.arm())
-    how = refit.estimator(found)
-    again, _ = refit.estimate(how, found.rows)
+    how = reweighted.estimator(found)
+    again, _ = reweighted.estimate(how, found.rows)
     np.testing.assert_allclose(again, found.fitted.estimate.values, atol=1e-9)
-    matrix, _, _ = consistency.sensitivity(found, arm, [case])
+    matrix, _, _ = geometry_uncertainty.sensitivity(found, arm, [case])
 
     def refitted(values: np.ndarray) -> np.ndarray:
-        return refit.estimate(how, refit.rows_on(found, arm.with_values(values), [case]))[0]
+        return reweighted.estimate(how, reweighted.rows_on(found, arm.with_values(values), [case]))[0]
 
     differences.check(refitted, matrix[:, :-2], np.array(arm.values), step=1e-5, tolerance=1e-7)
 
@@ -71,9 +72,9 @@ def test_the_sensitivity_is_the_derivative_of_the_estimate(settings):
 def test_pieces_of_a_long_recording_tell_the_same(monkeypatch):
     arm, case = planted.arm(), planted.case("a", 0, noise=0.0, duration=60.0)
     found = identify(arm, [case], PLAIN)
-    whole, _, _ = consistency.sensitivity(found, arm, [case])
-    monkeypatch.setattr(consistency, "SAMPLES", 6000)
-    part, _, _ = consistency.sensitivity(found, arm, [case])
+    whole, _, _ = geometry_uncertainty.sensitivity(found, arm, [case])
+    monkeypatch.setattr(geometry_uncertainty, "SAMPLES", 6000)
+    part, _, _ = geometry_uncertainty.sensitivity(found, arm, [case])
     sigma = found.fitted.estimate.sigma[:, None]
     assert np.abs((part - whole) / sigma).max() < 0.1 * np.abs(whole / sigma).max()
     assert not np.array_equal(part, whole)
@@ -84,7 +85,7 @@ def test_an_element_is_a_joint_that_nobody_moves():
     arm, case = planted.arm().with_values(MOVED), planted.case("a", 0, band=80.0, duration=6.0)
     found = identify(arm, [case], PLAIN)
     assert case.motion.decimator.factor == 1
-    _, felt, _ = consistency.sensitivity(found, arm, [case])
+    _, felt, _ = geometry_uncertainty.sensitivity(found, arm, [case])
     count = len(arm.elements)
     loose = Chain(
         "loose", tuple(Joint(f"j{k}") for k in range(count)),
@@ -109,7 +110,7 @@ def test_an_element_is_a_joint_that_nobody_moves():
 def test_an_offset_of_the_last_joint_turns_its_bodys_parameters_and_nothing_else():
     arm, case = planted.arm(), planted.case("a", 0, noise=0.0)
     found = identify(arm, [case], PLAIN)
-    carried = consistency.propagate(found, arm, [case])
+    carried = geometry_uncertainty.propagate(found, arm, [case])
     slope = dict.fromkeys(found.base.standard, 0.0)
     xx, xy, xz, yy, yz, _, mx, my, _, _ = planted.INERTIAS[2]
     slope |= {"XX3": 2 * xy, "XY3": yy - xx, "XZ3": yz, "YY3": -2 * xy, "YZ3": -xz, "MX3": my, "MY3": -mx}
@@ -121,11 +122,11 @@ def test_an_offset_of_the_last_joint_turns_its_bodys_parameters_and_nothing_else
 def test_geometry_that_is_exact_adds_nothing():
     arm, case = planted.arm(), planted.case("a", 0)
     found = identify(arm, [case], PLAIN)
-    without = consistency.propagate(found, arm, [case])
-    assert without.geometry is None and "taken as exact" in consistency_tables.summary(without)
+    without = geometry_uncertainty.propagate(found, arm, [case])
+    assert without.geometry is None and "taken as exact" in geometry_tables.summary(without)
     np.testing.assert_array_equal(without.covariance, found.fitted.estimate.covariance)
-    tiny = consistency.propagate(found, arm, [case], 1e-16 * np.eye(6))
-    assert not tiny.changed.any() and "no matter" in consistency_tables.summary(tiny)
+    tiny = geometry_uncertainty.propagate(found, arm, [case], 1e-16 * np.eye(6))
+    assert not tiny.changed.any() and "no matter" in geometry_tables.summary(tiny)
     assert np.linalg.eigvalsh(tiny.covariance - tiny.torque).min() > -1e-12
 
 
@@ -142,7 +143,7 @@ def test_intervals_cover_the_truth_with_propagation_and_fail_without():
         case = planted.case("a", 0, noise=0.0)
         noisy = replace(case, target=case.target + 0.2 * rng.normal(size=case.target.shape))
         found = identify(believed, [noisy], settings, real)
-        carried = consistency.propagate(found, believed, [noisy], spread_of)
+        carried = geometry_uncertainty.propagate(found, believed, [noisy], spread_of)
         off = np.abs(found.fitted.estimate.values - truth)
         inside.append(off < 1.96 * carried.sigma)
         outside.append(off < 1.96 * carried.sigma_torque)
@@ -158,7 +159,7 @@ def fitted_folder(tmp_path: Path, covariance: float | None) -> Path:
     moved = nominal.with_values(MOVED)
     description.write(folder / "robot.toml", moved, {"provenance": {"nominal": nominal.values.tolist()}})
     if covariance is not None:
-        calibrated.write_chain_covariance(["up", "shoulder"], covariance * np.eye(2), folder)
+        robot_file.write_chain_covariance(["up", "shoulder"], covariance * np.eye(2), folder)
     return folder
 
 
@@ -182,7 +183,7 @@ def test_the_command_carries_the_fits_covariance(tmp_path, capsys):
     assert {row["element"] for row in ranked} > {"gravity.rx", "turn", "fore"}
     assert (out / "plot_geometries.png").is_file() and (out / "geometries.csv").is_file()
     assert "which geometric errors matter" in capsys.readouterr().out
-    kept = calibrated.chain_covariance(out, planted.arm())
+    kept = robot_file.chain_covariance(out, planted.arm())
     assert kept is not None and kept[1, 1] == pytest.approx(1e-6), "the identified robot carries it on"
 
 
@@ -190,27 +191,27 @@ def test_the_command_says_where_the_geometry_is_taken_as_exact(tmp_path, capsys)
     found, rows, out = run(fitted_folder(tmp_path, None), tmp_path)
     assert not found["propagated"] and {row["sigma_geometry"] for row in rows} == {""}
     assert "taken as exact" in capsys.readouterr().out.replace("\n", " ")
-    assert not (out / calibrated.COVARIANCE).exists()
+    assert not (out / robot_file.COVARIANCE).exists()
 
 
 def test_a_fit_leaves_the_covariance_of_its_chain(tmp_path):
     from calib.geometry.first_guess import install
     from calib.geometry.fit import fit
     from calib.robot.chain import random_joints
-    from calib.simulation.cell import measure
-    from calib.simulation.cells import lwr4plus_cell
+    from calib.simulation.cells.cell import measure
+    from calib.simulation.cells.virtual_cells import lwr4plus_cell
 
     cell = lwr4plus_cell(hidden=0.0)
     measured: PoseMeasurements = measure(cell, random_joints(cell.nominal, 40, 1), 2)
     found = fit(install(cell.nominal, [measured]), [measured])
-    calibrated.write_covariance(found, tmp_path)
-    read = calibrated.chain_covariance(tmp_path, found.cell.chain)
+    robot_file.write_covariance(found, tmp_path)
+    read = robot_file.chain_covariance(tmp_path, found.cell.chain)
     assert read is not None
     sigma = dict(zip(found.estimate.names, found.estimate.sigma))
     for name, variance in zip(found.cell.chain.names, np.diag(read)):
         assert np.sqrt(variance) == pytest.approx(sigma.get(name, 0.0), rel=1e-9)
     arm = set(found.estimate.names) & set(found.cell.chain.names)
     assert np.count_nonzero(np.diag(read)) == len(arm) > 20
-    files.write_table(tmp_path / calibrated.COVARIANCE, ("name", "alpha2"), [("d2", 1.0)])
+    files.write_table(tmp_path / robot_file.COVARIANCE, ("name", "alpha2"), [("d2", 1.0)])
     with pytest.raises(RobotError, match="do not name the same elements"):
-        calibrated.chain_covariance(tmp_path, found.cell.chain)
+        robot_file.chain_covariance(tmp_path, found.cell.chain)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from measured_rows import JOINTS, POSE
 
-from calib.data.options import FileOptions
-from calib.data.pose_files import read_measurements
+from calib.data.poses.fit_options import FileOptions
+from calib.data.poses.pose_files import read_measurements
 from calib.errors import MeasurementError
 
 WIDE = ([-3.0] * 3, [3.0] * 3)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.data.base_frame import relative_to_base
-from calib.data.measurements import PoseMeasurements
-from calib.data.pose_files import read_measurements
+from calib.data.poses.base_frame import relative_to_base
+from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.pose_files import read_measurements
 from calib.errors import MeasurementError
 from calib.transforms import from_quaternion, invert, to_quaternion
 

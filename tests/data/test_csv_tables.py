@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from calib.data.tables import read_header, read_table
+from calib.data.csv_table import read_header, read_table
 from calib.errors import MeasurementError
 
 

@@ -6,8 +6,8 @@ import re
 
 import pytest
 
-from calib.data import options as module
-from calib.data.options import FitOptions, check_files, parse_options, read_options
+from calib.data.poses import fit_options as module
+from calib.data.poses.fit_options import FitOptions, check_files, parse_options, read_options
 from calib.errors import UsageError
 
 

@@ -7,8 +7,8 @@ import pytest
 from measured_rows import JOINTS, POSE
 from scipy.spatial.transform import Rotation
 
-from calib.data.options import FileOptions
-from calib.data.pose_files import joint_columns, read_measurements
+from calib.data.poses.fit_options import FileOptions
+from calib.data.poses.pose_files import joint_columns, read_measurements
 
 
 def read(path, options=None, **more):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.data.measurements import PoseMeasurements
-from calib.data.plans import check_against, read_poses, write_poses
+from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.plans import check_against, read_poses, write_poses
 from calib.errors import CalibError, MeasurementError
 
 NAMES = ("a", "b", "c", "d")

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.data.options import FileOptions
-from calib.data.pose_files import joint_columns, read_measurements
+from calib.data.poses.fit_options import FileOptions
+from calib.data.poses.pose_files import joint_columns, read_measurements
 
 
 def load(data: Path, file: str, urdf: str, names: list[str] | None = None, options: FileOptions | None = None):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.data.options import FileOptions
-from calib.data.pose_files import read_measurements
+from calib.data.poses.fit_options import FileOptions
+from calib.data.poses.pose_files import read_measurements
 from calib.errors import MeasurementError
 
 JOINTS = tuple(f"joint_{i}" for i in range(1, 7))

@@ -8,11 +8,11 @@ from arms import motley, physical, states
 from differences import check
 
 from calib.dynamics import base, drives, friction, model, rigid_body
+from calib.dynamics.bodies import standard_parameters, tree, with_gravity, with_payload
 from calib.dynamics.idim import MODELS, IdentificationModel, from_chain
-from calib.dynamics.tree import standard_parameters, tree, with_gravity, with_payload
 from calib.errors import CalibError
 from calib.robot.load import load
-from calib.simulation import lwr4plus
+from calib.simulation.cells import lwr4plus
 
 SENSED = "Ia Fvl Fcl offl Fvm Fcm offm"
 

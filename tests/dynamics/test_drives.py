@@ -6,8 +6,8 @@ from arms import motley, states
 from differences import check
 
 from calib.dynamics import drives, friction
+from calib.dynamics.bodies import tree
 from calib.dynamics.idim import IdentificationModel, friction_states, from_chain, stacked, with_load, with_terms
-from calib.dynamics.tree import tree
 from calib.errors import CalibError
 from calib.robot.load import load
 

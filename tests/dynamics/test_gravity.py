@@ -7,8 +7,8 @@ import pytest
 
 from calib.dynamics.gravity import gravity_torques
 from calib.errors import RobotError
-from calib.robot import urdf
 from calib.robot.chain import random_joints
+from calib.robot.formats import urdf
 from calib.robot.load import load
 
 ARM = """<robot name="arm"><link name="base"/>{links}

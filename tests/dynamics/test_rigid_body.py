@@ -6,8 +6,8 @@ from arms import LIBRARY, motley, physical, states
 from differences import check
 
 from calib.dynamics import model, rigid_body
+from calib.dynamics.bodies import standard_parameters, tree, with_gravity, with_payload
 from calib.dynamics.gravity import gravity_torques
-from calib.dynamics.tree import standard_parameters, tree, with_gravity, with_payload
 from calib.errors import CalibError, RobotError
 from calib.robot.chain import Chain, Element, Joint
 from calib.robot.load import load
@@ -142,7 +142,7 @@ def test_mimic_is_a_chain_of_three_with_tied_coordinates():
 
 def test_payload_is_a_body_of_its_own():
     """A payload's torques are those of the last link with the payload's parameters moved into its frame."""
-    from calib.robot.tree import transform_body
+    from calib.robot.formats.urdf_tree import transform_body
 
     chain, load_ = ARMS["lwr4plus"], physical(1, 4)[0]
     placement = displace(np.eye(4), [0.1, -0.2, 0.3, 0.4, 0.5, 0.6])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.estimation.columns import split_columns, weak_directions
+from calib.estimation.base_columns import split_columns, weak_directions
 
 
 def dependent(seed: int, rows: int = 60, rank: int = 8, p: int = 13) -> np.ndarray:

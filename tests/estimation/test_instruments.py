@@ -7,7 +7,7 @@ import pytest
 
 from calib.errors import Unidentifiable
 from calib.estimation.constrained import minimise, within
-from calib.estimation.instruments import (
+from calib.estimation.instrumental_variables import (
     exogeneity,
     hausman,
     instrument,

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.simulation import lwr4plus
+from calib.simulation.cells import lwr4plus
 
 ROOT = Path(__file__).parents[2]
 

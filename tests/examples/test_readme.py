@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 
 from calib import cli
-from calib.robot import library, urdf_write
+from calib.robot import library
 from calib.robot.chain import random_joints
+from calib.robot.formats import urdf_write
 from calib.robot.load import load
-from calib.simulation import brought
-from calib.simulation.cell import measure
-from calib.simulation.cells import virtual_cell
-from calib.simulation.moving import moving_arm, record
-from calib.simulation.references import random_fourier
+from calib.simulation.cells import measured_files
+from calib.simulation.cells.cell import measure
+from calib.simulation.cells.virtual_arm import moving_arm, record
+from calib.simulation.cells.virtual_cells import virtual_cell
+from calib.simulation.loop.references import random_fourier
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
@@ -35,13 +36,13 @@ def at_a_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with the files the README speaks of."""
     cell, arm = virtual_cell("lwr4plus", 1), load("lwr4plus")
     (tmp_path / "robot.urdf").write_text(urdf_write.write_new(arm))
-    brought.write(measure(cell, random_joints(arm, 60, 1), 2), tmp_path / "measured.csv")
+    measured_files.write(measure(cell, random_joints(arm, 60, 1), 2), tmp_path / "measured.csv")
     joints = ",".join(f"{name} [rad]" for name in arm.joint_names)
     np.savetxt(tmp_path / "targets.csv", 0.5 * random_joints(arm, 5, 2), delimiter=",", header=joints, comments="")
     moves, speed = moving_arm(cell, "lwr4plus", 1), np.array([joint.velocity for joint in arm.joints])
     for seed, name in enumerate(("log", "other")):
         motion = random_fourier(0.6 * arm.lower, 0.6 * arm.upper, 0.6 * speed, 15.0, 1000.0, seed=seed)
-        brought.write_log(record(moves, motion, seed), tmp_path / f"{name}.csv")
+        measured_files.write_log(record(moves, motion, seed), tmp_path / f"{name}.csv")
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

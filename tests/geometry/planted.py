@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.data.measurements import PoseMeasurements
+from calib.data.poses.measurements import PoseMeasurements
 from calib.geometry.installation import Installation, see
 from calib.geometry.observation import observe, prepare, stack
 from calib.geometry.result import GeometricFit

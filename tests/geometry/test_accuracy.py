@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.data.measurements import PoseMeasurements
+from calib.data.poses.measurements import PoseMeasurements
 from calib.geometry.accuracy import errors, pair_errors, statistics, summary
 from calib.geometry.installation import Installation, see
 from calib.robot.load import load

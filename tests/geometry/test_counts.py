@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 from planted import cell, load, measure, perturb, random_joints
 
-from calib.data.measurements import PoseMeasurements
+from calib.data.poses.measurements import PoseMeasurements
 from calib.geometry.identifiability import base_columns, observation_matrix
 from calib.geometry.installation import Installation, see
 from calib.geometry.observation import prepare
 from calib.geometry.parameters import layout
-from calib.robot import mdh, urdf, urdf_write
+from calib.robot import mdh
 from calib.robot.chain import Chain
-from calib.simulation import lwr4plus
+from calib.robot.formats import urdf, urdf_write
+from calib.simulation.cells import lwr4plus
 from calib.transforms import to_quaternion
 
 

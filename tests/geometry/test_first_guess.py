@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from planted import cell, frames, load, measure, perturb, position_error, random_joints
 
-from calib.data.measurements import take
+from calib.data.poses.measurements import take
 from calib.errors import MeasurementError
 from calib.geometry.first_guess import average_pose, install
 from calib.geometry.fit import polish_frames

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from planted import cell, load, measure
 
-from calib.data.measurements import PoseMeasurements, take
+from calib.data.poses.measurements import PoseMeasurements, take
 from calib.errors import UsageError
-from calib.geometry.folds import Folds, folds_by_name, random_folds, region_folds, transfer_folds
+from calib.geometry.model_choice.folds import Folds, folds_by_name, random_folds, region_folds, transfer_folds
 
 
 @pytest.fixture(scope="module")

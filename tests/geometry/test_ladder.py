@@ -14,7 +14,7 @@ from calib.errors import UsageError
 from calib.geometry.deflection import Deflection, Term, evaluate, names
 from calib.geometry.first_guess import install
 from calib.geometry.installation import Installation, see
-from calib.geometry.ladder import climb
+from calib.geometry.model_choice.ladder import climb
 
 SIGMA = 4e-5
 

@@ -11,7 +11,7 @@ from planted import cell, load, measure, mixed_arm, perturb, random_joints
 from scipy.spatial.transform import Rotation
 
 from calib.geometry.deflection import Deflection, Term
-from calib.geometry.effects import EFFECTS
+from calib.geometry.model_choice.effects import EFFECTS
 from calib.geometry.observation import observe, predict, prepare, target_jacobian
 from calib.geometry.parameters import layout, step
 from calib.transforms import pose

@@ -179,7 +179,7 @@ def test_equation_11_and_levenberg_marquardt_end_at_the_same_arm():
 
 def test_the_order_of_rows_and_blocks_does_not_matter():
     nominal, _, measured, _ = planted("two stations", 5)
-    from calib.data.measurements import take
+    from calib.data.poses.measurements import take
 
     rng = np.random.default_rng(0)
     mixed = [take(block, rng.permutation(len(block))) for block in measured[::-1]]

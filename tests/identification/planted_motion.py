@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.data.motion import FilterOptions, make_motion
-from calib.data.recording import Recording
+from calib.data.recordings.recording import Recording
+from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics import drives
+from calib.dynamics.bodies import tree, with_payload
 from calib.dynamics.drives import Term
 from calib.dynamics.idim import IdentificationModel
-from calib.dynamics.tree import tree, with_payload
 from calib.identification.cases import Case, make_case
 from calib.robot.chain import Chain, Element, Joint
 

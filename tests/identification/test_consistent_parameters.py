@@ -9,11 +9,12 @@ from scipy.stats import chi2
 from calib.dynamics import base as bases
 from calib.dynamics import pseudo_inertia
 from calib.dynamics.idim import IdentificationModel, from_chain
-from calib.identification import consistent
-from calib.identification.nearest import nearest
+from calib.identification.possible import solve
+from calib.identification.possible.information import Told, whitened
+from calib.identification.possible.nearest import nearest
+from calib.identification.possible.prior_bodies import find_references
+from calib.identification.possible.problem import BodyCost, make_problem
 from calib.identification.prediction import Dynamics
-from calib.identification.references import find_references
-from calib.identification.told import Told, whitened
 from calib.robot.chain import Chain, Element, Joint
 
 CAD = (pseudo_inertia.rod(4.0, [0.0, 0.0, 0.4], 0.12), pseudo_inertia.rod(3.0, [0.3, 0.05, 0.0], 0.1),
@@ -89,7 +90,7 @@ def test_planted_robots_come_back_within_their_covariance():
     inside = 0
     for seed in range(6):
         truth, _, base, data = planted(seed)
-        found = consistent.find_consistent(data)
+        found = solve.find_consistent(data)
         assert (found.margins > 1e-3).all() and found.possible and not found.blamed
         assert found.distance < found.allowed
         off = base.transform @ (found.dynamics.values - truth)
@@ -102,7 +103,7 @@ def test_planted_robots_come_back_within_their_covariance():
 
 def test_with_exact_data_the_torques_are_those_of_the_base_parameters():
     _, model, _, data = planted(3, noise=1e-5)
-    found = consistent.find_consistent(data)
+    found = solve.find_consistent(data)
     samples = bases.random_samples(model, 50, 9)
     matrix = model.regressor(samples.q, samples.v, samples.a)
     wanted = matrix @ data.dynamics.values
@@ -115,7 +116,7 @@ def test_an_impossible_base_is_told_with_the_body_and_a_possible_one_is_not():
     values = np.array(data.values)
     place = base.names.index(next(name for name in base.names if name.startswith("ZZ2")))
     values[place] = -0.5
-    found = consistent.find_consistent(told(data.chain, model, base, values, data.covariance))
+    found = solve.find_consistent(told(data.chain, model, base, values, data.covariance))
     assert not found.possible and found.nearest > found.allowed
     assert any("body 2" in name or "body 3" in name for name, _ in found.blamed)
     assert found.blamed[0][1] < found.nearest
@@ -125,29 +126,29 @@ def test_an_impossible_base_is_told_with_the_body_and_a_possible_one_is_not():
 def test_without_a_cad_rods_of_a_mass_the_data_choose_stand_in():
     _, model, base, data = planted(5)
     bare = told(arm(None), model, base, data.values, data.covariance)
-    found = consistent.find_consistent(bare)
+    found = solve.find_consistent(bare)
     assert "no masses" in found.source and found.possible and found.distance < found.allowed
     assert 1.0 < found.dynamics.values[[9, 19, 29]].sum() < 100.0
 
 
-def problem_of(data: Told) -> consistent.Problem:
-    return consistent.make_problem(data, next(find_references(data.chain, data.dynamics.model)))
+def problem_of(data: Told) -> BodyCost:
+    return make_problem(data, next(find_references(data.chain, data.dynamics.model)))
 
 
 def test_slope_and_curvature_are_those_of_the_cost():
     _, _, _, data = planted(6, noise=1.0)
     problem = problem_of(data)
-    values = consistent.solve(problem, 30.0)
-    slope, curvature = consistent.derivatives(problem, 30.0, values)
+    values = solve.solve(problem, 30.0)
+    slope, curvature = solve.derivatives(problem, 30.0, values)
     scale = 1.0 / np.sqrt(np.diag(curvature))
     assert np.abs(slope * scale).max() < 1e-3, "optimal"
     shifted = values + 0.05 * scale * np.random.default_rng(0).standard_normal(len(values))
-    slope, curvature = consistent.derivatives(problem, 30.0, shifted)
+    slope, curvature = solve.derivatives(problem, 30.0, shifted)
     for k in range(0, len(values), 3):
         step = np.zeros(len(values))
         step[k] = 1e-4 * scale[k]
-        ends = [consistent.cost(problem, 30.0, shifted + sign * step) for sign in (1, -1)]
-        slopes = [consistent.derivatives(problem, 30.0, shifted + sign * step)[0] for sign in (1, -1)]
+        ends = [solve.cost(problem, 30.0, shifted + sign * step) for sign in (1, -1)]
+        slopes = [solve.derivatives(problem, 30.0, shifted + sign * step)[0] for sign in (1, -1)]
         assert (ends[0] - ends[1]) / 2e-4 == pytest.approx(slope[k] * scale[k], rel=1e-5, abs=1e-5)
         bent = (slopes[0] - slopes[1]) / (2 * step[k])
         assert np.abs((bent - curvature[k]) * scale * scale[k]).max() < 1e-5
@@ -158,7 +159,7 @@ def test_cvxpy_finds_the_same_optimum():
     _, _, _, data = planted(7, noise=1.0)
     problem = problem_of(data)
     gamma = 50.0
-    values = consistent.solve(problem, gamma)
+    values = solve.solve(problem, gamma)
     x = cp.Variable(len(values))
     scale = np.abs(values) + 1e-2
     chi = cp.multiply(x, scale)
@@ -171,6 +172,6 @@ def test_cvxpy_finds_the_same_optimum():
         parts.append(term / size - cp.log(term) if problem.positive[k] else cp.square(term / size))
     cp.Problem(cp.Minimize(0.5 * sum(parts))).solve(solver=cp.CLARABEL)
     theirs = scale * x.value
-    ours, other = (consistent.cost(problem, gamma, one) for one in (values, theirs))
+    ours, other = (solve.cost(problem, gamma, one) for one in (values, theirs))
     assert ours <= other + 1e-6 * abs(other)
     assert np.linalg.norm((theirs - values) / scale) < 1e-2

@@ -12,7 +12,7 @@ import pytest
 
 from calib import cli
 from calib.estimation.triangles import collect
-from calib.identification.estimators import ASSUMES, METHODS, _tls
+from calib.identification.methods.least_squares import ASSUMES, METHODS, _tls
 
 
 def identify(robot: Path, log: Path, method: str, out: Path) -> dict[str, tuple[float, float]]:

@@ -9,11 +9,11 @@ import pytest
 from calib.dynamics import friction
 from calib.dynamics.drives import term
 from calib.errors import CalibError, MeasurementError, UsageError
+from calib.identification.friction.friction_ladder import Ground, climb
 from calib.identification.gains import identify_gains
 from calib.identification.identify import common_decimator, find_base, first_fit, identify
-from calib.identification.ladder import Ground, climb
 from calib.identification.prediction import Dynamics, predict
-from calib.identification.refit import standstill_shift
+from calib.identification.reweighted import standstill_shift
 from calib.identification.rows import observe, pool, triangulate, with_blocks
 from calib.identification.scores import score
 from calib.identification.settings import Payload, Settings, make_model
@@ -107,8 +107,8 @@ def test_gains_come_from_a_payload_of_known_mass():
 
 def one_sine(name: str = "s"):
     """Return the case of a robot whose joints share one sine."""
-    from calib.data.motion import FilterOptions, make_motion
-    from calib.data.recording import Recording
+    from calib.data.recordings.recording import Recording
+    from calib.data.signals.motion import FilterOptions, make_motion
     from calib.identification.cases import make_case
 
     t = np.arange(0, 30, 1 / planted.RATE)

@@ -15,10 +15,11 @@ from calib import cli
 from calib.cli.shared import make_console
 from calib.data import values
 from calib.errors import UsageError
-from calib.identification.replay import CAD, FEEDBACK, FLOOR, IDENTIFIED, Replay
-from calib.procedure import identification_plots, identification_tracking
-from calib.procedure.drawing import motion_units
-from calib.procedure.identification_tracking import Tracking
+from calib.identification.loop.replay import CAD, FEEDBACK, FLOOR, IDENTIFIED, Replay
+from calib.procedure.dynamic_stage import tracking
+from calib.procedure.dynamic_stage.tracking import Tracking
+from calib.procedure.report import identification_figures
+from calib.procedure.report.style import motion_units
 
 
 def test_a_pipe_gets_tables_of_full_width(monkeypatch):
@@ -41,7 +42,7 @@ def test_ctrl_c_says_what_the_same_command_will_do(monkeypatch, capsys, command,
 def test_names_in_brackets_reach_the_console():
     still = {name: np.full(3, 1e-3) for name in (FEEDBACK, CAD, IDENTIFIED, FLOOR)}
     one = Replay("log.npz", 1.0, None, True, (), np.zeros(3), still)
-    *_, last = identification_tracking.tracking_lines(Tracking((one,), True), planted.arm())
+    *_, last = tracking.tracking_lines(Tracking((one,), True), planted.arm())
     assert "the controller of [loop];" in Text.from_markup(last).plain
 
 
@@ -52,7 +53,7 @@ def test_figures_have_units_at_their_axes():
         fit={"train": None}, repeated={}, found=SimpleNamespace(settings=SimpleNamespace(kind="motor")),
         inputs=SimpleNamespace(unit="N m", chain=replace(planted.arm(), joints=joints)),
     )  # fmt: skip
-    figure = identification_plots.torques(one, np.asarray(one.target), outcome)
+    figure = identification_figures.torques(one, np.asarray(one.target), outcome)
     assert [axis.get_ylabel() for axis in figure.axes] == ["joint 1\n[N]", "joint 2\n[N m]", "joint 3\n[N m]"]
     assert not any(axis.get_legend() for axis in figure.axes), "a legend inside would cover the curve"
     assert motion_units(["revolute"] * 2) == ("rad", "rad/s", "rad/s²", "N m")

@@ -9,11 +9,11 @@ import numpy as np
 import planted_motion as planted
 import pytest
 
-from calib.data.excitation import report_excitation
+from calib.data.signals.persistency import report_excitation
 from calib.identification.scores import Part, Score
-from calib.procedure import identification_verdict
-from calib.procedure.identification_verdict import judge, with_prior
-from calib.procedure.verdict import Verdict
+from calib.procedure.dynamic_stage import verdict
+from calib.procedure.dynamic_stage.verdict import judge, with_prior
+from calib.procedure.kinematic_stage.verdict import Verdict
 
 TORQUE = np.array([10.0, 100.0, 0.5])  # rms of each joint: the third does not matter
 
@@ -51,7 +51,7 @@ def test_a_joint_without_a_model_is_named_and_fails_where_its_torque_matters(joi
 
 
 def test_the_documented_thresholds_are_those_that_judge():
-    own = identification_verdict
+    own = verdict
     words = " ".join((own.__doc__ or "").split())
     told = (
         f"above {own.POOR:g} %", f"up to {own.GOOD:g} %", f"up to {own.TRANSFER:g} times", f"{own.LOST:g} % or more",
@@ -69,18 +69,18 @@ def test_the_total_says_which_criterion_was_missed():
 
 def test_motion_far_beyond_the_limits_is_a_warning():
     case, chain = planted.case("train", 0), planted.arm()
-    assert identification_verdict.beyond(case, chain) == []
+    assert verdict.beyond(case, chain) == []
     reach = float(np.abs(case.motion.q[:, 1]).max())
     tight = tuple(replace(one, lower=-0.8 * reach, upper=0.8 * reach) if j == 1 else one
                   for j, one in enumerate(chain.joints))  # fmt: skip
-    (told,) = identification_verdict.beyond(case, replace(chain, joints=tight))
+    (told,) = verdict.beyond(case, replace(chain, joints=tight))
     assert "joint2 by" in told and "joint1" not in told and "is this the robot" in told
 
 
 @pytest.mark.parametrize("drawn, told", [(5, False), (6, True)])
 def test_most_parameters_from_the_cad_are_told_in_the_reason(monkeypatch, drawn, told):
     names = [f"p{k}" for k in range(drawn)]
-    monkeypatch.setattr(identification_verdict, "resting_names", lambda found: names)
+    monkeypatch.setattr(verdict, "resting_names", lambda found: names)
     found = SimpleNamespace(base=SimpleNamespace(b=10), prior=SimpleNamespace(source="cad"))
     reason = with_prior(Verdict("marginal", "why"), found).reason
     assert (reason == f"why; {drawn} of 10 parameters are the CAD's: this motion does not tell them") == told

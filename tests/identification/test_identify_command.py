@@ -170,9 +170,9 @@ def test_columns_in_different_units_are_pointed_at(robot, tmp_path, capsys):
     ],
 )
 def test_options_are_held_against_what_exists(robot, tmp_path, capsys, text, said):
-    train, options = planted.write(tmp_path, "train.npz", 0), tmp_path / "options.toml"
-    options.write_text(text)
-    code = run(robot, train, "--options", options, "--out", tmp_path / "out")
+    train, identify_options = planted.write(tmp_path, "train.npz", 0), tmp_path / "options.toml"
+    identify_options.write_text(text)
+    code = run(robot, train, "--options", identify_options, "--out", tmp_path / "out")
     assert code == 2 and said in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
@@ -188,20 +188,20 @@ def test_other_folders_are_not_overwritten(robot, tmp_path, capsys):
 
 
 def test_every_key_of_the_documented_options_is_read(tmp_path):
-    from calib.identification import options
+    from calib.identification import identify_options
 
-    text = options.__doc__.split("from 1::\n\n", 1)[1]
+    text = identify_options.__doc__.split("from 1::\n\n", 1)[1]
     path = Path(tmp_path / "documented.toml")
     path.write_text("\n".join(line[4:] for line in text.splitlines()))
-    found = options.read_options(path)
+    found = identify_options.read_options(path)
     assert found.settings.ratio == 20.0 and found.gain_pair is not None
     assert found.for_file("x/run_load.npz").payload == ("tool",)
     assert found.settings.couplings[0].joints == (4, 5)
 
 
 def test_the_model_comes_back_from_its_folder_and_predicts_the_same(robot, tmp_path):
+    from calib.identification.model_file import read_dynamics
     from calib.identification.prediction import predict
-    from calib.identification.storage import read_dynamics
 
     train, out = planted.write(tmp_path, "train.npz", 0), tmp_path / "out"
     assert run(robot, train, "--out", out, "--friction", "presliding") == 0

@@ -13,9 +13,10 @@ import pytest
 
 from calib import cli
 from calib.errors import CalibError, UsageError
-from calib.identification import loop_settings, options
-from calib.simulation import controllers, references
-from calib.simulation.closed_loop import Plant, Run, Sensing, simulate
+from calib.identification import identify_options
+from calib.identification.loop import loop_settings
+from calib.simulation.loop import controllers, references
+from calib.simulation.loop.closed_loop import Plant, Run, Sensing, simulate
 
 RATE, EVERY = 1000.0, 4
 KP, KD = np.array([4000.0, 3000.0, 500.0]), np.array([200.0, 150.0, 25.0])
@@ -163,7 +164,7 @@ def test_what_cannot_be_simulated_is_refused(robot, tmp_path, capsys, log_as, lo
 def test_every_key_of_the_loop_is_documented_and_read():
     for key in loop_settings._PARSERS:
         assert f"{key} =" in loop_settings.__doc__ or f" {key} " in loop_settings.__doc__, key
-    found = options.parse_options(
+    found = identify_options.parse_options(
         {"loop": {"controller": "cascade", "position": 40, "velocity": [9.0, 5.0, 1.0], "reset": 0.1, "delay": 2}}
     ).settings.loop
     assert found is not None
@@ -172,6 +173,6 @@ def test_every_key_of_the_loop_is_documented_and_read():
     np.testing.assert_allclose(made.ki, np.array([9.0, 5.0, 1.0]) * 400)
     assert made.delay == 2
     with pytest.raises(UsageError, match="expected a whole number of control periods"):
-        options.parse_options({"loop": {"controller": "identify", "delay": -1}})
+        identify_options.parse_options({"loop": {"controller": "identify", "delay": -1}})
     with pytest.raises(CalibError, match="there is no key 'gain'"):
-        options.parse_options({"loop": {"controller": "identify", "gain": 1}})
+        identify_options.parse_options({"loop": {"controller": "identify", "gain": 1}})

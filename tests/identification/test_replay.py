@@ -10,14 +10,14 @@ import planted_motion as planted
 import pytest
 
 from calib import cli
-from calib.data.motion import FilterOptions, make_motion
-from calib.data.recording import Recording
-from calib.identification import replay as replays
+from calib.data.recordings.recording import Recording
+from calib.data.signals.motion import FilterOptions, make_motion
 from calib.identification.cases import Case, make_case
+from calib.identification.loop import replay as replays
 from calib.identification.prediction import Dynamics, predict
-from calib.simulation import controllers, references
-from calib.simulation.closed_loop import Plant, simulate
-from calib.simulation.tracking import replayed_error
+from calib.simulation.loop import controllers, references
+from calib.simulation.loop.closed_loop import Plant, simulate
+from calib.simulation.loop.tracking import replayed_error
 
 PD = controllers.pd(np.array([900.0, 700.0, 120.0]), np.array([80.0, 60.0, 10.0]))
 

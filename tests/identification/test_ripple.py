@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from calib.dynamics.shapes import Joined
-from calib.identification import ripple
-from calib.identification.ripple import Track
+from calib.identification.friction import ripple
+from calib.identification.friction.ripple import Track
 
 RATE, TURNS = 500.0, 100
 

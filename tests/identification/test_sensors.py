@@ -12,8 +12,8 @@ import pytest
 
 from calib import cli
 from calib.dynamics import drives
+from calib.dynamics.bodies import tree, with_payload
 from calib.dynamics.idim import IdentificationModel
-from calib.dynamics.tree import tree, with_payload
 
 SIDED = {
     "Ia": (0.5, 0.4, 0.1), "Fvl": (1.2, 0.5, 0.2), "Fcl": (1.0, 1.5, 0.3), "offl": (0.1, -0.1, 0.05),

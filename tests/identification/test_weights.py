@@ -9,12 +9,12 @@ import planted_motion as planted
 import pytest
 
 from calib import cli
-from calib.data.motion import FilterOptions, make_motion
-from calib.data.recording_files import read_recording
+from calib.data.recordings.recording_files import read_recording
+from calib.data.signals.motion import FilterOptions, make_motion
 from calib.estimation.linear import wls
 from calib.identification.cases import make_case
 from calib.identification.identify import identify
-from calib.identification.options import parse_options
+from calib.identification.identify_options import parse_options
 from calib.identification.settings import Settings
 
 SINGLE = np.array([0.2, 4.0, 0.1])  # standard deviations of one sample over the periods [N m]

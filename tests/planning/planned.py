@@ -9,12 +9,12 @@ import numpy as np
 from scipy.optimize import brentq
 
 from calib.dynamics import drives
+from calib.dynamics.bodies import standard_parameters, tree
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.path_dynamics import PathDynamics, of_standard
-from calib.dynamics.tree import standard_parameters, tree
 from calib.robot.load import load
-from calib.simulation.robots import truth
-from trajectories.timing import Limits
+from calib.simulation.cells.known_robots import truth
+from trajectories.timing.limits import Limits
 
 CHAIN = load("lwr4plus")
 WAYPOINTS = np.array(

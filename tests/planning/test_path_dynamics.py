@@ -8,10 +8,10 @@ import pytest
 from dynamics import arms
 
 from calib.dynamics import base, drives, friction
+from calib.dynamics.bodies import standard_parameters, tree
 from calib.dynamics.idim import IdentificationModel, with_terms
 from calib.dynamics.model import model as pinocchio_model
 from calib.dynamics.path_dynamics import of_base, of_standard
-from calib.dynamics.tree import standard_parameters, tree
 from calib.errors import CalibError
 from calib.robot.load import load
 

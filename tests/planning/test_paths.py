@@ -7,7 +7,7 @@ import pytest
 from planned import CHAIN, WAYPOINTS
 
 from trajectories.errors import BadInput
-from trajectories.path import check_within, extremes, reversals, spline, through
+from trajectories.timing.path import check_within, extremes, reversals, spline, through
 
 EVEN = np.linspace(0, 4, 60)
 

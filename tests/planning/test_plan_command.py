@@ -13,12 +13,12 @@ from planned import CHAIN, WAYPOINTS, lwr
 
 from calib import cli, files
 from calib.dynamics import drives
-from calib.dynamics.tree import STANDARD
-from calib.procedure import motion_outputs, motion_planning
-from calib.procedure.motion_waypoints import read_waypoints
+from calib.dynamics.bodies import STANDARD
+from calib.procedure.excitation import plan_folder, planning
+from calib.procedure.excitation.waypoints import read_waypoints
 from calib.robot import description
 from calib.robot.kinematics import forward
-from calib.simulation.robots import truth
+from calib.simulation.cells.known_robots import truth
 from calib.transforms import to_quaternion
 
 
@@ -90,24 +90,24 @@ def test_an_identified_model_is_planned_with(room, capsys):
 
 
 def test_model_and_stated_drives_plan_the_same_motion(room):
-    one = motion_planning.plan("lwr4plus", room / "way.csv", model=room / "model")
-    two = motion_planning.plan("lwr4plus", room / "way.csv", drives_file=room / "drives.toml")
+    one = planning.plan("lwr4plus", room / "way.csv", model=room / "model")
+    two = planning.plan("lwr4plus", room / "way.csv", drives_file=room / "drives.toml")
     assert one.track.duration == two.track.duration and "no covariance" in one.notes[1]
     assert "collisions and floor are NOT checked" in one.notes[0]
-    bare = motion_planning.plan("lwr4plus", room / "way.csv")
+    bare = planning.plan("lwr4plus", room / "way.csv")
     assert bare.track.duration < one.track.duration and "friction not known" in bare.notes[1]
 
 
 def test_lines_and_shapes(room):
     given = {"model": room / "model", "limits": None}
-    straight = motion_planning.plan("lwr4plus", room / "way.csv", lines=True, **given)
-    table = motion_outputs.metrics(straight)
+    straight = planning.plan("lwr4plus", room / "way.csv", lines=True, **given)
+    table = plan_folder.metrics(straight)
     assert len(table["segments"]) == 2 and table["line_deviation"]["position"] <= 1e-6
     corner = forward(CHAIN, WAYPOINTS[1:2])[0, :3, 3]
     tool = forward(CHAIN, straight.track.q)[:, :3, 3]
     assert np.linalg.norm(tool - corner, axis=1).min() < 1e-4
-    shaped = motion_planning.plan("lwr4plus", room / "way.csv", evaluations=20, stray=0.1, **given)
-    found = motion_outputs.metrics(shaped)["shortened"]
+    shaped = planning.plan("lwr4plus", room / "way.csv", evaluations=20, stray=0.1, **given)
+    found = plan_folder.metrics(shaped)["shortened"]
     assert found["after"] <= found["before"] and found["evaluations"] >= 20
 
 
@@ -149,7 +149,7 @@ def test_waypoints_of_the_tool(room, capsys):
         if name != "place":
             np.testing.assert_allclose(found, poses, atol=2e-6)
     assert np.abs(q - WAYPOINTS).max() < 0.2
-    planned = motion_planning.plan("lwr4plus", room / "both.csv", drives_file=room / "drives.toml")
+    planned = planning.plan("lwr4plus", room / "both.csv", drives_file=room / "drives.toml")
     tool = forward(CHAIN, planned.track.q)[:, :3, 3]
     assert all(np.linalg.norm(tool - place, axis=1).min() < 2e-3 for place in poses[:, :3, 3])
     write_waypoints([[0.2, 0.1, 0.6], [2.0, 0.0, 0.5]], "far.csv", "x,y,z")
@@ -212,8 +212,8 @@ def test_an_uncertain_model_keeps_torque_free(room, capsys):
     files.write_table(
         room / "model" / "covariance.csv", ("name", "Ia2", "ZZ3R"), [("Ia2", 0.04, 0.0), ("ZZ3R", 0.0, 0.0)]
     )
-    sharp = motion_planning.plan("lwr4plus", room / "way.csv", drives_file=room / "drives.toml")
-    careful = motion_planning.plan("lwr4plus", room / "way.csv", model=room / "model")
+    sharp = planning.plan("lwr4plus", room / "way.csv", drives_file=room / "drives.toml")
+    careful = planning.plan("lwr4plus", room / "way.csv", model=room / "model")
     assert careful.sigma is not None
     np.testing.assert_allclose(careful.sigma[1], 0.2 * np.abs(sharp.timings[0].sampled.a[:, 1]).max(), rtol=1e-6)
     np.testing.assert_allclose(careful.limits.torque, sharp.limits.torque - 2 * careful.sigma, atol=1e-9)
@@ -230,7 +230,7 @@ def test_a_payload_on_board_takes_longer(room):
     load = dict(zip([f"{name}tool" for name in STANDARD], truth("lwr4plus")["payload"]["inertia"]))
     place.write_text(json.dumps(table | {"payloads": ["tool"], "bodies": table["bodies"] | load}))
     free, loaded = (
-        motion_planning.plan("lwr4plus", room / "way.csv", model=room / "model", payloads=on).track.duration
+        planning.plan("lwr4plus", room / "way.csv", model=room / "model", payloads=on).track.duration
         for on in ((), ("tool",))
     )
     assert free < loaded

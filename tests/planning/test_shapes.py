@@ -10,10 +10,10 @@ from calib.robot.chain import random_joints
 from calib.robot.kinematics import element_jacobian, forward, joint_jacobian, sweep
 from calib.robot.load import load
 from trajectories.errors import BadInput, NothingFeasible
-from trajectories.lines import line
-from trajectories.path import extremes, spline
-from trajectories.shape import build, count, shorten
-from trajectories.timing import time_optimal
+from trajectories.timing.lines import line
+from trajectories.timing.path import extremes, spline
+from trajectories.timing.shape import build, count, shorten
+from trajectories.timing.time_scaling import time_optimal
 
 
 def kinematics(chain):

@@ -9,11 +9,11 @@ from planned import CHAIN, WAYPOINTS, Cart, cart_limits, limits, lwr
 
 from calib.dynamics.model import model as pinocchio_model
 from calib.robot.chain import random_joints
-from calib.simulation.robots import truth
+from calib.simulation.cells.known_robots import truth
 from trajectories.errors import BadInput, NothingFeasible
-from trajectories.path import spline
-from trajectories.profile import track
-from trajectories.timing import time_optimal
+from trajectories.timing.path import spline
+from trajectories.timing.profile import track
+from trajectories.timing.time_scaling import time_optimal
 
 LINE = spline([[0.0], [1.5]])
 
@@ -60,7 +60,7 @@ def test_planned_torques_by_pinocchio_keep_the_limits_and_reach_them():
 @pytest.mark.parametrize("seed", range(8))
 def test_any_path_is_timed_with_no_limit_crossed_and_some_limit_active(seed):
     """Strong friction and accelerations limited, by turns; the sampling is other than that of the search."""
-    from trajectories.profile import dense
+    from trajectories.timing.profile import dense
 
     rng = np.random.default_rng(seed)
     bounds = limits(acceleration=np.full(7, 8.0)) if seed % 2 else limits()

@@ -68,7 +68,7 @@ def figures() -> bool:
 def calib(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, figures: bool):
     """Return a function that runs a command: its exit code, and what it said on stdout and stderr."""
     if not figures:
-        monkeypatch.setattr("calib.procedure.report.write", lambda outcome, folder: None)
+        monkeypatch.setattr("calib.procedure.report.fit_certificate.write", lambda outcome, folder: None)
 
     def run(*arguments: object) -> tuple[int, str, str]:
         code = cli.run([str(argument) for argument in arguments])

@@ -17,22 +17,23 @@ import numpy as np
 import pytest
 from differences import check
 
-from calib.data.recording_files import read_recording
+from calib.data.recordings.recording_files import read_recording
 from calib.dynamics import base, drives
+from calib.dynamics.bodies import standard_parameters, tree
 from calib.dynamics.idim import IdentificationModel
-from calib.dynamics.tree import standard_parameters, tree
-from calib.procedure import excitation_outputs, excitation_table, exciting
-from calib.procedure.excitable import read_dynamics
-from calib.procedure.excitation_existing import read_existing
-from calib.procedure.excitation_holding import told
-from calib.procedure.motion_limits import Points, read_motion_limits
+from calib.procedure.excitation import coefficients, design, design_folder
+from calib.procedure.excitation.limits import Points, read_motion_limits
+from calib.procedure.excitation.locked_joints import told
+from calib.procedure.excitation.model import read_dynamics
+from calib.procedure.excitation.prior_motions import read_existing
+from calib.procedure.report import motion_figures
 from calib.robot.kinematics import forward
 from calib.robot.load import load
 from trajectories.basis import Motion
+from trajectories.design.objectives import condition_numbers
+from trajectories.design.search import Run
+from trajectories.design.verify import dense_motion
 from trajectories.fourier import evaluate
-from trajectories.objectives import condition_numbers
-from trajectories.search import Run
-from trajectories.verify import dense_motion
 
 LIMITS = """
 [target]
@@ -108,15 +109,15 @@ def check_playback(q: np.ndarray, stands: np.ndarray, metrics: dict) -> None:
 def earlier(tmp_path_factory) -> Path:
     """Return the folder of a quick excitation, two periods of it."""
     folder = tmp_path_factory.mktemp("excited") / "e"
-    designed = exciting.excite("lwr4plus", repeat=2, **SHORT)
-    return excitation_outputs.write_folder(designed, folder)
+    designed = design.excite("lwr4plus", repeat=2, **SHORT)
+    return design_folder.write_folder(designed, folder, motion_figures.write_design)
 
 
 def test_motions_before_count(earlier, tmp_path):
     """Designed with what is known, the two motions together tell more than twice the first one would."""
-    before = excitation_table.read(earlier)
+    before = coefficients.read(earlier)
     known = json.loads((earlier / "metrics.json").read_text())["condition_number"]
-    second = exciting.excite("lwr4plus", existing=[str(earlier)], **SHORT)
+    second = design.excite("lwr4plus", existing=[str(earlier)], **SHORT)
     assert second.condition["raw_before"] == pytest.approx(known["raw"], rel=0.02)
     assert second.condition["raw"] < 0.9 * second.condition["raw_before"]
     # the same from the matrices themselves
@@ -163,7 +164,7 @@ def test_the_columns_told_with_a_joint_held_are_all_there_are():
 
 
 def test_a_motion_is_recalled_from_a_log_and_read_by_identify(earlier, tmp_path, cell, calib):
-    reference = excitation_table.read(earlier)
+    reference = coefficients.read(earlier)
     times, sigma = np.arange(4 * 1600) / 100, 0.02
     q, rng = reference.orders(times)[0], np.random.default_rng(0)
     log = np.concatenate([np.tile(q[0], (137, 1)), q, np.tile(q[0], (80, 1))])

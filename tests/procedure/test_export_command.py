@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.robot import urdf
+from calib.robot.formats import urdf
+from calib.robot.formats.urdf_write import write_new
 from calib.robot.kinematics import forward
 from calib.robot.load import load
-from calib.robot.urdf_write import write_new
 from calib.transforms import from_xyz_rpy, to_xyz_rpy
 
 
@@ -138,7 +138,7 @@ def test_what_is_mounted_behind_wrist_3_is_not_in_its_kinematics(cell, calib, ol
 
 
 def test_an_arm_without_ur_axes_has_no_ur_kinematics(cell, calib):
-    from calib.procedure.exporting import Calibration, export_ur_kinematics
+    from calib.procedure.export.geometry import Calibration, export_ur_kinematics
 
     panda = load("panda")
     with pytest.raises(Exception, match="not the axes of a UR arm"):

@@ -16,11 +16,12 @@ from calib.dynamics import base as bases
 from calib.dynamics import pseudo_inertia
 from calib.dynamics.idim import from_chain
 from calib.errors import RobotError, UsageError
+from calib.identification.model_file import to_table
 from calib.identification.prediction import Dynamics
-from calib.identification.storage import to_table
-from calib.procedure import exporting_dynamics
-from calib.robot import description, urdf
-from calib.robot.tree import read as read_tree
+from calib.procedure.export import dynamics
+from calib.robot import description
+from calib.robot.formats import urdf
+from calib.robot.formats.urdf_tree import read as read_tree
 
 SOURCE = """<?xml version="1.0"?>
 <robot name="arm">
@@ -79,9 +80,9 @@ def test_urdf_mjcf_and_tables_hold_the_same_robot(tmp_path, kind):
     source = SOURCE.replace("AXIS", kind)
     (tmp_path / "source.urdf").write_text(source)
     folder = write_identification(tmp_path / "found", source)
-    notes = exporting_dynamics.deliver_dynamics(folder, tmp_path / "source.urdf", tmp_path / "out")
+    notes = dynamics.deliver_dynamics(folder, tmp_path / "source.urdf", tmp_path / "out")
     assert any("no place for motor inertias" in note for note in notes)
-    given = exporting_dynamics.read(folder)
+    given = dynamics.read(folder)
     check_torques_with_pinocchio(tmp_path / "out" / "robot.urdf", given)
     before, after = read_tree(source, "before"), read_tree((tmp_path / "out" / "robot.urdf").read_text(), "after")
     assert np.array_equal(after.bodies["cover"], before.bodies["cover"]), "links fixed to others keep their CAD"
@@ -96,7 +97,7 @@ def test_urdf_mjcf_and_tables_hold_the_same_robot(tmp_path, kind):
     assert all(margin > 0.0 for margin in table["dynamics"]["consistency"]["margins_m"].values())
 
 
-def check_torques_with_pinocchio(path: Path, given: exporting_dynamics.Exported) -> None:
+def check_torques_with_pinocchio(path: Path, given: dynamics.Exported) -> None:
     """Compare with a reading of the test's own: `rnea` of the file against W χ of all standard parameters."""
     pin = pytest.importorskip("pinocchio")
     model = pin.buildModelFromUrdf(str(path))
@@ -119,7 +120,7 @@ def test_all_else_of_the_source_stays(tmp_path):
     source = SOURCE.replace("AXIS", "revolute")
     (tmp_path / "source.urdf").write_text(source)
     folder = write_identification(tmp_path / "found", source)
-    exporting_dynamics.deliver_dynamics(folder, tmp_path / "source.urdf", tmp_path / "out")
+    dynamics.deliver_dynamics(folder, tmp_path / "source.urdf", tmp_path / "out")
     after = (tmp_path / "out" / "robot.urdf").read_text()
 
     def bare(text: str) -> str:
@@ -136,7 +137,7 @@ def test_tesseracts_yaml_moves_the_source_to_the_export(tmp_path):
     source = SOURCE.replace("AXIS", "revolute")
     (tmp_path / "source.urdf").write_text(source)
     folder = write_identification(tmp_path / "found", source)
-    exporting_dynamics.deliver_dynamics(folder, tmp_path / "source.urdf", tmp_path / "out")
+    dynamics.deliver_dynamics(folder, tmp_path / "source.urdf", tmp_path / "out")
     table = yaml.safe_load((tmp_path / "out" / "joint_origins.yaml").read_text())["calibration"]["joints"]
     after = read_tree((tmp_path / "out" / "robot.urdf").read_text(), "after")
     assert set(table) == {"a", "b"}
@@ -152,23 +153,23 @@ def test_a_cover_heavier_than_the_body_gives_way_and_a_finger_is_refused(tmp_pat
     folder = write_identification(tmp_path / "found", source)
     heavy = source.replace('<mass value="3"/>', '<mass value="30"/>')
     (tmp_path / "source.urdf").write_text(heavy)
-    notes = exporting_dynamics.deliver_dynamics(folder, tmp_path / "source.urdf", tmp_path / "out")
+    notes = dynamics.deliver_dynamics(folder, tmp_path / "source.urdf", tmp_path / "out")
     assert any("flange" in note and "mass zero" in note for note in notes)
     assert read_tree((tmp_path / "out" / "robot.urdf").read_text(), "after").bodies["flange"] is None
     (tmp_path / "source.urdf").write_text(source.replace('<mass value="0.05"/>', '<mass value="50"/>'))
     with pytest.raises(RobotError, match="finger"):
-        exporting_dynamics.deliver_dynamics(folder, tmp_path / "source.urdf", tmp_path / "never")
+        dynamics.deliver_dynamics(folder, tmp_path / "source.urdf", tmp_path / "never")
     assert not (tmp_path / "never").exists()
 
 
 def test_a_robot_without_urdf_gets_a_new_one_and_a_fit_is_refused(tmp_path):
     folder = write_identification(tmp_path / "found", SOURCE.replace("AXIS", "prismatic"))
-    exporting_dynamics.deliver_dynamics(folder, None, tmp_path / "out")
+    dynamics.deliver_dynamics(folder, None, tmp_path / "out")
     assert not (tmp_path / "out" / "joint_origins.yaml").exists()
     check_torques_with_pinocchio_by_joint_names(tmp_path / "out" / "robot.urdf")
     (tmp_path / "found" / "dynamics.json").unlink()
     with pytest.raises(UsageError, match="calib identify"):
-        exporting_dynamics.check_identified(folder)
+        dynamics.check_identified(folder)
 
 
 def check_torques_with_pinocchio_by_joint_names(path: Path) -> None:
@@ -182,8 +183,8 @@ def test_mujoco_reads_the_mjcf(tmp_path):
     if not interpreter:
         pytest.skip("MuJoCo is not part of the environment: set CALIB_MUJOCO to a python that has it")
     folder = write_identification(tmp_path / "found", SOURCE.replace("AXIS", "revolute"))
-    exporting_dynamics.deliver_dynamics(folder, None, tmp_path / "out")
-    given = exporting_dynamics.read(folder)
+    dynamics.deliver_dynamics(folder, None, tmp_path / "out")
+    given = dynamics.read(folder)
     from calib.dynamics import rigid_body
 
     rng = np.random.default_rng(3)

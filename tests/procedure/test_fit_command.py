@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.procedure import calibrated
-from calib.robot import urdf
+from calib.procedure.kinematic_stage import robot_file
+from calib.robot.formats import urdf
+from calib.robot.formats.urdf_write import write_new
 from calib.robot.kinematics import forward
 from calib.robot.load import load
-from calib.robot.urdf_write import write_new
 from calib.transforms import from_xyz_rpy
 
 ERRORS = {"mean", "rms", "p95", "max"}
@@ -50,7 +50,7 @@ def test_the_files_of_a_fit_hold_the_same_robot(cell, calib):
     file = cell.write("day1.csv", cell.measure(60))
     assert calib("fit", "ur5", file, "--model", "geometry", "--out", "done")[0] == 0
     q = np.random.default_rng(0).uniform(-2, 2, (20, 6))
-    installation = calibrated.read("done")
+    installation = robot_file.read("done")
     poses = installation.stations[0] @ forward(installation.chain, q) @ installation.tools[0]
     rows = cell.measure(60)
     seen = np.array([[row[axis] for axis in "xyz"] for row in rows])
@@ -129,11 +129,11 @@ def test_a_pose_file_from_another_station_needs_refitted_frames(cell, calib):
 def test_two_files_have_two_stations_unless_one_is_asked_for(cell, calib):
     file, other = cell.write("a.csv", cell.measure(40)), cell.write("b.csv", cell.measure(40, 1))
     assert calib("fit", "ur5", file, other, "--model", "geometry", "--out", "each")[0] == 0
-    assert calibrated.read("each").station_names == ("a", "b")
+    assert robot_file.read("each").station_names == ("a", "b")
     assert calib("fit", "ur5", file, other, "--stations", "one", "--model", "geometry", "--out", "one")[0] == 0
-    assert calibrated.read("one").station_names == ("station",)
+    assert robot_file.read("one").station_names == ("station",)
     assert calib("fit", "ur5", file, other, "--tools", "each", "--model", "geometry", "--out", "tools")[0] == 0
-    assert calibrated.read("tools").tool_names == ("a tool", "b tool")
+    assert robot_file.read("tools").tool_names == ("a tool", "b tool")
 
 
 def test_one_station_for_an_instrument_that_was_moved_is_said(cell, calib):
@@ -199,7 +199,7 @@ def test_a_calibrated_folder_is_a_robot_and_a_worse_arm_fails(cell, calib):
 def test_deflections_go_out_as_a_table_with_its_formula_and_come_back(cell, calib):
     file = cell.write("a.csv", cell.measure(90))
     assert calib("fit", "ur5", file, "--model", "coupling", "--out", "done")[0] in (0, 1)
-    installation = calibrated.read("done")
+    installation = robot_file.read("done")
     rows = read_rows(Path("done/joint_corrections.csv"))
     assert len(rows) == len(installation.deflection.terms) > 0
     assert "coefficient * b(q)" in Path("done/joint_corrections.txt").read_text()
@@ -218,7 +218,7 @@ def test_deflections_go_out_as_a_table_with_its_formula_and_come_back(cell, cali
     with_corrections = forward(urdf.read("done/robot_for_corrections.urdf"), some)
     assert np.abs(with_corrections - forward(load("done"), some)).max() < 1e-9
     rigid = urdf.read("done/robot.urdf")
-    assert np.abs(forward(rigid, some) - forward(calibrated.rigid_chain("done"), some)).max() < 1e-9
+    assert np.abs(forward(rigid, some) - forward(robot_file.rigid_chain("done"), some)).max() < 1e-9
     Path("ur5.urdf").write_text(write_new(load("ur5")))
     said = calib("export", "done", "--urdf", "ur5.urdf", "--out", "new.urdf")[1]
     assert f"the URDF alone leaves {alone:.3f} mm rms" in said

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from calib.geometry.accuracy import Errors
-from calib.procedure.comparing import Comparison, urdf_alone
-from calib.procedure.verdict import judge
+from calib.procedure.kinematic_stage.validation import Comparison, urdf_alone
+from calib.procedure.kinematic_stage.verdict import judge
 
 
 def rows(

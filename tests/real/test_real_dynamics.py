@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from calib import cli
-from calib.identification.options import parse_options
-from calib.procedure.identification_gains import find_gains
-from calib.procedure.identifying import read_motion
+from calib.identification.identify_options import parse_options
+from calib.procedure.dynamic_stage.gains import find_gains
+from calib.procedure.dynamic_stage.identify import read_motion
 from calib.robot.load import load
 
 
@@ -184,8 +184,8 @@ def test_tx40_standstill_in_the_fit_is_noticed(data, tmp_path):
     folder = data / "staubli_tx40"
     options = TX40.replace("cut_slow = true", "cut_slow = false")
     found = identify(tmp_path / "out", folder / "model.urdf", folder / "tx40_first_5p4s.npz", options=options)
-    told = " ".join(line for line in found["warnings"] if "Coulomb" in line)
-    assert "Fc3 +" in told and "cut_slow" in told
+    information = " ".join(line for line in found["warnings"] if "Coulomb" in line)
+    assert "Fc3 +" in information and "cut_slow" in information
 
 
 @pytest.mark.slow
@@ -204,8 +204,12 @@ def test_lwr_with_one_sine_says_what_it_cannot_tell(data, tmp_path):
     folder = data / "kuka_lwr4plus_iit"
     log = folder / "measurements_1.npz"
     found = identify(tmp_path / "out", folder / "model.urdf", f"{log}@2.5:18", "--validate", f"{log}@18:")
-    told = " ".join(found["warnings"])
-    assert "one frequency" in told and "not identifiable from this motion" in told and "no evidence" in told
+    information = " ".join(found["warnings"])
+    assert (
+        "one frequency" in information
+        and "not identifiable from this motion" in information
+        and "no evidence" in information
+    )
     assert found["verdict"] == "marginal"
     assert total(found, "measurements_1.npz@18:") < 10.0, "the untouched CAD's error"
     own = values(tmp_path / "out")
@@ -214,17 +218,18 @@ def test_lwr_with_one_sine_says_what_it_cannot_tell(data, tmp_path):
 
 def test_lwr_full_parameters_hold_where_it_has_not_been(data, tmp_path):
     """Half of the one closed curve learnt, the other half predicted: plain least squares is worse than the CAD."""
-    from calib.dynamics.tree import standard_parameters
-    from calib.identification import consistent, prediction, told
-    from calib.procedure import identifying
+    from calib.dynamics.bodies import standard_parameters
+    from calib.identification import prediction
+    from calib.identification.possible import information, solve
+    from calib.procedure.dynamic_stage import identify as identifying
 
     folder = data / "kuka_lwr4plus_iit"
     log = folder / "measurements_1.npz"
     arguments = (folder / "model.urdf", f"{log}@2.5:8.75", "--validate", f"{log}@8.75:15")
     bare = identify(tmp_path / "bare", *arguments, options='prior = "none"')
     identify(tmp_path / "drawn", *arguments, options='prior = "cad"')
-    data_alone = told.read(tmp_path / "drawn")
-    found = consistent.find_consistent(data_alone)
+    data_alone = information.read(tmp_path / "drawn")
+    found = solve.find_consistent(data_alone)
     assert data_alone.rests_on_prior and (found.margins > 0.0).all()
     inputs = identifying.gather(arguments[0], [str(arguments[1])], [str(arguments[3])])
     case = inputs.unseen[0]

@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.data.measurements import PoseMeasurements, take
+from calib.data.poses.measurements import PoseMeasurements, take
 from calib.geometry.accuracy import errors, summary
-from calib.geometry.diagnosis import diagnose
-from calib.geometry.explanation import explain
+from calib.geometry.checks.diagnosis import diagnose
+from calib.geometry.checks.explanation import explain
 from calib.geometry.first_guess import install
-from calib.geometry.ladder import Climb, climb
+from calib.geometry.model_choice.ladder import Climb, climb
 from calib.geometry.result import outliers
 from calib.geometry.weighing import Settings
-from calib.robot import urdf
+from calib.robot.formats import urdf
 
 
 def columns(file: Path, names: list[str]) -> np.ndarray:

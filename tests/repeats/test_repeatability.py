@@ -11,14 +11,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calib import cli
-from calib.data.measurements import PoseMeasurements
-from calib.geometry import repeatability
+from calib.data.poses.measurements import PoseMeasurements
+from calib.geometry.checks import repeatability
 from calib.geometry.installation import Installation, see
-from calib.procedure import inputs
-from calib.procedure import repeatability as stated
+from calib.procedure.kinematic_stage import inputs
+from calib.procedure.kinematic_stage import iso9283 as stated
 from calib.robot.load import load
-from calib.simulation.cell import Instrument, measure
-from calib.simulation.cells import perturbed_cell
+from calib.simulation.cells.cell import Instrument, measure
+from calib.simulation.cells.virtual_cells import perturbed_cell
 from calib.transforms import from_xyz_rpy
 
 STATION = from_xyz_rpy([1.0, -2.0, 0.5], [0.2, -0.4, 1.0])
@@ -110,7 +110,7 @@ def test_cycles_of_a_pose_are_held_out_together():
 def files(tmp_path, monkeypatch) -> Path:
     """Forty poses once, five of them thirty times, and a validation file at the fit's joints."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("calib.procedure.report.write", lambda outcome, folder: None)
+    monkeypatch.setattr("calib.procedure.report.fit_certificate.write", lambda outcome, folder: None)
     cell = perturbed_cell(load("ur5"), 1, Instrument(position_sigma=2e-5, orientation_sigma=5e-5))
     rng = np.random.default_rng(3)
     once, five = rng.uniform(-2, 2, (60, 6)), rng.uniform(-2, 2, (5, 6))

@@ -10,8 +10,9 @@ from differences import central
 from robot_oracle import axis, inertial, joint, robot
 
 from calib.errors import RobotError
-from calib.robot import description, library, mdh, urdf
+from calib.robot import description, library, mdh
 from calib.robot.chain import Chain, random_joints
+from calib.robot.formats import urdf
 from calib.robot.kinematics import forward
 from calib.robot.load import load
 

@@ -8,8 +8,9 @@ from differences import check
 from robot_oracle import axis, joint, robot
 
 from calib.errors import RobotError
-from calib.robot import library, mdh, urdf
+from calib.robot import library, mdh
 from calib.robot.chain import Chain, random_joints
+from calib.robot.formats import urdf
 from calib.robot.kinematics import element_jacobian, forward, jacobian, joint_frames, joint_jacobian, sweep
 from calib.transforms import rotation_vector
 

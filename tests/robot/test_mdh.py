@@ -9,10 +9,10 @@ from robot_oracle import pinocchio_poses
 from calib.errors import RobotError
 from calib.robot import mdh
 from calib.robot.chain import random_joints
+from calib.robot.formats.urdf_write import write_new
 from calib.robot.kinematics import forward, joint_frames
 from calib.robot.mdh import Row
 from calib.robot.tables import number
-from calib.robot.urdf_write import write_new
 
 HALF = np.pi / 2
 

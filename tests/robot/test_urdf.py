@@ -8,8 +8,8 @@ from recordings import DATA
 from robot_oracle import axis, inertial, joint, pinocchio_inertias, pinocchio_poses, robot
 
 from calib.errors import RobotError
-from calib.robot import urdf
 from calib.robot.chain import random_joints
+from calib.robot.formats import urdf
 from calib.robot.kinematics import forward
 
 Z, MIMIC = axis("0 0 1"), '<mimic joint="a" multiplier="-0.7" offset="0.2"/>'

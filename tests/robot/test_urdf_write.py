@@ -10,8 +10,9 @@ from recordings import DATA
 from robot_oracle import axis, inertial, joint, pinocchio_inertias, pinocchio_poses, robot
 
 from calib.errors import RobotError
-from calib.robot import library, mdh, urdf, urdf_write
+from calib.robot import library, mdh
 from calib.robot.chain import Chain, random_joints
+from calib.robot.formats import urdf, urdf_write
 from calib.robot.kinematics import forward
 from calib.robot.load import load
 from calib.transforms import from_xyz_rpy, to_xyz_rpy

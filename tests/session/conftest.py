@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from calib.procedure import demo, steps
-from calib.procedure.guided import begin
-from calib.procedure.session import Session, locked, open_session
-from calib.simulation.cells import virtual_cell
+from calib.procedure.session import demo, steps
+from calib.procedure.session.commands import begin
+from calib.procedure.session.folder import Session, locked, open_session
+from calib.simulation.cells.virtual_cells import virtual_cell
 
 
 def quiet(words: str) -> None:
@@ -69,6 +69,6 @@ def finished(finished_folder: Path, tmp_path: Path) -> Session:
 @pytest.fixture
 def plain(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw no figures: most claims about sessions are not about them, and drawing takes most of the time."""
-    from calib.procedure import figures
+    from calib.procedure.report import figures
 
     monkeypatch.setattr(figures, "draw", lambda report: {})

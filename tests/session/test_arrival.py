@@ -7,18 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.data.measurements import take
-from calib.data.options import FitOptions
+from calib.data.poses.fit_options import FitOptions
+from calib.data.poses.measurements import take
 from calib.errors import MeasurementError, UsageError
-from calib.procedure import arrival, inputs
-from calib.procedure.answers import QUESTIONS, Answers, checked, with_answer
-from calib.procedure.dynamic_stages import options_of
-from calib.procedure.guided import begin
-from calib.procedure.session import Session
-from calib.procedure.stages import chain_of, check_file
+from calib.procedure.kinematic_stage import inputs
+from calib.procedure.session import arrival
+from calib.procedure.session.commands import begin
+from calib.procedure.session.dynamics_steps import options_of
+from calib.procedure.session.folder import Session
+from calib.procedure.session.geometry_steps import chain_of, check_file
+from calib.procedure.session.questions import QUESTIONS, Answers, checked, with_answer
 from calib.robot.chain import random_joints
-from calib.simulation.cell import measure, wandering
-from calib.simulation.cells import virtual_cell
+from calib.simulation.cells.cell import measure, wandering
+from calib.simulation.cells.virtual_cells import virtual_cell
 
 CELL = virtual_cell("lwr4plus")
 Q = random_joints(CELL.nominal, 30, 3)

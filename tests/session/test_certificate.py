@@ -14,8 +14,9 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from calib.errors import CalibError
-from calib.procedure import certificate, drawing, figures, plots, report
-from calib.procedure.session import Session
+from calib.procedure.report import figures, fit_report, geometry_figures, style
+from calib.procedure.report import page as certificate
+from calib.procedure.session.folder import Session
 
 from .conftest import go_on
 
@@ -93,7 +94,7 @@ def test_ids_of_figures_do_not_meet(page: str) -> None:
 
 
 def test_numbers_of_the_report_are_those_of_the_fit(finished_folder: Path) -> None:
-    found = report.read(finished_folder / "4-fit")
+    found = fit_report.read(finished_folder / "4-fit")
     metrics = json.loads((finished_folder / "4-fit/metrics.json").read_text())
     errors = 1e3 * np.array(found.sets[0]["calibrated"]["position"])
     assert np.sqrt(np.mean(errors**2)) == pytest.approx(metrics["fit"]["calibrated"]["position_mm"]["rms"], rel=1e-5)
@@ -102,7 +103,7 @@ def test_numbers_of_the_report_are_those_of_the_fit(finished_folder: Path) -> No
 
 
 def test_hostile_names_do_not_become_markup(finished_folder: Path) -> None:
-    found = replace(report.read(finished_folder / "4-fit"), robot="<script>alert(1)</script>")
+    found = replace(fit_report.read(finished_folder / "4-fit"), robot="<script>alert(1)</script>")
     written = certificate.render(certificate.of_fit(found, {}))
     assert "<script>" not in written and "&lt;script&gt;" in written
 
@@ -111,14 +112,14 @@ def test_another_versions_report_is_refused(finished_folder: Path, tmp_path: Pat
     content = json.loads((finished_folder / "4-fit/report.json").read_text()) | {"schema": 99}
     (tmp_path / "report.json").write_text(json.dumps(content))
     with pytest.raises(CalibError, match="schema 99"):
-        report.read(tmp_path)
+        fit_report.read(tmp_path)
 
 
 def test_before_and_after_differ_in_greyscale() -> None:
     def grey(colour: str) -> float:
         return float(np.dot(to_rgb(colour), (0.299, 0.587, 0.114)))
 
-    assert grey(drawing.BEFORE) - grey(drawing.AFTER) > 0.35
+    assert grey(style.BEFORE) - grey(style.AFTER) > 0.35
 
 
 def test_every_figure_is_drawn_from_plain_arrays(tmp_path: Path) -> None:
@@ -127,21 +128,23 @@ def test_every_figure_is_drawn_from_plain_arrays(tmp_path: Path) -> None:
     q, points = rng.uniform(-2.0, 2.0, (60, 7)), rng.normal(size=(60, 3))
     names = [f"p{k}" for k in range(20)]
     drawn = [
-        plots.error_histogram(before, after, noise=2e-5),
-        plots.error_histogram(before, before, "orientation"),
-        plots.residuals_by_joint(q, before, after, names[:7], [False] * 6 + [True]),
-        plots.error_map(points, after),
-        plots.parameter_changes(names, ["m", "rad"] * 10, rng.normal(size=20), np.ones(20), most=6),
-        plots.parameter_changes(names[:2], ["rad", "rad"], np.ones(2), np.ones(2)),
-        plots.singular_values(np.array([3.0, 1.0, 1e-9, 0.0]), 2),
-        plots.singular_values(np.array([3.0, 1.0]), 2),
-        plots.ladder(["frames", "geometry"], [12, 34], [5e-3, 1e-3], [True, True], 1e-4),
-        plots.selection_growth(range(5, 9), {"detmax": [1.0, 2.0, 3.0, 4.0], "random": [0.5, 1.0, np.nan, np.nan]}),
-        plots.correlation_map(names, np.eye(20)),
+        geometry_figures.error_histogram(before, after, noise=2e-5),
+        geometry_figures.error_histogram(before, before, "orientation"),
+        geometry_figures.residuals_by_joint(q, before, after, names[:7], [False] * 6 + [True]),
+        geometry_figures.error_map(points, after),
+        geometry_figures.parameter_changes(names, ["m", "rad"] * 10, rng.normal(size=20), np.ones(20), most=6),
+        geometry_figures.parameter_changes(names[:2], ["rad", "rad"], np.ones(2), np.ones(2)),
+        geometry_figures.singular_values(np.array([3.0, 1.0, 1e-9, 0.0]), 2),
+        geometry_figures.singular_values(np.array([3.0, 1.0]), 2),
+        geometry_figures.ladder(["frames", "geometry"], [12, 34], [5e-3, 1e-3], [True, True], 1e-4),
+        geometry_figures.selection_growth(
+            range(5, 9), {"detmax": [1.0, 2.0, 3.0, 4.0], "random": [0.5, 1.0, np.nan, np.nan]}
+        ),
+        geometry_figures.correlation_map(names, np.eye(20)),
     ]
     for number, figure in enumerate(drawn):
         assert isinstance(figure, Figure)
-        path = drawing.save(figure, tmp_path / f"{number}.png", dpi=40)
+        path = style.save(figure, tmp_path / f"{number}.png", dpi=40)
         assert path.read_bytes()[:4] == b"\x89PNG"
         for axes in figure.axes:
             if axes.get_xlabel() and axes.axison:
@@ -151,12 +154,12 @@ def test_every_figure_is_drawn_from_plain_arrays(tmp_path: Path) -> None:
 
 def test_a_figure_as_svg_is_the_same_twice() -> None:
     values = np.array([2.0, 1.0, 1e-12])
-    one, two = (drawing.svg(plots.singular_values(values, 2), "a") for _ in range(2))
+    one, two = (style.svg(geometry_figures.singular_values(values, 2), "a") for _ in range(2))
     assert one == two and one.startswith("<svg") and "<metadata>" not in one
 
 
 def test_what_the_data_do_not_give_is_left_out(finished_folder: Path) -> None:
-    found = report.read(finished_folder / "4-fit")
+    found = fit_report.read(finished_folder / "4-fit")
     bare = [{key: value for key, value in found.sets[0].items() if key not in ("q", "points")}]
     drawn = figures.draw(replace(found, sets=bare, singular_values=[]))
     assert "joints" not in drawn and "singular_values" not in drawn and "position" in drawn

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from calib import cli
-from calib.procedure import steps
-from calib.procedure.session import open_session
-from calib.robot import urdf
+from calib.procedure.session import steps
+from calib.procedure.session.folder import open_session
+from calib.robot.formats import urdf
 from calib.robot.kinematics import forward
 from calib.robot.load import load
 

@@ -12,10 +12,12 @@ import pytest
 
 from calib import cli
 from calib.errors import MeasurementError
-from calib.procedure import asking, demo, excitation_outputs, guided, identification_plots, steps
-from calib.procedure.guided import begin
-from calib.procedure.session import Session, open_session
-from calib.simulation.cells import virtual_cell
+from calib.procedure.excitation import design_folder
+from calib.procedure.report import identification_figures
+from calib.procedure.session import commands, demo, instructions, steps
+from calib.procedure.session.commands import begin
+from calib.procedure.session.folder import Session, open_session
+from calib.simulation.cells.virtual_cells import virtual_cell
 
 from .conftest import edit, go_on
 
@@ -38,7 +40,7 @@ def waiting_folder(finished_folder: Path, tmp_path_factory: pytest.TempPathFacto
         lines = [f"{key} = {value}" if line.startswith(f"{key} =") else line for line in path.read_text().splitlines()]
         path.write_text("\n".join(lines) + "\n")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(excitation_outputs, "save", lambda figure, path: path)
+        patch.setattr(design_folder, "save", lambda figure, path: path)
         waiting = go_on(open_session(folder))
     assert waiting is not None and waiting.step.name == "record"
     return folder
@@ -58,7 +60,7 @@ def whole_folder(recorded_folder: Path, tmp_path_factory: pytest.TempPathFactory
     folder = tmp_path_factory.mktemp("whole") / "cell"
     shutil.copytree(recorded_folder, folder)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(identification_plots, "write", lambda outcome, path: None)
+        patch.setattr(identification_figures, "write", lambda outcome, path: None)
         assert go_on(open_session(folder)) is None
     return folder
 
@@ -91,7 +93,7 @@ def test_dynamics_asked_for_afterwards_keep_the_geometry(waiting: Session) -> No
 
 def test_two_lines_say_what_to_play_and_what_to_log(waiting: Session) -> None:
     state = next(state for state in steps.states(waiting) if state.kind == steps.WAITING)
-    first, second = asking.asks(waiting, state)
+    first, second = instructions.asks(waiting, state)
     assert "6-excitation/training/run.csv" in first and "validation/run.csv" in first
     assert "2 times" in first and "250 Hz" in first and "never learnt from" in first
     assert "7-recorded/training.csv" in second and "q_joint1 [deg]" in second and "tau_joint7 [Nm]" in second
@@ -121,7 +123,7 @@ def test_it_ends_in_one_certificate_of_both(whole: Session) -> None:
 
 
 def test_the_parameters_are_those_of_the_hidden_arm(whole: Session) -> None:
-    from calib.procedure.truth import torques_against_truth
+    from calib.procedure.session.truth import torques_against_truth
 
     cell = virtual_cell("lwr4plus", 1)
     found = torques_against_truth(whole, cell, demo.arm_of(whole, cell))
@@ -132,7 +134,7 @@ def test_a_worse_stage_decides(whole: Session) -> None:
     before = whole.path("8-dynamics/estimate.csv").stat().st_mtime_ns
     edit(whole.path("session.toml"), "tolerance_percent = 0.0", "tolerance_percent = 0.1")
     assert kinds(whole)["identify"] == steps.DONE and kinds(whole)["predict"] == steps.STALE
-    stop = guided.go_on(whole.folder, lambda words: None, lambda words: None, "calib next")
+    stop = commands.go_on(whole.folder, lambda words: None, lambda words: None, "calib next")
     assert stop.verdict == "fail"
     assert "above the tolerance of 0.1 %" in whole.path("certificate.html").read_text()
     assert whole.path("8-dynamics/estimate.csv").stat().st_mtime_ns == before

@@ -13,7 +13,7 @@ import pytest
 
 from calib import cli
 from calib.errors import MeasurementError, NotConverged, Unidentifiable, UsageError, exit_code
-from calib.procedure import fleet
+from calib.procedure.session import fleet
 
 from .conftest import edit
 

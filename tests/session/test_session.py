@@ -15,8 +15,8 @@ import pytest
 
 from calib import cli
 from calib.errors import CalibError, MeasurementError, SessionError
-from calib.procedure import asking, certifying, judged, steps
-from calib.procedure.session import Session, locked, open_session, read_state
+from calib.procedure.session import certificate, instructions, outcome, steps
+from calib.procedure.session.folder import Session, locked, open_session, read_state
 from calib.robot.load import load
 
 from .conftest import edit, go_on, quiet
@@ -42,7 +42,7 @@ def test_a_finished_session_is_done_wherever_it_is(finished: Session, tmp_path: 
 
 def test_two_lines_say_what_to_do_and_what_to_bring(planned: Session) -> None:
     waiting = next(state for state in steps.states(planned) if state.kind == steps.WAITING)
-    first, second = asking.asks(planned, waiting)
+    first, second = instructions.asks(planned, waiting)
     assert "20 poses" in first and "optical CMM" in first and "poses.csv" in first
     assert "measured.csv" in second and "joint1 [deg]" in second and "qw" in second
     assert "the 8 of" in first and "2-poses/validation.csv (never fitted)" in first and "validation.csv" in second
@@ -52,7 +52,7 @@ def test_the_fit_waits_for_validation_but_not_the_other_way_round(measured: Sess
     validation = measured.path("3-measured/validation.csv").rename(measured.folder / "later.csv")
     waiting = go_on(measured)
     assert waiting is not None and waiting.step.name == "validate"
-    assert "8 poses" in asking.asks(measured, waiting)[0]
+    assert "8 poses" in instructions.asks(measured, waiting)[0]
     before = measured.path("4-fit/robot.toml").stat().st_mtime_ns
     validation.rename(measured.path("3-measured/validation.csv"))
     assert go_on(measured) is None
@@ -92,7 +92,7 @@ def test_what_a_person_replaced_is_kept_and_said(finished: Session) -> None:
     urdf.write_text(urdf.read_text() + "<!-- checked -->\n")
     assert kinds(finished)["export"] == steps.DONE
     assert "replaced by hand: 6-export/robot.urdf" in words(finished, "export")
-    roles = {name: role for name, role, _, _ in certifying.listed(finished)}
+    roles = {name: role for name, role, _, _ in certificate.listed(finished)}
     assert roles["6-export/robot.urdf"] == "edited by hand" and roles["6-export/robot.toml"] == "calibrated robot"
     assert go_on(finished) is None
     assert "checked" in urdf.read_text()
@@ -242,7 +242,7 @@ def test_a_failed_robots_files_say_so_until_it_does_not_fail(finished: Session, 
 
 @pytest.mark.parametrize("head", [b"", b"\xef\xbb\xbf", b'<?xml version="1.0"?>', b'\xef\xbb\xbf<?xml version="1.0"?>'])
 def test_a_comment_goes_behind_what_xml_wants_first(head: bytes) -> None:
-    found = ElementTree.fromstring(judged.headed(head + b"<robot name='a'/>", "off by 3 µm --- too much"))
+    found = ElementTree.fromstring(outcome.headed(head + b"<robot name='a'/>", "off by 3 µm --- too much"))
     assert found.tag == "robot" and found.get("name") == "a"
 
 

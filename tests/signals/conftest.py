@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.data.recording import Recording
+from calib.data.recordings.recording import Recording
 
 
 @pytest.fixture

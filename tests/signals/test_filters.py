@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.data.decimation import (
+from calib.data.signals.decimation import (
     KINDS,
     decimate,
     decimate_blocks,
@@ -16,7 +16,7 @@ from calib.data.decimation import (
     factor_for,
     kept,
 )
-from calib.data.filtering import border, curvature, low_pass, slope
+from calib.data.signals.filtering import border, curvature, low_pass, slope
 from calib.errors import CalibError, MeasurementError
 
 RATE = 1000.0

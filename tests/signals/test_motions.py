@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.data.bandwidth import propose_cutoffs, spectrum
-from calib.data.clock import find_clock
-from calib.data.decimation import decimate, decimate_regressor
-from calib.data.excitation import repeats, report_excitation
-from calib.data.motion import FilterOptions, filters_of, in_band, make_motion, moving, standstill, thin
-from calib.data.recording import Recording, take
-from calib.data.resampling import resample
+from calib.data.recordings.clock import find_clock
+from calib.data.recordings.recording import Recording, take
+from calib.data.signals.bandwidth import propose_cutoffs, spectrum
+from calib.data.signals.decimation import decimate, decimate_regressor
+from calib.data.signals.motion import FilterOptions, filters_of, in_band, make_motion, moving, standstill, thin
+from calib.data.signals.persistency import repeats, report_excitation
+from calib.data.signals.resampling import resample
 from calib.errors import MeasurementError, UsageError
 
 

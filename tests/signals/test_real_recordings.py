@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.data.excitation import repeats, report_excitation
-from calib.data.motion import make_motion
-from calib.data.recording_files import read_recording
+from calib.data.recordings.recording_files import read_recording
+from calib.data.signals.motion import make_motion
+from calib.data.signals.persistency import repeats, report_excitation
 
 PANDA = "franka_panda_inria/traj1_first60pct.npz"
 LWR = "kuka_lwr4plus_iit/measurements_1.npz"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.data.recording_files import read_recording
+from calib.data.recordings.recording_files import read_recording
 from calib.errors import MeasurementError
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.data.recording import Joints, Recording, cut, parse_cut
-from calib.data.recording_files import read_recording
-from calib.data.recording_options import RecordingOptions
+from calib.data.recordings.recording import Joints, Recording, cut, parse_cut
+from calib.data.recordings.recording_files import read_recording
+from calib.data.recordings.recording_options import RecordingOptions
 from calib.errors import MeasurementError, UsageError
 
 LIMITS = {"lower": np.full(3, -3.0), "upper": np.full(3, 3.0), "effort": np.full(3, 100.0)}
@@ -232,16 +232,16 @@ def test_recordings_and_options_are_held_to_their_shapes(recording):
 
 
 def test_blocks_of_numbers_and_what_is_none_of_them_read_alike(tmp_path, monkeypatch):
-    from calib.data import tables
+    from calib.data import csv_table
 
-    monkeypatch.setattr(tables, "_CHUNK", 4)
+    monkeypatch.setattr(csv_table, "_CHUNK", 4)
     rows = [f"{k}.5,{-k}e-3,{k}" for k in range(11)]
     plain, mixed = tmp_path / "plain.csv", tmp_path / "mixed.csv"
     plain.write_text("\n".join(["a,b,c", *rows]))
     rows[5] = "# a comment\n\n" + rows[5]
     rows[9] = '9.5,"-9e-3",'
     mixed.write_text("\n".join(["a,b,c", *rows, ""]))
-    found, other = tables.read_table(plain), tables.read_table(mixed)
+    found, other = csv_table.read_table(plain), csv_table.read_table(mixed)
     expected = np.array([[k + 0.5, float(f"{-k}e-3"), k] for k in range(11)])
     np.testing.assert_array_equal(np.stack(found.cells, axis=1), expected)
     expected[9, 2] = np.nan
@@ -250,9 +250,9 @@ def test_blocks_of_numbers_and_what_is_none_of_them_read_alike(tmp_path, monkeyp
 
 
 def test_half_an_hours_stamps_fall_on_their_grid():
-    from calib.data.clock import find_clock
-    from calib.data.recording import Recording
-    from calib.data.resampling import resample
+    from calib.data.recordings.clock import find_clock
+    from calib.data.recordings.recording import Recording
+    from calib.data.signals.resampling import resample
 
     t = np.arange(2_000_000) / 1000.0
     q = np.sin(t)[:, None]

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from calib.dynamics import drives, rigid_body
-from calib.dynamics.tree import standard_parameters, tree, with_payload
+from calib.dynamics.bodies import standard_parameters, tree, with_payload
 from calib.errors import CalibError, NotConverged
 from calib.robot import description, library
 from calib.robot.chain import Chain, Element, Joint
-from calib.simulation import controllers, references, robots
-from calib.simulation.closed_loop import Plant, Sensing, forward_dynamics, inertia_diagonal, simulate
-from calib.simulation.references import Reference
+from calib.simulation.cells import known_robots
+from calib.simulation.loop import controllers, references
+from calib.simulation.loop.closed_loop import Plant, Sensing, forward_dynamics, inertia_diagonal, simulate
+from calib.simulation.loop.references import Reference
 from calib.transforms import displace
 
 HIGH = np.array([2.0, 1.2, 1.2, 2.0, 1.5, 2.0])
@@ -127,15 +128,15 @@ def test_energy_stays_without_friction_and_controller_and_the_drift_falls_with_t
 
 
 def test_what_is_recorded_obeys_the_model_to_rounding():
-    plant = robots.plant("tx40", coupled=True, offset=np.full(6, 0.2))
-    run = simulate(plant, robots.controller("tx40"), motion(), Sensing(1e-6, 1e-6, 0.0, 0.0, every=5), seed=2)
-    tau = np.einsum("kij,j->ki", robots.model(plant).regressor(run.q, run.v, run.a), plant.parameters)
+    plant = known_robots.plant("tx40", coupled=True, offset=np.full(6, 0.2))
+    run = simulate(plant, known_robots.controller("tx40"), motion(), Sensing(1e-6, 1e-6, 0.0, 0.0, every=5), seed=2)
+    tau = np.einsum("kij,j->ki", known_robots.model(plant).regressor(run.q, run.v, run.a), plant.parameters)
     assert np.abs(tau - run.torque).max() < 1e-11 * np.abs(run.torque).max()
 
 
 def test_friction_holds_without_chatter_where_explicit_steps_are_too_long():
-    plant, controller = robots.plant("tx40"), robots.controller("tx40")
-    known = robots.truth("tx40")["drives"]
+    plant, controller = known_robots.plant("tx40"), known_robots.controller("tx40")
+    known = known_robots.truth("tx40")["drives"]
     stiffness = known["Fc"][5] / known["v0"] / inertia_diagonal(plant, np.zeros((1, 6)))[5]
     assert stiffness / 1000.0 > 2.785  # a 1 kHz RK4 step is unstable there
     reference = still(np.array([0.2, 0.5, 0.5, 0.3, 0.5, 0.1]), 1.0, 1000.0)
@@ -147,9 +148,9 @@ def test_friction_holds_without_chatter_where_explicit_steps_are_too_long():
 
 
 def test_the_robot_follows_and_feed_forward_pays():
-    plant, controller, reference = robots.plant("tx40"), robots.controller("tx40"), motion()
+    plant, controller, reference = known_robots.plant("tx40"), known_robots.controller("tx40"), motion()
     plain = simulate(plant, controller, reference)
-    regressor = robots.model(plant).regressor(reference.q, reference.v, reference.a)
+    regressor = known_robots.model(plant).regressor(reference.q, reference.v, reference.a)
     ahead = np.einsum("kij,j->ki", regressor, plant.parameters)
     better = simulate(plant, controllers.with_feedforward(controller, ahead), reference)
     errors = [np.sqrt(np.mean((run.q - reference.q) ** 2, axis=0)) for run in (plain, better)]
@@ -180,8 +181,8 @@ def test_a_cascade_is_the_pid_it_says():
 
 
 def test_sensing_and_actuation_are_as_stated():
-    plant, reference = robots.plant("tx40"), motion(duration=0.5)
-    controller = replace(robots.controller("tx40"), limit=np.full(6, 3.0), delay=2)
+    plant, reference = known_robots.plant("tx40"), motion(duration=0.5)
+    controller = replace(known_robots.controller("tx40"), limit=np.full(6, 3.0), delay=2)
     run = simulate(plant, controller, reference, Sensing(quantum=1e-4, sigma_q=1e-5))
     assert np.abs(run.torque).max() == 3.0
     assert np.abs(run.measured / 1e-4 - np.round(run.measured / 1e-4)).max() < 1e-6
@@ -191,7 +192,7 @@ def test_sensing_and_actuation_are_as_stated():
 
 
 def test_the_seed_repeats_a_run_to_the_last_bit():
-    plant, controller, reference = robots.plant("rv2sq"), robots.controller("rv2sq"), motion(duration=0.2)
+    plant, controller, reference = known_robots.plant("rv2sq"), known_robots.controller("rv2sq"), motion(duration=0.2)
     sensing = Sensing(1e-6, 0.0, 0.05, 0.5, push_band=20.0)
     one, again, other = (simulate(plant, controller, reference, sensing, seed) for seed in (4, 4, 5))
     assert np.array_equal(one.tau, again.tau) and np.array_equal(one.q, again.q)
@@ -199,7 +200,7 @@ def test_the_seed_repeats_a_run_to_the_last_bit():
 
 
 def test_what_cannot_be_simulated_is_refused():
-    plant, controller, reference = robots.plant("tx40"), robots.controller("tx40"), motion(duration=0.2)
+    plant, controller, reference = known_robots.plant("tx40"), known_robots.controller("tx40"), motion(duration=0.2)
     with pytest.raises(CalibError, match="not positive definite"):
         simulate(replace(plant, parameters=-plant.parameters), controller, reference)
     with pytest.raises(NotConverged, match="diverged"):
@@ -227,15 +228,15 @@ def test_references_are_their_own_derivatives_and_keep_the_limits():
 
 def test_the_truths_are_those_of_the_library():
     for name in ("tx40", "rv2sq"):
-        chain, plant = description.read(library.path(name)), robots.plant(name)
+        chain, plant = description.read(library.path(name)), known_robots.plant(name)
         assert np.array_equal(plant.parameters[: 10 * chain.n], standard_parameters(chain))
-        assert robots.controller(name).kp.shape == (chain.n,)
+        assert known_robots.controller(name).kp.shape == (chain.n,)
 
 
 def test_the_better_model_tracks_better():
-    from calib.simulation.tracking import tracking_error
+    from calib.simulation.loop.tracking import tracking_error
 
-    plant, controller, reference = robots.plant("tx40"), robots.controller("tx40"), motion()
+    plant, controller, reference = known_robots.plant("tx40"), known_robots.controller("tx40"), motion()
     rough = replace(plant, parameters=1.2 * plant.parameters)
     none, poor, good = (tracking_error(plant, one, controller, reference) for one in (None, rough, plant))
     assert np.all(good < poor) and np.all(poor < none)

@@ -7,20 +7,20 @@ from functools import cache
 import numpy as np
 import pytest
 
-from calib.data.motion import FilterOptions, make_motion
-from calib.data.recording import Recording
+from calib.data.recordings.recording import Recording
+from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics import base as bases
 from calib.dynamics import drives
+from calib.dynamics.bodies import tree
 from calib.dynamics.idim import IdentificationModel
-from calib.dynamics.tree import tree
 from calib.errors import MeasurementError, NotConverged, Unidentifiable, UsageError
-from calib.estimation import instruments
+from calib.estimation import instrumental_variables
 from calib.identification.cases import make_case
-from calib.identification.controller import identify_controller
-from calib.identification.instrumental import Loop, identify_instrumental
+from calib.identification.loop.controller import identify_controller
+from calib.identification.methods.instrumental import Loop, identify_instrumental
 from calib.robot import mdh
-from calib.simulation import controllers, references
-from calib.simulation.closed_loop import Plant, Sensing, simulate
+from calib.simulation.loop import controllers, references
+from calib.simulation.loop.closed_loop import Plant, Sensing, simulate
 
 RATE, EVERY = 2000.0, 4
 ROWS = [
@@ -134,7 +134,7 @@ def test_the_loop_ends_in_few_rounds_wherever_it_starts():
 
 def test_gains_stated_for_another_inertia_follow_the_estimate():
     """Half the gains, stated for half the inertia, are the robot's own once the estimate is."""
-    from calib.simulation.closed_loop import inertia_diagonal
+    from calib.simulation.loop.closed_loop import inertia_diagonal
 
     case, plant = log(1e-3, 6), arm()[0]
     design = 0.5 * inertia_diagonal(plant, motion().q[::200])
@@ -179,7 +179,7 @@ def test_what_cannot_be_done_is_said():
         found(case, Loop(PD, motion(), 2 * EVERY))
     with pytest.raises(MeasurementError, match="does not fit"):
         identify_controller(motion(), np.zeros((100, 2)), np.zeros((100, 2)), 333.0)
-    assert instruments.settled(found(case).fit, found(case).fit)
+    assert instrumental_variables.settled(found(case).fit, found(case).fit)
 
 
 def test_instruments_that_do_not_excite_a_parameter_are_named():

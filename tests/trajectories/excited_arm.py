@@ -7,8 +7,8 @@ from functools import cache, partial
 import numpy as np
 
 from calib.dynamics import base, drives
+from calib.dynamics.bodies import standard_parameters, tree
 from calib.dynamics.idim import IdentificationModel
-from calib.dynamics.tree import standard_parameters, tree
 from calib.robot.chain import Chain
 from calib.robot.kinematics import element_jacobian, joint_jacobian, sweep
 from calib.robot.load import load

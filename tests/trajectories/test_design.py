@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 
 from calib.dynamics import model
-from calib.dynamics.tree import standard_parameters
+from calib.dynamics.bodies import standard_parameters
 from trajectories.bspline import bspline
 from trajectories.constraints import BoxLimit, TorqueLimit, box_limits
+from trajectories.design.objectives import Duration, Excitation, FrictionCoverage, TorqueSlack, condition_numbers
+from trajectories.design.optimise import design
+from trajectories.design.pareto import non_dominated, proposed_goals, sweep
+from trajectories.design.problem import Goal, Problem
+from trajectories.design.search import Found, Stuck, one_start
+from trajectories.design.starts import random_start
+from trajectories.design.verify import dense_motion, ensured, verify
 from trajectories.errors import BadInput, NotExciting, NothingFeasible
 from trajectories.fourier import fourier
-from trajectories.objectives import Duration, Excitation, FrictionCoverage, TorqueSlack, condition_numbers
-from trajectories.optimise import design
-from trajectories.pareto import non_dominated, proposed_goals, sweep
 from trajectories.places import Workspace
-from trajectories.problem import Goal, Problem
-from trajectories.search import Found, Stuck, one_start
-from trajectories.starts import random_start
-from trajectories.verify import dense_motion, ensured, verify
 
 BASE, CHI, CHAIN = arm.lwr()
 EFFORT = np.array([joint.effort for joint in CHAIN.joints])

@@ -8,18 +8,18 @@ import pytest
 from differences import check
 
 from trajectories.constraints import BoxLimit, TorqueLimit, gathered
-from trajectories.errors import BadInput, NotExciting
-from trajectories.fourier import fourier
-from trajectories.objectives import (
+from trajectories.design.objectives import (  # fmt: skip
     Duration,
     Excitation,
     FrictionCoverage,
     TorqueSlack,
     condition_numbers,
     information,
-)  # fmt: skip
+)
+from trajectories.design.problem import Problem, evaluate
+from trajectories.errors import BadInput, NotExciting
+from trajectories.fourier import fourier
 from trajectories.places import Clearance, Workspace
-from trajectories.problem import Problem, evaluate
 
 BASE, CHI, CHAIN = arm.lwr(0.3)
 LIMITS = np.array([joint.effort for joint in CHAIN.joints])

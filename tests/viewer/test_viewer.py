@@ -13,13 +13,15 @@ import pytest
 
 from calib import cli
 from calib.errors import UsageError
-from calib.procedure import calibrated, viewer, viewing
-from calib.robot import urdf_write
+from calib.procedure.kinematic_stage import robot_file
+from calib.procedure.report import scene as viewing
+from calib.procedure.report import viewer
+from calib.robot.formats import urdf_write
 from calib.robot.kinematics import forward
 from calib.robot.load import load
 from calib.robot.visuals import visuals
-from calib.simulation.cell import Instrument, measure
-from calib.simulation.cells import perturbed_cell
+from calib.simulation.cells.cell import Instrument, measure
+from calib.simulation.cells.virtual_cells import perturbed_cell
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +35,7 @@ def fitted(tmp_path_factory) -> Path:
         head = [*(f"q{k + 1}" for k in range(6)), "x", "y", "z", "qx", "qy", "qz", "qw"]
         csv.writer(file).writerows([head, *np.hstack([seen.q, seen.position, seen.quaternion]).tolist()])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("calib.procedure.report.write", lambda outcome, folder: None)
+        patch.setattr("calib.procedure.report.fit_certificate.write", lambda outcome, folder: None)
         arguments = ["fit", "ur5", folder / "seen.csv", "--holdout", "0.25", "--model", "geometry"]
         assert cli.run([*map(str, arguments), "--out", str(folder / "done")]) == 0
     return folder / "done"
@@ -97,7 +99,7 @@ def test_the_arrows_are_the_errors_that_the_fit_reports(fitted):
     for points, column in ((measured.calibrated, "size [mm]"), (measured.nominal, "nominal size [mm]")):
         sizes = 1e3 * np.linalg.norm(measured.seen - points, axis=1)
         assert sizes == pytest.approx([float(row[column]) for row in table], rel=1e-4)
-    tool = calibrated.read(fitted).tools[0]
+    tool = robot_file.read(fitted).tools[0]
     at = (forward(load(fitted), measured.q) @ tool)[:, :3, 3]
     assert np.abs(at - measured.calibrated).max() < 1e-9  # in the base of the arm that is drawn
 

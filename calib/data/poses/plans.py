@@ -1,0 +1,150 @@
+"""Lists of poses for the robot to take, and whether what was measured is what was planned."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import KDTree
+
+from calib import files
+from calib.arrays import shaped
+from calib.data.csv_table import read_table
+from calib.data.poses import plausible
+from calib.data.poses.columns import check_names, find_joints
+from calib.data.poses.fit_options import FileOptions
+from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.plausible import Limits
+from calib.data.poses.pose_files import read_joints
+from calib.errors import MeasurementError
+
+NEAR = 0.02  # read-back and commanded joints of one pose differ by less [rad or m]; our choice
+
+
+def write_poses(
+    path: str | Path, q: ArrayLike, joint_names: Sequence[str], *, unit: str = "rad", kinds: Sequence[str] | None = None
+) -> Path:
+    """Write joint values (m, n) [rad or m] as a CSV with the joint names as header.
+
+    Args:
+        unit: ``rad`` or ``deg`` (headers then say ``[deg]``); prismatic joints stay in m.
+        kinds: URDF's type of each joint; all revolute by default.
+    """
+    values = shaped(q, (None, len(joint_names)), "q").copy()
+    header = list(joint_names)
+    for j, kind in enumerate(kinds or ["revolute"] * len(header)):
+        if unit == "deg" and kind != "prismatic":
+            values[:, j] = np.rad2deg(values[:, j])
+            header[j] = f"{header[j]} [deg]"
+    return files.write_table(path, header, values.tolist())
+
+
+def read_poses(
+    path: str | Path,
+    joints: Sequence[str],
+    options: FileOptions | None = None,
+    *,
+    kinds: Sequence[str] | None = None,
+    limits: Limits | None = None,
+) -> np.ndarray:
+    """Read joint values (m, n) [rad or m] in the order of `joints`; columns and checks as for measurements."""
+    options = options or FileOptions()
+    table = read_table(path)
+    check_names(table, options, joints)
+    columns = find_joints(table, options, joints)
+    q = read_joints(table, options, columns)
+    if len(q) > 1:
+        plausible.check_joints(q, table, columns, joints, options, kinds, limits)
+    return q
+
+
+def check_against(plan: ArrayLike, measured: PoseMeasurements, near: float = NEAR) -> tuple[str, ...]:
+    """Hold the joints of a measurement against the poses (m, n) [rad or m] that were to be measured.
+
+    A planned and a measured pose are the same where no joint differs by more than `near`.
+
+    Returns:
+        Notes: planned poses that were not measured, rows that nobody planned.
+
+    Raises:
+        MeasurementError: where most rows were not planned, with the cause if degrees, swapped or reversed joint
+            columns explain it.
+    """
+    plan = shaped(plan, (None, measured.q.shape[1]), "plan")
+    q, rows = _distinct(measured)
+    if (matched := _matched(plan, q, near)).mean() < 0.5:
+        raise _explain(plan, q, rows, measured, near)
+    notes = []
+    if not (hit := _matched(q, plan, near)).all():
+        missing = np.flatnonzero(~hit) + 1
+        notes.append(f"{len(missing)} of {len(plan)} planned poses were not measured: {_listed(missing)}")
+    if not matched.all():
+        notes.append(f"{int((~matched).sum())} rows were not planned: {_listed(rows[~matched])}")
+    return tuple(notes)
+
+
+def _distinct(measured: PoseMeasurements) -> tuple[np.ndarray, np.ndarray]:
+    """Return one row per row of the file, where several targets made several."""
+    rows, first = np.unique(measured.rows if measured.rows is not None else [], return_index=True)
+    return measured.q[first], rows
+
+
+def _matched(these: np.ndarray, those: np.ndarray, near: float) -> np.ndarray:
+    """Tell which of `those` has one of `these` within `near` (largest joint difference)."""
+    distance, _ = KDTree(these).query(those, p=math.inf)
+    return distance <= near
+
+
+def _explain(
+    plan: np.ndarray, q: np.ndarray, rows: np.ndarray, measured: PoseMeasurements, near: float
+) -> MeasurementError:
+    names = measured.joint_names
+    for factor, what in ((1.0, ""), (math.pi / 180, "degrees"), (180 / math.pi, "radians converted from degrees")):
+        order, sign = _best_order(plan, q * factor)
+        if _matched(plan, q[:, order] * sign * factor, near).mean() < 0.5:
+            continue
+        causes = [f"the values are {what}"] if what else []
+        moved = [j for j in range(len(names)) if order[j] != j]
+        if moved:
+            pairs = ", ".join(f"{names[order[j]]} holds joint {j + 1}" for j in moved)
+            causes.append(f"columns are swapped ({pairs})")
+        if (sign < 0).any():
+            turned = ", ".join(names[order[j]] for j in np.flatnonzero(sign < 0))
+            causes.append(f"the sign is reversed ({turned})")
+        message = f"the measured joints fit the plan if {' and '.join(causes)}"
+        column = names[order[moved[0]]] if moved else names[0]
+        return MeasurementError(f"{message}; correct the header or the options", measured.file, None, column)
+    distance, index = (np.atleast_1d(found) for found in KDTree(plan).query(q, p=math.inf))
+    worst = int(np.argmax(distance))
+    joint = int(np.argmax(np.abs(q[worst] - plan[index[worst]])))
+    count = int((distance <= near).sum())
+    message = f"only {count} of {len(q)} rows are planned poses; the nearest differs here by {distance[worst]:.3g}"
+    return MeasurementError(f"{message}: is it the right plan?", measured.file, int(rows[worst]), names[joint])
+
+
+def _best_order(plan: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return which measured column (n,) best holds each planned joint, and with which sign (n,).
+
+    Each pair of columns is compared as two sets of numbers (mean distance to the nearest one, at most 1), so that order
+    and completeness of the rows do not matter; the assignment minimises the sum.
+    """
+    n = plan.shape[1]
+    cost = np.empty((2, n, n))
+    for j in range(n):
+        planned = KDTree(plan[:, j : j + 1])
+        for k in range(n):
+            for s, sign in enumerate((1.0, -1.0)):
+                taken = planned.query(sign * q[:, k : k + 1])[0]
+                missed = KDTree(sign * q[:, k : k + 1]).query(plan[:, j : j + 1])[0]
+                cost[s, j, k] = np.minimum(taken, 1.0).mean() + np.minimum(missed, 1.0).mean() + 1e-9 * s
+    order = linear_sum_assignment(cost.min(axis=0))[1]
+    sign = np.where(cost[0, np.arange(n), order] <= cost[1, np.arange(n), order], 1.0, -1.0)
+    return order, sign
+
+
+def _listed(numbers: np.ndarray) -> str:
+    return ", ".join(str(number) for number in numbers[:10]) + (", ..." if len(numbers) > 10 else "")

@@ -1,0 +1,141 @@
+"""Forms that other programs write: RoboDK's point and pose CSV, and the headerless CSV of three reflectors.
+
+RoboDK (six joints). The header has J1 to J6 (``J1``, ``J1 (deg)``, ``Joint 1``), and what follows is read by its place,
+as RoboDK's own macros do (RoboDK-API, CalculateErrorsDistances.py, CalculateErrorsPoses.py):
+
+    points, 9 or 12 columns    J1..J6 [deg], x y z [mm] measured, TCP x y z [mm]
+    poses, 12 or 18 columns    J1..J6 [deg], x y z [mm] w p r [deg] measured, TCP x y z w p r
+
+Where 12 columns could be either, the tenth name decides: ``w``, ``rx``, ``r`` or ``a`` is a pose, any other a point. A
+unit in brackets wins over the one above. Rows with different TCPs saw different reflectors: each TCP is a tool. The
+TCP's values themselves are not used (tools are fitted).
+
+What w, p, r mean differs between RoboDK's displays and versions, so that the options say it (``euler``): ``wpr``, the
+default, is Fanuc's R = Rz(r) Ry(p) Rx(w); ``xyz`` is R = Rx(w) Ry(p) Rz(r), which RoboDK's macro for pose errors
+assumes, in rad; ``vector`` is a rotation vector. Angles that would fit radians are refused until a unit is stated.
+
+Three reflectors without a header (``format = "three_smr"``, only on request): N1 x y z, N2 x y z, N3 x y z [mm],
+columns of padding, joints [deg] last; 18 to 21 columns for six joints. A reflector at 0, 0, 0 was not seen.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.arrays import frozen
+from calib.data.csv_table import Table, read_header, read_table, row_width
+from calib.data.poses.fit_options import FileOptions
+from calib.errors import MeasurementError
+
+QUATERNION = ("qx", "qy", "qz", "qw")
+_POSE_MARKS = ("w", "rx", "r", "a")
+
+Read = tuple[Table, FileOptions, tuple[str, ...]]
+
+
+def recognises(header: Sequence[str]) -> bool:
+    """Tell whether a header is RoboDK's: J1 to J6 (or ``Joint 1`` to ``Joint 6``) first.
+
+    ``joint1`` in one word is a name that robots have: such a file is read by its names.
+    """
+    first = [name.split("(")[0].split("[")[0].strip().lower() for name in header[:6]]
+    named = first in ([f"j{i}" for i in range(1, 7)], [f"joint {i}" for i in range(1, 7)])
+    return named and _plain(header[6] if len(header) > 6 else "") not in ("j7", "joint7")
+
+
+def read_robodk(path: str | Path, joints: int, options: FileOptions) -> Read:
+    """Read RoboDK's CSV into a table that the plain reader understands, with the options to read it and notes."""
+    found = read_header(path)[0]
+    if not recognises(found):
+        raise MeasurementError(f"is no RoboDK file: its header begins {', '.join(found[:7])}, not J1 to J6", path)
+    if joints != 6:
+        raise MeasurementError(f"RoboDK's form has 6 joints, the robot has {joints}", path)
+    pose = len(found) == 18 or (len(found) == 12 and _plain(found[9]) in _POSE_MARKS)
+    if len(found) not in (9, 12, 18):
+        message = f"has {len(found)} columns; RoboDK's points have 9 or 12, its poses 12 or 18"
+        raise MeasurementError(message, path)
+    raw = read_table(path, doubles=True)
+    measured = 12 if pose else 9
+    tcp = tuple(f"TCP {name}" for name in "xyzwpr"[: len(found) - measured])
+    names = (*found[:6], *"xyzwpr"[: measured - 6], *tcp)
+    units = tuple(unit or ("deg" if i < 6 else "mm" if i < 9 else "") for i, unit in enumerate(raw.units))
+    table, notes = _with_tools(Table(raw.file, names, units, raw.cells, raw.rows), tcp, options)
+    if pose:
+        table, more = _with_quaternion(table, options)
+        notes += more
+    columns = {**options.columns, **{f"q{i + 1}": name for i, name in enumerate(names[:6])}}
+    kind = options.kind or ("pose" if pose else "position")
+    return table, replace(options, columns=columns, kind=kind), (f"read as RoboDK's {kind}s", *notes)
+
+
+def read_three_smr(path: str | Path, joints: int, options: FileOptions) -> Read:
+    """Read the headerless CSV of three reflectors, as `read_robodk`."""
+    targets = [f"{axis}{k}" for k in (1, 2, 3) for axis in "xyz"]
+    width = row_width(path)
+    padding = width - 9 - joints
+    if padding < 0:
+        message = f"has {width} columns; three reflectors and {joints} joints need {9 + joints}"
+        raise MeasurementError(message, path)
+    names = (*targets, *(f"padding {i + 1}" for i in range(padding)), *(f"q{i + 1}" for i in range(joints)))
+    raw = read_table(path, header=names)
+    cells = list(raw.cells)
+    for k in range(0, 9, 3):
+        triple = [raw.numbers(name, gaps=True) for name in targets[k : k + 3]]
+        unseen = np.all([values == 0 for values in triple], axis=0)
+        cells[k : k + 3] = [frozen(np.where(unseen, np.nan, values)) for values in triple]
+    table = Table(raw.file, names, ("mm",) * 9 + ("",) * padding + ("deg",) * joints, tuple(cells), raw.rows)
+    return table, options, (f"read as three reflectors, {padding} columns of padding, {joints} joints",)
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", name.lower())
+
+
+def _with_quaternion(table: Table, options: FileOptions) -> tuple[Table, tuple[str, ...]]:
+    """Return the table with w p r (columns 9 to 11) replaced by a quaternion."""
+    unit = options.units.get("orientation", "")
+    angles = np.stack([table.numbers(name, "angle", unit) for name in ("w", "p", "r")], axis=1)
+    if not unit and not any(table.units[9:12]):
+        if np.abs(angles).max() < 1.001 * np.pi:
+            message = "all angles are within ±3.15: deg as RoboDK's manual says, or rad as its macro takes them?"
+            message += " State it: units.orientation = 'deg' or 'rad' in the options, or [deg] in the header"
+            raise MeasurementError(message, table.file, int(table.rows[0]), "w")
+        angles = np.deg2rad(angles)
+    if options.euler == "vector":
+        rotation = Rotation.from_rotvec(angles)
+    else:
+        rotation = Rotation.from_euler("xyz" if options.euler == "wpr" else "XYZ", angles)
+    meaning = {"wpr": "Rz(r) Ry(p) Rx(w)", "xyz": "Rx(w) Ry(p) Rz(r)", "vector": "a rotation vector"}[options.euler]
+    quaternion = tuple(frozen(column) for column in rotation.as_quat(canonical=True).T)
+    return (
+        Table(
+            table.file,
+            (*table.header[:9], *QUATERNION, *table.header[12:]),
+            (*table.units[:9], "", "", "", "", *table.units[12:]),
+            (*table.cells[:9], *quaternion, *table.cells[12:]),
+            table.rows,
+        ),
+        (f"w p r are taken as {meaning}; other conventions: euler in the options",),
+    )
+
+
+def _with_tools(table: Table, tcp: Sequence[str], options: FileOptions) -> tuple[Table, tuple[str, ...]]:
+    """Return the table with a column ``tool`` where rows have different TCPs."""
+    if not tcp:
+        return table, ()
+    triples = [tuple(row) for row in np.round(np.stack([table.numbers(name) for name in tcp], axis=1), 3)]
+    labels = {triple: f"{options.tool} {k + 1}" for k, triple in enumerate(dict.fromkeys(triples))}
+    if len(labels) == 1:
+        return table, ()
+    told = "; ".join(f"{label}: {', '.join(f'{value:g}' for value in triple)}" for triple, label in labels.items())
+    cells = (*table.cells, np.array([labels[triple] for triple in triples], dtype=object))
+    return (
+        Table(table.file, (*table.header, "tool"), (*table.units, ""), cells, table.rows),
+        (f"{len(labels)} different TCPs, hence as many tools ({told})",),
+    )

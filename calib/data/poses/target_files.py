@@ -1,0 +1,175 @@
+"""Targets for `calib compensate`: where the real tool is to stand, one row each, as a CSV table.
+
+==================  ===================================================================================================
+joints              the robot's joint names, or ``q_<joint name>``, or ``q1`` to ``qn``: the pose that the *nominal*
+                    robot would have there
+pose                ``x y z``, with ``qx qy qz qw`` or ``r11`` to ``r33``; also with ``_target``. Without an
+                    orientation only the position counts
+both                the pose is the target; the joints say which configuration to keep (elbow, wrist, turns)
+==================  ===================================================================================================
+
+A unit in brackets is converted (``q1 [deg]``, ``x [mm]``); plain headers are SI. All other columns are ignored and
+listed. Frames are not in the file: they are said by ``--frame`` and ``--tool``.
+
+COMMANDS.csv has one row per target, in their order. Where a target cannot be reached nothing is written, and the exit
+code is 2; with ``--partial`` the others are written, and its row has no joints:
+
+==================  ===================================================================================================
+row                 the target's number, from 1
+joints              what to send, under the targets' joint columns and units (else the joint names, rad or m); empty
+                    where the target cannot be reached
+status              ``reached`` or ``not reached``
+left                position [mm] and orientation [mrad] that the calibrated model leaves at these joints
+before              the same for the nominal joints: what goes wrong without compensation
+sigma               of the tool's position [mm] and orientation [mrad] (root of the sum over the axes), from the fit's
+                    covariance
+unseen_rms [mm]     rms error of the calibrated arm on poses that its fit has not seen: what to expect of a real arm
+reason              why not, or what is odd
+==================  ===================================================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.arrays import frozen
+from calib.data.csv_table import ANGLES, LENGTHS, Table, nearest, read_table
+from calib.data.poses import plausible
+from calib.data.poses.columns import MATRIX, POSITION, QUATERNION, find_joints
+from calib.data.poses.fit_options import FileOptions
+from calib.data.poses.plausible import Limits
+from calib.data.poses.pose_files import read_joints
+from calib.errors import MeasurementError
+
+SUFFIXES = ("", "_target")
+MOSTLY = 0.5  # of all rows outside the limits: it is the file, not the row (our choice)
+
+
+@dataclass(frozen=True, eq=False)
+class Targets:
+    """m targets from one file.
+
+    Attributes:
+        q: (m, n) nominal joint values [rad or m]; None where the file has none.
+        position: (m, 3) [m]; None where joints say it all.
+        rotation: (m, 3, 3); None without an orientation.
+        columns: the file's names of the joint columns with their units in brackets; () without joints.
+        factors: (n,) SI value of one unit of each joint column.
+        ignored: columns that were not read.
+        notes: what is odd but was accepted.
+        file: where it came from.
+    """
+
+    q: np.ndarray | None
+    position: np.ndarray | None = None
+    rotation: np.ndarray | None = None
+    columns: tuple[str, ...] = ()
+    factors: tuple[float, ...] = ()
+    ignored: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    file: str = ""
+
+    def __post_init__(self) -> None:
+        for name in ("q", "position", "rotation"):
+            if (value := getattr(self, name)) is not None:
+                object.__setattr__(self, name, frozen(value))
+
+    def __len__(self) -> int:
+        return len(self.q if self.q is not None else self.position)  # type: ignore[arg-type]  # one of them is there
+
+
+def read_targets(
+    path: str | Path, joints: Sequence[str], *, kinds: Sequence[str] | None = None, limits: Limits | None = None
+) -> Targets:
+    """Read the targets in `path` for a robot with these joints.
+
+    Args:
+        joints: the robot's n joint names.
+        kinds: URDF's type of each joint (revolute, continuous, prismatic); all revolute by default.
+        limits: lower and upper limits, each (n,) [rad or m]. Single rows may lie outside; a file of which most rows do
+            holds something else.
+
+    Raises:
+        MeasurementError: for whatever cannot be what it claims to be, with row and column.
+    """
+    table = read_table(path)
+    columns = find_joints(table, FileOptions(), joints) if _has_joints(table, joints) else ()
+    position, orientation = _family(table, POSITION), _family(table, QUATERNION) or _family(table, MATRIX)
+    if not columns and not position and not orientation:
+        needed = f"joints ({', '.join(joints)}, or q1 to q{len(joints)}), or x y z with or without qx qy qz qw"
+        raise MeasurementError(f"no targets found: expected {needed}; found {', '.join(table.header)}", table.file)
+    if orientation and not position:
+        raise MeasurementError(f"has {orientation[0]} but no x y z: an orientation alone is no target", table.file)
+    used = {*columns, *position, *orientation}
+    q, notes = _joints(table, columns, joints, kinds, limits) if columns else (None, ())
+    return Targets(
+        q,
+        _position(table, position) if position else None,
+        _rotation(table, orientation) if orientation else None,
+        tuple(_with_unit(table, name) for name in columns),
+        tuple(_factor(table, name) for name in columns),
+        tuple(name for name in table.header if name not in used),
+        notes,
+        table.file,
+    )
+
+
+def _has_joints(table: Table, joints: Sequence[str]) -> bool:
+    forms = (*joints, *(f"q_{name}" for name in joints), *(f"q{k + 1}" for k in range(len(joints))))
+    return any(name in table for name in forms)
+
+
+def _family(table: Table, names: Sequence[str]) -> tuple[str, ...]:
+    """Return the file's names of columns that go together; () if none of them is there."""
+    for suffix in SUFFIXES:
+        wanted = [name + suffix for name in names]
+        there = [name in table for name in wanted]
+        if all(there):
+            return tuple(wanted)
+        if any(there):
+            missing = wanted[there.index(False)]
+            message = f"missing{nearest(missing, table.header)}: {', '.join(wanted)} go together"
+            raise MeasurementError(message, table.file, column=missing)
+    return ()
+
+
+def _joints(
+    table: Table, columns: tuple[str, ...], joints: Sequence[str], kinds: Sequence[str] | None, limits: Limits | None
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    q = read_joints(table, FileOptions(), columns)
+    if limits is not None:
+        lower, upper = (np.asarray(side, dtype=float) for side in limits)
+        outside = ((q < lower - plausible.SLACK) | (q > upper + plausible.SLACK)).any(axis=1)
+        limits = limits if outside.mean() > MOSTLY else None
+    once = (
+        q if np.ptp(q, axis=0).max() > plausible.STILL else q[:1]
+    )  # the same target twice is no robot that stood still
+    return q, plausible.check_joints(once, table, columns, joints, FileOptions(), kinds, limits)
+
+
+def _position(table: Table, names: tuple[str, ...]) -> np.ndarray:
+    position = np.stack([table.numbers(name, "length") for name in names], axis=1)
+    plausible.check_lengths(position, table, names)
+    return position
+
+
+def _rotation(table: Table, names: tuple[str, ...]) -> np.ndarray:
+    values = np.stack([table.numbers(name) for name in names], axis=1)
+    if len(names) == 4:
+        return Rotation.from_quat(plausible.unit_quaternions(values, table, names)).as_matrix()
+    return plausible.rotation_matrices(values, table, names)
+
+
+def _with_unit(table: Table, name: str) -> str:
+    unit = table.units[table.index(name)]
+    return f"{name} [{unit}]" if unit else name
+
+
+def _factor(table: Table, name: str) -> float:
+    unit = table.units[table.index(name)].lower()
+    return (ANGLES | LENGTHS)[unit] if unit else 1.0

@@ -1,0 +1,135 @@
+"""Recordings in ROS bags: ``sensor_msgs/JointState`` from MCAP, ROS 2 (sqlite3) and ROS 1 files, without ROS.
+
+Positions, velocities and efforts are taken by joint name; efforts are torques (or currents, where the options say so:
+many drivers publish currents under that name). Stamps are those of the headers; where these are all zero, the times
+at which the messages were logged. Messages that lack one of the joints (a gripper's own) are left out.
+
+Read by `rosbags` (pure Python, Apache-2.0; its wheels' C parts exist for Linux and macOS), which is
+imported when a bag is read (75 ms). Memory grows with the joint states alone, time with their number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.data.csv_table import nearest
+from calib.data.recordings.archives import Ends
+from calib.data.recordings.recording import Joints, Recording, cut
+from calib.data.recordings.recording_options import RecordingOptions
+from calib.errors import MeasurementError
+
+JOINT_STATE = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
+
+
+def read_bag(
+    path: Path, joints: Joints | None = None, options: RecordingOptions | None = None, ends: Ends = (None, None)
+) -> Recording:
+    """Return the joint states of a bag from ends[0] to ends[1] [s] after its first, unchecked but for their shapes."""
+    from rosbags.highlevel import AnyReader, AnyReaderError
+    from rosbags.typesys import Stores, get_typestore
+
+    options = options or RecordingOptions()
+    try:
+        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+            connections = _connections(reader, options, path)
+            names, parts, skipped = _collect(reader, connections, joints, path)
+    except MeasurementError:
+        raise
+    except (AnyReaderError, OSError, ValueError, KeyError, AssertionError) as error:
+        raise MeasurementError(f"cannot be read as a ROS bag ({error}): was it closed properly?", path) from error
+    return _assemble(names, parts, skipped, path, options, ends)
+
+
+def _connections(reader: Any, options: RecordingOptions, path: Path) -> list[Any]:
+    """Return the connections of the one topic of joint states, or of the one the options name."""
+    found = {c.topic for c in reader.connections if c.msgtype in JOINT_STATE}
+    if not found:
+        topics = ", ".join(sorted(f"{c.topic} ({c.msgtype})" for c in reader.connections)) or "none"
+        raise MeasurementError(f"has no topic of sensor_msgs/JointState; found: {topics}", path)
+    topic = options.topic or (min(found) if len(found) == 1 else "/joint_states")
+    if topic not in found:
+        known = ", ".join(sorted(found))
+        message = f"there are joint states on {known}: say which (topic = '...')"
+        if options.topic:
+            message = f"has no joint states on '{topic}'{nearest(topic, sorted(found))}; found: {known}"
+        raise MeasurementError(message, path)
+    return [c for c in reader.connections if c.topic == topic and c.msgtype in JOINT_STATE]
+
+
+def _collect(
+    reader: Any, connections: list[Any], joints: Joints | None, path: Path
+) -> tuple[tuple[str, ...], dict[str, np.ndarray], int]:
+    """Return the joints' names, arrays of stamps, q, v and effort, and the number of messages left out."""
+    names = joints.names if joints else ()
+    order: dict[tuple[str, ...], list[int] | None] = {}
+    rows: dict[str, list[Any]] = {"header": [], "logged": [], "q": [], "v": [], "effort": []}
+    skipped = 0
+    for connection, logged, raw in reader.messages(connections=connections):
+        message = reader.deserialize(raw, connection.msgtype)
+        own = tuple(message.name)
+        names = names or own
+        if own not in order:
+            order[own] = [own.index(name) for name in names] if set(names) <= set(own) else None
+        place = order[own]
+        if place is None:
+            skipped += 1
+            continue
+        rows["header"].append(message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec)
+        rows["logged"].append(logged)
+        for ours, values in (("q", message.position), ("v", message.velocity), ("effort", message.effort)):
+            rows[ours].append(values[place] if len(values) == len(own) else None)
+    if not rows["q"]:
+        _refuse_joints(names, list(order), path)
+    return names, {ours: _stack(values, ours, path) for ours, values in rows.items()}, skipped
+
+
+def _stack(values: list[Any], ours: str, path: Path) -> np.ndarray:
+    """Return the rows as one array; an empty one where no message has the quantity."""
+    missing = [k for k, value in enumerate(values) if value is None]
+    if len(missing) == len(values):
+        return np.empty((0, 0))
+    if missing:
+        raise MeasurementError(f"the message has no {ours} of its joints, others do", path, missing[0] + 1, ours)
+    return np.array(values)
+
+
+def _refuse_joints(names: Sequence[str], seen: Sequence[tuple[str, ...]], path: Path) -> None:
+    if not seen:
+        raise MeasurementError("its topic of joint states has no messages", path)
+    known = sorted({name for own in seen for name in own})
+    missing = [name for name in names if name not in known]
+    what = f"no joint '{missing[0]}'{nearest(missing[0], known)}" if missing else "no message with all joints at once"
+    raise MeasurementError(f"has {what}; found: {', '.join(known)}", path)
+
+
+def _assemble(
+    names: tuple[str, ...],
+    parts: dict[str, np.ndarray],
+    skipped: int,
+    path: Path,
+    options: RecordingOptions,
+    ends: Ends,
+) -> Recording:
+    for ours, what in (("q", "positions"), ("effort", "efforts")):
+        if not parts[ours].size:
+            raise MeasurementError(f"its joint states have no {what}", path)
+    notes = [f"{skipped} messages lack one of the joints; left out"] if skipped else []
+    stamps = parts["header"]
+    if not stamps.any():
+        stamps = parts["logged"]
+        notes.append("the headers have no stamps; the times of logging are used, which jitter more")
+    recording = Recording(
+        (stamps - stamps[0]) * 1e-9,
+        parts["q"],
+        parts["effort"],
+        options.kind or "torque",
+        names,
+        v=parts["v"] if parts["v"].size else None,
+        file=str(path),
+        notes=tuple(notes),
+    )
+    return recording if ends == (None, None) else cut(recording, *ends)

@@ -1,0 +1,157 @@
+"""Recordings in CSV tables: a column of stamps, and one per joint and quantity (``q1 [deg]``, ``tau_elbow [Nm]``).
+
+A quantity's name (`recording_options`) stands before the joint's number or name, with or without a ``_`` (``q1``,
+``q_1``, ``position_elbow``, ``elbow_position``, ``q[1]`` is not a unit but a number); numbers start at 0 or 1.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from calib.data.csv_table import Table, nearest, read_table
+from calib.data.recordings.archives import Ends
+from calib.data.recordings.recording import Joints, Recording, cut, named
+from calib.data.recordings.recording_options import SYNONYMS, RecordingOptions, one_effort, scale
+from calib.errors import MeasurementError, UsageError
+
+_NUMBERED = re.compile(r"^(?P<stem>.*?)[_\s.]?(?P<number>\d+)$")
+
+
+def read_log(
+    path: Path, joints: Joints | None = None, options: RecordingOptions | None = None, ends: Ends = (None, None)
+) -> Recording:
+    """Return the rows of a CSV table from ends[0] to ends[1] [s], unchecked but for their shapes; some 20 MB/s."""
+    options = options or RecordingOptions()
+    table = _numbered_brackets(read_table(path, doubles=True))
+    found = _find(table, options, joints.names if joints else ())
+    chosen = one_effort({ours: ours for ours in found}, options, table.header, path)
+    found = {ours: found[theirs] for ours, theirs in chosen.items()}
+    n = len(found["q"])
+    for ours, columns in found.items():
+        if ours != "t" and len(columns) != n:
+            message = f"{len(columns)} columns of {ours} ({', '.join(_called(table, columns))}) for {n} of q"
+            raise MeasurementError(message, path)
+    kind = "current" if "current" in found else "torque"
+    series = {
+        "effort" if ours == kind else ours: np.column_stack([_values(table, c, ours, options) for c in columns])
+        for ours, columns in found.items()
+        if ours not in ("t", "q")
+    }
+    used = {place for columns in found.values() for place in columns}
+    unused = [name for place, name in enumerate(table.header) if place not in used]
+    notes = [f"not read: {', '.join(unused)}"] if unused else []
+    for ours, columns in found.items():
+        if len(units := dict.fromkeys(table.units[place] or "no unit" for place in columns)) > 1:
+            notes.append(f"the columns of {ours} differ in their units ({', '.join(units)}): is that meant?")
+    names = joints.names if joints is not None and len(joints.names) == n else _joint_names(table, found["q"])
+    recording = Recording(
+        _stamps(table, found, options),
+        np.column_stack([_values(table, place, "q", options) for place in found["q"]]),
+        kind=kind,
+        joint_names=named(names, n),
+        file=str(path),
+        rows=table.rows,
+        notes=tuple(notes),
+        **series,
+    )
+    return recording if ends == (None, None) else cut(recording, *ends)
+
+
+def read_positions(
+    path: Path, joints: Joints | None = None, options: RecordingOptions | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return stamps (N,) [s] and positions (N, n) of a table without torques: of q_ref, or of q where that is not."""
+    options = options or RecordingOptions()
+    table = _numbered_brackets(read_table(path, doubles=True))
+    here = replace(options, names={key: name for key, name in options.names.items() if key in ("t", "q", "q_ref")})
+    found = _find(table, here, joints.names if joints else ())
+    ours = "q_ref" if "q_ref" in found else "q"
+    if ours not in found:
+        wanted = ", ".join((*SYNONYMS["q_ref"], *SYNONYMS["q"]))
+        message = f"has no positions that were asked for ({wanted}, with the joints' numbers or names)"
+        raise MeasurementError(f"{message}; found: {', '.join(table.header)}", path)
+    q = np.column_stack([_values(table, place, ours, options) for place in found[ours]])
+    return _stamps(table, found, options), q
+
+
+def _numbered_brackets(table: Table) -> Table:
+    """Return the table with headings like ``q[1]``, whose bracket holds a joint's number, undone."""
+    if not any(unit.isdigit() for unit in table.units):
+        return table
+    header = tuple(name + unit if unit.isdigit() else name for name, unit in zip(table.header, table.units))
+    units = tuple("" if unit.isdigit() else unit for unit in table.units)
+    return Table(table.file, header, units, table.cells, table.rows)
+
+
+def _find(table: Table, options: RecordingOptions, joints: Sequence[str]) -> dict[str, list[int]]:
+    """Return our name → the places of its columns, in the robot's order."""
+    found = {}
+    for ours, synonyms in SYNONYMS.items():
+        stems = (options.names[ours],) if ours in options.names else synonyms
+        if places := next((places for stem in stems if (places := _family(table, stem, joints, ours == "t"))), None):
+            found[ours] = places
+        elif ours in options.names:
+            message = f"no column begins with '{options.names[ours]}'{nearest(options.names[ours], table.header)}"
+            raise MeasurementError(f"{message}; found: {', '.join(table.header)}", table.file)
+    return found
+
+
+def _family(table: Table, stem: str, joints: Sequence[str], single: bool) -> list[int]:
+    """Return the places of the columns of one quantity: by the joints' names, else by numbers."""
+    header = [name.lower() for name in table.header]
+    stem = stem.lower()
+    if single:
+        return [header.index(stem)] if stem in header else []
+    for pattern in (f"{stem}_{{}}", f"{stem}{{}}", f"{stem} {{}}", f"{{}}_{stem}", f"{{}}.{stem}", f"{stem}.{{}}"):
+        columns = [pattern.format(joint.lower()) for joint in joints]
+        if columns and all(column in header for column in columns):
+            return [header.index(column) for column in columns]
+    places = [(int(m["number"]), k) for k, name in enumerate(header) if (m := _NUMBERED.match(name)) and _is(m, stem)]
+    numbers = sorted(number for number, _ in places)
+    if not numbers or numbers != list(range(numbers[0], numbers[0] + len(numbers))) or numbers[0] > 1:
+        return []
+    return [place for _, place in sorted(places)]
+
+
+def _is(match: re.Match[str], stem: str) -> bool:
+    return match["stem"] in (stem, f"{stem}_joint", f"{stem}_j", f"joint_{stem}")
+
+
+def _called(table: Table, places: Sequence[int]) -> list[str]:
+    return [table.header[place] for place in places]
+
+
+def _joint_names(table: Table, places: Sequence[int]) -> list[str]:
+    names = [name.split("_", 1)[-1] for name in _called(table, places)]
+    return names if len(set(names)) == len(names) and all(names) else []
+
+
+def _values(table: Table, place: int, ours: str, options: RecordingOptions) -> np.ndarray:
+    """Return a column in SI; a NaN stays, and is refused later with the rows of the cut alone."""
+    cells, own, stated = table.cells[place], table.units[place], options.units.get(ours, "")
+    if cells.dtype != float:
+        values = table.numbers(table.header[place])  # raises, with the row
+        raise MeasurementError(f"expected numbers, found {values}", table.file, column=table.header[place])
+    if own and stated and own != stated:
+        message = f"its header says [{own}], the options say {stated}: take one of them away"
+        raise MeasurementError(message, table.file, column=table.header[place])
+    try:
+        return cells * scale(ours, own or stated)
+    except UsageError as error:
+        raise MeasurementError(str(error), table.file, column=table.header[place]) from error
+
+
+def _stamps(table: Table, found: dict[str, list[int]], options: RecordingOptions) -> np.ndarray:
+    if "t" in found:
+        t = _values(table, found["t"][0], "t", options)
+        return t - t[0]
+    if options.rate:
+        return np.arange(len(table)) / options.rate
+    wanted = ", ".join(SYNONYMS["t"])
+    message = f"has no column of stamps ({wanted}), and the options state no rate; found: {', '.join(table.header)}"
+    raise MeasurementError(message, table.file)

@@ -1,0 +1,69 @@
+"""Recordings from files: NumPy archives, CSV tables, ROS bags; the first bytes say which."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from calib.data.recordings.archives import Ends, read_archive
+from calib.data.recordings.bags import read_bag
+from calib.data.recordings.checks import check_recording
+from calib.data.recordings.csv_logs import read_log
+from calib.data.recordings.recording import Joints, Recording, parse_cut
+from calib.data.recordings.recording_options import RecordingOptions
+from calib.errors import MeasurementError
+
+Reader = Callable[[Path, Joints | None, RecordingOptions, Ends], Recording]
+
+
+def read_recording(
+    path: str | Path, joints: Joints | None = None, options: RecordingOptions | None = None
+) -> Recording:
+    """Return the checked recording at `path`, which may be cut in time (``log.npz@0:9.4``).
+
+    Args:
+        joints: the robot's; columns are put in their order where the file names its own.
+
+    Raises:
+        MeasurementError: where the file cannot be what it should be; with row and column.
+        UsageError: for a cut that is none.
+    """
+    file, start, stop = parse_cut(str(path))
+    options = options or RecordingOptions()
+    reader = _reader(Path(file))
+    recording = reader(Path(file), joints, options, (start, stop))
+    if joints is not None:
+        check_names(recording, joints)
+    return check_recording(recording, joints)
+
+
+def check_names(recording: Recording, joints: Joints) -> None:
+    """Refuse a recording of another number of joints, or of other joints, than the robot has."""
+    if recording.n != len(joints.names):
+        message = (
+            f"has {recording.n} joints ({', '.join(recording.joint_names)}), the robot has {len(joints.names)} "
+            f"({', '.join(joints.names)}): is this another robot's recording?"
+        )
+        raise MeasurementError(message, recording.file)
+
+
+def _reader(path: Path) -> Reader:
+    """Return the reader that the first bytes of the file, or a folder, ask for."""
+    if path.is_dir() or path.suffix in (".bag", ".mcap", ".db3"):
+        return read_bag
+    try:
+        with open(path, "rb") as file:
+            head = file.read(1 << 16)
+    except OSError as error:
+        hint = "; a cut is written log.npz@0:9.4, in seconds" if "@" in path.name else ""
+        raise MeasurementError(f"cannot be read: {error.strerror}{hint}", path) from error
+    if head[:2] == b"PK":
+        return read_archive
+    if head and path.suffix == ".npz":
+        raise MeasurementError("is no NumPy archive, whatever its name says: was it written by np.savez?", path)
+    if not head or b"\0" in head:
+        found = "is empty" if not head else "is neither a NumPy archive, a bag nor text"
+        raise MeasurementError(f"{found}: expected .npz, .csv, .mcap, .bag or a ROS 2 bag's folder", path)
+    if len(head) == 1 << 16 and b"\n" not in head:
+        raise MeasurementError("has a first line of more than 64 kB: this is no table", path)
+    return read_log

@@ -1,0 +1,189 @@
+"""Cut-offs from the data: how far up the motion reaches, where noise begins, and which filters follow.
+
+Gautier's rules, with ω_dyn the highest frequency at which the rigid body moves: the positions' low-pass filter at
+ω_f ≥ 5 ω_dyn, so that it bends nothing in the band, and the parallel decimation at ω_fp ≥ 2 ω_dyn, with
+ω_fp = 2π 0.8 f_m / (2 n_d). His ω_dyn is the closed loop's; a log shows what of it was excited (our choice: the
+frequency below which 95 % of a joint's acceleration power lies, the floor of noise taken off, a resonance left out).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+from scipy.signal import get_window
+
+from calib.arrays import frozen
+from calib.data.signals.decimation import factor_for
+from calib.data.signals.resampling import Resampled
+from calib.errors import MeasurementError
+
+SHARE = 0.95  # of the acceleration power that is the motion
+LOWEST = 2.0  # [Hz]; friction turns faster than slow trajectories do
+WINDOW = 4.0  # length of the spectra's windows [s]
+ABOVE = 10.0  # a power that stands this far above the floor is seen
+RISE = 30.0  # a power that rises this far again above the motion is a resonance, not a gap between two lines
+ACTIVE = 0.05  # a joint of less than this share of the fastest one's speed says nothing
+HIGHEST = 20.0  # [Hz]; rigid industrial robots reach 10 to 20 (Gautier); above that, joints bend
+SPREAD = 3.0  # a joint this many times above the median of all is taken to vibrate
+USABLE = 0.8  # of the Nyquist frequency
+NOISE = 0.05  # of the acceleration's rms: noise in it that is too much
+
+
+@dataclass(frozen=True, eq=False)
+class Cutoffs:
+    """Proposed cut-offs, and the spectra behind them for a plot.
+
+    Attributes:
+        dynamics: f_dyn of the robot [Hz], joint_dynamics: (n,) of each joint (0 for one that does not move).
+        position: cut-off of the positions' Butterworth filter, f_q [Hz].
+        band: cut-off of the parallel decimation, f_p [Hz], factor: its n_d.
+        resonance: (n,) where power rises again above the motion's [Hz]; NaN where it does not.
+        noise: (n,) standard deviation of white noise in the positions [rad or m], read above the motion.
+        frequency: (F,) [Hz], position_power, effort_power: (F, n) one-sided spectral densities [unit²/Hz].
+        reasons: how the values came about, in words.
+    """
+
+    dynamics: float
+    joint_dynamics: np.ndarray
+    position: float
+    band: float
+    factor: int
+    resonance: np.ndarray
+    noise: np.ndarray
+    frequency: np.ndarray
+    position_power: np.ndarray
+    effort_power: np.ndarray
+    reasons: tuple[str, ...]
+
+
+def propose_cutoffs(sampled: Resampled, dynamics: float | None = None) -> Cutoffs:
+    """Return the cut-offs that `sampled` asks for.
+
+    Args:
+        dynamics: f_dyn where it is known [Hz] (the bandwidth of the position loop); else it is read from the data.
+    """
+    longest = np.bincount(sampled.segment).argmax()
+    start, stop = (int(i) for i in np.searchsorted(sampled.segment, [longest, longest + 1]))
+    own = slice(start, stop)
+    size = min(stop - start, max(64, int(WINDOW * sampled.rate)))
+    f, power = spectrum(sampled.series["q"][own], sampled.rate, size)
+    _, effort = spectrum(sampled.series["effort"][own], sampled.rate, size)
+    floor = np.median(power[int(0.6 * len(f)) : int(0.9 * len(f))], axis=0)
+    active = _active(sampled.series["q"][own])
+    read = [_joint_dynamics(f, power[:, j], floor[j]) if active[j] else (0.0, np.nan) for j in range(len(active))]
+    per_joint, resonance = frozen([joint for joint, _ in read]), frozen([peak for _, peak in read])
+    dynamics, reason = _choose(per_joint, dynamics)
+    reasons = [reason]
+    reasons += [
+        f"joint {j + 1}: a resonance, or noise of the loop, at {peak:.3g} Hz is left out"
+        for j, peak in enumerate(resonance)
+        if np.isfinite(peak)
+    ]
+    position, why = _position_cutoff(f, power, floor, active, dynamics, sampled.rate)
+    factor = factor_for(sampled.rate, min(2 * dynamics, USABLE * sampled.rate / 2))
+    band = USABLE * sampled.rate / (2 * factor)
+    reasons += [why, f"f_p = {band:.3g} Hz (2 f_dyn, to the next whole n_d = {factor})"]
+    noise = np.sqrt(floor * sampled.rate / 2)
+    return Cutoffs(
+        dynamics, per_joint, position, band, factor, resonance, frozen(noise), frozen(f), frozen(power), frozen(effort),
+        tuple(reasons),
+    )  # fmt: skip
+
+
+def spectrum(values: np.ndarray, rate: float, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return frequencies (F,) [Hz] and one-sided power densities (F, n) [unit²/Hz] of `values` (N, n), by Welch.
+
+    Windows of `size` samples (Hann's), half overlapping, a straight line taken off each.
+    """
+    window = np.asarray(get_window("hann", size))
+    line = np.linalg.qr(np.stack([np.ones(size), np.arange(size)], axis=1))[0]
+    starts = range(0, len(values) - size + 1, max(1, size // 2))
+    power = np.zeros((size // 2 + 1, values.shape[1]))
+    for start in starts:
+        own = values[start : start + size]
+        own = own - line @ (line.T @ own)
+        power += np.abs(np.fft.rfft(own.T * window, axis=1).T) ** 2
+    power *= 2 / (len(starts) * rate * (window**2).sum())
+    power[0] /= 2
+    return np.arange(size // 2 + 1) * rate / size, power
+
+
+def check_cutoff(cutoff: float, rate: float, file: str = "") -> None:
+    """Refuse a cut-off that the sampling rate does not allow [Hz]."""
+    if not 0 < cutoff < rate / 2:
+        message = (
+            f"a cut-off of {cutoff:g} Hz is not between 0 and the Nyquist frequency, {rate / 2:g} Hz at {rate:g} Hz: "
+            f"choose at most {USABLE * rate / 2:.4g} Hz"
+        )
+        raise MeasurementError(message, file)
+
+
+def _position_cutoff(
+    f: np.ndarray, power: np.ndarray, floor: np.ndarray, active: np.ndarray, dynamics: float, rate: float
+) -> tuple[float, str]:
+    """Return f_q [Hz] and why: 5 f_dyn, less where noise would reach 5 % of the acceleration, but at least 2 f_dyn.
+
+    White noise of density S_0 becomes an acceleration of variance (2π)⁴ S_0 f_q⁵/5.
+    """
+    band = f <= 2 * dynamics
+    signal = (f[:, None] ** 4 * np.maximum(power - floor, 0))[band].sum(axis=0) * (f[1] - f[0])
+    quiet = (5 * NOISE**2 * signal / np.maximum(floor, 1e-300)) ** 0.2
+    quiet = float(np.median(quiet[active])) if active.any() else np.inf
+    most = USABLE * rate / 2
+    if most <= min(5 * dynamics, quiet):
+        return most, f"f_q = {most:.3g} Hz, {USABLE:g} of the Nyquist frequency; 5 f_dyn would be {5 * dynamics:.3g} Hz"
+    if quiet >= 5 * dynamics:
+        return 5 * dynamics, f"f_q = {5 * dynamics:.3g} Hz (5 f_dyn)"
+    lower = min(max(quiet, 2 * dynamics), most)
+    return (
+        lower,
+        f"f_q = {lower:.3g} Hz: at 5 f_dyn = {5 * dynamics:.3g} Hz noise exceeds 5 % of the acceleration",
+    )
+
+
+def _active(q: np.ndarray) -> np.ndarray:
+    """Return (n,) which joints move fast enough to tell of the bandwidth."""
+    speed = np.quantile(np.abs(np.diff(q, axis=0)), 0.95, axis=0)
+    return speed > ACTIVE * speed.max()
+
+
+def _choose(per_joint: np.ndarray, stated: float | None) -> tuple[float, str]:
+    """Return f_dyn of the robot [Hz] and why."""
+    if stated is not None:
+        return stated, f"f_dyn = {stated:.3g} Hz as stated"
+    fastest = int(np.argmax(per_joint))
+    top, middle = float(per_joint[fastest]), float(np.median(per_joint[per_joint > 0])) if per_joint.any() else 0.0
+    found = min(top, SPREAD * middle)
+    if found < LOWEST:
+        where = f"ends at {found:.2g} Hz" if found else "hardly stands out of the noise"
+        return LOWEST, f"f_dyn = {LOWEST:g} Hz: the motion {where}, but friction turns faster"
+    if found > HIGHEST:
+        return HIGHEST, f"f_dyn = {HIGHEST:g} Hz: joint {fastest + 1} moves at {top:.3g} Hz, where no robot is rigid"
+    if found < top:
+        return (
+            found,
+            f"f_dyn = {found:.3g} Hz, {SPREAD:g} times the median: joint {fastest + 1}'s {top:.3g} Hz stands apart",
+        )
+    return found, f"f_dyn = {found:.3g} Hz: 95 % of the acceleration power of joint {fastest + 1} lies below"
+
+
+def _joint_dynamics(f: np.ndarray, power: np.ndarray, floor: float) -> tuple[float, float]:
+    """Return how far up one joint's motion reaches [Hz], and where a resonance above it stands (NaN: none)."""
+    smooth = uniform_filter1d(power, 5, mode="nearest")
+    peak = int(np.argmax(f**2 * np.maximum(smooth - ABOVE * floor, 0)))
+    sunk = smooth[peak:] < ABOVE * floor
+    top = peak + (int(np.argmax(sunk)) if sunk.any() else len(sunk) - 1)
+    acceleration = f**4 * smooth
+    lowest = np.minimum.accumulate(acceleration[peak : top + 1])
+    risen = acceleration[peak : top + 1] > RISE * lowest
+    resonance = np.nan
+    if risen.any():
+        first = peak + int(np.argmax(risen))
+        resonance = float(f[first + int(np.argmax(acceleration[first : top + 1]))])
+        top = peak + int(np.argmin(acceleration[peak : first + 1]))
+    share = np.cumsum(f[: top + 1] ** 4 * np.maximum(power[: top + 1] - floor, 0))
+    if top == 0 or share[-1] <= 0:
+        return 0.0, resonance
+    return float(f[int(np.argmax(share >= SHARE * share[-1]))]), resonance

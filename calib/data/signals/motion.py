@@ -1,0 +1,268 @@
+"""From a raw log to what a dynamic model can be compared with: positions filtered, derivatives, torques on one grid.
+
+`Motion` is the only type that carries accelerations, so an unfiltered log cannot reach a regressor. Its torques are as
+recorded (on the even grid): what filters them is the parallel decimation, which filters every column of W alike
+(`calib.data.signals.decimation`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.arrays import frozen
+from calib.data.recordings.recording import Recording, read_only
+from calib.data.signals.bandwidth import USABLE, Cutoffs, check_cutoff, propose_cutoffs
+from calib.data.signals.decimation import Decimator, decimate, design_decimator, factor_for, kept, too_short
+from calib.data.signals.filtering import ORDER, border, curvature, low_pass, slope
+from calib.data.signals.resampling import GAP, Resampled, SamplingReport, resample
+from calib.errors import MeasurementError, UsageError
+
+SLOW = 0.01  # of a joint's peak speed: below it stands, for friction (the TX40's own thresholds are this share)
+CREEP = 1e-3  # no joint moves below this [rad/s or m/s]
+
+
+@dataclass(frozen=True)
+class FilterOptions:
+    """How a recording becomes a motion; None: from the data, by Gautier's rules (`calib.data.signals.bandwidth`).
+
+    Attributes:
+        cutoff: f_q of the positions' Butterworth filter [Hz]: one, or one per joint.
+        order: of one pass of it.
+        band: f_p of the parallel decimation [Hz], above which nothing is compared.
+        dynamics: f_dyn, where it is known [Hz].
+        width: half-width of the central differences (`calib.data.signals.filtering`).
+        clock, gap: as in `calib.data.signals.resampling`; gap [s].
+        borders: time left out at both ends of each segment [s].
+        decimator: ``kaiser`` or ``chebyshev``.
+    """
+
+    cutoff: float | tuple[float, ...] | None = None
+    order: int = ORDER
+    band: float | None = None
+    dynamics: float | None = None
+    width: int = 4
+    clock: str = "auto"
+    gap: float = GAP
+    borders: float | None = None
+    decimator: str = "kaiser"
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """N samples on an even grid, in segments without gaps.
+
+    Attributes:
+        t: (N,) [s]; within a segment in steps of 1/rate.
+        q, v, a: (N, n) filtered position [rad or m] and its central differences [/s], [/s²].
+        effort: (N, n) torque [N·m or N] or current [A] (`kind`), not filtered; interpolated where a sample is
+            missing (weight 0).
+        weight: (N,) 1 at a sample, 0 at one that was lost and interpolated.
+        segment: (N,) number of the segment, rising.
+        rate: [Hz].
+        band: f_p, the identification band [Hz].
+        cutoff: (n,) f_q [Hz].
+        decimator: the filter of the parallel decimation to that band.
+        joint_names, kind, file, drive_gain, effort_variance: the recording's.
+        tau_link, tau_motor, q_link, q_ref, tau_ff, v_measured: (N, n) the recording's others on the grid, not
+            filtered; or None.
+        sampling, cutoffs: what was found; notes: what a user should be told.
+    """
+
+    t: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    effort: np.ndarray
+    kind: str
+    weight: np.ndarray
+    segment: np.ndarray
+    rate: float
+    band: float
+    cutoff: np.ndarray
+    decimator: Decimator
+    joint_names: tuple[str, ...]
+    file: str
+    sampling: SamplingReport
+    cutoffs: Cutoffs
+    notes: tuple[str, ...]
+    tau_link: np.ndarray | None = None
+    tau_motor: np.ndarray | None = None
+    q_link: np.ndarray | None = None
+    q_ref: np.ndarray | None = None
+    tau_ff: np.ndarray | None = None
+    v_measured: np.ndarray | None = None
+    drive_gain: np.ndarray | None = None
+    effort_variance: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    @property
+    def n(self) -> int:
+        """The number of joints."""
+        return self.q.shape[1]
+
+
+ROWS = (
+    "t", "q", "v", "a", "effort", "weight", "segment", "tau_link", "tau_motor", "q_link", "q_ref", "tau_ff",
+    "v_measured",
+)  # fmt: skip
+
+
+def make_motion(recording: Recording, options: FilterOptions | None = None, sampled: Resampled | None = None) -> Motion:
+    """Return the motion of a recording: dated, on an even grid, low-passed without phase shift, differentiated.
+
+    Args:
+        sampled: the recording on its grid, where it is known from before, with the same clock and gap (`sample`).
+
+    Raises:
+        MeasurementError: for a cut-off at or above the Nyquist frequency; for segments that the filters eat up.
+        UsageError: for a list of cut-offs of another length than the joints.
+    """
+    options = options or FilterOptions()
+    sampled = sample(recording, options) if sampled is None else sampled
+    cutoffs = propose_cutoffs(sampled, options.dynamics)
+    cutoff = _per_joint(cutoffs.position if options.cutoff is None else options.cutoff, recording)
+    for value in cutoff:
+        check_cutoff(float(value), sampled.rate, recording.file)
+    decimator = _decimator(cutoffs, options, sampled.rate, recording.file)
+    q, v, a, mask = _derive(sampled, cutoff, options)
+    if not len(kept(sampled.segment[mask], decimator)):
+        raise too_short(int(mask.sum()), decimator)
+    inside = _span(mask)
+    others = {name: read_only(value[inside]) for name, value in sampled.series.items() if name not in ("q", "v")}
+    v_measured = read_only(sampled.series["v"][inside]) if "v" in sampled.series else None
+    return Motion(
+        *(read_only(values[inside]) for values in (sampled.t, q, v, a)),
+        weight=read_only(sampled.weight[inside]),
+        segment=frozen(sampled.segment[inside], int),
+        rate=sampled.rate,
+        band=decimator.band,
+        cutoff=frozen(cutoff),
+        decimator=decimator,
+        kind=recording.kind,
+        joint_names=recording.joint_names,
+        file=recording.file,
+        sampling=sampled.report,
+        cutoffs=cutoffs,
+        notes=(*recording.notes, *sampled.report.lines(), *_told(cutoffs, options)),
+        drive_gain=recording.drive_gain,
+        effort_variance=recording.effort_variance,
+        v_measured=v_measured,
+        **others,
+    )
+
+
+def sample(recording: Recording, options: FilterOptions) -> Resampled:
+    """Return a recording on its even grid: the part of `make_motion` that no filter changes."""
+    return resample(recording, options.clock, options.gap)
+
+
+def filters_of(motion: Motion) -> FilterOptions:
+    """Return the options that treat another recording as `motion` was: validation wants the filters of the fit."""
+    return FilterOptions(cutoff=tuple(float(f) for f in motion.cutoff), band=motion.band * (1 - 1e-9))
+
+
+def thin(motion: Motion) -> Motion:
+    """Return the motion at the samples its decimator keeps: q, v, a as they are there, efforts filtered to the band.
+
+    W for it is `decimate_regressor` of the *whole* motion; building W from the thinned q, v, a would not be parallel.
+    """
+    index = kept(motion.segment, motion.decimator)
+    efforts = {
+        name: None if (value := getattr(motion, name)) is None else decimate(value, motion.decimator, motion.segment)
+        for name in ("effort", "tau_link", "tau_motor")
+    }
+    picked = {name: value[index] for name in ROWS if (value := getattr(motion, name)) is not None}
+    rate = motion.rate / motion.decimator.factor
+    whole = design_decimator(rate, 1)
+    weight = decimate(motion.weight, motion.decimator, motion.segment)
+    return replace(motion, **(picked | efforts | {"weight": weight}), rate=rate, decimator=whole)
+
+
+def in_band(motion: Motion, values: np.ndarray) -> np.ndarray:
+    """Return `values` (N, ...) below the identification band at the full rate, without phase shift; by segments."""
+    parts = [
+        low_pass(values[motion.segment == i], motion.rate, min(motion.band, USABLE * motion.rate / 2))
+        for i in np.unique(motion.segment)
+    ]
+    return np.concatenate(parts)
+
+
+def moving(motion: Motion, slow: float | Sequence[float] = SLOW) -> np.ndarray:
+    """Return (N, n) whether each joint moves: |v_j| at or above `slow`, a share of its peak or (n,) [rad/s or m/s]."""
+    peak = np.abs(motion.v).max(axis=0)
+    threshold = slow * peak if isinstance(slow, (int, float)) else np.asarray(slow, dtype=float)
+    noise = 3 * velocity_noise(motion)
+    return np.abs(motion.v) >= np.maximum(np.maximum(threshold, noise), CREEP)
+
+
+def standstill(motion: Motion, slow: float | Sequence[float] = SLOW) -> np.ndarray:
+    """Return (N,) whether all joints stand: friction is then any value up to Coulomb's, unknown."""
+    return np.asarray(~moving(motion, slow).any(axis=1))
+
+
+def velocity_noise(motion: Motion) -> np.ndarray:
+    """Return (n,) the standard deviation of white position noise in the filtered velocities [rad/s or m/s].
+
+    σ_v² = σ_q² (2/f_s) ∫ (2πf)² |H(f)|⁴ df with |H|² of the two passes, about σ_q² (2/f_s) (2π)² f_q³/3.
+    """
+    return motion.cutoffs.noise * 2 * np.pi * np.sqrt(2 * motion.cutoff**3 / (3 * motion.rate))
+
+
+def _derive(
+    sampled: Resampled, cutoff: np.ndarray, options: FilterOptions
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return q, v, a (N, n) and the mask (N,) of the samples that the filters' ends do not spoil."""
+    q, v, a = (np.full(sampled.series["q"].shape, np.nan) for _ in range(3))
+    inside = np.zeros(len(q), dtype=bool)
+    for i in np.unique(sampled.segment):
+        start, stop = np.searchsorted(sampled.segment, [i, i + 1])
+        for j, f in enumerate(cutoff):
+            own = low_pass(sampled.series["q"][start:stop, j], sampled.rate, float(f), options.order)
+            q[start:stop, j] = own
+            v[start:stop, j] = slope(own, sampled.rate, options.width)
+            a[start:stop, j] = curvature(own, sampled.rate, options.width)
+        edge = border(sampled.rate, float(cutoff.min()))
+        edge = edge if options.borders is None else int(np.ceil(options.borders * sampled.rate))
+        edge = max(edge, options.width)
+        inside[start + edge : max(start + edge, stop - edge)] = True
+    return q, v, a, inside
+
+
+def _span(mask: np.ndarray) -> np.ndarray | slice:
+    """Return a mask (N,) as a slice where it is one run: slices copy nothing."""
+    first, stop = int(np.argmax(mask)), len(mask) - int(np.argmax(mask[::-1]))
+    return slice(first, stop) if mask[first:stop].all() else mask
+
+
+def _decimator(cutoffs: Cutoffs, options: FilterOptions, rate: float, file: str) -> Decimator:
+    if options.band is None:
+        return design_decimator(rate, cutoffs.factor, options.decimator)
+    if not 0 < options.band < rate / 2:
+        message = f"an identification band of {options.band:g} Hz is not below the Nyquist frequency {rate / 2:g} Hz"
+        raise MeasurementError(message, file)
+    return design_decimator(rate, factor_for(rate, options.band), options.decimator)
+
+
+def _per_joint(cutoff: float | tuple[float, ...], recording: Recording) -> np.ndarray:
+    values = np.atleast_1d(np.asarray(cutoff, dtype=float))
+    if len(values) not in (1, recording.n):
+        raise UsageError(f"cutoff: {len(values)} values for {recording.n} joints; give one, or one per joint")
+    return np.broadcast_to(values, (recording.n,))
+
+
+def _hertz(value: float | tuple[float, ...]) -> str:
+    return " ".join(f"{one:.4g}" for one in np.atleast_1d(value))
+
+
+def _told(cutoffs: Cutoffs, options: FilterOptions) -> tuple[str, ...]:
+    stated = [name for name in ("cutoff", "band") if getattr(options, name) is not None]
+    lines = [
+        f"{name} = {_hertz(getattr(options, name))} Hz, not from this recording: stated, or the training's"
+        for name in stated
+    ]
+    return (*lines, *cutoffs.reasons) if len(stated) < 2 else tuple(lines)

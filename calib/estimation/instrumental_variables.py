@@ -1,0 +1,313 @@
+"""Instrumental variables: estimates that stay right where the noise of y reaches W through the feedback of the robot.
+
+The instruments Z (r, p), one per column, are the observation matrix of a noise-free simulation. All that IV needs is in
+the R factor of [Z W y], so that the triangles of `triangles` serve here too:
+
+    [Z W y] = Q [Rz A b; 0 B c; 0 0 ρ],    Zᵀ W = Rzᵀ A,    P_Z W = Q1 A,
+
+the IV estimate solves A x = b, the residual of W on Z is Q2 B, and nothing is squared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.stats
+
+from calib.arrays import shaped
+from calib.errors import CalibError, Unidentifiable
+from calib.estimation.base_columns import split_columns
+from calib.estimation.estimate import Estimate
+from calib.estimation.linear import LinearFit
+from calib.estimation.triangles import (
+    Triangles,
+    absorb,
+    combine,
+    condition_numbers,
+    empty,
+    require_rank,
+    residual_squares,
+    retriangulate,
+    select,
+    solve_triangle,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Strength:
+    """How well instruments stand for the columns.
+
+    Attributes:
+        names: p columns of W.
+        correlations: (p,) canonical correlations between Z and W, falling; 1 where Z spans W, 0 where the rank fails.
+        partial_r2: (p,) share of each column, cleaned of the others, that Z explains (Shea 1997).
+        first_stage_f: (p,) F of each column's regression on Z.
+        cragg_donald: F of the weakest combination, (r - p) λ² / (1 - λ²) / p with λ the least correlation; above 10 the
+            usual approximations hold (Staiger & Stock 1997).
+        condition: condition number of Zᵀ W, columns of Z and W of unit norm.
+    """
+
+    names: tuple[str, ...]
+    correlations: np.ndarray
+    partial_r2: np.ndarray
+    first_stage_f: np.ndarray
+    cragg_donald: float
+    condition: float
+
+    @property
+    def weak(self) -> bool:
+        return self.cragg_donald < 10.0
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A test of the claim that W is uncorrelated with the noise, hence least squares unbiased.
+
+    Attributes:
+        statistic: F (augmented regression) or χ² (Hausman's form).
+        degrees: of freedom, numerator and denominator; (k, 0) for χ².
+        p: probability of a larger statistic if the claim is true.
+    """
+
+    statistic: float
+    degrees: tuple[int, int]
+    p: float
+
+    def biased(self, level: float = 0.01) -> bool:
+        """Say whether least squares is refuted at this level: use IV."""
+        return self.p < level
+
+
+@dataclass(frozen=True, eq=False)
+class Instruments:
+    """Triangles of [Z W y]; the first p columns are the instruments."""
+
+    data: Triangles
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.data.names[len(self.data.names) // 2 :]
+
+
+def instrument(
+    instruments: np.ndarray,
+    matrix: np.ndarray,
+    target: np.ndarray,
+    group: np.ndarray | None = None,
+    names: Sequence[str] | None = None,
+    units: Sequence[str] | None = None,
+    before: Instruments | None = None,
+) -> Instruments:
+    """Return the triangles of [Z W y], with those of earlier rows where `before` is given.
+
+    Args:
+        instruments: Z (r, p), one column for each of W.
+        matrix: W (r, p).
+        target: y (r,).
+        group: (r,) integers, as in `triangles.absorb`.
+        names, units: of W's columns.
+        before: earlier rows of the same problem.
+    """
+    matrix = shaped(matrix, (None, None), "observation matrix W")
+    instruments = shaped(instruments, matrix.shape, "instruments Z")
+    if before is None:
+        own = tuple(names) if names is not None else tuple(f"x{k + 1}" for k in range(matrix.shape[1]))
+        given = tuple(units) if units is not None else ("",) * len(own)
+        count = 1 if group is None or len(group) == 0 else int(np.max(group)) + 1
+        before = Instruments(empty([*(f"Z {name}" for name in own), *own], given * 2, count))
+    rows = 0 if group is None else group
+    return replace(before, data=absorb(before.data, np.hstack([instruments, matrix]), target, rows))
+
+
+def least_squares(problem: Instruments) -> Triangles:
+    """Return the triangles of [W y] alone, for `linear.ols` and `linear.wls`."""
+    p = len(problem.names)
+    return select(problem.data, np.arange(p, 2 * p))
+
+
+def iv(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1.0) -> LinearFit:
+    """Estimate x = (Zᵀ Ω⁻¹ W)⁻¹ Zᵀ Ω⁻¹ y, covariance σ² (ZᵀΩ⁻¹W)⁻¹ (ZᵀΩ⁻¹Z) (WᵀΩ⁻¹Z)⁻¹, Ω = diag(σ_g² I).
+
+    Janot, Vandanjon & Gautier (2014) write the covariance (ZᵀΩ⁻¹Z)⁻¹, which is the same where Z is W without its noise
+    and too small where the simulation misses. σ² is estimated, so `std` matters up to a factor. As many instruments as
+    columns: two-stage least squares is the same estimate.
+
+    Args:
+        problem: triangles of [Z W y].
+        std: (g,) of the groups; None: alike. Those of the weighted least squares of W are the usual choice.
+        inflation: >= 1, see `linear`; one number for all groups.
+
+    Raises:
+        Unidentifiable: where Zᵀ W is singular, naming the columns concerned.
+    """
+    p = len(problem.names)
+    sigma = np.ones(problem.data.groups) if std is None else shaped(std, (problem.data.groups,), "std per group")
+    factor = combine(problem.data, sigma)
+    values, inverse, _ = solve_triangle(_projected(factor, problem.names), problem.names)
+    squares = residual_squares(problem.data, np.concatenate([np.zeros(p), values]))
+    left = problem.data.rows - inflation * p * problem.data.rows / problem.data.rows.sum()
+    dof = int(problem.data.rows.sum() / inflation) - p
+    if dof <= 0:
+        raise Unidentifiable("fewer independent rows than parameters; record longer", problem.names)
+    residual_std = float(np.sqrt(np.sum(squares / sigma**2) / left.sum()))
+    covariance = inflation * residual_std**2 * inverse @ inverse.T
+    units = problem.data.units[p:]
+    estimate = Estimate(problem.names, units, values, covariance, residual_std, dof)
+    return LinearFit(estimate, np.sqrt(squares / left), *condition_numbers(factor[:, p : 2 * p]))
+
+
+def settled(before: LinearFit, now: LinearFit, change: float = 0.025, residual: float = 0.025) -> bool:
+    """Say whether the outer loop (simulate, estimate) may stop: parameters and residual have come to rest.
+
+    |Δx_j| < change · |x_j| for every parameter and |Δ‖ρ‖| < residual · ‖ρ‖ (Janot, Vandanjon & Gautier 2014; both
+    usually 1 … 5 %). A parameter that moves by less than a fifth of its standard deviation rests as well (our choice:
+    one near zero never meets a relative rule).
+    """
+    moved = np.abs(now.estimate.values - before.estimate.values)
+    allowed = np.maximum(change * np.abs(before.estimate.values), 0.2 * now.estimate.sigma)
+    sizes = before.estimate.residual_std, now.estimate.residual_std
+    return bool(np.all(moved <= allowed) and abs(sizes[1] - sizes[0]) <= residual * sizes[0])
+
+
+def strength(problem: Instruments, std: np.ndarray | None = None) -> Strength:
+    """Return what the instruments tell about the columns; all measures from one R factor.
+
+    Args:
+        problem: triangles of [Z W y].
+        std: as in `iv`.
+    """
+    p, rows = len(problem.names), int(problem.data.rows.sum())
+    factor = combine(problem.data, std)
+    explained, rest = factor[:p, p : 2 * p], factor[p : 2 * p, p : 2 * p]
+    norms = np.linalg.norm(factor[:, p : 2 * p], axis=0)
+    basis = np.linalg.qr(factor[: 2 * p, p : 2 * p] / norms)[0]
+    correlations = np.clip(np.linalg.svd(basis[:p], compute_uv=False), 0.0, 1.0)
+    both, gone = np.sum(explained**2, axis=0), np.sum(rest**2, axis=0)
+    cross = (factor[:p, :p] / np.linalg.norm(factor[:p, :p], axis=0)).T @ (explained / norms)
+    least = correlations[-1] ** 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first = np.where(gone > 0.0, both / gone, np.inf) * (rows - p) / p
+        donald = float((rows - p) / p * np.divide(least, 1.0 - least))
+    return Strength(
+        problem.names,
+        correlations,
+        _shea(explained / norms, factor[:, p : 2 * p] / norms),
+        first,
+        donald,
+        np.linalg.cond(cross),
+    )
+
+
+def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1.0) -> Verdict:
+    """Test whether W is uncorrelated with the noise (Durbin, Wu, Hausman), by augmented regression and QR.
+
+    With V = W - P_Z W the part of the columns that the instruments do not explain, y = W x + V δ + e; the claim is
+    δ = 0, F = [(RSS0 - RSS1) / k] / [RSS1 / (r - p - k)] (Janot, Vandanjon & Gautier 2016, after Hausman 1978). Only
+    the k independent columns of V count. It takes valid instruments for granted: look at `strength` first.
+
+    Args:
+        problem: triangles of [Z W y].
+        std: as in `iv`; unlike groups tested with equal weights give false alarms.
+        inflation: >= 1; autocorrelated residuals without it give false alarms.
+    """
+    p, rows = len(problem.names), problem.data.rows.sum() / inflation
+    factor = combine(problem.data, std)
+    whole = factor[:, p : 2 * p]
+    norms = np.linalg.norm(whole, axis=0)
+    require_rank(whole / np.where(norms > 0.0, norms, 1.0), problem.names)
+    part = np.vstack([np.zeros((p, p)), factor[p:, p : 2 * p]])
+    size = np.linalg.norm(part, axis=0) > 1e-8 * norms
+    columns = np.hstack([whole, part[:, size]])
+    split = split_columns(columns, [np.arange(p)], 1e-8)
+    k = split.rank - p
+    dof = int(rows) - p - k
+    if k <= 0 or dof <= 0:
+        raise CalibError("instruments equal to the columns leave nothing to test (or too few rows)")
+    target = factor[:, -1]
+    first, second = _rss(whole, target), _rss(columns[:, split.kept], target)
+    f = (first - second) / k / (second / (rows - p - k)) / inflation if second > 0.0 else np.inf
+    return Verdict(float(f), (k, dof), float(scipy.stats.f.sf(f, k, dof)))
+
+
+def hausman(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1.0) -> Verdict:
+    """Test the same claim by the distance of two estimates (Hausman 1978): (b_IV - b_LS)ᵀ (S_IV - S_LS)⁺ (…) ~ χ²(k).
+
+    Both covariances with the σ² of least squares, so that their difference is never negative: with λ the canonical
+    correlations of Z and W it is (1 - λ²) / λ² in the coordinates where S_LS is σ² I.
+
+    Args:
+        problem, std, inflation: as in `exogeneity`.
+    """
+    p, rows = len(problem.names), int(problem.data.rows.sum())
+    factor = combine(problem.data, std)
+    basis, upper = np.linalg.qr(factor[: 2 * p, p : 2 * p])
+    _, lam, vt = np.linalg.svd(basis[:p])
+    ordinary = solve_triangle(retriangulate(factor[:, p:]), problem.names)[0]
+    instrumental = solve_triangle(_projected(factor, problem.names), problem.names)[0]
+    gap = np.maximum(1.0 - lam**2, 0.0)
+    open_ = gap > 1e-12
+    k = int(open_.sum())
+    if k == 0:
+        raise CalibError("instruments equal to the columns leave nothing to test")
+    variance = _rss(factor[:, p : 2 * p], factor[:, -1]) / (rows - p)
+    distance = (vt @ upper @ (instrumental - ordinary))[open_]
+    chi = float(np.sum(distance**2 * lam[open_] ** 2 / gap[open_]) / variance / inflation)
+    return Verdict(chi, (k, 0), float(scipy.stats.chi2.sf(chi, k)))
+
+
+def projected(problem: Instruments, std: np.ndarray | None = None) -> np.ndarray:
+    """Return the triangle (p + 1, p + 1) of min ‖P_Z (y - W x)‖, two-stage least squares; its solution is `iv`.
+
+    Constraints enter IV through it: `constrained.minimise` with Q = Wᵀ P_Z W, which is positive definite, and not with
+    Zᵀ W, which need not be.
+    """
+    return _projected(combine(problem.data, std), problem.names)
+
+
+def testable(problem: Instruments, fit: LinearFit, std: np.ndarray | None = None) -> Triangles:
+    """Return triangles [A b; 0 ‖ρ‖] of one group, on which least squares gives the IV estimate and its covariance.
+
+    ρ = y - W x_IV, whitened. With it tests of nested models are those of two-stage least squares (Wooldridge 2010,
+    section 5.2.3): differences of ‖P_Z (y - W x)‖² against the variance of ρ.
+
+    Args:
+        problem, std: as in `iv`.
+        fit: what `iv` made of them.
+    """
+    p = len(problem.names)
+    sigma = np.ones(problem.data.groups) if std is None else std
+    squares = residual_squares(problem.data, np.concatenate([np.zeros(p), fit.estimate.values]))
+    factor = np.zeros((1, p + 1, p + 1))
+    factor[0, :p] = projected(problem, sigma)[:p]
+    factor[0, p, p] = np.sqrt(np.sum(squares / sigma**2))
+    return replace(empty(problem.names, problem.data.units[p:], 1), factors=factor, rows=problem.data.rows.sum()[None])
+
+
+def _projected(factor: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """Return the R factor of P_Z [W y], after making sure that Z and Zᵀ W have full rank."""
+    p = len(names)
+    size = np.linalg.norm(factor[:p, :p], axis=0)
+    require_rank(
+        factor[:p, :p] / np.where(size > 0.0, size, 1.0), [f"instrument of {name}" for name in names],
+        "the simulated motion does not excite them: simulate the reference of the recording itself",
+    )  # fmt: skip
+    norms = np.linalg.norm(factor[:, p : 2 * p], axis=0)
+    require_rank(
+        factor[:p, p : 2 * p] / np.where(norms > 0.0, norms, 1.0), names,
+        "the instruments do not tell them apart: they are dependent in W, or the simulated motion is another one",
+    )  # fmt: skip
+    return retriangulate(factor[:p, p:])
+
+
+def _shea(explained: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    """Return diag((WᵀW)⁻¹) / diag((WᵀP_Z W)⁻¹) (Shea 1997 in the form of Godfrey 1999)."""
+    variances = [np.sum(np.linalg.pinv(part) ** 2, axis=1) for part in (whole, explained)]
+    return variances[0] / variances[1]
+
+
+def _rss(matrix: np.ndarray, target: np.ndarray) -> float:
+    """Return the residual sum of squares of the regression of target on the columns."""
+    size = matrix.shape[1]
+    return float(np.sum(retriangulate(np.column_stack([matrix, target]))[size:, size] ** 2))

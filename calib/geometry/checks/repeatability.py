@@ -1,0 +1,162 @@
+"""Pose accuracy and repeatability after ISO 9283:1998, where a measured file holds the same pose several times.
+
+For the n cycles of one commanded pose, p_j measured, p̄ their mean (the barycentre), p_c the command:
+
+    AP  = |p̄ - p_c|,   AP_x = x̄ - x_c, …                  pose accuracy (7.2.1)
+    RP  = l̄ + 3 S_l,   l_j = |p_j - p̄|                    pose repeatability (7.2.2), S_l with n - 1
+    AP_a, AP_b, AP_c; RP_a = 3 S_a, …                      of orientations, as rotation vectors about the base's axes
+    vAP = the largest distance between the barycentres of cycles that came from different directions (7.2.3)
+
+The command is what an arm's model says of the mean joints of the cycles, so that nominal and calibrated arm each have
+an accuracy of their own, while repeatability is the robot's (and the instrument's). Rotation vectors in place of the
+norm's Euler angles are our choice; for the small angles at hand they differ by nothing that counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from calib.data.poses.measurements import PoseMeasurements
+from calib.geometry.accuracy import Torques
+from calib.geometry.installation import Installation
+from calib.geometry.observation import Block, has_instrument, predict, prepare
+
+SAME = 1e-3  # joints of one commanded pose, as read back, differ by less [rad or m]; our choice, as the next two
+FEWEST = 3  # cycles that make a repeated pose
+APART = np.radians(30.0)  # directions of approach that differ by more are different ones
+
+
+@dataclass(frozen=True, eq=False)
+class Repeats:
+    """P poses that were measured several times.
+
+    Attributes:
+        rows: per pose, the file's rows of its cycles.
+        cycles: (P,) how many.
+        accuracy: (P, 3) barycentre minus command, in the axes of the arm's base [m].
+        repeatability: (P,) RP [m].
+        turn_accuracy, turn_repeatability: (P, 3) of orientations about the base's axes [rad]; None for positions.
+        variation: (P,) vAP [m]; NaN where all cycles came from one direction.
+    """
+
+    rows: tuple[np.ndarray, ...]
+    cycles: np.ndarray
+    accuracy: np.ndarray
+    repeatability: np.ndarray
+    turn_accuracy: np.ndarray | None
+    turn_repeatability: np.ndarray | None
+    variation: np.ndarray
+
+
+def repeats(
+    cell: Installation, measured: Sequence[PoseMeasurements], torques: Torques = None, same: float = SAME
+) -> Repeats | None:
+    """Return accuracy and repeatability of all poses measured at least `FEWEST` times; None without any.
+
+    Args:
+        cell: the arm whose commands are meant.
+        measured: blocks; those without an instrument say nothing of it.
+        torques: gravity torques (m, n) per block [N m], for compliance terms.
+        same: joints that differ by no more are one commanded pose [rad or m].
+    """
+    found = [
+        _one(cell, block, index)
+        for block in prepare(cell, measured, torques)
+        if has_instrument(block.measured)
+        for index in repeated_rows(block.measured, same)
+    ]
+    if not found:
+        return None
+    rows, shift, spread, turn, about, variation = zip(*found)
+    whole = all(each is not None for each in turn)
+    return Repeats(
+        rows,
+        np.array([len(each) for each in rows]),
+        np.array(shift),
+        np.array(spread),
+        np.array(turn) if whole else None,
+        np.array(about) if whole else None,
+        np.array(variation),
+    )
+
+
+def repeated_rows(measured: PoseMeasurements, same: float = SAME) -> list[np.ndarray]:
+    """Return for each pose measured at least `FEWEST` times the indices of its rows, in the file's order.
+
+    Rows with the very same numbers are copies of one measurement and count once.
+    """
+    assert measured.position is not None
+    table = np.hstack([measured.q, measured.position, measured.tool[:, None].astype(float)])
+    _, first = np.unique(np.round(table, 12), axis=0, return_index=True)
+    rows = np.sort(first)
+    key = np.hstack([measured.q[rows], 1e3 * measured.tool[rows, None]])  # another reflector is another pose
+    near = KDTree(key).query_ball_point(key, same, p=np.inf)
+    groups, taken = [], np.zeros(len(rows), dtype=bool)
+    for k, each in enumerate(near):
+        own = np.array([i for i in each if not taken[i]], dtype=int)
+        if not taken[k] and len(own) >= FEWEST:
+            taken[own] = True
+            groups.append(np.sort(rows[own]))
+    return groups
+
+
+def spread(points: np.ndarray) -> float:
+    """Return RP = l̄ + 3 S_l of points (n, 3) [m]."""
+    length = np.linalg.norm(points - points.mean(axis=0), axis=1)
+    return float(length.mean() + 3.0 * length.std(ddof=1))
+
+
+def _one(cell: Installation, block: Block, index: np.ndarray) -> tuple:
+    """Return rows, accuracy, repeatability, those of orientation or None, and variation of one pose."""
+    measured = block.measured
+    assert measured.position is not None and measured.rows is not None
+    seen = predict(cell, block)
+    base = cell.stations[block.station][:3, :3]
+    points = measured.position[index]
+    command, shift = seen.point[:, index].mean(axis=1), points.mean(axis=0)
+    turn, about = None, None
+    if measured.quaternion is not None:
+        turns = Rotation.from_quat(measured.quaternion[index])
+        middle = turns.mean()
+        wanted = Rotation.from_matrix(seen.rotation.transpose(2, 1, 0)[index]).mean()
+        turn = base.T @ (middle * wanted.inv()).as_rotvec()
+        about = 3.0 * ((turns * middle.inv()).as_rotvec() @ base).std(axis=0, ddof=1)
+    variation = _variation(points, _directions(measured, index))
+    return measured.rows[index], base.T @ (shift - command), spread(points), turn, about, variation
+
+
+def _directions(measured: PoseMeasurements, index: np.ndarray) -> np.ndarray:
+    """Return where each row was approached from (k, 3), by the row before it in the file; NaN where that is not there.
+
+    Both as measured: what counts is the direction, not the tenths of a millimetre.
+    """
+    assert measured.position is not None and measured.rows is not None
+    result = np.full((len(index), 3), np.nan)
+    place = {int(row): k for k, row in reversed(list(enumerate(measured.rows)))}
+    for number, k in enumerate(index):
+        before = place.get(int(measured.rows[k]) - 1)
+        if before is not None and measured.tool[before] == measured.tool[k]:
+            step = measured.position[k] - measured.position[before]
+            length = np.linalg.norm(step)
+            if length > SAME:
+                result[number] = step / length
+    return result
+
+
+def _variation(points: np.ndarray, directions: np.ndarray) -> float:
+    """Return vAP [m] of points (k, 3) with their directions of approach (k, 3); NaN for one direction."""
+    left = np.flatnonzero(~np.isnan(directions[:, 0]))
+    centres = []
+    while len(left):
+        alike = directions[left] @ directions[left[0]] > np.cos(APART)
+        if alike.sum() > 1:
+            centres.append(points[left[alike]].mean(axis=0))
+        left = left[~alike]
+    if len(centres) < 2:
+        return float("nan")
+    return max(float(np.linalg.norm(a - b)) for k, a in enumerate(centres) for b in centres[:k])

@@ -1,0 +1,211 @@
+"""Errors on rows a model was not fitted to, from sufficient statistics: every fold and every subset of terms is cheap.
+
+The model is linear in its terms and, near its optimum, in the geometry: per fold the statistics WᵀW, Wᵀr of the
+training rows give the estimate, those of the held-out rows its error. Nothing is fitted to held-out rows but the
+placement of a held-out station (projected out).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.data.poses.measurements import PoseMeasurements, take
+from calib.estimation.relevance import Gram, gram, relevance
+from calib.geometry.deflection import Deflection, Term
+from calib.geometry.fit import plausible_deviation
+from calib.geometry.installation import Installation
+from calib.geometry.model_choice.folds import Folds
+from calib.geometry.observation import has_instrument, observe, prepare
+from calib.geometry.parameters import layout
+from calib.geometry.result import GeometricFit, row_weights, used_sigmas
+from calib.robot.chain import Chain
+
+CHUNK = 1000  # poses observed at once
+METRES = ("position", "consistency", "distance", "plane")
+
+
+@dataclass(frozen=True, eq=False)
+class Unseen:
+    """Errors on held-out rows.
+
+    Attributes:
+        squares: (folds,) sum of squared errors [m²].
+        rows: (folds,) rows, each counted by its robust weight.
+    """
+
+    squares: np.ndarray
+    rows: np.ndarray
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the error's norm over all rows [m]."""
+        return float(np.sqrt(max(self.squares.sum(), 0.0) / max(self.rows.sum(), 1)))
+
+    def wins(self, other: Unseen) -> bool:
+        """Say whether this is better than `other` in at least half of the folds."""
+        return bool(np.sum(self.squares < other.squares) * 2 >= len(self.squares))
+
+
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """Statistics of every fold for the columns [free geometry, terms].
+
+    Attributes:
+        rigid: number of geometry columns.
+        groups: (E,) ridge group of each term.
+        sizes: (E,) first guess of each coefficient.
+        plausible: (rigid,) wide prior on the geometry, so that what a fold cannot tell stays at the optimum.
+        training: per fold, statistics of the other folds' rows, whitened.
+        held_out: per fold, statistics of its rows [m], and how many.
+        rows: per fold.
+    """
+
+    rigid: int
+    groups: np.ndarray
+    sizes: np.ndarray
+    plausible: np.ndarray
+    training: list[Gram]
+    held_out: list[Gram]
+    rows: np.ndarray
+    total: Gram
+
+    def problem(self, terms: np.ndarray, fold: int | None = None) -> tuple[Gram, np.ndarray, np.ndarray]:
+        """Return statistics, ridge groups and first sizes for geometry and terms: of all rows, or without a fold."""
+        data = self.total if fold is None else self.training[fold]
+        index = np.concatenate([np.arange(self.rigid), self.rigid + terms])
+        square = data.square[np.ix_(index, index)]
+        square[np.arange(self.rigid), np.arange(self.rigid)] += 1.0 / self.plausible**2
+        _, groups = np.unique(self.groups[terms], return_inverse=True) if len(terms) else (None, np.array([], int))
+        groups = np.concatenate([np.full(self.rigid, -1), groups])
+        sizes = np.concatenate([np.ones(self.rigid), self.sizes[terms]])
+        return Gram(square, data.cross[index], data.total, data.rows), groups, sizes
+
+    def error(self, terms: np.ndarray) -> Unseen:
+        """Return the error on held-out rows of geometry + terms."""
+        index = np.concatenate([np.arange(self.rigid), self.rigid + terms])
+        squares = []
+        for fold, held in enumerate(self.held_out):
+            x = relevance(*self.problem(terms, fold), iterations=8).values
+            square = held.square[np.ix_(index, index)]
+            squares.append(held.total - 2.0 * x @ held.cross[index] + x @ square @ x)
+        return Unseen(np.array(squares), self.rows)
+
+    def error_rigid(self) -> float:
+        """Return the rms error on held-out rows of the geometry alone [m]."""
+        return self.error(np.array([], dtype=int)).rms
+
+    def alive(self, terms: np.ndarray) -> int:
+        """Return how many of the terms the data keep."""
+        ridge = relevance(*self.problem(terms)).ridge[self.rigid :]
+        return int(np.sum(ridge > 0.0))
+
+
+def judge(
+    found: GeometricFit,
+    measured: Sequence[PoseMeasurements],
+    terms: tuple[Term, ...],
+    groups: np.ndarray,
+    sizes: np.ndarray,
+    reference: Chain,
+    folds: Folds,
+    torques: Sequence[np.ndarray | None] | None = None,
+) -> Judge:
+    """Gather the statistics of every fold at a fitted model, for its free parameters and `terms`.
+
+    Args:
+        found: the model, fitted to all rows.
+        measured: the blocks it was fitted to.
+        terms: E deflection terms on offer.
+        groups, sizes: (E,) see `calib.geometry.model_choice.effects`.
+        reference: chain on which the terms' bases are evaluated.
+        folds: partition of the rows.
+        torques: gravity torques per block.
+    """
+    cell = replace(found.cell, deflection=Deflection(terms, np.zeros(len(terms)), reference))
+    free = np.concatenate([found.free, layout(cell).term_index])
+    scales, weights = used_sigmas(found), row_weights(found)
+    rigid = len(found.free)
+    each: list[Gram] = []
+    held_out, rows = [], []
+    pooled = all(has_instrument(block) for block in measured)
+    for fold in range(folds.count):
+        inside = [np.flatnonzero(members == fold) for members in folds.members]
+        metric, whitened, count = _statistics(
+            cell, measured, inside, free, scales, weights, torques, folds.kind == "stations"
+        )
+        held_out.append(metric)
+        rows.append(count)
+        if not pooled:
+            outside = [np.flatnonzero(members != fold) for members in folds.members]
+            whitened = _statistics(cell, measured, outside, free, scales, weights, torques, False)[1]
+        each.append(whitened)
+    if pooled:
+        total = sum(each[1:], each[0])
+        training = [_without(total, part) for part in each]
+    else:
+        total, training = (
+            _statistics(cell, measured, [np.arange(len(b)) for b in measured], free, scales, weights, torques, False)[
+                1
+            ],
+            each,
+        )
+    wide = plausible_deviation(found.cell, found.free) if found.prior is None else found.prior
+    plausible = np.where(np.isfinite(wide), wide, 10.0)
+    return Judge(rigid, groups, sizes, plausible, training, held_out, np.array(rows), total)
+
+
+def _without(total: Gram, part: Gram) -> Gram:
+    return Gram(total.square - part.square, total.cross - part.cross, total.total - part.total, total.rows - part.rows)
+
+
+def _statistics(
+    cell: Installation,
+    measured: Sequence[PoseMeasurements],
+    chosen: Sequence[np.ndarray],
+    free: np.ndarray,
+    scales: Sequence[dict[str, float]],
+    weights: Sequence[np.ndarray],
+    torques: Sequence[np.ndarray | None] | None,
+    replace_station: bool,
+) -> tuple[Gram, Gram, float]:
+    """Return the statistics of chosen rows in metres (of what is in metres), whitened, and the count of metric rows."""
+    p = len(free)
+    metric = whitened = Gram(np.zeros((p, p)), np.zeros(p), 0.0, 0)
+    count = 0.0
+    for number, (block, rows) in enumerate(zip(measured, chosen)):
+        frames: list[tuple[np.ndarray, np.ndarray]] = []
+        pieces = np.array_split(rows, max(1, len(rows) // CHUNK)) if has_instrument(block) else [rows]
+        for piece in pieces:
+            if len(piece) == 0:
+                continue
+            torque = None if torques is None else torques[number]
+            part_block = take(block, piece)
+            ready = prepare(cell, [part_block], [None if torque is None else torque[piece]])
+            for part in observe(cell, ready[0], free):
+                weight = weights[number][piece][part.index]
+                root = np.broadcast_to(np.sqrt(weight), part.value.shape).ravel()
+                residual, matrix = root * part.value.ravel(), (root * part.jacobian.reshape(p, -1)).T
+                sigma = scales[number][part.label]
+                whitened = whitened + gram(residual / sigma, matrix / sigma)
+                if part.label in METRES:
+                    count += float(weight.sum())
+                    if replace_station:
+                        frames.append((residual, matrix))
+                    else:
+                        metric = metric + gram(residual, matrix)
+        if frames:
+            metric = metric + _replaced(cell, frames, free)
+    return metric, whitened, count
+
+
+def _replaced(cell: Installation, frames: list[tuple[np.ndarray, np.ndarray]], free: np.ndarray) -> Gram:
+    """Return the statistics of one block with its station's placement projected out."""
+    residual = np.concatenate([r for r, _ in frames])
+    matrix = np.concatenate([w for _, w in frames])
+    station = np.flatnonzero(np.isin(free, layout(cell).station_index))
+    q, _ = np.linalg.qr(matrix[:, station])
+    residual = residual - q @ (q.T @ residual)
+    return gram(residual, matrix - q @ (q.T @ matrix))

@@ -1,0 +1,136 @@
+"""How measurements are set aside to judge a model: by station, by file, by fixture, or by region of the joint space.
+
+A random split of grid data holds out neighbours of what was fitted and flatters every model; these folds ask for
+transfer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.data.poses.measurements import PoseMeasurements
+from calib.errors import UsageError
+from calib.geometry.observation import has_instrument
+
+REGIONS = 20
+FOLDS = 5
+MOST = 150
+
+
+@dataclass(frozen=True, eq=False)
+class Folds:
+    """A partition of the rows of all blocks.
+
+    Attributes:
+        kind: ``stations``, ``files``, ``fixtures`` or ``regions``; ``random`` or ``poses`` (one left out) on request.
+        count: number of folds.
+        members: per block, (m,) fold of each row.
+    """
+
+    kind: str
+    count: int
+    members: tuple[np.ndarray, ...]
+
+
+def transfer_folds(measured: Sequence[PoseMeasurements], seed: int = 0) -> Folds:
+    """Return the most demanding folds the measurements allow.
+
+    Two or more stations: leave one station out (its placement is fitted anew on the held-out rows). Two or more files
+    without an instrument: leave one file out. Several fixtures (groups of linked sockets, planes): leave some out. Else
+    `REGIONS` regions of the joint space by k-means, in `FOLDS` folds, both fewer where there are few rows.
+    """
+    stations = list(dict.fromkeys(block.station for block in measured if has_instrument(block)))
+    if len(stations) >= 2 and all(has_instrument(block) for block in measured):
+        count = min(len(stations), 2 * FOLDS)
+        members = tuple(np.full(len(b), stations.index(b.station) % count) for b in measured)
+        return Folds("stations", count, members)
+    files = list(dict.fromkeys(block.file for block in measured))
+    if len(files) >= 2 and not stations:
+        count = min(len(files), 2 * FOLDS)
+        return Folds("files", count, tuple(np.full(len(b), files.index(b.file) % count) for b in measured))
+    if len(measured) == 1 and measured[0].kind == "sockets" and (fixtures := _fixtures(measured[0])) is not None:
+        return fixtures
+    return region_folds(measured, seed=seed)
+
+
+def region_folds(
+    measured: Sequence[PoseMeasurements], regions: int = REGIONS, folds: int = FOLDS, seed: int = 0
+) -> Folds:
+    """Return folds made of regions of the joint space (k-means on joint values in units of their spread)."""
+    from scipy.cluster.vq import kmeans2
+
+    q = np.concatenate([block.q for block in measured])
+    spread = q.std(axis=0)
+    scaled = q[:, spread > 1e-9] / spread[spread > 1e-9]
+    regions = int(np.clip(len(q) // 12, 2, regions))
+    count = min(folds, regions)
+    _, label = kmeans2(scaled, regions, rng=seed, minit="++", missing="warn")
+    order = {int(old): new for new, old in enumerate(np.argsort(-np.bincount(label, minlength=regions)))}
+    fold = np.array([order[int(k)] for k in label]) % count
+    members = np.split(fold, np.cumsum([len(block) for block in measured])[:-1])
+    return Folds("regions", count, tuple(_whole(block, rows) for block, rows in zip(measured, members)))
+
+
+def folds_by_name(name: str, measured: Sequence[PoseMeasurements], seed: int = 0) -> Folds:
+    """Return `transfer_folds`, `region_folds`, ten `random_folds`, or one fold for each of the ``poses``.
+
+    Raises:
+        UsageError: for another name, or for leaving out each of more than `MOST` poses.
+    """
+    if name == "poses" and sum(len(block) for block in measured) > MOST:
+        raise UsageError(
+            f"--folds poses leaves out every pose once, which is for {MOST} rows at most; take --folds random"
+        )
+    ways = {
+        "transfer": lambda: transfer_folds(measured, seed),
+        "regions": lambda: region_folds(measured, seed=seed),
+        "random": lambda: random_folds(measured, 10, seed),
+        "poses": lambda: random_folds(measured, None, seed),
+    }
+    if name not in ways:
+        raise UsageError(f"--folds {name}: expected one of {', '.join(ways)}")
+    return ways[name]()
+
+
+def random_folds(measured: Sequence[PoseMeasurements], folds: int | None = 10, seed: int = 0) -> Folds:
+    """Return folds drawn at random: k-fold, or leave-one-out where `folds` is None.
+
+    They ask for interpolation only: on a grid every held-out pose has neighbours among the fitted ones, so that errors
+    come out smaller than elsewhere in the workspace. Reflectors of one pose and the two rows of a distance stay
+    together.
+    """
+    members = []
+    for number, block in enumerate(measured):
+        _, unit = np.unique(block.group if block.kind == "distance" else block.rows, return_inverse=True)
+        count = int(unit.max(initial=-1)) + 1
+        wanted = count if folds is None else min(folds, count)
+        order = np.random.default_rng([seed, number]).permutation(count)
+        members.append((order % wanted)[unit])
+    highest = max(int(fold.max(initial=0)) for fold in members) + 1
+    return Folds("poses" if folds is None else "random", highest, tuple(members))
+
+
+def _whole(block: PoseMeasurements, fold: np.ndarray) -> np.ndarray:
+    """Keep the two rows of a distance in one fold."""
+    if block.kind != "distance":
+        return fold
+    _, first, inverse = np.unique(block.group, return_index=True, return_inverse=True)
+    return fold[first][inverse]
+
+
+def _fixtures(block: PoseMeasurements) -> Folds | None:
+    """Return folds of whole fixtures, sockets tied by known distances counting as one; None for fewer than three."""
+    root = {int(group): int(group) for group in np.unique(block.group)}
+    for a, b, _ in block.links:
+        if a in root and b in root:
+            old, new = root[b], root[a]
+            root = {group: new if parent == old else parent for group, parent in root.items()}
+    names = sorted(set(root.values()))
+    if len(names) < 3:
+        return None
+    count = min(len(names), FOLDS)
+    fold = {group: names.index(parent) % count for group, parent in root.items()}
+    return Folds("fixtures", count, (np.array([fold[int(group)] for group in block.group]),))

@@ -1,0 +1,277 @@
+"""A ladder of models, climbed as far as the data carry it.
+
+    frames → offsets → geometry → + stiffness → + bending → + coupling → + harmonics → + wobble
+
+Every rung is judged on rows it was not fitted to (`calib.geometry.model_choice.folds`). Of the effects, the one that
+lowers that
+error most is taken up, then the one that pays most beside it, until none pays: sag may show only once gear errors are
+gone. Without an instrument (sockets, planes, distances) the geometry is drawn to its nominal as strongly as the data
+say (`calib.geometry.fit.drawn_fit`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.data.poses.measurements import PoseMeasurements
+from calib.errors import UsageError
+from calib.estimation.relevance import relevance
+from calib.geometry.deflection import Deflection, Term
+from calib.geometry.fit import fit, fit_with_prior, polish_frames
+from calib.geometry.installation import Installation
+from calib.geometry.model_choice.cross_validation import Judge, judge
+from calib.geometry.model_choice.effects import EFFECTS, MODELS, Effect, term_groups, term_sizes
+from calib.geometry.model_choice.folds import Folds, transfer_folds
+from calib.geometry.observation import has_instrument, prepare
+from calib.geometry.parameters import layout
+from calib.geometry.result import GeometricFit, outliers
+from calib.geometry.weighing import Settings
+
+GAIN = 0.03  # an effect has to lower the error on unseen rows by this share (our choice)
+POSES_PER_ORDER = 8  # harmonics of order k are offered to sets of at least 8 k poses (our choice)
+
+GROSS = 8.0  # robust sigmas beyond which a row is not of this robot (our choice)
+
+Progress = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One model tried.
+
+    Attributes:
+        model: its name, e.g. ``geometry`` or ``+ harmonics``.
+        parameters: how many it fits.
+        cross_validated: rms error on unseen rows [m].
+        kept: whether the climb goes on from here.
+        note: why, in words.
+    """
+
+    model: str
+    parameters: int
+    cross_validated: float
+    kept: bool
+    note: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Climb:
+    """Where the ladder ended.
+
+    Attributes:
+        fit: the chosen model, fitted to all rows.
+        nominal: the nominal arm with its frames fitted to all rows.
+        rigid: the best fit without effects, to all rows. The geometry inside ``fit`` is good only together with its
+            effects, which trade with it; what has to do without them (a URDF) takes this one.
+        rungs: all models tried, in order.
+        chosen: name of the chosen model, e.g. ``geometry + harmonics``.
+        folds: how the unseen rows were set aside.
+        loss: the loss that was used.
+    """
+
+    fit: GeometricFit
+    nominal: GeometricFit
+    rigid: GeometricFit
+    rungs: tuple[Rung, ...]
+    chosen: str
+    folds: Folds
+    loss: str = "none"
+
+
+def climb(
+    cell: Installation,
+    measured: Sequence[PoseMeasurements],
+    model: str = "auto",
+    *,
+    settings: Settings | None = None,
+    torques: Sequence[np.ndarray | None] | None = None,
+    fixed: np.ndarray | None = None,
+    prior: np.ndarray | None = None,
+    seed: int = 0,
+    folds: Folds | None = None,
+    progress: Progress | None = None,
+) -> Climb:
+    """Fit the model the data support, or the one asked for by name.
+
+    Args:
+        cell: nominal arm, frames placed (`calib.geometry.first_guess.install`).
+        measured: blocks of measurements.
+        model: ``auto``, or one of `MODELS`: that rung and all below it.
+        settings: of every fit. With loss ``auto``, rows beyond `GROSS` robust sigmas of the rigid fit turn it into
+            ``cauchy``, for the fits and for the errors on unseen rows alike.
+        torques: gravity torques (m, n) per block [N m]; None where the masses are not known.
+        fixed: positions in the parameter vector that stay at their nominal.
+        prior: standard deviations of the parameter vector about its nominal; infinite where nothing is known.
+        seed: of the regions.
+        folds: how unseen rows are set aside; None for the most demanding way (`calib.geometry.model_choice.folds`).
+        progress: called with (done, total, what).
+
+    Raises:
+        UsageError: for a model that does not exist.
+    """
+    if model not in ("auto", *MODELS):
+        raise UsageError(f"model '{model}' is none of auto, {', '.join(MODELS)}")
+    tell = progress or (lambda done, total, what: None)
+    folds, settings = folds or transfer_folds(measured, seed), settings or Settings()
+    climber = _Climber(cell, measured, settings, torques, fixed, prior, folds, tell)
+    climber.rigid(model)
+    if settings.loss == "auto" and outliers(climber.best, GROSS):
+        climber = _Climber(cell, measured, replace(settings, loss="cauchy"), torques, fixed, prior, folds, tell)
+        climber.rigid(model)
+    if model == "auto" or model in [effect.name for effect in EFFECTS]:
+        climber.effects(model)
+    return climber.result()
+
+
+class _Climber:
+    """The state of one climb: what is kept so far and the rungs tried."""
+
+    def __init__(
+        self,
+        cell: Installation,
+        measured: Sequence[PoseMeasurements],
+        settings: Settings,
+        torques: Sequence[np.ndarray | None] | None,
+        fixed: np.ndarray | None,
+        prior: np.ndarray | None,
+        folds: Folds,
+        tell: Progress,
+    ):
+        self.measured, self.settings, self.torques, self.folds, self.tell = measured, settings, torques, folds, tell
+        self.fixed, self.prior = np.array([], dtype=int) if fixed is None else fixed, prior
+        tell(0, len(MODELS), "frames")
+        self.nominal = polish_frames(cell, measured, settings)
+        self.best, self.rungs, self.chosen = self.nominal, [], "frames"
+        self.stiff = self.nominal
+        self.steps = 0
+        self.drawn = not all(has_instrument(block) for block in measured)
+
+    def rigid(self, model: str) -> None:
+        """Try frames, joint offsets and the full geometry."""
+        table = layout(self.nominal.cell)
+        chain = self.nominal.cell.chain
+        offsets = [k for k, e in enumerate(chain.elements) if e.joint is not None]
+        choices = {
+            "frames": table.frame_index,
+            "offsets": np.concatenate([offsets, table.frame_index]).astype(int),
+            "geometry": np.concatenate([table.arm_index, table.frame_index]),
+        }
+        error = np.inf
+        last = model if model in choices else "geometry"
+        for name, candidates in choices.items():
+            self._tick(name)
+            candidates = np.setdiff1d(candidates, self.fixed)
+            found = self.nominal if name == "frames" else fit(
+                self.nominal.cell, self.measured, candidates, settings=self.settings, drawn=self.drawn, prior=self.prior
+            )  # fmt: skip
+            unseen = self._judge(found, ()).error_rigid()
+            better = unseen < error * (1.0 - GAIN)
+            wanted = better if model == "auto" else name == last
+            self.rungs.append(Rung(name, len(found.free), unseen, wanted, "" if better else "no better on unseen rows"))
+            if wanted:
+                self.best, self.chosen, error = found, name, unseen
+            elif model != "auto" and name != last:
+                error = min(error, unseen)
+            if name == last:
+                break
+        self.stiff = self.best
+
+    def effects(self, model: str) -> None:
+        """Try the effects one by one on top of the geometry; by name, take all up to it."""
+        if self.chosen != "geometry":
+            return
+        offered = {effect.name: self._terms(effect) for effect in EFFECTS}
+        everything = tuple(term for terms in offered.values() for term in terms)
+        self._tick("observation matrix")
+        bench = self._judge(self.best, everything)
+        place = _places(offered)
+        names = [effect.name for effect in EFFECTS]
+        if model == "auto":
+            kept = self._greedy(bench, offered, place)
+        else:
+            kept = names[: names.index(model) + 1]
+            where = np.concatenate([place[name] for name in kept])
+            self._tick(model)
+            self.rungs.append(self._rung(bench, f"+ {model}", where, True, ""))
+        if kept:
+            self._tick("final fit")
+            self.best = self._final(bench, [term for name in kept for term in offered[name]], [place[n] for n in kept])
+            self.chosen = " + ".join(["geometry", *kept])
+            last = max(k for k, rung in enumerate(self.rungs) if rung.kept)
+            self.rungs[last] = replace(self.rungs[last], parameters=len(self.best.free))
+
+    def _greedy(self, bench: Judge, offered: dict[str, list[Term]], place: dict[str, np.ndarray]) -> list[str]:
+        """Return the effects that pay on unseen rows, in the order they were taken up: each time the best one."""
+        kept: list[str] = []
+        error = bench.error(np.array([], dtype=int))
+        waiting = [name for name in offered if offered[name]]
+        while waiting:
+            tried = {}
+            for name in waiting:
+                self._tick(name)
+                tried[name] = bench.error(np.concatenate([place[other] for other in [*kept, name]]))
+            best = min(waiting, key=lambda name: tried[name].rms)
+            pays = tried[best].rms < error.rms * (1.0 - GAIN) and tried[best].wins(error)
+            for name in waiting if not pays else [best]:
+                note = "" if name == best and pays else "no better on unseen rows: left out"
+                where = np.concatenate([place[other] for other in [*kept, name]])
+                self.rungs.append(self._rung(bench, f"+ {name}", where, not note, note, tried[name].rms))
+            if not pays:
+                break
+            kept.append(best)
+            waiting.remove(best)
+            error = tried[best]
+        return kept
+
+    def _rung(
+        self, bench: Judge, name: str, where: np.ndarray, kept: bool, note: str, rms: float | None = None
+    ) -> Rung:
+        rms = bench.error(where).rms if rms is None else rms
+        return Rung(name, bench.rigid + bench.alive(where), rms, kept, note)
+
+    def _final(self, bench: Judge, terms: list[Term], places: list[np.ndarray]) -> GeometricFit:
+        """Fit geometry and effects to all rows, each term with the ridge the data chose; terms without effect go."""
+        chosen = relevance(*bench.problem(np.concatenate(places)))
+        ridge = chosen.ridge[bench.rigid :]
+        alive = np.flatnonzero(ridge > 0.0)
+        picked = tuple(terms[k] for k in alive)
+        cell = replace(
+            self.best.cell, deflection=Deflection(picked, np.zeros(len(picked)), self.nominal.cell.chain)
+        )  # fmt: skip
+        free = np.concatenate([self.best.free, layout(cell).term_index])
+        own = np.full(len(self.best.free), np.inf) if self.best.prior is None else self.best.prior
+        prior = np.concatenate([own, ridge[alive]])
+        blocks = prepare(cell, self.measured, self.torques)
+        nominal = replace(cell, chain=self.nominal.cell.chain)
+        found = fit_with_prior(cell, blocks, free, prior, settings=self.settings, nominal=nominal)
+        return replace(found, start=self.best.start, split=self.best.split, candidates=self.best.candidates)
+
+    def _terms(self, effect: Effect) -> list[Term]:
+        """Return an effect's terms, harmonics only up to what so many poses can ever tell."""
+        known = self.torques is not None and all(torque is not None for torque in self.torques)
+        highest = sum(len(block) for block in self.measured) // POSES_PER_ORDER
+        terms = effect.terms(self.nominal.cell.chain, known)
+        return [term for term in terms if term.basis not in ("cos", "sin") or term.order <= highest]
+
+    def _judge(self, found: GeometricFit, terms: tuple[Term, ...]) -> Judge:
+        return judge(
+            found, self.measured, terms, term_groups(terms), term_sizes(terms), self.nominal.cell.chain, self.folds,
+            self.torques,
+        )  # fmt: skip
+
+    def _tick(self, what: str) -> None:
+        self.steps += 1
+        self.tell(self.steps, 2 * len(MODELS), what)
+
+    def result(self) -> Climb:
+        loss = "none" if self.settings.loss == "auto" else self.settings.loss
+        return Climb(self.best, self.nominal, self.stiff, tuple(self.rungs), self.chosen, self.folds, loss)
+
+
+def _places(offered: dict[str, list[Term]]) -> dict[str, np.ndarray]:
+    """Return where each effect's terms stand among all of them."""
+    edges = np.cumsum([0, *(len(terms) for terms in offered.values())])
+    return {name: np.arange(edges[k], edges[k + 1]) for k, name in enumerate(offered)}

@@ -1,0 +1,122 @@
+"""What a pose would tell of a robot: the callables that pose selection (package `poses`) works with.
+
+Both pickle, so that selection can run on several processes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.data.poses.measurements import PoseMeasurements
+from calib.errors import Unidentifiable, UsageError
+from calib.geometry.identifiability import base_columns
+from calib.geometry.installation import Installation, see
+from calib.geometry.observation import Block, prepare, target_jacobian
+from calib.geometry.parameters import layout
+from calib.robot.chain import Chain, random_joints
+from calib.robot.kinematics import element_jacobian, joint_jacobian
+from calib.transforms import pose, to_quaternion
+
+KINDS = ("pose", "position")
+SAMPLES = 300  # random postures that decide what is identifiable
+SIGMA_POSITION, SIGMA_ORIENTATION = 1e-4, 1e-4  # [m], [rad]: our choice where none is stated
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """Whitened observation Jacobian in base columns: q (m, n) -> (m, rows, p).
+
+    Attributes:
+        cell: the nominal arm, its base at the instrument's origin, with its targets.
+        kind: ``pose`` (six rows per target) or ``position`` (three).
+        free: (p,) the parameters that such measurements can tell, in the full vector.
+        sigmas: of a position [m] and of an orientation [rad].
+    """
+
+    cell: Installation
+    kind: str
+    free: np.ndarray
+    sigmas: tuple[float, float] = (SIGMA_POSITION, SIGMA_ORIENTATION)
+
+    def __call__(self, q: np.ndarray) -> np.ndarray:
+        rows = []
+        for number in range(len(self.cell.tools)):
+            seen = see(self.cell, q, 0, np.full(len(q), number))
+            block = Block(_measured(q, self.cell, number, self.kind), 0, np.full(len(q), number))
+            jacobian = target_jacobian(self.cell, block, seen, self.free)
+            rows.append(jacobian[:, :3] / self.sigmas[0])
+            if self.kind == "pose":
+                rows.append(jacobian[:, 3:] / self.sigmas[1])
+        return np.concatenate(rows, axis=1).transpose(2, 1, 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """Where the first target is, in the arm's base: q (m, n) -> rotation (m, 3, 3), position (m, 3) [m]."""
+
+    cell: Installation
+
+    def __call__(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        poses = see(self.cell, q).poses()
+        return poses[:, :3, :3], poses[:, :3, 3]
+
+
+@dataclass(frozen=True, eq=False)
+class TargetJacobian:
+    """Velocity and angular velocity of the first target per joint velocity: q (m, n) -> (m, 6, n)."""
+
+    cell: Installation
+
+    def __call__(self, q: np.ndarray) -> np.ndarray:
+        seen = see(self.cell, q)
+        elements = element_jacobian(self.cell.chain, seen.walked, seen.point)
+        return joint_jacobian(self.cell.chain, elements).transpose(2, 1, 0)
+
+
+def targets_of(chain: Chain, tools: Sequence[Sequence[float]] = ()) -> Installation:
+    """Return the arm with targets at the given places in the tip's frame (3,) [m]; at the tip where none is given."""
+    places = [np.asarray(tool, dtype=float) for tool in tools] or [np.zeros(3)]
+    names = tuple(f"tool {k + 1}" for k in range(len(places))) if len(places) > 1 else ("tool",)
+    return Installation(chain, tools=np.array([pose(None, place) for place in places]), tool_names=names)
+
+
+def observation(
+    cell: Installation, kind: str = "pose", sigmas: tuple[float, float] | None = None, seed: int = 0
+) -> Observation:
+    """Return the observation Jacobian of a nominal arm in the columns that random postures can tell.
+
+    Args:
+        cell: see `targets_of`.
+        kind: ``pose`` or ``position``.
+        sigmas: of a position [m] and an orientation [rad].
+        seed: of the postures.
+    """
+    if kind not in KINDS:
+        raise UsageError(f"kind '{kind}' is none of {', '.join(KINDS)}")
+    q = random_joints(cell.chain, SAMPLES, seed)
+    blocks = prepare(cell, [_measured(q, cell, number, kind) for number in range(len(cell.tools))])
+    columns = np.arange(len(layout(cell).names))
+    if kind == "position":  # a point has no orientation of its own
+        turns = [k for k in layout(cell).tool_index if layout(cell).units[k] == "rad"]
+        columns = np.setdiff1d(columns, turns)
+    split = base_columns(cell, blocks, columns)
+    if not split.rank:
+        raise Unidentifiable(f"robot '{cell.chain.name}': no parameter has an effect on what is measured")
+    return Observation(cell, kind, columns[split.kept], sigmas or (SIGMA_POSITION, SIGMA_ORIENTATION))
+
+
+def _measured(q: np.ndarray, cell: Installation, number: int, kind: str) -> PoseMeasurements:
+    """Return what an exact instrument would measure of one target."""
+    poses = see(cell, q, 0, np.full(len(q), number)).poses()
+    return PoseMeasurements(
+        kind,
+        q,
+        cell.chain.joint_names,
+        position=poses[:, :3, 3],
+        quaternion=to_quaternion(poses) if kind == "pose" else None,
+        tool_names=(cell.tool_names[number],),
+        station=cell.station_names[0],
+    )

@@ -1,0 +1,244 @@
+"""A ladder of friction, climbed joint by joint as far as unseen time rewards it.
+
+    standard → + load → + presliding → + stribeck → + asymmetric → + root → + cubic → + ripple
+
+Every rung is tried on top of those taken: all joints get its terms, every time block is predicted by a fit to the
+others, and the terms stay at the joints whose error on unseen time falls by `GAIN`. Terms of a rung have a ridge per
+joint, chosen by evidence, so that a rich rung (ripple) may offer more than the data can tell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.data.signals.decimation import Decimator
+from calib.dynamics import friction
+from calib.dynamics.drives import Term
+from calib.errors import UsageError
+from calib.identification.cases import Case
+from calib.identification.friction.time_folds import Bench
+from calib.identification.rows import Rows, extend, observe_terms, triangulate
+
+GAIN = 0.02  # a rung has to lower a joint's rms error on unseen time by this share (our choice)
+WIDTHS = (0.0005, 0.002, 0.008, 0.03)  # of presliding, shares of a joint's travel (our choice)
+WINS = 0.6  # and on this share of the blocks
+RUNGS = ("load", "presliding", "stribeck", "asymmetric", "root", "cubic")
+NAMES = ("auto", "standard", *RUNGS, "ripple")
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One rung tried.
+
+    Attributes:
+        model: e.g. ``standard`` or ``+ load``.
+        parameters: of the model, all joints.
+        cross_validated: relative error on unseen time, total over all rows [%].
+        joints: the same for each row [%].
+        kept_at: joints, from 0, where it stays.
+        note: in words.
+    """
+
+    model: str
+    parameters: int
+    cross_validated: float
+    joints: tuple[float, ...]
+    kept_at: tuple[int, ...]
+    note: str = ""
+
+    @property
+    def kept(self) -> bool:
+        return bool(self.kept_at) or self.model == "standard"
+
+
+@dataclass(frozen=True, eq=False)
+class Climb:
+    """Where the ladder ended: the terms taken, their ridge groups, and the rungs."""
+
+    terms: tuple[Term, ...]
+    groups: tuple[int, ...]
+    rungs: tuple[Rung, ...]
+
+    @property
+    def chosen(self) -> str:
+        return " + ".join(["standard", *(rung.model[2:] for rung in self.rungs if rung.kept and rung.model[0] == "+")])
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """What a climb stands on.
+
+    Attributes:
+        cases: recordings to learn from.
+        rows: their rows in the base columns and standard drive terms, blocks numbered.
+        loads: transmitted torques of each case (N, n), by a first fit.
+        decimator: of the rows.
+        std, inflation: (rows,) of the first fit's residuals.
+        v0: (n,) smoothing of the Coulomb sign.
+        linear: (n,) prismatic joints.
+        prior: (k, b + 1) what is known of the base parameters (`calib.identification.prior`); None for nothing.
+    """
+
+    cases: Sequence[Case]
+    rows: Sequence[Rows]
+    loads: Sequence[np.ndarray | None]
+    decimator: Decimator
+    std: np.ndarray
+    inflation: np.ndarray
+    v0: np.ndarray
+    linear: np.ndarray
+    prior: np.ndarray | None = None
+
+    @property
+    def n(self) -> int:
+        return self.cases[0].motion.n
+
+
+def climb(ground: Ground, wanted: str = "auto", progress: Progress | None = None) -> Climb:
+    """Return the friction terms that unseen time rewards, or those of a rung by name.
+
+    Args:
+        wanted: ``auto``; ``standard`` (or ``ripple``, found later by `calib.identification.friction.ripple`): none;
+            a rung's name: that rung at all joints, nothing else.
+    """
+    say = progress or (lambda words: None)
+    if wanted not in NAMES:
+        raise UsageError(f"friction '{wanted}' is none of {', '.join(NAMES)}")
+    say("friction: columns")
+    offered = {name: _terms(ground, name) for name in RUNGS if wanted in ("auto", name)}
+    every = [one for terms in offered.values() for one in terms]
+    bench, place = _bench(ground, offered, every)
+    base = np.arange(bench.data.parameters - len(every))
+    say("friction: standard")
+    size = _sizes(ground, bench)
+    error = bench.errors(base)
+    rungs = [_rung("standard", len(base), error, size, tuple(range(ground.n)))]
+    taken: list[int] = []
+    waiting = list(offered)
+    for second in (False, True):
+        refused = []
+        for name in waiting:
+            say(f"friction: {name}")
+            columns = [k for k in place[name] if k not in taken]
+            found, new, at = _try(bench, base, taken, columns, every, error, wanted != "auto")
+            note = "" if at else "no better on unseen time: left out"
+            shown = new if found else bench.errors(np.array([*base, *taken, *columns]))
+            rungs.append(_rung(f"+ {name}", len(base) + len(taken) + len(found or columns), shown, size, at, note))
+            if found:
+                taken, error = [*taken, *found], new
+            else:
+                refused.append(name)
+        if second or not taken or not refused:
+            break
+        waiting = [name for name in refused if any(at > place[name][0] for at in taken)]
+    groups = bench.group[taken]
+    return Climb(tuple(every[k - len(base)] for k in taken), tuple(int(g) for g in groups), tuple(rungs))
+
+
+def _try(
+    bench: Bench,
+    base: np.ndarray,
+    taken: list[int],
+    columns: list[int],
+    every: list[Term],
+    error: np.ndarray,
+    forced: bool,
+) -> tuple[list[int], np.ndarray, tuple[int, ...]]:
+    """Return the columns that stay, the errors with them, and their joints."""
+    joint = {k: every[k - len(base)].acts[0][0] for k in columns}
+    everyone = tuple(sorted(set(joint.values())))
+    new = bench.errors(np.array([*base, *taken, *columns]))
+    if forced:
+        return columns, new, everyone
+    at = tuple(j for j in everyone if _pays(error[:, j], new[:, j]))
+    if not at:
+        return [], error, ()
+    some = [k for k in columns if joint[k] in at]
+    if len(some) < len(columns):
+        new = bench.errors(np.array([*base, *taken, *some]))
+        at = tuple(j for j in at if _pays(error[:, j], new[:, j]))
+        some = [k for k in some if joint[k] in at]
+        new = bench.errors(np.array([*base, *taken, *some])) if some else error
+    return some, new, at
+
+
+def _pays(before: np.ndarray, after: np.ndarray) -> bool:
+    """Say whether a joint's squared errors per block fell enough, and on enough blocks."""
+    used = before > 0.0
+    if not used.any():
+        return False
+    lower = float(np.mean(after[used] < before[used]))
+    return bool(after.sum() < (1.0 - GAIN) ** 2 * before.sum() and lower >= WINS)
+
+
+def _terms(ground: Ground, name: str) -> list[Term]:
+    """Return a rung's terms of all joints."""
+    found: list[Term] = []
+    for j in range(ground.n):
+        v = np.concatenate([np.abs(case.motion.v[:, j]) for case in ground.cases])
+        peak = float(np.quantile(v, 0.98))
+        if peak <= 0.0:
+            continue
+        travel = float(np.ptp(np.concatenate([case.motion.q[:, j] for case in ground.cases])))
+        v0 = float(ground.v0[j])
+        terms = {
+            "load": lambda: friction.load_dependent(j, v0, viscous=True),  # noqa: B023
+            "presliding": lambda: friction.presliding(j, [travel * x for x in WIDTHS], v0),  # noqa: B023
+            "stribeck": lambda: (
+                *friction.stribeck(j, 0.05 * peak, v0=v0),  # noqa: B023
+                replace(friction.stribeck(j, 0.2 * peak, v0=v0)[0], name=f"Fs{j + 1}.2"),  # noqa: B023
+            ),
+            "asymmetric": lambda: friction.asymmetric(j),  # noqa: B023
+            "root": lambda: friction.root(j, v0),  # noqa: B023
+            "cubic": lambda: friction.cubic(j),  # noqa: B023
+        }[name]()
+        found += [replace(one, linear=bool(ground.linear[j])) for one in terms]
+    return found
+
+
+def _bench(ground: Ground, offered: dict[str, list[Term]], every: list[Term]) -> tuple[Bench, dict[str, list[int]]]:
+    """Return the bench with all offered columns behind the base's, and where each rung's stand."""
+    rows = [
+        extend(part, every, observe_terms(every, case, ground.decimator, load))
+        for part, case, load in zip(ground.rows, ground.cases, ground.loads)
+    ]
+    data = triangulate(rows)
+    base = data.parameters - len(every)
+    group, place, start, number = np.full(data.parameters, -1), {}, base, 0
+    for name, terms in offered.items():
+        place[name] = list(range(start, start + len(terms)))
+        for k, one in enumerate(terms):
+            if k and one.acts[0][0] != terms[k - 1].acts[0][0]:
+                number += 1
+            group[start + k] = number
+        start += len(terms)
+        number += 1
+    blocks = 1 + max(int(part.block.max(initial=-1)) for part in rows)
+    return Bench(
+        data, rows[0].target.shape[1], blocks, ground.std, ground.inflation, group, _padded(ground.prior, len(every))
+    ), place
+
+
+def _padded(prior: np.ndarray | None, more: int) -> np.ndarray | None:
+    """Return the prior's rows with zeros for `more` columns behind the base's."""
+    if prior is None:
+        return None
+    return np.hstack([prior[:, :-1], np.zeros((len(prior), more)), prior[:, -1:]])
+
+
+def _sizes(ground: Ground, bench: Bench) -> np.ndarray:
+    """Return Σ τ² per row over the judged blocks (rows,)."""
+    squares = bench.data.factors[:, :, -1] ** 2
+    return squares.sum(axis=1).reshape(-1, bench.rows)[: bench.blocks].sum(axis=0)
+
+
+def _rung(name: str, parameters: int, error: np.ndarray, size: np.ndarray, at: tuple[int, ...], note: str = "") -> Rung:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        joints = 100.0 * np.sqrt(error.sum(axis=0) / size)
+    total = float(100.0 * np.sqrt(error.sum() / size.sum()))
+    return Rung(name, parameters, total, tuple(float(x) for x in np.nan_to_num(joints)), at, note)

@@ -1,0 +1,299 @@
+"""Gear ripple: torque that repeats with a gear's position, found in what a model leaves above the motion's band.
+
+    tau_j += Σ_i Σ_k Σ_m g_m(k v_i) (s_ikm sin k q_i + c_ikm cos k q_i),
+
+g_m hat functions of the ripple's frequency k v / 2π, one set per direction: the structure answers it as an oscillator,
+with a gain and a phase that depend on that frequency (our choice). Not only a joint's own gear is felt: on the Panda,
+gear 1 explains more of joint 3's ripple than joint 3's own does. Beyond the positions it was learnt at, it fades.
+
+Orders come in families: a gear of N motor turns per turn shows at N, a harmonic drive (whose wave has two lobes) above
+all at 2 N against the flexspline and at 2 N + 2 against the output, and at twice those. A motion of three radians
+hardly tells orders two apart, and single ones that fit one place do not carry over to another: on the Panda, with the
+same search, free orders explain less of unseen motion than the family does. So a gear's N is found first, joints of
+similar gears sharing it; free orders are offered where no family pays. What repeats shows in how far the residual's
+waves agree in phase between blocks of time:
+
+    S(k) = Σ_b (|Σ_c F_bc(k)|² - Σ_c |F_bc(k)|²) / N_b,    F_bc(k) = Σ residual · exp(-i k q)
+
+over speed bins b and time blocks c, for all whole orders at once by FFT over the position (our choice: neither noise
+nor a single loud moment has a part in it). How strongly the columns are drawn to zero, how finely frequency is told
+apart, and whether an order stays at all, time blocks that are left out decide.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from calib.arrays import frozen
+from calib.data.signals.filtering import low_pass
+from calib.dynamics.drives import Term
+from calib.dynamics.shapes import Joined
+from calib.identification.cases import Case
+from calib.identification.rows import segments
+
+COARSE, FINE = (10.0, 40.0), (10.0, 20.0, 30.0, 45.0, 65.0)  # nodes of the gains [Hz]
+LOWEST, HIGHEST = 16, 800  # orders per turn
+TURNS = range(16, 321)  # motor turns per turn that a family may have
+SIMILAR = 0.6  # of a gear's own best coherence: a number of turns that other gears have is taken instead (our choice)
+CELLS = 8192  # of a turn, for the search
+BINS = 4  # of the speed, per direction
+RIDGES = (0.03, 0.1, 0.3, 1.0)  # of the mean information of a column
+LEAST = 0.1  # [rad] that a joint must travel
+BLOCKS = 8
+PAYS = 0.015  # of the fast residual's power on left-out blocks, per step of the search in families
+WORTH = 0.03  # in all: 1.5 % of its rms
+FREE = 0.04  # and where no family pays: 2 % of its rms (our choices)
+PAIRS = 3  # of free orders, at most
+SAMPLES = 4_000  # of the search
+START = 0.5  # [s] left out at the beginning, where robots start
+
+Wave = tuple[int, int]  # joint whose gear turns, order per turn of it
+
+
+@dataclass(frozen=True, eq=False)
+class Ripple:
+    """The ripple in one joint's torque.
+
+    Attributes:
+        joint: from 0.
+        waves: (joint whose gear makes it, order per turn of it).
+        terms, values: (k,) drive terms and their parameters.
+        share: part of the fast residual's power on left-out blocks that it explains.
+    """
+
+    joint: int
+    waves: tuple[Wave, ...]
+    terms: tuple[Term, ...]
+    values: np.ndarray
+    share: float
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Where the gears have been: q, v (N, n), the number of the time block (N,), and the joints that travel."""
+
+    q: np.ndarray
+    v: np.ndarray
+    block: np.ndarray
+    moving: tuple[int, ...]
+
+
+def find_all(cases: Sequence[Case], residuals: Sequence[np.ndarray]) -> list[Ripple]:
+    """Return the ripples in all joints' torques.
+
+    Args:
+        residuals: per case (N, n), torque not explained at the full rate; what is slow in it is taken off here.
+    """
+    step = max(1, sum(len(case.motion) for case in cases) // SAMPLES)
+    used = np.concatenate([case.motion.weight[::step] > 0.5 for case in cases])
+    block = np.where(used, np.concatenate([own[::step] for own in _blocks(cases)]), -1)
+    kept = block >= 0
+    if len(np.unique(block[kept])) < 2:
+        return []
+    q, v = (np.concatenate([getattr(case.motion, name)[::step] for case in cases])[kept] for name in ("q", "v"))
+    moving = tuple(int(j) for j in np.flatnonzero(np.ptp(q, axis=0) >= LEAST))
+    track = Track(q, v, block[kept], moving)
+    fast = np.zeros(q.shape)
+    for j in moving:
+        parts = [_fast(case, residual[:, j])[::step] for case, residual in zip(cases, residuals)]
+        fast[:, j] = np.concatenate(parts)[kept]
+    turns = find_turns(track, fast)
+    found = [find(j, track, fast[:, j], turns) for j in moving]
+    return [one for one in found if one is not None]
+
+
+def find_turns(track: Track, residuals: np.ndarray) -> dict[int, int]:
+    """Return joint → motor turns per turn of its gear, of the joints that travel: the most coherent family.
+
+    Args:
+        residuals: (N, n) fast parts.
+    """
+    scores = {j: _lobes(coherence(track, j, residuals[:, j])) for j in track.moving}
+    every = sum(score / max(float(score.max()), 1e-300) for score in scores.values())
+    found = {j: int(np.argmax(score)) for j, score in scores.items()}
+    offered = sorted({*found.values(), int(np.argmax(every))}, key=lambda k: -float(np.asarray(every)[k]))
+    return {
+        j: TURNS[next((k for k in offered if scores[j][k] >= SIMILAR * scores[j][own]), own)]
+        for j, own in found.items()
+    }
+
+
+def find(joint: int, track: Track, residual: np.ndarray, turns: Mapping[int, int]) -> Ripple | None:
+    """Return the ripple in a joint's torque that left-out blocks confirm, or None.
+
+    Args:
+        residual: (N,) torque not explained, without its slow part, at the samples of `track`.
+        turns: as of `find_turns`.
+    """
+    if not residual.any():
+        return None
+    bench = Bench(track, residual)
+    others = {j: _lobes(coherence(track, j, residual))[turns[j] - TURNS[0]] for j in turns if j != joint}
+    sources = [joint, *sorted(others, key=lambda j: -others[j])[:1]]
+    offers = [tuple((j, order) for order in one) for j in sources for one in family(turns[j])]
+    taken, best, ridge = _climb(bench, lambda rest: offers, PAYS)
+    if not taken:
+        taken, best, ridge = _climb(bench, lambda rest: _free(track, joint, rest), FREE, PAIRS)
+    if not taken:
+        return None
+    nodes = COARSE
+    share, level = bench.judge(taken, FINE)
+    if share > best:
+        nodes, best, ridge = FINE, share, level
+    values = bench.fit(taken, nodes, ridge)[1]
+    return Ripple(joint, taken, terms(joint, taken, nodes, track), frozen(values), best)
+
+
+def family(turns: int) -> tuple[tuple[int, ...], ...]:
+    """Return the orders per turn at which a gear shows, in the sets that are offered together."""
+    n = turns
+    return tuple(
+        one for one in ((2 * n, 2 * n + 2), (n,), (3 * n,), (4 * n, 4 * n + 2, 4 * n + 4)) if one[-1] <= HIGHEST
+    )  # fmt: skip
+
+
+def terms(joint: int, waves: Sequence[Wave], nodes: Sequence[float], track: Track | None) -> tuple[Term, ...]:
+    """Return the terms of the ripple in a joint's torque, wave after wave; without a track they reach everywhere."""
+    edges = (0.0, *nodes, np.inf)
+    found = []
+    for source, order in waves:
+        reach = (-np.inf, np.inf) if track is None else (track.q[:, source].min(), track.q[:, source].max())
+        label = f"{joint + 1}" if source == joint else f"{joint + 1}q{source + 1}"
+        for m, node in enumerate(nodes):
+            for way, sign in ((1.0, "+"), (-1.0, "-")):
+                for shape, name in (("sine_band", "Rs"), ("cosine_band", "Rc")):
+                    settings = (order, *edges[m : m + 3], way, *reach)
+                    acts = ((joint, ((source, 1.0),)),)
+                    title = f"{name}{label}.{order}{sign}{node:g}Hz"
+                    found.append(Term(title, shape, acts, tuple(float(x) for x in settings)))
+    return tuple(found)
+
+
+class Bench:
+    """A joint's residual and the columns offered for it: how much of it they explain on blocks left out.
+
+    Columns of a wave are made once.
+    """
+
+    def __init__(self, track: Track, residual: np.ndarray) -> None:
+        self._track, self.residual = track, residual
+        self._parts = [slice(a, b) for a, b in segments(track.block)]
+        self._made: dict[tuple[Wave, tuple[float, ...]], np.ndarray] = {}
+
+    def columns(self, waves: Sequence[Wave], nodes: tuple[float, ...]) -> np.ndarray:
+        """Return the columns (N, k), in the order of `terms`."""
+        for wave in waves:
+            if (wave, nodes) not in self._made:
+                self._made[wave, nodes] = columns(self._track, wave, nodes)
+        return np.hstack([self._made[wave, nodes] for wave in waves])
+
+    def judge(self, waves: Sequence[Wave], nodes: tuple[float, ...]) -> tuple[float, float]:
+        """Return the share of the power on left-out blocks that the waves explain, and the ridge with which."""
+        matrix, residual = self.columns(waves, nodes), self.residual
+        squares = [matrix[own].T @ matrix[own] for own in self._parts]
+        crosses = [matrix[own].T @ residual[own] for own in self._parts]
+        whole, cross = np.sum(squares, axis=0), np.sum(crosses, axis=0)
+        unit, power = float(np.trace(whole)) / len(whole), float(residual @ residual)
+        if unit == 0.0:
+            return 0.0, RIDGES[-1]
+        result = []
+        for ridge in RIDGES:
+            gained = 0.0
+            for square, own in zip(squares, crosses):
+                left = whole - square
+                left[np.diag_indices(len(left))] += ridge * unit
+                x = scipy.linalg.solve(left, cross - own, assume_a="pos", overwrite_a=True, check_finite=False)
+                gained += float(2.0 * x @ own - x @ square @ x)
+            result.append(gained / power)
+        best = int(np.argmax(result))
+        return result[best], RIDGES[best]
+
+    def fit(self, waves: Sequence[Wave], nodes: tuple[float, ...], ridge: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return what the waves leave (N,), and their columns' values (k,)."""
+        matrix = self.columns(waves, nodes)
+        square = matrix.T @ matrix
+        unit = float(np.trace(square)) / len(square)
+        x = np.linalg.solve(square + ridge * unit * np.eye(len(square)), matrix.T @ self.residual)
+        return self.residual - matrix @ x, x
+
+
+def columns(track: Track, wave: Wave, nodes: Sequence[float]) -> np.ndarray:
+    """Return the columns (N, k) of a wave at the samples of a track, in the order of `terms`."""
+    q, v = track.q[:, wave[0]], track.v[:, wave[0]]
+    seen = Joined(q, v, np.zeros_like(q))
+    return np.stack([one.form.values(seen, one.settings) for one in terms(wave[0], (wave,), nodes, None)], axis=1)
+
+
+def coherence(track: Track, source: int, residual: np.ndarray) -> np.ndarray:
+    """Return S(k) of all whole orders k of a gear from 0 on, (CELLS / 2 + 1,); see the module."""
+    q, v = track.q[:, source], track.v[:, source]
+    speed = np.abs(v)
+    edges = np.quantile(speed, np.linspace(0.1, 1.0, BINS + 1))[:-1]
+    bins = np.searchsorted(edges, speed, side="right") * np.where(v > 0.0, 1, -1)
+    cell = np.floor(q / (2.0 * np.pi) * CELLS).astype(int) % CELLS
+    numbers, place = np.unique(track.block, return_inverse=True)
+    result = np.zeros(CELLS // 2 + 1)
+    for b in np.unique(bins[bins != 0]):
+        own = bins == b
+        index = place[own] * CELLS + cell[own]
+        waves = np.bincount(index, residual[own], len(numbers) * CELLS).reshape(len(numbers), CELLS)
+        spectrum = np.fft.rfft(waves, axis=1)
+        result += (np.abs(spectrum.sum(axis=0)) ** 2 - (np.abs(spectrum) ** 2).sum(axis=0)) / own.sum()
+    return result
+
+
+def _lobes(power: np.ndarray) -> np.ndarray:
+    """Return S at N, 2 N and 2 N + 2 together, for every N of `TURNS`."""
+    turns = np.array(TURNS)
+    seen = np.maximum(power, 0.0)
+    return seen[turns] + seen[2 * turns] + seen[2 * turns + 2]
+
+
+def _climb(
+    bench: Bench, offer: Callable[[np.ndarray], Sequence[tuple[Wave, ...]]], pays: float, most: int = 12
+) -> tuple[tuple[Wave, ...], float, float]:
+    """Return the waves taken one set after the other as long as left-out blocks gain, their share, and the ridge."""
+    taken: tuple[Wave, ...] = ()
+    best, ridge = 0.0, RIDGES[-1]
+    rest = bench.residual
+    for _ in range(most):
+        wanted = [tuple(dict.fromkeys((*taken, *more))) for more in offer(rest) if not set(more) <= set(taken)]
+        judged = [(*bench.judge(waves, COARSE), waves) for waves in wanted]
+        share, level, waves = max(judged, default=(0.0, ridge, taken), key=lambda one: one[0])
+        if share < best + pays:
+            break
+        taken, best, ridge = waves, share, level
+        rest = bench.fit(taken, COARSE, ridge)[0]
+    return (taken, best, ridge) if best >= WORTH else ((), 0.0, ridge)
+
+
+def _free(track: Track, joint: int, rest: np.ndarray) -> list[tuple[Wave, ...]]:
+    """Return the most coherent order of the joint's own gear, and the most coherent two that are two apart."""
+    power = coherence(track, joint, rest)
+    order = LOWEST + int(np.argmax(power[LOWEST : HIGHEST + 1]))
+    lower = LOWEST + int(np.argmax(power[LOWEST : HIGHEST - 1] + power[LOWEST + 2 : HIGHEST + 1]))
+    return [((joint, order),), ((joint, lower), (joint, lower + 2))]
+
+
+def _fast(case: Case, residual: np.ndarray) -> np.ndarray:
+    """Return what of a residual (N,) lies above twice the motion's own band, each segment by itself."""
+    motion = case.motion
+    cutoff = min(2.0 * motion.cutoffs.dynamics, 0.4 * motion.rate)
+    slow = [low_pass(residual[a:b], motion.rate, cutoff) for a, b in segments(motion.segment)]
+    return residual - np.concatenate(slow)
+
+
+def _blocks(cases: Sequence[Case]) -> list[np.ndarray]:
+    """Number contiguous blocks of all cases, about `BLOCKS` in all; -1 at the start of a recording."""
+    sizes = [len(case.motion) for case in cases]
+    own = [max(1 if len(cases) > 1 else 2, round(BLOCKS * size / sum(sizes))) for size in sizes]
+    numbers, first = [], 0
+    for case, size, count in zip(cases, sizes, own):
+        number = first + np.arange(size) * count // size
+        numbers.append(np.where(case.motion.t < START, -1, number))
+        first += count
+    return numbers

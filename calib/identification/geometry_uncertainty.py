@@ -1,0 +1,258 @@
+"""What the geometry's uncertainty does to the dynamics identified on it: sensitivities and the total covariance.
+
+The estimate on a geometry g (values of the chain's elements) minimises ‖(y - W(g) φ) / σ‖² (plus a prior's term, if
+there is one), so that at fixed torques y and weights
+
+    dφ/dg_k = A⁻¹ [ (∂W/∂g_k)ᵀ R⁻¹ (y - W φ) - Wᵀ R⁻¹ (∂W/∂g_k) φ ],     A = Wᵀ R⁻¹ W (+ the prior's information),
+
+with R the residuals' variances as the estimate weighed them, and W, ∂W/∂g_k φ, y low-passed and thinned alike. It is
+the implicit derivative of the normal equations; ∂W/∂g_k is a central difference of the regressor's kernel, element by
+element, good to nine digits. Errors of the geometric fit and of the torques are independent of each other, hence
+
+    Σ = Σ_torque + S Σ_geometry Sᵀ.
+
+What the intervals are about: φ* = T(g*) χ*, the standard parameters χ* of the real bodies in the link frames of the
+real geometry g*, regrouped there. Link frames are those of the fit's own convention: elements that it keeps at their
+nominal because they merge with the instrument's or the tool's frame have no error of their own, they are a choice of
+frames. The coefficients of T printed with an estimate are those of T(ĝ); that they are uncertain, too, widens no
+interval of φ*, for the estimate never uses them.
+
+Not part of S: the weights' and the prior's own dependence on g, and that of load-dependent friction's columns (which
+rest on the fitted torque, and that hardly changes with g). For methods other than OLS and WLS the sensitivity is that
+of WLS with their residuals' spread.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.arrays import frozen, shaped
+from calib.data.signals.decimation import Decimator, decimate, kept, spread
+from calib.dynamics import base as bases
+from calib.dynamics import rigid_body
+from calib.dynamics.bodies import Tree
+from calib.identification.cases import Case
+from calib.identification.identify import Identification, common_decimator
+from calib.identification.prediction import carried_columns
+from calib.identification.reweighted import cut, estimator, inverted, stacked, weights
+from calib.identification.rows import Rows, segments
+from calib.identification.settings import make_model
+from calib.robot.chain import Chain
+
+STEP = 1e-5  # of the central differences [m or rad]
+BLOCK = 512  # samples at a time: the regressor of so many stays in the processor's cache
+SAMPLES = 30_000  # at the full rate; longer recordings are represented by pieces spread over them (our choice)
+PIECE = 32  # thinned samples of such a piece at least
+NOTHING = 0.01  # a σ that grows by a smaller share has not changed (our choice)
+TILTS = ("gravity.rx", "gravity.ry")
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Propagation:
+    """The estimate's sensitivity to the geometry and what it adds to the covariance.
+
+    Attributes:
+        names: of the p parameters of the estimate.
+        elements, units: the K elements of the chain, then the tilts of gravity about the base's x and y axes.
+        sensitivity: (p, K + 2) dφ/dg.
+        torque: (p, p) covariance from the torques' noise: the estimate's own.
+        deviations: (K + 2,) standard deviations of the geometry; NaN where nothing states one.
+        geometry: (p, p) S Σ_geometry Sᵀ; None where no covariance of the geometry is known.
+        felt, left: (K + 2,) rms change of the rigid torque over rows and samples per unit of each element [N m or N],
+            at fixed parameters, and after they have been estimated anew.
+    """
+
+    names: tuple[str, ...]
+    elements: tuple[str, ...]
+    units: tuple[str, ...]
+    sensitivity: np.ndarray
+    torque: np.ndarray
+    deviations: np.ndarray
+    geometry: np.ndarray | None
+    felt: np.ndarray
+    left: np.ndarray
+
+    def __post_init__(self) -> None:
+        for name in ("sensitivity", "torque", "deviations", "felt", "left"):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(p, p) Σ_torque + S Σ_geometry Sᵀ."""
+        return np.asarray(self.torque) if self.geometry is None else self.torque + self.geometry
+
+    @property
+    def sigma_torque(self) -> np.ndarray:
+        return np.sqrt(np.clip(np.diag(self.torque), 0.0, None))
+
+    @property
+    def sigma_geometry(self) -> np.ndarray:
+        """(p,) zero where the geometry is taken as exact."""
+        if self.geometry is None:
+            return np.zeros(len(self.names))
+        return np.sqrt(np.clip(np.diag(self.geometry), 0.0, None))
+
+    @property
+    def sigma(self) -> np.ndarray:
+        return np.hypot(self.sigma_torque, self.sigma_geometry)
+
+    @property
+    def changed(self) -> np.ndarray:
+        """(p,) bool: σ grows by more than `NOTHING`."""
+        return self.sigma > (1.0 + NOTHING) * self.sigma_torque
+
+    @property
+    def dominated(self) -> np.ndarray:
+        """(p,) bool: the geometric part exceeds the torque part."""
+        return self.sigma_geometry > self.sigma_torque
+
+
+def propagate(
+    found: Identification,
+    chain: Chain,
+    cases: Sequence[Case],
+    covariance: np.ndarray | None = None,
+    progress: Progress | None = None,
+) -> Propagation:
+    """Carry the covariance of a chain into the dynamics identified on it.
+
+    Args:
+        found: the identification.
+        chain: the one it was made on.
+        cases: those it learnt from.
+        covariance: (K, K) of the chain's element values, zero where an element was not fitted; None: not known.
+    """
+    matrix, felt, left = sensitivity(found, chain, cases, progress)
+    count = len(chain.elements)
+    geometry, deviations = None, np.full(count + len(TILTS), np.nan)
+    if covariance is not None:
+        covariance = shaped(covariance, (count, count), "covariance of the chain's elements")
+        geometry = frozen(matrix[:, :count] @ covariance @ matrix[:, :count].T)
+        own = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
+        deviations[:count] = np.where(own > 0.0, own, np.nan)
+    return Propagation(
+        found.names, (*chain.names, *TILTS), (*chain.units, *("rad" for _ in TILTS)), matrix,
+        found.fitted.estimate.covariance, deviations, geometry, felt, left,
+    )  # fmt: skip
+
+
+def sensitivity(
+    found: Identification, chain: Chain, cases: Sequence[Case], progress: Progress | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return dφ/dg (p, K + 2), and the rms change of the rigid torque per unit, fixed and re-estimated, (K + 2,) each.
+
+    The last two columns turn gravity about the base's x and y axes [per rad].
+    """
+    say = progress or (lambda words: None)
+    how = estimator(found)
+    p, count = len(how.pull), len(chain.elements) + len(TILTS)
+    if found.dynamics.model.kind == "drive":  # no bodies: rows that no geometry reaches
+        return np.zeros((p, count)), np.zeros(count), np.zeros(count)
+    moved = neighbours(found, chain)
+    decimator = common_decimator(cases, found.settings)
+    step = -(-sum(len(case.motion) for case in cases) // SAMPLES)
+    pulled = np.zeros((p, count))
+    used: list[Rows] = []
+    changes: list[np.ndarray] = []
+    for part, case in zip(found.rows, cases):
+        for number, (own, span) in enumerate(pieces(case, decimator, step)):
+            say(f"sensitivity to the geometry: {case.name}, part {number + 1}")
+            used.append(cut(part, own))
+            residual = used[-1].target - used[-1].matrix @ found.fitted.estimate.values
+            weighed = residual * used[-1].present / how.deviation**2
+            change, pull = _differences(found, moved, case, span, weighed, decimator)
+            changes.append(change)
+            pulled[: found.base.b] += pull
+    matrix, scale = (np.concatenate(x) for x in zip(*[(stacked(part), weights(how, part)) for part in used]))
+    change = np.concatenate([x.reshape(-1, count) for x in changes])
+    share = float(np.count_nonzero(scale) / sum(np.count_nonzero(part.present) for part in found.rows))
+    white = matrix * scale[:, None]
+    inverse = inverted(white.T @ white + share * how.prior)
+    solved = inverse @ (pulled - white.T @ (change * scale[:, None]))
+    seen = scale > 0.0
+    after = change + matrix @ solved
+    return solved, _rms(change[seen]), _rms(after[seen])
+
+
+def neighbours(found: Identification, chain: Chain) -> list[tuple[Tree, Tree]]:
+    """Return the bodies with each element, then with each tilt of gravity, `STEP` above and below its value."""
+    result = []
+    for k in range(len(chain.elements)):
+        beside = [np.array(chain.values), np.array(chain.values)]
+        beside[0][k] += STEP
+        beside[1][k] -= STEP
+        result.append((_tree(found, chain.with_values(beside[0])), _tree(found, chain.with_values(beside[1]))))
+    gravity = np.array(found.dynamics.model.tree.gravity)
+    for axis in np.eye(3)[:2]:
+        turned = [Rotation.from_rotvec(sign * STEP * axis).apply(gravity) for sign in (1.0, -1.0)]
+        tilted = [replace(found.settings, gravity=tuple(map(float, one))) for one in turned]
+        result.append((make_model(chain, tilted[0]).tree, make_model(chain, tilted[1]).tree))
+    return result
+
+
+def _tree(found: Identification, chain: Chain) -> Tree:
+    return make_model(chain, found.settings).tree
+
+
+def pieces(case: Case, decimator: Decimator, step: int = 1) -> list[tuple[slice, slice]]:
+    """Return (thinned rows, samples at the full rate that these see) of every `step`-th piece of a case.
+
+    With step 1 each segment is one piece.
+    """
+    result, first, h, r = [], 0, decimator.reach, decimator.factor
+    size = max(4096 // r, PIECE)
+    for start, stop in segments(case.motion.segment):
+        count = len(kept(np.zeros(stop - start, dtype=int), decimator))
+        length = max(count, 1) if step == 1 else size
+        for number, i in enumerate(range(0, count, length)):
+            if number % step:
+                continue
+            rows = min(length, count - i)
+            begin = start + i * r
+            result.append((slice(first + i, first + i + rows), slice(begin, begin + (rows - 1) * r + 2 * h + 1)))
+        first += count
+    return result
+
+
+def _differences(
+    found: Identification, moved: Sequence[tuple[Tree, Tree]], case: Case, span: slice, residual: np.ndarray,
+    decimator: Decimator,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Return (∂W/∂g) φ (M, rows, K + 2), filtered and thinned, and (∂W/∂g)ᵀ R⁻¹ (y - W φ) (b, K + 2).
+
+    Args:
+        residual: (M, rows) R⁻¹ (y - W φ) of the rows that the samples in `span` make.
+    """
+    model, motion, b = found.dynamics.model, case.motion, found.base.b
+    bodies = 10 * model.tree.bodies
+    onboard = carried_columns(model, case.carried)
+    parameters = bases.to_standard(found.base, found.fitted.estimate.values[:b])[:bodies] * onboard
+    q, v, a = (np.asarray(x[span]) for x in (motion.q, motion.v, motion.a))
+    times = model.rows // model.tree.n
+    felt = spread(residual, decimator, len(q)).reshape(len(q), times, -1).sum(axis=1)
+    change = np.empty((len(moved), model.tree.n, len(q)))
+    pulled = np.zeros((bodies, len(moved)))
+    for start in range(0, len(q), BLOCK):
+        part = slice(start, min(start + BLOCK, len(q)))
+        weights = np.ascontiguousarray(felt[part].T).ravel()
+        for k, (above, below) in enumerate(moved):
+            for sign, one in ((1.0, above), (-1.0, below)):
+                regressor = rigid_body.regressor(one, q[part], v[part], a[part]).transpose(2, 1, 0).reshape(bodies, -1)
+                torque = (parameters @ regressor).reshape(model.tree.n, -1)
+                change[k, :, part] = torque if sign > 0 else (change[k, :, part] - torque) / (2.0 * STEP)
+                pulled[:, k] += sign / (2.0 * STEP) * (regressor @ weights)
+    thinned = decimate(change.transpose(2, 1, 0), decimator)
+    inertial = found.base.kept < bodies
+    result = np.zeros((b, len(moved)))
+    result[inertial] = (pulled * onboard[:, None])[found.base.kept[inertial]]
+    return np.tile(thinned, (1, times, 1)), result
+
+
+def _rms(values: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.mean(values**2, axis=0))

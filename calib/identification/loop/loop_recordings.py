@@ -1,0 +1,225 @@
+"""Recordings in the loop they came from: reference and controller of every stretch, ready to be simulated.
+
+A stretch is a part of a recording without gaps. The simulation runs along the whole of it and is compared some way
+inside: the filters' ends (2 / f_q), and `SETTLE` for the simulated robot to forget that it started on the reference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from calib.arrays import frozen
+from calib.data.signals.bandwidth import USABLE
+from calib.data.signals.decimation import Decimator
+from calib.data.signals.filtering import border, low_pass
+from calib.data.signals.motion import ROWS, Motion
+from calib.dynamics.bodies import Tree, standard_parameters
+from calib.errors import MeasurementError, NotConverged, UsageError
+from calib.identification.cases import Case
+from calib.identification.loop.controller import IdentifiedController, identify_controller
+from calib.identification.loop.loop_settings import LoopSettings, completed, per_joint, stated_controller
+from calib.identification.methods.instrumental import Loop
+from calib.identification.rows import segments
+from calib.robot.chain import Chain
+from calib.simulation.loop.closed_loop import Plant
+from calib.simulation.loop.controllers import Controller, with_feedforward
+from calib.simulation.loop.references import Reference
+from calib.simulation.loop.tracking import feed_forward
+
+LEAST_RATE = 1000.0  # of a controller whose rate is not stated [Hz] (our choice)
+SETTLE = 0.2  # [s] our choice
+SMOOTH = 4.0  # times f_q: low-pass of the logged reference, against the rounding of its digits (our choice)
+WHOLE = 0.01  # periods by which a control rate may miss a multiple of the log's
+FAR = 0.3  # of a joint's motion: a reference that is further off is another one (our choice)
+DEGREES = 180.0 / np.pi
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedLoops:
+    """Stretches of recordings, each with its loop.
+
+    Attributes:
+        pairs: what `calib.identification.methods.instrumental` takes.
+        controller: of all.
+        identified: how the controller was read from the logs; None where it was stated.
+        notes: what a user should know.
+    """
+
+    pairs: tuple[tuple[Case, Loop], ...]
+    controller: Controller
+    identified: IdentifiedController | None
+    notes: tuple[str, ...]
+
+
+def close_loops(
+    chain: Chain, tree: Tree, cases: Sequence[Case], decimator: Decimator, loop: LoopSettings
+) -> ClosedLoops:
+    """Return the loops of recordings whose motions hold `q_ref`.
+
+    Args:
+        chain: the robot; its inertias serve a feed-forward of kind ``cad``.
+        tree: the model's bodies.
+        decimator: of the rows; stretches that it eats up are left out.
+
+    Raises:
+        MeasurementError: where a recording has no reference, or one that cannot be its own.
+        UsageError: for a rate that does not go with the recording's, or gains of another number of joints.
+    """
+    for case in cases:
+        check_reference(case.motion)
+    stretches = [
+        (case, part, *make_reference(part.motion, loop.rate))
+        for case in cases
+        for part in (take(case, slice(a, b)) for a, b in segments(case.motion.segment))
+        if _inside(part.motion).stop - _inside(part.motion).start > 2 * len(decimator.taps)
+    ]
+    if not stretches:
+        raise MeasurementError("no stretch without gaps is long enough to be simulated", cases[0].motion.file)
+    controller, identified, notes = _controller(loop, max((s[1:3] for s in stretches), key=lambda s: len(s[0].motion)))
+    design = per_joint(loop, "design", chain.n) if loop.design else None
+    pairs = []
+    for _, part, reference, every in stretches:
+        own = _fed_forward(controller, loop, chain, tree, part.motion, reference, every)
+        pairs.append((take(part, _inside(part.motion)), Loop(own, reference, every, design)))
+    return ClosedLoops(tuple(pairs), controller, identified, notes)
+
+
+def take(case: Case, part: slice) -> Case:
+    """Return the samples of a case at `part`."""
+    rows = {name: value[part] for name in ROWS if (value := getattr(case.motion, name)) is not None}
+    return replace(
+        case, motion=replace(case.motion, **rows), target=case.target[part], present=case.present[part]
+    )  # fmt: skip
+
+
+def check_reference(motion: Motion) -> None:
+    """Refuse a motion without a reference, or with one that is not its own (or is in degrees)."""
+    if motion.q_ref is None:
+        raise MeasurementError(
+            "holds no reference (columns q_ref1 …, also q_des, q_cmd; or [recording] names = { q_ref = '…' }), and the "
+            "simulation of the closed loop needs the positions that were asked for: log them, or state a file, "
+            "[loop] reference = '…'; without them use wls or irls",
+            motion.file,
+        )
+    finite = np.isfinite(motion.q_ref).all(axis=0)
+    if not finite.all():
+        joint = int(np.argmin(finite))
+        raise MeasurementError(
+            f"the reference of {motion.joint_names[joint]} (joint {joint + 1}) is not finite everywhere", motion.file
+        )
+    for j in np.flatnonzero(np.ptp(motion.q, axis=0) > 1e-3):
+        _compare(motion, int(j))
+
+
+def _compare(motion: Motion, joint: int) -> None:
+    """Refuse a reference that one joint does not follow; say where it looks like another unit."""
+    assert motion.q_ref is not None  # `check_reference` asks first
+    q, asked = motion.q[:, joint], motion.q_ref[:, joint]
+    spread, size = np.std(q), np.std(asked)
+    away = float(np.sqrt(np.mean((q - asked) ** 2)) / spread)
+    if away < FAR:
+        return
+    name = f"{motion.joint_names[joint]} (joint {joint + 1})"
+    alike = abs(float(np.corrcoef(q, asked)[0, 1])) > 0.95 if size > 0.0 else False
+    if alike and abs(size / spread / DEGREES - 1.0) < 0.1:
+        raise MeasurementError(
+            f"the reference of {name} is {size / spread:.3g} times its position: it looks like deg; if so, say so (a "
+            f"header 'q_ref{joint + 1} [deg]', or [recording] units = {{ q_ref = 'deg' }})",
+            motion.file,
+        )
+    raise MeasurementError(
+        f"{name} is {away:.2g} times its own travel (rms) away from its reference, "
+        + (f"which is {size / spread:.3g} times as large" if alike else "and does not move with it")
+        + ": is this the reference of this recording, joint by joint and from the same instant?",
+        motion.file,
+    )
+
+
+def make_reference(motion: Motion, rate: float | None = None) -> tuple[Reference, int]:
+    """Return the reference of a motion without gaps at the control rate, and control periods per sample.
+
+    The logged positions are low-passed at `SMOOTH` f_q and joined by a cubic spline, whose slopes are v and a.
+
+    Raises:
+        UsageError: where the control rate is no whole multiple of the motion's.
+    """
+    every = periods_per_sample(motion, rate)
+    cutoff = min(SMOOTH * float(motion.cutoff.max()), USABLE * motion.rate / 2)
+    smooth = low_pass(np.asarray(motion.q_ref), motion.rate, cutoff)
+    spline = CubicSpline(np.arange(len(smooth)), smooth)
+    place = np.arange((len(smooth) - 1) * every + 1) / every
+    v, a = (spline(place, order) * motion.rate**order for order in (1, 2))
+    return Reference(motion.t[0] + place / motion.rate, spline(place), v, a), every
+
+
+def periods_per_sample(motion: Motion, rate: float | None = None) -> int:
+    """Return how many control periods a sample lasts; without a rate, as few as make `LEAST_RATE`.
+
+    Raises:
+        UsageError: where the control rate is no whole multiple of the motion's.
+    """
+    if rate is None:
+        return max(1, int(np.ceil(LEAST_RATE / motion.rate - 1e-6)))
+    every = round(rate / motion.rate)
+    if every < 1 or abs(rate / motion.rate - every) > WHOLE * every:
+        least = max(1, int(rate / motion.rate))
+        raise UsageError(
+            f"[loop] rate: {rate:g} Hz is no whole multiple of {motion.rate:.6g} Hz, the rate of {motion.file}; "
+            f"near it are {least * motion.rate:.6g} and {(least + 1) * motion.rate:.6g} Hz"
+        )
+    return every
+
+
+def _inside(motion: Motion) -> slice:
+    """Return the samples of a stretch that are compared."""
+    edge = max(border(motion.rate, float(motion.cutoff.min())), 4)
+    return slice(max(edge, int(np.ceil(SETTLE * motion.rate))), len(motion) - edge)
+
+
+def _controller(
+    loop: LoopSettings, longest: tuple[Case, Reference]
+) -> tuple[Controller, IdentifiedController | None, tuple[str, ...]]:
+    """Return the controller, stated or read from the longest stretch, and what to say of it."""
+    case, reference = longest
+    n = case.motion.n
+    if loop.controller != "identify":
+        return stated_controller(loop, n), None, ()
+    motion = case.motion
+    band = min(loop.band, float(motion.cutoff.min()), 0.4 * motion.rate)
+    found = identify_controller(
+        reference, motion.q, case.target, motion.rate, band, (1, 2) if loop.integral else (0, 1), loop.integral
+    )  # fmt: skip
+    kp, kd = found.controller.kp, found.controller.kd
+    bad = np.flatnonzero((kp <= 0.0) | (kd <= 0.0))
+    shown = ", ".join(f"{x:.4g}/{y:.3g} ({share:.0f} %)" for x, y, share in zip(kp, kd, found.explained))
+    if len(bad):
+        raise NotConverged(
+            f"{case.name}: the log tells no controller at joint {bad[0] + 1} (kp/kd by joint: {shown}); state the "
+            "gains, or lower [loop] band",
+            found,
+        )
+    note = f"controller read from {case.name} up to {band:.3g} Hz, kp/kd and the torque's share it explains: {shown}"
+    return completed(loop, found.controller, n), found, (note,)
+
+
+def _fed_forward(
+    controller: Controller, loop: LoopSettings, chain: Chain, tree: Tree, motion: Motion, reference: Reference,
+    every: int,
+) -> Controller:  # fmt: skip
+    """Return the controller with the torques it adds along the reference."""
+    if loop.feedforward == "none":
+        return controller
+    if loop.feedforward == "recording":
+        if motion.tau_ff is None:
+            raise MeasurementError("[loop] feedforward: the recording has no column tau_ff", motion.file)
+        grid = np.arange(len(motion))
+        return with_feedforward(controller, CubicSpline(grid, motion.tau_ff)(np.arange(len(reference.t)) / every))
+    if chain.inertias is None:
+        raise UsageError(f"[loop] feedforward = 'cad': robot '{chain.name}' has no inertias")
+    own = standard_parameters(chain)
+    bodies = frozen(np.concatenate([own, np.zeros(10 * tree.bodies - len(own))]))
+    return with_feedforward(controller, feed_forward(Plant(tree, (), bodies), reference))

@@ -1,0 +1,180 @@
+"""The closed loop that recordings came from, as the options file states it: table [loop].
+
+Instrumental variables (method iv) simulate that loop; with another method and a [loop], the same simulation tests
+whether least squares is biased. Gains are what the joints feel, torque per position error on the joint side::
+
+    [loop]
+    controller = "pd"                # pd, cascade, or identify: gains read from the logs (ARX, see below)
+    kp = [12000.0, 4500.0]           # pd: [N m/rad], one per joint or one for all; kd [N m s/rad], ki [N m/(rad s)]
+    kd = [90.0, 28.0]
+    position = [40.0, 40.0]          # cascade P-PI: P [1/s], velocity K [N m s/rad], reset Ti [s] (none: P-P)
+    velocity = [90.0, 28.0]
+    reset = 0.05
+    share = 1.0                      # of the reference's velocity that the velocity loop sees
+    rate = 5000.0                    # of the controller [Hz], a whole multiple of the log's; default: the log's, or the
+                                     # least multiple of it that is 1 kHz or more
+    delay = 1                        # control periods from measurement to torque
+    limit = [130.0, 60.0]            # saturation [N m]
+    windup = 0.1                     # largest integral of the error [rad s]
+    velocity_cutoff = 200.0          # low-pass of the measured velocity [Hz]
+    feedforward = "none"             # none; cad: the robot's own inertias; recording: column tau_ff
+    reference = "recording"          # the column q_ref (q_des, q_cmd, …); or a file, see below
+    design = [1.2, 1.5]              # inertias for which the gains are stated [kg m²], if they follow the estimate
+    inertia = [0.4, 0.5]             # of the robot the simulation starts from [kg m²]; default kd² / (2 kp)
+    instruments = "iv"               # iv, or didim: the simulated motion alone
+    positive = ["Ia1", "Fv1"]        # base parameters that must not be negative
+    band = 20.0                      # identify: up to which frequency [Hz] the gains are read
+    integral = false                 # identify: look for ki too
+
+A reference of its own is a table (CSV) or an archive (npz) with stamps and q_ref or q, no torques; its clock is the
+recording's: both count from their first sample. ``[files."run.csv"] reference = "run_ref.csv"`` states one per
+recording, relative to the options file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from calib.data import values
+from calib.errors import UsageError
+from calib.simulation.loop.controllers import Controller, cascade, pd
+
+CONTROLLERS = ("pd", "cascade", "identify")
+AHEAD = ("none", "cad", "recording")
+INSTRUMENTS = ("iv", "didim")
+NEEDED = {"pd": ("kp", "kd"), "cascade": ("position", "velocity"), "identify": ()}
+OWNED = {"pd": ("kp", "kd", "ki"), "cascade": ("position", "velocity", "reset"), "identify": ("band", "integral")}
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """What is known of the loop; the module says what each key means. Tuples hold one value, or one per joint."""
+
+    controller: str
+    kp: tuple[float, ...] = ()
+    kd: tuple[float, ...] = ()
+    ki: tuple[float, ...] = (0.0,)
+    position: tuple[float, ...] = ()
+    velocity: tuple[float, ...] = ()
+    reset: tuple[float, ...] = (np.inf,)
+    share: float = 1.0
+    rate: float | None = None
+    delay: int = 0
+    limit: tuple[float, ...] = (np.inf,)
+    windup: tuple[float, ...] = (np.inf,)
+    velocity_cutoff: float | None = None
+    feedforward: str = "none"
+    reference: str = "recording"
+    design: tuple[float, ...] = ()
+    inertia: tuple[float, ...] = ()
+    instruments: str = "iv"
+    positive: tuple[str, ...] = ()
+    band: float = 20.0
+    integral: bool = False
+
+
+def parse_loop(table: Any, place: str) -> LoopSettings:
+    """Return the loop that a parsed TOML table states.
+
+    Raises:
+        UsageError: for an unknown key, a value that cannot be, or gains that do not go with the controller.
+    """
+    found = dict(values.table(table, place))
+    values.known(found, set(_PARSERS), place)
+    found = {key: _PARSERS[key](value, f"{place}.{key}") for key, value in found.items()}
+    kind = found.get("controller", "")
+    if not kind:
+        raise UsageError(f"{place}: there is no 'controller'; expected one of {', '.join(CONTROLLERS)}")
+    for other, keys in OWNED.items():
+        wrong = [key for key in keys if key in found and other != kind and key not in OWNED[kind]]
+        if wrong:
+            raise UsageError(f"{place}.{wrong[0]}: belongs to controller '{other}', found controller '{kind}'")
+    for key in NEEDED[kind]:
+        if key not in found:
+            raise UsageError(f"{place}: controller '{kind}' needs {' and '.join(NEEDED[kind])}; there is no '{key}'")
+    if kind != "pd" and kind != "cascade" and found.get("share", 1.0) != 1.0:
+        raise UsageError(f"{place}.share: a controller that is identified sees the whole velocity of the reference")
+    return LoopSettings(**found)
+
+
+def stated_controller(loop: LoopSettings, n: int) -> Controller:
+    """Return the controller with the gains stated, for n joints.
+
+    Raises:
+        UsageError: where a list has another length than the joints.
+    """
+    if loop.controller == "cascade":
+        first, second, third = (per_joint(loop, key, n) for key in ("position", "velocity", "reset"))
+        made = cascade(first, second, third, share=loop.share)
+    else:
+        made = pd(per_joint(loop, "kp", n), per_joint(loop, "kd", n), ki=per_joint(loop, "ki", n))
+    return completed(loop, made, n)
+
+
+def completed(loop: LoopSettings, controller: Controller, n: int) -> Controller:
+    """Return the controller with what surrounds its gains: saturation, delay, filter."""
+    return Controller(
+        controller.kp, controller.kd, controller.ki, np.full(n, loop.share), per_joint(loop, "limit", n),
+        per_joint(loop, "windup", n), delay=loop.delay, cutoff=loop.velocity_cutoff,
+    )  # fmt: skip
+
+
+def per_joint(loop: LoopSettings, key: str, n: int) -> np.ndarray:
+    """Return (n,) values of a key that holds one or n."""
+    found = getattr(loop, key)
+    if len(found) not in (1, n):
+        raise UsageError(f"[loop] {key}: {len(found)} values for {n} joints; give one, or one per joint")
+    return np.broadcast_to(np.array(found, dtype=float), (n,)).copy()
+
+
+def _numbers(least: float = 0.0) -> Callable[[Any, str], tuple[float, ...]]:
+    def parse(value: Any, place: str) -> tuple[float, ...]:
+        found = value if isinstance(value, list) else [value]
+        fine = all(isinstance(x, (int, float)) and not isinstance(x, bool) and x >= least for x in found)
+        if not found or not fine or any(np.isnan(x) for x in found):
+            raise values.refuse(value, place, "a number not below 0, or a list with one per joint")
+        return tuple(float(x) for x in found)
+
+    return parse
+
+
+def _above_zero(value: Any, place: str) -> tuple[float, ...]:
+    found = _numbers()(value, place)
+    if min(found) <= 0.0:
+        raise values.refuse(value, place, "numbers above 0")
+    return found
+
+
+def _periods(value: Any, place: str) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 100:
+        raise values.refuse(value, place, "a whole number of control periods, 0 to 100")
+    return value
+
+
+_PARSERS: Mapping[str, Callable[[Any, str], Any]] = {
+    "controller": values.one_of(*CONTROLLERS),
+    "kp": _above_zero,
+    "kd": _numbers(),
+    "ki": _numbers(),
+    "position": _above_zero,
+    "velocity": _above_zero,
+    "reset": _above_zero,
+    "share": values.positive(1.0),
+    "rate": values.positive(1e5, "Hz"),
+    "delay": _periods,
+    "limit": _above_zero,
+    "windup": _above_zero,
+    "velocity_cutoff": values.positive(),
+    "feedforward": values.one_of(*AHEAD),
+    "reference": values.text,
+    "design": _above_zero,
+    "inertia": _above_zero,
+    "instruments": values.one_of(*INSTRUMENTS),
+    "positive": values.names,
+    "band": values.positive(),
+    "integral": values.flag,
+}

@@ -1,0 +1,418 @@
+"""IDIM-IV: instruments from a closed-loop simulation with the last estimate, until both come to rest.
+
+    simulate with x_k → Z = W(q_s, v_s, a_s), filtered and thinned like W → x_{k+1} = (Zᵀ Ω⁻¹ W)⁻¹ Zᵀ Ω⁻¹ y
+
+(Janot, Vandanjon & Gautier 2014). Same reference, same controller: the simulation feels what the robot was asked to do,
+and not its noise, so Z is uncorrelated with the noise that the feedback brings into W. It starts from a regular robot:
+inertia diag(J), no gravity, no friction. DIDIM (Gautier, Janot & Vandanjon 2013) estimates from the simulated W alone,
+x_{k+1} = W_s⁺ y. Inequalities on base parameters make it PC-IDIM-IV (`calib.estimation.constrained`); they do not cure
+a bias.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.arrays import frozen
+from calib.data.signals.decimation import Decimator
+from calib.data.signals.filtering import curvature, low_pass, slope
+from calib.data.signals.motion import Motion
+from calib.dynamics import base as bases
+from calib.dynamics.base import Base
+from calib.dynamics.drives import standard
+from calib.dynamics.idim import IdentificationModel
+from calib.errors import CalibError, NotConverged, UsageError
+from calib.estimation import instrumental_variables
+from calib.estimation.constrained import Constrained, within
+from calib.estimation.instrumental_variables import Instruments, Strength, Verdict
+from calib.estimation.linear import LinearFit, settled_std, wls
+from calib.estimation.triangles import absorb, empty, residual_squares, select
+from calib.estimation.whiteness import inflation
+from calib.identification.cases import Case
+from calib.identification.prediction import carried_columns
+from calib.identification.rows import Rows, observe
+from calib.simulation.loop.closed_loop import Plant, Run, Sensing, inertia_diagonal, simulate, with_parameters
+from calib.simulation.loop.controllers import Controller, scaled
+from calib.simulation.loop.references import Reference
+
+METHODS = ("iv", "didim")
+LIMIT = 10  # iterations; 3 to 6 are usual
+RETREATS = 6  # halvings of a step to parameters that cannot be simulated
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """The closed loop that a recording came from.
+
+    Attributes:
+        controller: given, identified from the log (`calib.identification.loop.controller`) or guessed: a third of the
+            bandwidth still serves.
+        reference: at the controller's rate, in the recording's time, and spanning it.
+        every: control periods per recorded sample.
+        design: (n,) inertia for which the gains are what they say [kg m²]; the simulated robot then gets gains times
+            J(x_k) / design, so that its bandwidth stays (Gautier & Janot). None: gains as they are.
+    """
+
+    controller: Controller
+    reference: Reference
+    every: int = 1
+    design: np.ndarray | None = None
+
+
+Runs = list[tuple[tuple[Case, Loop], Run]]
+
+
+@dataclass(frozen=True)
+class Round:
+    """One iteration.
+
+    Attributes:
+        change: largest |Δx_j| / max(|x_j|, 8 σ_j), 8 = 0.2 / 2.5 %, see
+            `calib.estimation.instrumental_variables.settled`.
+        residual: standard deviation of the weighted residuals.
+        retreats: halvings before it, until the parameters could be simulated.
+    """
+
+    change: float
+    residual: float
+    retreats: int
+
+
+@dataclass(frozen=True, eq=False)
+class Instrumental:
+    """What IDIM-IV found.
+
+    Attributes:
+        fit: the estimate.
+        ordinary: weighted least squares of the same rows, to compare.
+        columns: of the base parameters that were estimated.
+        plant: the simulated robot with the estimate.
+        rounds: what happened.
+        strength: how well the instruments stand for W.
+        verdict: whether least squares is biased (Durbin, Wu, Hausman).
+        std, inflation: of the rows, (rows,), and of all together.
+        distance: (n,) 100 ‖q - q_s‖ / ‖q - mean q‖ [%] of filtered measured and simulated positions: large where the
+            controller is not the robot's.
+        constrained: the optimum under constraints, where there are any; `fit` has its values and covariance.
+        problem: triangles of [Z W y], one group per torque row.
+    """
+
+    fit: LinearFit
+    ordinary: LinearFit
+    columns: np.ndarray
+    plant: Plant
+    rounds: tuple[Round, ...]
+    strength: Strength
+    verdict: Verdict
+    std: np.ndarray
+    inflation: float
+    distance: np.ndarray
+    constrained: Constrained | None
+    problem: Instruments
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters that were estimated, as of `Base.names`."""
+        return self.fit.estimate.names
+
+    @property
+    def direct(self) -> np.ndarray:
+        """(n,) 100 ‖y - Z x‖ / ‖y‖ [%]: the torque of the simulated robot against the recorded, joint by joint."""
+        p = len(self.names)
+        values = np.concatenate([self.fit.estimate.values, np.zeros(p)])
+        rest, size = (residual_squares(self.problem.data, x) for x in (values, np.zeros(2 * p)))
+        return 100.0 * np.sqrt(rest / np.where(size > 0.0, size, np.inf))
+
+    @property
+    def shift(self) -> np.ndarray:
+        """(p,) distance of least squares from this estimate, in standard deviations.
+
+        The test finds any bias that the data can tell; this says whether it matters.
+        """
+        estimate = self.fit.estimate
+        return np.abs(self.ordinary.estimate.values - estimate.values) / np.where(estimate.sigma > 0, estimate.sigma, 1)
+
+    @property
+    def valid(self) -> bool:
+        """Whether the instruments may be trusted: full rank, not weak, and the simulated robot follows the real one."""
+        return not self.strength.weak and bool(np.all(self.distance < 10.0))
+
+
+def identify_instrumental(
+    model: IdentificationModel,
+    base: Base,
+    cases: Sequence[tuple[Case, Loop]],
+    decimator: Decimator,
+    *,
+    method: str = "iv",
+    columns: np.ndarray | None = None,
+    inertia: np.ndarray | None = None,
+    positive: Sequence[str] = (),
+    tolerance: float = 0.025,
+    limit: int = LIMIT,
+) -> Instrumental:
+    """Estimate base parameters with instruments from simulation.
+
+    Args:
+        model: rows of kind ``motor``.
+        base: its base columns.
+        cases: recordings, each with the loop it came from.
+        decimator: the parallel filter of W, Z and y.
+        method: ``iv`` or ``didim``.
+        columns: indices of the base parameters to estimate (essential ones), the others zero; None: all.
+        inertia: (n,) of the regular robot it starts from [kg m²]; None: kd² / (2 kp), for which the first controller
+            would be damped by 0.7.
+        positive: names of base parameters that must not be negative (PC-IDIM-IV).
+        tolerance: of parameters and of the residual, relative.
+        limit: most iterations.
+
+    Raises:
+        Unidentifiable: where the instruments do not tell the parameters apart.
+        NotConverged: with the last `LinearFit`, after `limit` iterations.
+    """
+    if method not in METHODS:
+        raise UsageError(f"method '{method}' is none of {', '.join(METHODS)}")
+    if model.kind != "motor" or not cases:
+        raise UsageError("instruments from simulation need motor torques, and a recording with its reference")
+    task = _task(model, base, cases, decimator, method, columns, positive)
+    ordinary = _ordinary(task.observed)
+    plant, std = _regular(model, cases[0][1], inertia), ordinary.group_std
+    before: LinearFit | None = None
+    rounds: list[Round] = []
+    runs, retreats, tau = _runs(plant, cases), 0, 1.0
+    for _ in range(limit):
+        found = _estimate_round(task, runs, std, tau)
+        new = _with_values(plant, task.standard(found.fit.estimate.values))
+        rounds.append(Round(_change(before, found.fit), found.fit.estimate.residual_std, retreats))
+        if (
+            before is not None
+            and retreats == 0
+            and instrumental_variables.settled(before, found.fit, tolerance, tolerance)
+        ):
+            return _result(task, found, ordinary, new, rounds, std, runs)
+        plant, runs, retreats = _simulate_new(plant, new, cases)
+        before, std, tau = found.fit, found.fit.group_std, found.tau
+    raise NotConverged(
+        f"instruments from simulation: parameters still change by {100 * rounds[-1].change:.3g} % after {limit} "
+        "rounds; estimate fewer (essential ones), or look at the controller's gains",
+        before,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """What stays the same from round to round."""
+
+    model: IdentificationModel
+    base: Base
+    kept: np.ndarray
+    cases: Sequence[tuple[Case, Loop]]
+    decimator: Decimator
+    observed: Sequence[Rows]
+    method: str
+    positive: Sequence[str]
+
+    def standard(self, values: np.ndarray) -> np.ndarray:
+        """Return standard parameters with the values of those base parameters that are estimated."""
+        whole = np.zeros(self.base.b)
+        whole[self.kept] = values
+        return bases.to_standard(self.base, whole)
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """One round's estimate, the triangles it came from, and the inflation that its residuals show."""
+
+    problem: Instruments
+    fit: LinearFit
+    tau: float
+    bound: Constrained | None
+
+
+def _task(
+    model: IdentificationModel, base: Base, cases: Sequence[tuple[Case, Loop]], decimator: Decimator, method: str,
+    columns: np.ndarray | None, positive: Sequence[str],
+) -> _Task:  # fmt: skip
+    kept = np.arange(base.b) if columns is None else np.asarray(columns, dtype=int)
+    observed = [observe(model, base.kept[kept], case, decimator) for case, _ in cases]
+    observed = [replace(rows, names=tuple(base.names[k] for k in kept)) for rows in observed]
+    return _Task(model, base, kept, cases, decimator, observed, method, positive)
+
+
+def _estimate_round(task: _Task, runs: Runs, std: np.ndarray, tau: float) -> _Found:
+    """Return the estimate with the instruments of these runs; its sigmas with the inflation `tau` of the last."""
+    columns = task.base.kept[task.kept]
+    simulated = [
+        observe(task.model, columns, simulated_case(case, run, loop), task.decimator).matrix
+        for (case, loop), run in runs
+    ]
+    problem = _stack(task.observed, simulated)
+    fit, bound = _constrain(problem, _estimate(problem, task.method, std, tau), std, task.positive)
+    return _Found(problem, fit, _inflation(task.observed, fit), bound)
+
+
+def _result(
+    task: _Task, found: _Found, ordinary: LinearFit, plant: Plant, rounds: Sequence[Round], std: np.ndarray, runs: Runs
+) -> Instrumental:  # fmt: skip
+    """Return the last round, sigmas with its own inflation, with what the tests say of it."""
+    fit = _estimate(found.problem, task.method, std, found.tau)
+    fit = replace(fit, estimate=replace(fit.estimate, values=found.fit.estimate.values))
+    verdict = instrumental_variables.exogeneity(found.problem, std, found.tau)
+    strength = instrumental_variables.strength(found.problem, std)
+    return Instrumental(
+        fit, ordinary, frozen(task.kept, int), plant, tuple(rounds), strength, verdict, frozen(std), found.tau,
+        _distance(runs), found.bound, found.problem,
+    )  # fmt: skip
+
+
+def simulated_case(case: Case, run: Run, loop: Loop) -> Case:
+    """Return the case with the simulated motion at the instants of the recorded one, filtered like that one.
+
+    The same low-pass and differences: what they do to a motion (they round off reversals) is in W and in Z alike, and
+    what tells W from Z is noise.
+    """
+    step = loop.reference.period * loop.every
+    t = case.motion.t - loop.reference.t[0]
+    index = np.rint(t / step).astype(int)
+    if index[0] < 0 or index[-1] >= len(run.t) or np.abs(index * step - t).max() > 0.01 * step:
+        raise CalibError(
+            f"the recording runs from {case.motion.t[0]:.6g} s to {case.motion.t[-1]:.6g} s in steps of "
+            f"{1 / case.motion.rate:.6g} s, the simulation from {run.t[0]:.6g} s to {run.t[-1]:.6g} s in steps of "
+            f"{step:.6g} s: give the whole reference, and `every`"
+        )
+    motion = case.motion
+    q = _filtered(run.q, motion)
+    v, a = slope(q, motion.rate), curvature(q, motion.rate)
+    return replace(case, motion=replace(motion, q=q[index], v=v[index], a=a[index]))
+
+
+def _filtered(q: np.ndarray, motion: Motion) -> np.ndarray:
+    """Return simulated positions through the low-pass of the recorded ones."""
+    result = np.empty_like(q)
+    for cutoff in np.unique(motion.cutoff):
+        own = motion.cutoff == cutoff
+        result[:, own] = low_pass(q[:, own], motion.rate, float(cutoff))
+    return result
+
+
+def _regular(model: IdentificationModel, loop: Loop, inertia: np.ndarray | None) -> Plant:
+    """Return a robot of inertia diag(J) and nothing else; its last n terms hold J."""
+    if inertia is None:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inertia = loop.controller.kd**2 / (2.0 * loop.controller.kp)
+        if not np.all(np.isfinite(inertia)) or not np.all(inertia > 0.0):
+            raise UsageError("no regular inertia follows from these gains; state it, (n,) [kg m²]")
+    n = model.tree.n
+    extra = tuple(replace(one, name=f"regular {one.name}") for one in standard(["Ia"] * n))
+    return Plant(model.tree, (*model.terms, *extra), np.concatenate([np.zeros(model.p), inertia]))
+
+
+def _with_values(plant: Plant, values: np.ndarray) -> Plant:
+    return with_parameters(plant, np.concatenate([values, np.zeros(len(plant.parameters) - len(values))]))
+
+
+def _runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
+    """Simulate every loop without noise."""
+    result: Runs = []
+    for case, loop in cases:
+        robot, controller = _loaded(plant, case), loop.controller
+        if loop.design is not None:
+            controller = scaled(controller, inertia_diagonal(robot, loop.reference.q[::200]) / loop.design)
+        result.append(((case, loop), simulate(robot, controller, loop.reference, Sensing(every=loop.every))))
+    return result
+
+
+def _loaded(plant: Plant, case: Case) -> Plant:
+    """Return the plant without the payloads that the case does not carry."""
+    there = carried_columns(IdentificationModel(plant.tree), case.carried)
+    return with_parameters(plant, plant.parameters * np.append(there, np.ones(len(plant.terms))))
+
+
+def _simulate_new(old: Plant, new: Plant, cases: Sequence[tuple[Case, Loop]]) -> tuple[Plant, Runs, int]:
+    """Simulate the new parameters, or those on the way to them that can be (our choice)."""
+    for retreats in range(RETREATS):
+        share = 0.5**retreats
+        tried = with_parameters(new, share * new.parameters + (1.0 - share) * old.parameters)
+        try:
+            return tried, _runs(tried, cases), retreats
+        except CalibError as error:
+            problem = error
+    raise NotConverged(f"the estimate cannot be simulated, nor anything near: {problem}", new)
+
+
+def _stack(observed: Sequence[Rows], simulated: Sequence[np.ndarray]) -> Instruments:
+    """Return the triangles of [Z W y], one group per torque row."""
+    problem: Instruments | None = None
+    for rows, z in zip(observed, simulated, strict=True):
+        samples, count, p = rows.matrix.shape
+        used = rows.present.T.ravel()
+        group = np.repeat(np.arange(count), samples)[used]
+        w, z = (x.transpose(1, 0, 2).reshape(-1, p)[used] for x in (rows.matrix, z))
+        target = rows.target.T.ravel()[used]
+        problem = instrumental_variables.instrument(z, w, target, group, rows.names, rows.units, problem)
+    assert problem is not None  # `cases` is not empty
+    return problem
+
+
+def _ordinary(observed: Sequence[Rows]) -> LinearFit:
+    """Return weighted least squares of the rows as they are."""
+    count, first = observed[0].target.shape[1], observed[0]
+    data = empty(first.names, first.units, count)
+    for rows in observed:
+        for row in range(count):
+            used = rows.present[:, row]
+            data = absorb(data, rows.matrix[used, row], rows.target[used, row], row)
+    return wls(data, settled_std(data, 1e-3))
+
+
+def _estimate(problem: Instruments, method: str, std: np.ndarray, tau: float = 1.0) -> LinearFit:
+    """Return the estimate from the triangles of [Z W y]: by instruments, or (DIDIM) from [Z y] alone."""
+    if method == "iv":
+        return instrumental_variables.iv(problem, std, tau)
+    p = len(problem.names)
+    simulated = replace(select(problem.data, np.arange(p)), names=problem.names)
+    return wls(simulated, std, np.full(problem.data.groups, tau))
+
+
+def _inflation(observed: Sequence[Rows], fit: LinearFit) -> float:
+    """Return how many rows count as one, the mean over torque rows of the residuals' integrated autocorrelation."""
+    series = [rows.target - rows.matrix @ fit.estimate.values for rows in observed]
+    longest = max(series, key=len)
+    return max(1.0, float(np.mean([inflation(longest[:, row]) for row in range(longest.shape[1])])))
+
+
+def _constrain(
+    problem: Instruments, fit: LinearFit, std: np.ndarray, positive: Sequence[str]
+) -> tuple[LinearFit, Constrained | None]:
+    """Return the estimate under x_j >= 0 for the names given (two-stage least squares; see the module)."""
+    if not positive:
+        return fit, None
+    unknown = [name for name in positive if name not in problem.names]
+    if unknown:
+        raise UsageError(f"'{unknown[0]}' is none of the estimated parameters {', '.join(problem.names)}")
+    lower = np.where([name in positive for name in problem.names], 0.0, -np.inf)
+    found = within(
+        instrumental_variables.projected(problem, std), np.eye(len(lower)), lower, np.full(len(lower), np.inf)
+    )
+    return replace(fit, estimate=replace(fit.estimate, values=found.values)), found
+
+
+def _change(before: LinearFit | None, now: LinearFit) -> float:
+    if before is None:
+        return float("inf")
+    size = np.maximum(np.abs(before.estimate.values), 8.0 * now.estimate.sigma)
+    return float(np.max(np.abs(now.estimate.values - before.estimate.values) / np.maximum(size, 1e-300)))
+
+
+def _distance(runs: Runs) -> np.ndarray:
+    """Return how far the simulated robot is from the recorded one (n,) [%], over all recordings."""
+    away, size = np.zeros((2, runs[0][0][0].motion.n))
+    for (case, loop), run in runs:
+        motion = case.motion
+        index = np.rint((motion.t - loop.reference.t[0]) / (loop.reference.period * loop.every)).astype(int)
+        away += np.sum((motion.q - _filtered(run.q, motion)[index]) ** 2, axis=0)
+        size += np.sum((motion.q - motion.q.mean(axis=0)) ** 2, axis=0)
+    return frozen(100.0 * np.sqrt(away / size))

@@ -1,0 +1,191 @@
+"""An identified model in a folder: ``robot.toml`` holds the geometry, ``dynamics.json`` the numbers.
+
+``estimate.csv`` has one row per parameter that was estimated, ``covariance.csv`` their covariance (a header, then one
+row per parameter, each beginning with its name): base parameters in the order of the model's columns, then richer
+friction. ZZ1R stands for the combination that ``dynamics.json`` spells out under ``base``. A richer term that the
+evidence switched off has no sigma, and is named under ``switched_off`` in ``metrics.json``.
+
+``unit`` in ``dynamics.json`` and ``metrics.json`` is "N m", or "A of joint 2" where currents had no gains: export,
+plan and excite refuse such a model. Gains that were identified stand in ``drive_gains.csv`` (joint, gain [N m per A],
+sigma) and under ``drive_gains`` in both; state them as ``gains`` to use them again.
+
+``torques_N.csv``: ``t [s]``, then measured_1 ... predicted_1 ... of each torque row [N m or N] and the joints q1 ...
+[rad or m], thinned to about 100 Hz. ``calib identify`` writes ``torques_1.csv`` alone, of the first validation
+recording (without one, of the first to learn from); a session writes one per validation recording.
+
+``metrics.json``: errors by file under ``identification`` (learnt from) and ``validation`` (``evidence`` false: it
+repeats the training). Each has ``raw`` (torque as recorded, full rate), ``filtered`` (both sides low-passed to the
+identification band f_p), ``moving`` and ``standing`` (raw, samples at which the joint is above or below ``slow``),
+with ``relative_error_percent`` 100 |tau - predicted| / |tau| in ``total`` and by ``joints`` (in the order of
+``rows``) and ``rms`` [N m or N]; ``above_band_percent``: share of the torque above f_p (noise, ripple, elasticity),
+which no model in the band explains; ``whiteness`` of the residuals; ``motion_share``: part of the samples at which
+joints move. Then ``parameters`` (standard, base, essential), ``condition_number`` (raw, and with columns of unit
+norm), ``friction`` and its ``ladder``, ``elimination``, ``loop``, ``tracking``, ``filters`` by file, ``geometry``,
+``warnings``, ``verdict``, its ``reason``, ``seed``.
+
+Figures: ``plot_torque_N.png`` of every file in the order given, training first (measured, predicted, residual);
+``plot_residuals.png`` (autocorrelation; dashed: white noise), ``plot_friction.png`` (over velocity), and, where the
+geometry's uncertainty is known, what it adds to sigma.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.dynamics.base import Base, expressions
+from calib.dynamics.bodies import tree, with_gravity, with_payload
+from calib.dynamics.drives import Term
+from calib.dynamics.idim import IdentificationModel
+from calib.errors import RobotError, UsageError
+from calib.identification.prediction import Dynamics
+from calib.robot import description
+from calib.robot.chain import Chain
+
+TORQUE = "N m"
+NOTE = "regrouped parameters hold base values, the others are zero: torques are right, single ones need not be"
+
+
+def read_dynamics(folder: str | Path) -> tuple[Chain, Dynamics]:
+    """Return the robot and the model that an identification left in `folder`.
+
+    Raises:
+        RobotError: where the folder holds none, or the two files do not belong together.
+    """
+    folder = Path(folder)
+    table = read_table(folder)
+    chain = description.read(folder / "robot.toml")
+    try:
+        return chain, from_table(chain, table)
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise RobotError(f"{folder}/dynamics.json is damaged or of another version: {error!r}") from error
+
+
+def read_table(folder: Path) -> dict[str, Any]:
+    """Return the content of ``dynamics.json``, for `from_table`.
+
+    Raises:
+        RobotError: where the folder holds none.
+    """
+    try:
+        found = json.loads((folder / "dynamics.json").read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise RobotError(
+            f"{folder} holds no identified model (dynamics.json): {error}; give the folder of an identification"
+        ) from error
+    if not isinstance(found, dict):
+        raise RobotError(f"{folder}/dynamics.json is damaged or of another version: it holds no table")
+    return found
+
+
+def refuse_currents(folder: Path, task: str) -> None:
+    """Refuse a model in amperes (of currents without gains) for a task that needs torques.
+
+    Raises:
+        UsageError: for a model whose unit is not newton metres.
+        RobotError: where the folder holds no model.
+    """
+    unit = read_table(folder).get("unit", TORQUE)
+    if unit != TORQUE:
+        raise UsageError(
+            f"{folder}: this model is in {unit}, identified from currents without drive gains; {task} needs N m: state "
+            "gains = [...] (N m/A) in the options file, or identify them with [gain_identification] (runs without and "
+            "with a load of known mass), and run calib identify again"
+        )
+
+
+def read_covariance(folder: Path) -> tuple[tuple[str, ...], np.ndarray] | None:
+    """Return names and covariance (p, p) of the estimated parameters; None without ``covariance.csv``.
+
+    Raises:
+        RobotError: where the file is damaged.
+    """
+    path = folder / "covariance.csv"
+    if not path.is_file():
+        return None
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            header, *rows = list(csv.reader(file))
+        covariance = np.array([row[1:] for row in rows], dtype=float)
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        raise RobotError(f"{path} is damaged ({error}); run calib identify again") from error
+    count = len(header) - 1
+    if covariance.shape != (count, count) or not np.isfinite(covariance).all():
+        raise RobotError(f"{path}: expected {count} rows of finite numbers; run calib identify again")
+    return tuple(header[1:]), covariance
+
+
+def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, Any]:
+    """Return the model as what JSON can hold; `unit` is that of its torques."""
+    model = dynamics.model
+    bodies = 10 * model.tree.bodies if model.kind != "drive" else 0
+    payloads = [label for label, coordinate in zip(model.tree.labels, model.tree.coordinates) if coordinate < 0]
+    return {
+        "robot": "robot.toml",
+        "kind": model.kind,
+        "unit": unit,
+        "gravity": model.tree.gravity.tolist(),
+        "payloads": payloads,
+        "bodies": dict(zip(model.names[:bodies], dynamics.values[:bodies].tolist())),
+        "terms": [
+            {
+                "name": one.name,
+                "shape": one.shape,
+                "acts": [[row, [list(pair) for pair in motion]] for row, motion in one.acts],
+                "settings": [float(x) if np.isfinite(x) else "inf" for x in one.settings],
+                "side": one.side,
+                "linear": one.linear,
+                "value": float(value),
+                "unit": in_unit(one.unit, unit),
+            }
+            for one, value in zip(model.columns, dynamics.values[bodies:])
+        ],
+        "base": dict(zip(base.names, expressions(base))),
+        "regrouping": regrouping(base),
+        "covariance": "covariance.csv",
+        "note": NOTE,
+    }
+
+
+def in_unit(own: str, unit: str) -> str:
+    """Return a parameter's unit in a model whose torques are in `unit`: of amperes, all are divided by a gain [N m/A].
+
+    ``N m s/rad`` becomes ``A s/rad``, ``kg m²`` becomes ``kg m² A/(N m)``.
+    """
+    if unit == TORQUE:
+        return own
+    return own.replace("N m", "A") if "N m" in own else f"{own} A/(N m)"
+
+
+def regrouping(base: Base) -> dict[str, dict[str, float]]:
+    """Return, by base parameter, the coefficients of the standard ones it stands for, in full."""
+    return {
+        name: {base.standard[k]: float(row[k]) for k in np.flatnonzero(row)}
+        for name, row in zip(base.names, base.transform)
+    }
+
+
+def from_table(chain: Chain, table: Mapping[str, Any]) -> Dynamics:
+    """Return the model of a table that `to_table` made, on the chain it was made for."""
+    bodies = with_gravity(tree(chain), np.array(table["gravity"], dtype=float))
+    for label in table.get("payloads", ()):
+        bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1)
+    terms = tuple(_term(entry) for entry in table["terms"])
+    model = IdentificationModel(bodies, terms, table.get("kind", "motor"))
+    own = table["bodies"]
+    standard = [] if model.kind == "drive" else [float(own[name]) for name in bodies.names]
+    values = np.array([*standard, *(float(entry["value"]) for entry in table["terms"])])
+    if len(values) != model.p or (model.kind != "drive" and len(own) != len(standard)):
+        raise ValueError(f"{len(values)} values for {model.p} parameters")
+    return Dynamics(model, values)
+
+
+def _term(entry: Mapping[str, Any]) -> Term:
+    acts = tuple((int(row), tuple((int(j), float(w)) for j, w in motion)) for row, motion in entry["acts"])
+    settings = tuple(float(x) for x in entry["settings"])
+    return Term(entry["name"], entry["shape"], acts, settings, entry["side"], bool(entry["linear"]))

@@ -1,0 +1,157 @@
+"""What an identification's data say about the standard parameters: ‖R T χ - z‖², and nothing else.
+
+T regroups the p parameters χ of the model into the b that the motion tells apart. R and z are the estimate β and its
+covariance Σ as rows, RᵀR = Σ⁻¹ and z = R β. Where a prior took part in the estimate, they are the data's own triangle
+instead (``information.csv``), so that what was known beforehand is not counted twice.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from calib.arrays import frozen
+from calib.errors import RobotError
+from calib.estimation.triangles import combine, retriangulate
+from calib.identification.model_file import read_dynamics
+from calib.identification.prediction import Dynamics
+from calib.robot.chain import Chain
+
+if TYPE_CHECKING:
+    from calib.identification.identify import Identification
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """An identified model with what its data say.
+
+    Attributes:
+        chain: the robot it was identified on.
+        dynamics: the model; its values hold base parameters.
+        names, units: b strings each.
+        values, covariance: (b,), (b, b) the estimate as identified, a prior included where there was one.
+        transform: T (b, p).
+        factor: (k, b + 1) the rows [R z].
+        rests_on_prior: whether the estimate holds a prior, the rows do not.
+    """
+
+    chain: Chain
+    dynamics: Dynamics
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: np.ndarray
+    covariance: np.ndarray
+    transform: np.ndarray
+    factor: np.ndarray
+    rests_on_prior: bool
+
+    def __post_init__(self) -> None:
+        for key in ("values", "covariance", "transform", "factor"):
+            object.__setattr__(self, key, frozen(getattr(self, key)))
+
+    @property
+    def b(self) -> int:
+        return len(self.names)
+
+    @property
+    def best(self) -> float:
+        """The least of ‖R β - z‖² over all β, those of impossible robots included."""
+        unit = np.linalg.norm(self.factor[:, :-1], axis=0)
+        scaled = self.factor[:, :-1] / np.where(unit > 0.0, unit, 1.0)
+        found = np.linalg.lstsq(scaled, self.factor[:, -1], rcond=1e-12)[0]
+        return float(np.sum((scaled @ found - self.factor[:, -1]) ** 2))
+
+    def distance(self, standard: np.ndarray) -> float:
+        """Return how far standard parameters (p,) are from the data's best, in standard deviations (Mahalanobis)."""
+        rest = self.factor[:, :-1] @ (self.transform @ standard) - self.factor[:, -1]
+        return float(np.sqrt(max(float(rest @ rest) - self.best, 0.0)))
+
+
+def information(found: Identification) -> np.ndarray:
+    """Return the triangle [R z] (b + 1, b + 1) of an identification's data, without its prior of base parameters.
+
+    Rows count as their residuals' autocorrelation lets them. The ridge of richer friction stays in: those terms have
+    no other prior.
+    """
+    fitted, own = found.fitted, found.base.b
+    rows = [combine(fitted.pooled, fitted.std * np.sqrt(fitted.inflation))]
+    count = len(found.names) - own
+    if count:
+        group = np.concatenate([np.full(own, -1), found.climb.groups]).astype(int)
+        from calib.identification.friction.time_folds import estimate
+
+        known = None if found.prior is None else _widened(found.prior.rows, count)
+        ridges = estimate(fitted.pooled, fitted.std, fitted.inflation, group, known)[1]
+        drawn = np.zeros((count, own + count + 1))
+        drawn[:, own:-1] = np.diag(1.0 / np.maximum(ridges[own:], 1e-12))
+        rows.append(drawn)
+    return retriangulate(np.vstack(rows))
+
+
+def _widened(rows: np.ndarray, more: int) -> np.ndarray:
+    return np.hstack([rows[:, :-1], np.zeros((len(rows), more)), rows[:, -1:]])
+
+
+def read(folder: str | Path) -> Told:
+    """Read what an identification left in `folder`.
+
+    Raises:
+        RobotError: where the folder holds none, or one of a version that did not write how parameters regroup.
+    """
+    folder = Path(folder)
+    chain, dynamics = read_dynamics(folder)
+    groups = json.loads((folder / "dynamics.json").read_text(encoding="utf-8")).get("regrouping")
+    if groups is None:
+        raise RobotError(f"{folder}/dynamics.json does not say how parameters regroup; identify again")
+    try:
+        names, units, values = _estimate(folder / "estimate.csv")
+        covariance = _numbers(folder / "covariance.csv", skip=1)
+        transform = _transform(names, groups, dynamics.model.names)
+        rested = (folder / "information.csv").is_file()
+        factor = _numbers(folder / "information.csv") if rested else whitened(values, covariance)
+        if covariance.shape != (len(names), len(names)) or factor.shape[1] != len(names) + 1:
+            raise ValueError("files of different sizes")
+    except (OSError, KeyError, ValueError) as error:
+        raise RobotError(f"{folder}: estimate.csv, covariance.csv and dynamics.json do not agree: {error}") from error
+    return Told(chain, dynamics, names, units, values, covariance, transform, factor, rested)
+
+
+def whitened(values: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Return [R z] (b, b + 1) with RᵀR = Σ⁻¹ and z = R β."""
+    sigma = np.sqrt(np.diag(covariance))
+    if not (sigma > 0.0).all():
+        raise ValueError("a parameter without variance")
+    size, axes = np.linalg.eigh(covariance / np.outer(sigma, sigma))
+    upper = (axes / np.sqrt(np.maximum(size, 1e-13 * size[-1]))).T / sigma
+    return np.column_stack([upper, upper @ values])
+
+
+def _transform(names: tuple[str, ...], groups: dict[str, dict[str, float]], standard: tuple[str, ...]) -> np.ndarray:
+    """Return T (b, p); richer friction, which regroups with nothing, stands for itself."""
+    place = {name: k for k, name in enumerate(standard)}
+    result = np.zeros((len(names), len(standard)))
+    for row, name in enumerate(names):
+        for own, coefficient in groups.get(name, {name: 1.0}).items():
+            result[row, place[own]] = coefficient
+    return result
+
+
+def _estimate(path: Path) -> tuple[tuple[str, ...], tuple[str, ...], np.ndarray]:
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    return (
+        tuple(row["name"] for row in rows),
+        tuple(row["unit"] for row in rows),
+        np.array([float(row["value"]) for row in rows]),
+    )
+
+
+def _numbers(path: Path, skip: int = 0) -> np.ndarray:
+    """Return the numbers of a CSV table below its header, without the first `skip` columns."""
+    with path.open(encoding="utf-8", newline="") as file:
+        return np.array([[float(cell) for cell in row[skip:]] for row in list(csv.reader(file))[1:]])

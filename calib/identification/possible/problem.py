@@ -1,0 +1,68 @@
+"""The cost of standard parameters that belong to bodies that can exist, as arrays: data, prior bodies, drive terms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.dynamics import pseudo_inertia
+from calib.identification.possible.information import Told
+from calib.identification.possible.prior_bodies import References
+from calib.identification.prior import DRIVES, POSITIVE, ROTOR
+
+WEAK = 2.0  # γ of payloads: nothing is known of them but the order of size
+
+
+@dataclass(frozen=True, eq=False)
+class BodyCost:
+    """The cost as arrays; parameters that the data do not see and no prior holds are fixed beforehand.
+
+    Attributes:
+        factor: (k, p + 1) [R T, z].
+        bodies: number of bodies, ten parameters each, before all others.
+        references: (B, 4, 4) P⁰.
+        drawn: (B,) whether the common weight γ counts for a body; `WEAK` does otherwise.
+        sizes: (p - 10 B,) x⁰ of positive drive terms; standard deviation of the free ones; 0 where fixed.
+        positive: (p - 10 B,) which terms are positive.
+        fixed: (p - 10 B,) their values where fixed.
+        lift: factor of all priors, 1 but on the way to the optimum.
+    """
+
+    factor: np.ndarray
+    bodies: int
+    references: np.ndarray
+    drawn: np.ndarray
+    sizes: np.ndarray
+    positive: np.ndarray
+    fixed: np.ndarray
+    lift: float = 1.0
+
+    @property
+    def free(self) -> np.ndarray:
+        """(p,) which parameters are unknown."""
+        return np.concatenate([np.ones(10 * self.bodies, bool), self.sizes > 0.0])
+
+    def weights(self, gamma: float) -> np.ndarray:
+        """(B,) the weight of each body."""
+        return self.lift * np.where(self.drawn, gamma, WEAK)
+
+
+def make_problem(told: Told, references: References) -> BodyCost:
+    """Return the cost of an identified model; sizes of drive terms come from the torque they could explain."""
+    model = told.dynamics.model
+    bodies = model.tree.bodies
+    columns = told.factor[:, :-1] @ told.transform
+    norms, target = np.linalg.norm(columns, axis=0)[10 * bodies :], np.linalg.norm(told.factor[:, -1])
+    seen = norms > 1e-9 * np.linalg.norm(columns, axis=0).max()
+    whole = target / np.where(seen, norms, 1.0)  # would explain all of the torque
+    positive = np.array([bool(POSITIVE.fullmatch(one.name)) for one in model.columns], dtype=bool)
+    sizes = np.where(positive, 0.1 * whole, DRIVES * whole)
+    mass = float(references.parameters[:, 9].sum())
+    for k, one in enumerate(model.columns):
+        if one.shape == "acceleration" and positive[k]:
+            sizes[k] = min(sizes[k], mass * ROTOR**2)
+    return BodyCost(
+        np.column_stack([columns, told.factor[:, -1]]), bodies, pseudo_inertia.from_standard(references.parameters),
+        references.drawn, np.where(seen, sizes, 0.0), positive, told.dynamics.values[10 * bodies :],
+    )  # fmt: skip

@@ -1,0 +1,274 @@
+"""All standard parameters, those of bodies that can exist: what simulators and URDFs ask for.
+
+The data fix b combinations T χ of the p standard parameters; the rest is free, and most choices of it belong to no
+body. With P_i the pseudo-inertia of body i (`calib.dynamics.pseudo_inertia`), P_i⁰ that of the CAD, d the drives' Ia,
+Fv, Fc (1×1 matrices of the same kind), the parameters are
+
+    argmin  ½ ‖R T χ - z‖² + ½ γ Σ_i D(P_i ‖ P_i⁰) + ½ Σ_d D(x_d ‖ x_d⁰)      R, z:
+    `calib.identification.possible.information`
+
+with the log-det divergence D (Lee, Wensing & Park 2020): convex, the same in any frame and any unit, and infinite at
+the border, so every body is possible with a margin. A Euclidean distance would need a weight between kg and kg m².
+
+How much the CAD counts. exp(-½ γ D) is, up to its norm, the Wishart density of a 4×4 matrix with mode P⁰ and γ + 5
+degrees of freedom (our observation), so γ has a marginal likelihood,
+
+    log p(data | γ) ≈ -J(χ̂) - ½ log det H(χ̂) + Σ_i log c(γ),
+    log c(γ) = 2 (γ + 5) log γ - 2 γ - 2 (γ + 5) log 2 - log Γ₄((γ + 5) / 2) - 10 log γ + const,
+
+Laplace's approximation, J the cost and H its curvature at the optimum: the weight is where that is largest (our choice;
+blocks of one poor motion repeat each other, so that cross-validation on them wants no prior at all). γ is not let below
+`LEAST`, where masses may be wrong by √(2/γ), a third (10 for rods, below which Laplace's approximation fails): what no
+model explains must not pass for a wrong CAD. Only where a possible robot is within the estimate's covariance and the
+result is not, γ is lowered until it is.
+
+Where even the nearest possible robot, whatever its CAD, is d > √b standard deviations from the estimate, the data's
+sigmas do not tell the errors of the model, and count d / √b times (Birge 1932): poor motion with a small residual would
+otherwise overrule any CAD.
+
+Newton's method solves it in milliseconds, strictly inside the cone; the nearest possible robot without any prior lies
+on the border, a semidefinite program for cvxpy with Clarabel (`nearest`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.linalg
+from scipy.special import multigammaln  # type: ignore[attr-defined]
+
+from calib.arrays import frozen
+from calib.dynamics import pseudo_inertia
+from calib.dynamics.idim import IdentificationModel
+from calib.errors import NotConverged, UsageError
+from calib.identification.possible import nearest as border
+from calib.identification.possible.information import Told
+from calib.identification.possible.prior_bodies import References, find_references
+from calib.identification.possible.problem import BodyCost, make_problem
+from calib.identification.prediction import Dynamics
+
+LEAST = 20.0  # of γ with a CAD
+WEIGHTS = tuple(float(10.0 ** (k / 4)) for k in range(0, 19))  # γ tried, 1 to 30 000
+DRIVE = 1.0  # the same of Ia, Fv, Fc
+SMALLEST = 1e-3  # of γ, where the estimate asks for less CAD than the evidence does
+STEPS = 200
+SETTLED = 1e-8  # Newton decrement²: the cost is within half of it of its least
+
+
+@dataclass(frozen=True, eq=False)
+class Consistent:
+    """Standard parameters of a robot that can exist.
+
+    Attributes:
+        dynamics: the identified model with all its parameters.
+        covariance: (p, p) of data and prior together, by the curvature at the optimum; zero where fixed.
+        weight: γ.
+        doubt: factor of the data's sigmas, above 1 where no possible robot is within them.
+        margins: (B,) of each body [m], see `pseudo_inertia.margin`.
+        distance: of these parameters from the data's best, in standard deviations (Mahalanobis).
+        nearest: the same of the nearest possible robot; 0 where the estimate itself is possible.
+        allowed: what that distance stays below in 95 % of all cases where the model is right: √χ²(b).
+        blamed: labels of the bodies or names of the drive terms that cost most of `nearest`, worst first, and the
+            distance without the demand on each; empty where it is within `allowed`.
+        source: where P⁰ comes from, in words.
+        notes: what the engineer should know.
+    """
+
+    dynamics: Dynamics
+    covariance: np.ndarray
+    weight: float
+    doubt: float
+    margins: np.ndarray
+    distance: float
+    nearest: float
+    allowed: float
+    blamed: tuple[tuple[str, float], ...]
+    source: str
+    notes: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "covariance", frozen(self.covariance))
+        object.__setattr__(self, "margins", frozen(self.margins))
+
+    @property
+    def possible(self) -> bool:
+        """Whether a possible robot lies within the estimate's covariance."""
+        return self.nearest <= self.allowed
+
+
+def find_consistent(told: Told, weight: float | None = None) -> Consistent:
+    """Return the full standard parameters of an identified model.
+
+    Args:
+        told: what was identified.
+        weight: γ; None: where the evidence is largest.
+
+    Raises:
+        UsageError: for a model without bodies (motor side alone).
+    """
+    from scipy.stats import chi2
+
+    model = told.dynamics.model
+    if model.kind == "drive":
+        raise UsageError("the model holds drives alone (kind 'drive'): there are no bodies to make consistent")
+    allowed = float(np.sqrt(chi2.ppf(0.95, told.b)))
+    choices = [(references, make_problem(told, references)) for references in find_references(told.chain, model)]
+    away, problem = min(
+        ((told.distance(border.nearest(problem)), problem) for _, problem in choices[:: max(len(choices) - 1, 1)]),
+        key=lambda pair: pair[0],
+    )
+    blamed = border.blame(problem, told) if away > allowed else ()
+    doubt = max(1.0, away / np.sqrt(told.b))
+    _, gamma, problem, values, references = max(
+        (candidate for choice in choices for candidate in _candidates(*choice, weight, doubt)), key=lambda one: one[0]
+    )
+    while weight is None and away <= allowed < told.distance(values) and gamma > SMALLEST:
+        gamma /= 2.0
+        values = solve(problem, gamma)
+    return Consistent(
+        Dynamics(model, values), covariance(problem, gamma, values), gamma, doubt,
+        np.array([pseudo_inertia.margin(body) for body in _bodies(problem, values)]),
+        told.distance(values), away, allowed, blamed, references.source,
+        (*references.notes, *_notes(model, told, problem, values, allowed)),
+    )  # fmt: skip
+
+
+def _candidates(
+    references: References, problem: BodyCost, weight: float | None, doubt: float
+) -> Iterator[tuple[float, float, BodyCost, np.ndarray, References]]:
+    """Yield the optimum of each weight with its evidence, the data's sigmas widened by `doubt`."""
+    doubted = replace(problem, factor=problem.factor / doubt)
+    usual = [g for g in WEIGHTS if g >= LEAST] if references.cad else WEIGHTS[4::3]
+    for gamma in usual if weight is None else [weight]:
+        values = solve(doubted, gamma)
+        yield evidence(doubted, gamma, values), gamma, doubted, values, references
+
+
+def solve(problem: BodyCost, gamma: float) -> np.ndarray:
+    """Return argmin of the cost (p,), by Newton's method from the references, inside the cone all the way.
+
+    From far off a weak barrier makes Newton's steps short, so all priors are as strong as the data at first and let
+    go by factors of ten, as interior-point methods do.
+
+    Raises:
+        NotConverged: with the last parameters.
+    """
+    terms = np.where(problem.sizes > 0.0, np.where(problem.positive, problem.sizes, 0.0), problem.fixed)
+    values = np.concatenate([pseudo_inertia.to_standard(problem.references).ravel(), terms])
+    rest = problem.factor[:, :-1] @ values - problem.factor[:, -1]
+    for power in range(max(int(np.ceil(np.log10(1.0 + float(rest @ rest)))), 0), -1, -1):
+        values = _descend(replace(problem, lift=10.0**power), gamma, values)
+    return values
+
+
+def _descend(problem: BodyCost, gamma: float, values: np.ndarray) -> np.ndarray:
+    """Return the optimum by Newton's method with steps halved until the cost falls (Armijo)."""
+    free, here = problem.free, cost(problem, gamma, values)
+    for _ in range(STEPS):
+        slope, curvature = derivatives(problem, gamma, values)
+        step = np.zeros_like(values)
+        step[free] = -_solved(curvature[np.ix_(free, free)], slope[free])
+        decrement = -float(slope @ step)
+        if decrement < (SETTLED if problem.lift == 1.0 else 0.1 * problem.lift):
+            return values + step
+        size = 1.0
+        while (there := cost(problem, gamma, values + size * step)) > here - 1e-4 * size * decrement:
+            size /= 2.0
+            if size < 1e-12:  # rounding: no step lowers the cost any more
+                return values
+        values, here = values + size * step, there
+    raise NotConverged(f"the consistent parameters still move after {STEPS} Newton steps", values)
+
+
+def cost(problem: BodyCost, gamma: float, values: np.ndarray) -> float:
+    """Return J(χ) of the module's equation; infinite outside of the cone."""
+    rest = problem.factor[:, :-1] @ values - problem.factor[:, -1]
+    pseudo = pseudo_inertia.from_standard(_bodies(problem, values))
+    inside = np.linalg.eigvalsh(_scaled(problem, pseudo))[:, 0] > 0.0
+    terms, live = values[10 * problem.bodies :], problem.sizes > 0.0
+    ratio = terms[live & problem.positive] / problem.sizes[live & problem.positive]
+    if not inside.all() or not (ratio > 0.0).all():
+        return np.inf
+    drawn = sum(
+        weight * pseudo_inertia.divergence(one, known)
+        for weight, one, known in zip(problem.weights(gamma), pseudo, problem.references)
+    )
+    drives = problem.lift * DRIVE * float(np.sum(ratio - np.log(ratio) - 1.0))
+    loose = live & ~problem.positive
+    return 0.5 * (float(rest @ rest) + drawn + drives + float(np.sum((terms[loose] / problem.sizes[loose]) ** 2)))
+
+
+def derivatives(problem: BodyCost, gamma: float, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return slope (p,) and curvature (p, p) of the cost."""
+    columns = problem.factor[:, :-1]
+    slope = columns.T @ (columns @ values - problem.factor[:, -1])
+    curvature = columns.T @ columns
+    pseudo = pseudo_inertia.from_standard(_bodies(problem, values))
+    for i, (weight, one, known) in enumerate(zip(problem.weights(gamma), pseudo, problem.references)):
+        own, inverse = slice(10 * i, 10 * i + 10), np.linalg.inv(one)
+        turned = inverse @ pseudo_inertia.BASIS
+        slope[own] += 0.5 * weight * np.einsum("ij,kji->k", np.linalg.inv(known) - inverse, pseudo_inertia.BASIS)
+        curvature[own, own] += 0.5 * weight * np.einsum("kij,lji->kl", turned, turned)
+    for k in np.flatnonzero(problem.sizes > 0.0):
+        place, size, x = 10 * problem.bodies + k, problem.sizes[k], values[10 * problem.bodies + k]
+        half = 0.5 * problem.lift * DRIVE
+        slope[place] += half * (1.0 / size - 1.0 / x) if problem.positive[k] else x / size**2
+        curvature[place, place] += half / x**2 if problem.positive[k] else 1.0 / size**2
+    return slope, curvature
+
+
+def evidence(problem: BodyCost, gamma: float, values: np.ndarray) -> float:
+    """Return log p(data | γ), Laplace's approximation, but for a constant."""
+    free = problem.free
+    curvature = derivatives(problem, gamma, values)[1][np.ix_(free, free)]
+    unit = np.sqrt(np.diag(curvature))
+    half = float(np.log(np.diag(np.linalg.cholesky(curvature / np.outer(unit, unit)))).sum() + np.log(unit).sum())
+    nu = gamma + 5.0
+    norm = 2.0 * nu * np.log(gamma) - 2.0 * gamma - 2.0 * nu * np.log(2.0) - float(multigammaln(nu / 2.0, 4))
+    scale = 2.5 * float(np.linalg.slogdet(problem.references)[1].sum())  # of P⁰: counts where references compete
+    return -cost(problem, gamma, values) - half + norm * float(problem.drawn.sum()) - scale
+
+
+def covariance(problem: BodyCost, gamma: float, values: np.ndarray) -> np.ndarray:
+    """Return the inverse of the cost's curvature (p, p), zero for what is fixed."""
+    free = problem.free
+    result = np.zeros((len(values), len(values)))
+    curvature = derivatives(problem, gamma, values)[1][np.ix_(free, free)]
+    result[np.ix_(free, free)] = _solved(curvature, np.eye(len(curvature)))
+    return 0.5 * (result + result.T)
+
+
+def _solved(curvature: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Return curvature⁻¹ target, by Cholesky in units that make the diagonal one."""
+    unit = np.sqrt(np.diag(curvature))
+    root = scipy.linalg.cho_factor(curvature / np.outer(unit, unit))
+    scale = unit if target.ndim == 1 else unit[:, None]
+    return scipy.linalg.cho_solve(root, target / scale) / scale
+
+
+def _bodies(problem: BodyCost, values: np.ndarray) -> np.ndarray:
+    return values[: 10 * problem.bodies].reshape(-1, 10)
+
+
+def _scaled(problem: BodyCost, pseudo: np.ndarray) -> np.ndarray:
+    """Return L⁻¹ P L⁻ᵀ with P⁰ = L Lᵀ: definite where P is, and of order one."""
+    inverse = np.linalg.inv(np.linalg.cholesky(problem.references))
+    return inverse @ pseudo @ inverse.transpose(0, 2, 1)
+
+
+def _notes(
+    model: IdentificationModel, told: Told, problem: BodyCost, values: np.ndarray, allowed: float
+) -> Sequence[str]:
+    """Return what stands out: a distance beyond the covariance, bodies thinner than a millimetre."""
+    found = []
+    if (away := told.distance(values)) > allowed:
+        found.append(
+            f"the consistent parameters are {away:.3g} standard deviations from the estimate, beyond {allowed:.3g} (95 "
+            f"% for {told.b} parameters): the torques no longer are quite those identified"
+        )
+    for label, body in zip(model.tree.labels, _bodies(problem, values)):
+        if pseudo_inertia.margin(body) < 1e-3:
+            found.append(f"body {label} is thinner than a millimetre: hardly possible")
+    return found

@@ -1,0 +1,100 @@
+"""An identification's estimate as a function of its rows: to be repeated on others, and to be differentiated."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.data.signals.motion import moving
+from calib.identification.cases import Case
+from calib.identification.identify import Identification, common_decimator
+from calib.identification.rows import Rows, observe, thinned
+from calib.identification.settings import make_model
+from calib.robot.chain import Chain
+
+
+@dataclass(frozen=True, eq=False)
+class Estimator:
+    """An estimate as a function of its rows: A φ = Wᵀ R⁻¹ y + pull, A = Wᵀ R⁻¹ W + prior.
+
+    Attributes:
+        deviation: (rows,) R = diag(deviation²).
+        prior: (p, p) information of what was known beforehand; zero for none.
+        pull: (p,) that information times its mean; what keeps parameters within bounds is part of it.
+    """
+
+    deviation: np.ndarray
+    prior: np.ndarray
+    pull: np.ndarray
+
+
+def estimator(found: Identification) -> Estimator:
+    """Return how an identification weighed its rows, and what it knew beforehand."""
+    fitted = found.fitted
+    p = fitted.pooled.parameters
+    drawn = fitted.method == "wls" and (found.prior is not None or len(found.climb.terms) > 0)
+    deviation = np.ones(len(fitted.std)) if fitted.method == "ols" else np.array(fitted.std)
+    if not drawn:
+        return Estimator(deviation, np.zeros((p, p)), np.zeros(p))
+    deviation = deviation * np.sqrt(fitted.inflation)
+    factors = (fitted.pooled.factors / deviation[:, None, None]).reshape(-1, p + 1)
+    own = factors.T @ factors
+    posterior = inverted(fitted.estimate.covariance)
+    return Estimator(deviation, posterior - own[:p, :p], posterior @ fitted.estimate.values - own[:p, p])
+
+
+def estimate(how: Estimator, all_rows: Sequence[Rows]) -> tuple[np.ndarray, np.ndarray]:
+    """Return φ (p,) from rows, and A⁻¹ (p, p)."""
+    normal, right = np.array(how.prior), np.array(how.pull)
+    for part in all_rows:
+        scale = weights(how, part)
+        white = stacked(part) * scale[:, None]
+        normal += white.T @ white
+        right += white.T @ (part.target.ravel() * scale)
+    inverse = inverted(normal)
+    return inverse @ right, inverse
+
+
+def rows_on(found: Identification, chain: Chain, cases: Sequence[Case]) -> list[Rows]:
+    """Return the rows of an identification as another geometry would have given them; friction's columns stay."""
+    model, decimator = make_model(chain, found.settings), common_decimator(cases, found.settings)
+    result = []
+    for part, case in zip(found.rows, cases):
+        own = observe(model, found.base.kept, case, decimator)
+        matrix = np.concatenate([own.matrix, part.matrix[:, :, found.base.b :]], axis=2)
+        result.append(replace(part, matrix=matrix))
+    return result
+
+
+def standstill_shift(found: Identification, cases: Sequence[Case]) -> np.ndarray:
+    """Return by how much φ (p,) changes where rows of nearly standing joints are left out; for one row per joint."""
+    how, decimator = estimator(found), common_decimator(cases, found.settings)
+    faster = [
+        replace(part, present=part.present & thinned(moving(case.motion), case.motion.segment, decimator))
+        for part, case in zip(found.rows, cases)
+    ]
+    return estimate(how, faster)[0] - estimate(how, found.rows)[0]
+
+
+def cut(rows: Rows, own: slice) -> Rows:
+    """Return some of the rows."""
+    return replace(
+        rows, matrix=rows.matrix[own], target=rows.target[own], present=rows.present[own], block=rows.block[own]
+    )
+
+
+def inverted(matrix: np.ndarray) -> np.ndarray:
+    """Return the inverse of a positive definite matrix whose rows have units of their own."""
+    unit = 1.0 / np.sqrt(np.diag(matrix))
+    return np.linalg.inv(matrix * np.outer(unit, unit)) * np.outer(unit, unit)
+
+
+def stacked(rows: Rows) -> np.ndarray:
+    return rows.matrix.reshape(-1, rows.matrix.shape[2])
+
+
+def weights(how: Estimator, rows: Rows, by: np.ndarray | None = None) -> np.ndarray:
+    """Return 1 / deviation (or 1 / `by`) of each row, all stacked; zero where nothing was learnt."""
+    return (rows.present / (how.deviation if by is None else by)).ravel()

@@ -1,0 +1,174 @@
+"""Currents become torques: by gains that are stated, that the file brings, or that a known payload tells."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from calib.data.recordings.recording import Joints, parse_cut
+from calib.data.recordings.recording_files import read_recording
+from calib.data.signals.motion import Motion, make_motion
+from calib.errors import UsageError
+from calib.identification.cases import Case, make_case
+from calib.identification.gains import DriveGains, identify_gains
+from calib.identification.identify import common_decimator, find_base, first_fit
+from calib.identification.identify_options import FileSettings, IdentifyOptions, file_settings
+from calib.identification.model_file import TORQUE
+from calib.identification.rows import observe, pool, triangulate, with_blocks
+from calib.identification.settings import Settings, make_model
+from calib.robot.chain import Chain
+
+
+@dataclass(frozen=True, eq=False)
+class FoundGains:
+    """How currents become torques.
+
+    Attributes:
+        options: the options, payload parameters found beside the gains put in.
+        gains: (n,) for recordings that state none of their own; None where none are needed.
+        found: the identification of gains; None where there was none.
+        unit: of the torques.
+        notes: what a user should know.
+    """
+
+    options: IdentifyOptions
+    gains: np.ndarray | None
+    found: DriveGains | None
+    unit: str
+    notes: tuple[str, ...]
+
+    def for_motion(self, motion: Motion, own: FileSettings) -> np.ndarray | None:
+        """Return the gains (n,) for a motion: the options', those found, or the file's; None for torques."""
+        if own.gains is not None:
+            if len(own.gains) not in (1, motion.n):
+                raise UsageError(f"gains: {len(own.gains)} values for {motion.n} joints ({motion.file})")
+            return np.broadcast_to(np.array(own.gains), (motion.n,))
+        if motion.kind != "current":
+            return None
+        return self.gains if self.gains is not None else motion.drive_gain
+
+
+def find_gains(
+    chain: Chain,
+    options: IdentifyOptions,
+    motions: Mapping[str, Motion],
+    training: Sequence[str],
+    say: Callable[[str], None],
+) -> FoundGains:
+    """Return how the currents of `motions` (path → motion) become torques."""
+    currents = [path for path, motion in motions.items() if motion.kind == "current"]
+    stated = [path for path in currents if file_settings(options, path).gains is not None]
+    if options.gain_pair is not None:
+        say("drive gains")
+        return _from_pair(chain, options, motions)
+    bare = [path for path in currents if path not in stated and motions[path].drive_gain is None]
+    if not bare:
+        return FoundGains(options, None, None, TORQUE, ())
+    if len(bare) < len(motions):
+        rest = [path for path in motions if path not in bare]
+        raise UsageError(
+            f"{bare[0]} holds currents without gains, {rest[0]} torques (or currents with gains): amperes and N m do "
+            "not go into one model; state gains for all of them"
+        )
+    say("relative drive gains")
+    return _relative(chain, options, [(path, motions[path]) for path in training if path in bare])
+
+
+def _from_pair(chain: Chain, options: IdentifyOptions, motions: Mapping[str, Motion]) -> FoundGains:
+    pair, settings = options.gain_pair, options.settings
+    assert pair is not None
+    known = {f"M{label}": own.mass for label, own in settings.payloads.items() if own.mass is not None}
+    for label, own in settings.payloads.items():
+        if own.com is not None and own.mass is not None:
+            known |= {f"M{axis}{label}": own.mass * c for axis, c in zip("XYZ", own.com)}
+    if not known:
+        raise UsageError(f"{options.source}: gain_identification needs a [payload.<label>] with its mass")
+    cases = [
+        _case(name, chain, options, motions, carried)
+        for names, carried in ((pair.unloaded, ()), (pair.loaded, tuple(settings.payloads)))
+        for name in names
+    ]
+    found = _identify(chain, cases, settings, known, None)
+    values = dict(zip(found.names, found.values))
+    loads = {
+        label: tuple(
+            float(values.get(name + label, 0.0)) for name in ("XX", "XY", "XZ", "YY", "YZ", "ZZ", "MX", "MY", "MZ", "M")
+        )
+        for label in settings.payloads
+    }
+    told = ", ".join(f"{gain:.4g} ± {sigma:.2g}" for gain, sigma in zip(found.gains, found.sigma))
+    files = ", ".join(Path(parse_cut(name)[0]).name for name in (*pair.unloaded, *pair.loaded))
+    notes = [
+        f"drive gains from {files} ({found.scale}): {told}",
+        f"gains and the payload's parameters rest on {files}: predictions of these files are not wholly unseen",
+    ]
+    notes += _unsure(found)
+    chosen = replace(options, settings=replace(settings, payload_values=loads))
+    return FoundGains(chosen, found.gains, found, TORQUE, tuple(notes))
+
+
+def _relative(chain: Chain, options: IdentifyOptions, currents: Sequence[tuple[str, Motion]]) -> FoundGains:
+    """Return gains relative to the joint with the largest current: torques in its amperes."""
+    if not currents:
+        return FoundGains(options, None, None, "A", ("no drive gains are known: torques are currents [A]",))
+    cases = [make_case(path, motion, carried=file_settings(options, path).payload) for path, motion in currents]
+    squares = sum(np.sum(np.asarray(case.target) ** 2, axis=0) for case in cases)
+    reference = int(np.argmax(squares))
+    found = _identify(chain, cases, options.settings, {}, reference)
+    told = ", ".join(f"{gain:.4g} ± {sigma:.2g}" for gain, sigma in zip(found.gains, found.sigma))
+    note = (
+        f"no drive gains are known: torques are in amperes of joint {reference + 1}, gains relative to it {told}; "
+        "for N m give gains, or [gain_identification] with a payload of known mass"
+    )
+    return FoundGains(options, found.gains, found, f"A of joint {reference + 1}", (note, *_unsure(found)))
+
+
+def relative_warnings(unit: str) -> tuple[str, ...]:
+    """Say what a model is whose torques are not in newton metres; nothing for one whose are."""
+    if unit == TORQUE:
+        return ()
+    return (
+        f"the model is in {unit}, not in N m: no masses, no URDF, no motion planning; the robot's own inertias do not "
+        "compare with it: state gains, or identify them with a load",
+    )
+
+
+def _identify(
+    chain: Chain, cases: Sequence[Case], settings: Settings, known: Mapping[str, float], reference: int | None
+) -> DriveGains:
+    model = make_model(chain, settings)
+    base = find_base(chain, model, settings, None, cases)
+    missing = [name for name in known if name not in [model.names[k] for k in base.kept]]
+    if missing:
+        raise UsageError(f"'{missing[0]}' is no parameter of its own in these recordings; is the loaded run loaded?")
+    decimator = common_decimator(cases, settings)
+    rows = with_blocks([observe(model, base.kept, case, decimator) for case in cases], settings.folds)
+    tau = first_fit(rows)[1]
+    return identify_gains(pool(triangulate(rows), chain.n), known, tau, reference=reference)
+
+
+def _case(
+    name: str, chain: Chain, options: IdentifyOptions, motions: Mapping[str, Motion], carried: tuple[str, ...]
+) -> Case:
+    """Return the currents of a recording of the command line, or of a file beside the options file."""
+    path = next((path for path in motions if path == name or Path(parse_cut(path)[0]).name == parse_cut(name)[0]), None)
+    if path is not None:
+        return make_case(name, motions[path], carried=carried)
+    beside = Path(options.source).parent / name if options.source else Path(name)
+    where = str(beside) if Path(parse_cut(str(beside))[0]).exists() else name
+    if not Path(parse_cut(where)[0]).exists():
+        raise UsageError(f"{options.source}: gain_identification names {name}, which is neither given nor a file")
+    own = file_settings(options, where)
+    motion = make_motion(read_recording(where, Joints(chain.joint_names), own.recording), own.filter)
+    return make_case(name, motion, carried=carried)
+
+
+def _unsure(found: DriveGains) -> list[str]:
+    unsure = [j for j in range(len(found.gains)) if found.sigma[j] > 0.1 * abs(found.gains[j])]
+    if not unsure:
+        return []
+    shown = ", ".join(f"joint {j + 1} ({100 * found.sigma[j] / abs(found.gains[j]):.0f} %)" for j in unsure)
+    return [f"these runs tell some gains badly: {shown}"]

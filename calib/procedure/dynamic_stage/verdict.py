@@ -1,0 +1,265 @@
+"""May one trust an identified model? What a user is told; all thresholds are our choice.
+
+The verdict of calib identify (exit code 0 for pass and marginal, 1 for fail) judges the raw total of the worst
+validation recording in which the robot moves and which does not repeat the training: above 30 % unexplained it fails;
+it passes up to 10 % and up to 2 times the training's own error; between, it is marginal. It is marginal as well
+without such a recording, or where the training motion is too poor to tell parameters apart. A joint of which 50 % or
+more is unexplained (in the band, and while it moves) is named and allows no pass; from 95 % on it fails the model
+where its rms torque is 10 % or more of the greatest joint's. Friction that drives a joint fails. The reason says
+which of these held.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from calib.data.signals.motion import moving
+from calib.data.signals.persistency import ExcitationReport
+from calib.identification.cases import Case
+from calib.identification.identify import Identification
+from calib.identification.prior import resting
+from calib.identification.reweighted import standstill_shift
+from calib.identification.scores import Score
+from calib.procedure.kinematic_stage.verdict import Verdict
+from calib.robot.chain import Chain
+
+TRANSFER = 2.0  # unseen errors this many times the fit's own: the model does not transfer
+GOOD = 10.0  # relative error of the torque on other motion below which the model passes [%]
+POOR = 30.0  # and above which it fails
+LOST = 50.0  # share of a joint's torque, in the band and while it moves, left unexplained from which it is named [%]
+NOTHING = 95.0  # and from which the model is as good as none for that joint [%]
+MATTERS = 0.1  # of the greatest joint's rms torque: from here on a joint without a model is a failure
+BEYOND = 0.05  # of a joint's range by which a recording may leave it: encoders and limits of a CAD are not exact
+CONDITION = 200.0  # of the observation matrix with columns of unit norm
+MOVES = 0.1  # share of moving rows below which a recording is no motion
+BEND = 1e-4  # rms of link minus motor position that shows elasticity [rad or m]
+SLOW_SHARE = 0.1  # share of samples near standstill from which on Coulomb friction is drawn down
+
+
+def judge(
+    fit: Mapping[str, Score],
+    validation: Mapping[str, Score],
+    repeated: Mapping[str, float],
+    excitation: Mapping[str, ExcitationReport],
+    driven: Sequence[int] = (),
+    rows: Sequence[str] = (),
+) -> Verdict:
+    """Judge an identification by motion it has not seen; the first rule that holds.
+
+    Recordings in which the robot stands are left aside. A total hides small joints: rules 1 to 5 judge the sum, then
+    each joint of which `LOST` is unexplained is named, and the verdict is no better than marginal; it is fail where
+    `NOTHING` is left of a torque that `MATTERS`.
+
+    0. friction drives a joint: fail;
+    1. the unseen error is above `POOR`: fail;
+    2. no unseen motion (or a repeat of the training's only): marginal;
+    3. the training motion is too poor to tell parameters apart: marginal;
+    4. the unseen error is above `GOOD`, or `TRANSFER` times the fit's own: marginal;
+    5. else pass.
+
+    Args:
+        fit, validation: scores by file; validation without repeats.
+        repeated: validation files that repeat the training motion.
+        excitation: of the training files.
+        driven: joints, from 0, see `calib.identification.friction.passivity`.
+        rows: what the torque rows are called, see `calib.identification.cases.row_labels`; default 1, 2, ...
+    """
+    if driven:
+        named = ", ".join(str(joint + 1) for joint in driven)
+        why = "is a torque's sign reversed, are columns swapped, is this the robot?"
+        return Verdict("fail", f"friction drives joint {named} instead of braking it, as in no robot: {why}")
+    moves = {name: scored for name, scored in validation.items() if scored.motion_share >= MOVES}
+    verdict = _judge_totals(fit, moves, len(moves) < len(validation), repeated, excitation)
+    return _held_by_joint(verdict, moves or fit, rows)
+
+
+def _judge_totals(
+    fit: Mapping[str, Score],
+    validation: Mapping[str, Score],
+    standing: bool,
+    repeated: Mapping[str, float],
+    excitation: Mapping[str, ExcitationReport],
+) -> Verdict:
+    """Return the verdict by rules 1 to 5; `standing`: there were recordings in which the robot stands."""
+    own = max((found.raw.total for found in fit.values()), default=np.nan)
+    if not validation:
+        why = "there is no unseen motion: --validate"
+        if repeated:
+            why = "the validation motion repeats the training motion"
+        elif standing:
+            why = "the robot stands in the validation recordings, where friction takes any value"
+        return Verdict("marginal", f"{why}; on the training motion {own:.2f} % of the torque is unexplained")
+    name = max(validation, key=lambda key: validation[key].raw.total)
+    worst = validation[name].raw.total
+    told = f"on {name}, unseen: {worst:.2f} % of the torque unexplained, {own:.2f} % on the training motion"
+    if worst > POOR:
+        return Verdict("fail", f"{told}; above {POOR:g} % fails")
+    if any(report.poor for report in excitation.values()) and all(report.poor for report in excitation.values()):
+        return Verdict("marginal", f"{told}; but the training motion cannot tell the parameters apart")
+    if worst > GOOD:
+        return Verdict("marginal", f"{told}; up to {GOOD:g} % passes")
+    if worst > TRANSFER * own:
+        return Verdict("marginal", f"{told}; up to {TRANSFER:g} times the training's passes")
+    return Verdict("pass", told)
+
+
+def _held_by_joint(verdict: Verdict, scores: Mapping[str, Score], rows: Sequence[str]) -> Verdict:
+    """Return the verdict with the joints named that the model does not explain, and no better than they allow.
+
+    Taken in the band, since noise is no fault of the model, and moving, since friction at rest takes any value.
+    """
+    lost: dict[int, float] = {}
+    failed = False
+    for scored in scores.values():
+        share = np.minimum(scored.filtered.joints, scored.moving.joints)  # NaN, a joint that stands, is not lost
+        with np.errstate(divide="ignore", invalid="ignore"):
+            torque = np.nan_to_num(100.0 * scored.raw.rms / scored.raw.joints, posinf=0.0)
+        failed |= bool(np.any((share >= NOTHING) & (torque >= MATTERS * torque.max())))
+        lost |= {int(k): max(lost.get(int(k), 0.0), float(share[k])) for k in np.flatnonzero(share >= LOST)}
+    if not lost:
+        return verdict
+    named = ", ".join(f"joint {rows[k] if rows else k + 1} ({lost[k]:.0f} % unexplained)" for k in sorted(lost))
+    level = "fail" if failed or verdict.level == "fail" else "marginal"
+    return Verdict(
+        level, f"{verdict.reason}; the model does not hold for {named}: is this the robot, are the columns in order?"
+    )
+
+
+def with_prior(verdict: Verdict, found: Identification) -> Verdict:
+    """Return the verdict with it said where most parameters are not the motion's: what they are worth, CAD knows."""
+    drawn = resting_names(found)
+    if 2 * len(drawn) <= found.base.b:
+        return verdict
+    source = "the CAD's" if found.prior is not None and found.prior.source == "cad" else "a guess of their sizes"
+    told = f"{len(drawn)} of {found.base.b} parameters are {source}: this motion does not tell them"
+    return replace(verdict, reason=f"{verdict.reason}; {told}")
+
+
+def warnings(
+    cases: Sequence[Case],
+    unseen: Sequence[Case],
+    found: Identification,
+    validation: Mapping[str, Score],
+    repeated: Mapping[str, float],
+    excitation: Mapping[str, ExcitationReport],
+    chain: Chain,
+) -> tuple[str, ...]:
+    """Return what a user should know, worst first."""
+    told = [line for case in (*cases, *unseen) for line in beyond(case, chain)]
+    told += [
+        f"{name}: {100 * share:.0f} % of its states were met in training: a repeat proves nothing, it is no evidence"
+        for name, share in repeated.items()
+    ]
+    for name, report in excitation.items():
+        told += [f"{name}: {note}" for note in report.notes]
+    told += [
+        f"{name}: the robot stands there; its errors are of friction at rest, which no function of q, v, a predicts"
+        for name, scored in validation.items()
+        if scored.motion_share < MOVES
+    ]
+    normalised = found.condition[1]
+    if normalised > CONDITION:
+        told.append(
+            f"condition number {normalised:.0f} (columns of unit norm): the motion tells some parameters apart badly; "
+            "design an excitation"
+        )
+    if excitation and all(report.poor for report in excitation.values()) and found.settings.friction == "auto":
+        told.append("friction: standard only, since on so poor a motion no block of time judges another")
+    told += found.bias.lines(found.fitted.method)
+    told += _rests(found)
+    told += _elastic(cases)
+    told += _slow_bias(cases, found)
+    return tuple(dict.fromkeys(told))
+
+
+def beyond(case: Case, chain: Chain) -> list[str]:
+    """Say which joints a recording takes far beyond the robot's limits."""
+    q = np.asarray(case.motion.q)
+    over = np.maximum(chain.lower - q.min(axis=0), q.max(axis=0) - chain.upper)
+    far = np.flatnonzero(np.isfinite(over) & (over > BEYOND * (chain.upper - chain.lower)))
+    if not len(far):
+        return []
+    named = ", ".join(
+        f"{chain.joint_names[j]} by {over[j]:.2g} {'m' if chain.joints[j].kind == 'prismatic' else 'rad'}" for j in far
+    )
+    return [f"{case.name}: far beyond the robot's limits ({named}): is this the robot, are the columns in its order?"]
+
+
+def resting_names(found: Identification) -> list[str]:
+    """Return the base parameters that the motion does not tell."""
+    if found.prior is None:
+        return []
+    on = resting(found.prior, found.fitted.estimate.covariance)
+    return [name for name, rests in zip(found.base.names, on) if rests]
+
+
+def _rests(found: Identification) -> list[str]:
+    """Say which parameters the motion does not tell."""
+    names = resting_names(found)
+    if found.prior is None or not names:
+        return []
+    source = "the robot's own inertias" if found.prior.source == "cad" else "nothing but the order of their sizes"
+    how = f"drawn to {source} (f = {found.prior.scale:.2g}; {len(names)} of {found.base.b})"
+    return [f"not identifiable from this motion, {how}: {', '.join(names)}"]
+
+
+def _elastic(cases: Sequence[Case]) -> list[str]:
+    """Say where second encoders show that joints bend: a rigid model does not know."""
+    told = []
+    for case in cases:
+        if case.motion.q_link is None:
+            continue
+        apart = np.asarray(case.motion.q_link - case.motion.q)
+        bend = np.std(apart, axis=0)
+        joints = [f"{1e3 * bend[j]:.2g} mrad at joint {j + 1}" for j in np.flatnonzero(bend > BEND)]
+        if joints:
+            told.append(
+                f"{case.name}: motor and link encoders move apart ({', '.join(joints)}, rms): elastic joints, "
+                "and what they store and release is beyond a rigid model"
+            )
+    return told
+
+
+def _slow_bias(cases: Sequence[Case], found: Identification) -> list[str]:
+    """Notice that rows of joints near standstill, where friction takes any value, are in the fit."""
+    total = np.zeros(cases[0].motion.n)
+    size = 0
+    for case in cases:
+        used = np.asarray(case.present)[:, : case.motion.n]
+        total += (~moving(case.motion) & used).sum(axis=0)
+        size += len(case.motion)
+    share = total / max(size, 1)
+    slow = [j for j in np.flatnonzero(share > SLOW_SHARE) if f"Fc{j + 1}" in found.names]
+    if not slow:
+        return _coulomb_shift(cases, found)
+    shown = ", ".join(f"{100 * share[j]:.0f} % at joint {j + 1}" for j in slow)
+    return [
+        f"rows of nearly standing joints are in the fit ({shown}): they draw Coulomb friction down; set cut_slow = true"
+    ]
+
+
+def _coulomb_shift(cases: Sequence[Case], found: Identification) -> list[str]:
+    """Notice that the few rows near standstill move Coulomb friction by more than its sigma.
+
+    Where a joint's friction is richer, they are modelled, not cut.
+    """
+    if found.settings.kind != "motor":
+        return []
+    richer = {joint for one in found.climb.terms for joint, _ in one.acts}
+    index = {j: found.names.index(f"Fc{j + 1}") for j in range(cases[0].motion.n) if f"Fc{j + 1}" in found.names}
+    estimate = found.fitted.estimate
+    shift, sigma, percent = standstill_shift(found, cases), estimate.sigma, 0.01 * np.abs(estimate.values)
+    moved = [
+        f"Fc{j + 1} {shift[k] / percent[k]:+.1f} % (sigma {sigma[k] / percent[k]:.1f} %)"
+        for j, k in index.items()
+        if j not in richer and abs(shift[k]) > sigma[k] and percent[k] > 0.0
+    ]
+    if not moved:
+        return []
+    return [
+        f"the few rows of nearly standing joints move Coulomb friction by more than its sigma; without them: "
+        f"{', '.join(moved)}; for its value set cut_slow = true, or choose a friction with presliding"
+    ]

@@ -1,0 +1,275 @@
+"""Planning a motion: a path through waypoints, timed by the package `trajectories` on the best model there is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from calib.data.poses.fit_options import FitOptions
+from calib.dynamics import drives
+from calib.dynamics.bodies import standard_parameters, tree
+from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.path_dynamics import PathDynamics, of_standard
+from calib.errors import RobotError, UsageError
+from calib.identification.model_file import read_dynamics, refuse_currents
+from calib.identification.prediction import Dynamics, carried_columns
+from calib.identification.torque_uncertainty import Uncertainty, read_uncertainty
+from calib.procedure.excitation.approach import approach_to
+from calib.procedure.excitation.limits import MotionLimits, read_motion_limits
+from calib.procedure.excitation.waypoints import read_waypoints
+from calib.procedure.kinematic_stage.inputs import load_robot
+from calib.robot.chain import Chain
+from calib.robot.kinematics import element_jacobian, forward, joint_jacobian, sweep
+from calib.robot.tables import check_keys, load, vector
+from trajectories.basis import Motion
+from trajectories.constraints import BoxLimit
+from trajectories.timing.limits import Limits
+from trajectories.timing.lines import line
+from trajectories.timing.path import Path as JointPath
+from trajectories.timing.path import check_within, checked, spline
+from trajectories.timing.profile import track
+from trajectories.timing.shape import Shaped, shorten
+from trajectories.timing.time_scaling import Timing, time_optimal
+from trajectories.track import Track, joined, slowed
+
+DRIVES = ("Ia", "Fv", "Fc", "off")
+COARSE = 150  # grid of the outer loop
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Planned:
+    """A planned motion.
+
+    Attributes:
+        chain: the robot, and `law`: its dynamics; None where its masses are not known.
+        limits, lower, upper: what the motion keeps.
+        timings: one per path: a single one through all waypoints, or one per tool line.
+        track: the motion at the controller's rate.
+        margins: (n,) to the joint limits [rad or m].
+        deviation: (2,) of the tool from its lines [m, rad]; None for joint paths.
+        shaped: what the outer loop found; None without one.
+        approach, rehearsal: tracks; None where not asked for.
+        sigma: (n,) largest standard deviation of each predicted torque; `limits.torque` leaves as many of them free as
+            the limits file says (default 2); None where the model states none.
+        notes: what a user should know.
+    """
+
+    chain: Chain
+    law: PathDynamics | None
+    limits: Limits
+    lower: np.ndarray
+    upper: np.ndarray
+    timings: tuple[Timing, ...]
+    track: Track
+    margins: np.ndarray
+    deviation: np.ndarray | None
+    shaped: Shaped | None
+    approach: Track | None
+    rehearsal: Track | None
+    sigma: np.ndarray | None
+    notes: tuple[str, ...]
+
+
+def plan(
+    robot: str | Path,
+    waypoints: Path,
+    *,
+    model: Path | None = None,
+    payloads: Sequence[str] = (),
+    limits: Path | None = None,
+    drives_file: Path | None = None,
+    lines: bool = False,
+    rate: float = 1000.0,
+    evaluations: int = 0,
+    stray: float = 0.0,
+    start: Sequence[float] | None = None,
+    slower: float = 1.0,
+    base: str | None = None,
+    tip: str | None = None,
+    progress: Progress | None = None,
+) -> Planned:
+    """Plan the fastest motion through the waypoints of a file.
+
+    Args:
+        robot: see `calib.robot.load`.
+        model: folder of an identification; its geometry is planned with, the limits are the robot's.
+        payloads: labels of identified payloads on board.
+        limits: see `calib.procedure.excitation.limits`; drives_file: see `read_drives`.
+        lines: the tool runs straight from waypoint to waypoint, and rests at each.
+        rate: of the controller [Hz].
+        evaluations, stray: of the outer loop, see `trajectories.timing.shape`; 0 evaluations for none.
+        start: (n,) where the robot stands now, for an approach.
+        slower: factor of a rehearsal; 1 for none.
+    """
+    say = progress or (lambda words: None)
+    _check(rate, evaluations, lines, slower)
+    chain, source = load_robot(robot, waypoints, FitOptions(), base, tip)
+    known = read_motion_limits(limits, chain, source)
+    law, notes, unsure = _law(chain, model, payloads, drives_file, known)
+    lower, upper, bounds = _bounds(chain, known, law)
+    arm = chain if model is None else read_dynamics(model)[0]
+    points = read_waypoints(waypoints, arm, lower, upper, start)
+    say("the path")
+    paths, deviation = _paths(arm, points, lines)
+    for path in paths:
+        check_within(path, lower, upper, points)
+    shaped = None
+    if evaluations:
+        timer = partial(_duration, limits=bounds, law=law, lower=lower, upper=upper, known=known)
+        words = lambda done, best: say(f"shaping the path: {best:.4f} s after {done} timings")  # noqa: E731
+        shaped = shorten(points, timer, evaluations, stray, words)
+        paths = [shaped.path]
+    margins = np.min([check_within(path, lower, upper) for path in paths], axis=0)
+    for path in paths:
+        check_places(path, known)
+    say("timing")
+    timings = tuple(time_optimal(path, bounds, law, rate=rate) for path in paths)
+    sigma = None
+    if unsure is not None and known.deviations > 0:
+        sigma = np.max([unsure.sigma(one.sampled) for one in timings], axis=0)
+        bounds = _guarded(bounds, known.deviations * sigma, chain)
+        timings = tuple(time_optimal(path, bounds, law, rate=rate) for path in paths)
+    torque = None if law is None else law.torque
+    motion = joined([track(one.path, one.profile, rate, torque) for one in timings])
+    lead, told = (None, ()) if start is None else approach_to(start, motion.q[0], rate, known, chain)
+    return Planned(
+        chain, law, bounds, lower, upper, timings, motion, margins, deviation, shaped, lead,
+        slowed(motion, slower) if slower != 1 else None, sigma, (*known.notes, *notes, *told),
+    )  # fmt: skip
+
+
+def read_drives(path: Path, chain: Chain) -> dict[str, np.ndarray]:
+    """Read drive parameters from TOML, one per joint: ``[drives]`` with any of Ia, Fv, Fc, off (SI, joint side)."""
+    table = load(path)
+    check_keys(table, ("drives",), str(path))
+    own = table.get("drives", {})
+    check_keys(own, DRIVES, f"{path}, drives")
+    return {key: vector(own[key], chain.n, f"{path}, drives.{key}") for key in own}
+
+
+def check_places(path: JointPath, known: MotionLimits) -> None:
+    """Refuse a path that breaks the workspace or comes too near to something (limits file), at 500 places.
+
+    Raises:
+        UsageError: what is broken, where, and by how much.
+    """
+    s = np.linspace(0, path.length, 500)
+    still = np.zeros((len(s), path.n))
+    for one in known.constraints:
+        if isinstance(one, BoxLimit):
+            continue
+        values = one.values(Motion(s, path(s), still, still, still))
+        if values.max() > 0:
+            k, column = (int(i) for i in np.unravel_index(np.argmax(values), values.shape))
+            raise UsageError(
+                f"{one.name}: {one.labels[column]} is broken by {values[k, column]:.3g} {one.unit} at "
+                f"{s[k] / path.length:.0%} of the path; move or add waypoints"
+            )
+
+
+def _check(rate: float, evaluations: int, lines: bool, slower: float) -> None:
+    if not (np.isfinite(rate) and rate > 0):
+        raise UsageError(f"--rate {rate:g}: expected a number of samples per second above zero")
+    if evaluations < 0:
+        raise UsageError(f"--shorten {evaluations}: expected a number of timings, 0 for none")
+    if evaluations and lines:
+        raise UsageError("--shorten changes the path between waypoints; a straight --line leaves nothing to change")
+    if not (np.isfinite(slower) and slower >= 1):
+        raise UsageError(f"--slower {slower:g}: a rehearsal runs a factor of 1 or more slower")
+
+
+def _law(
+    chain: Chain, folder: Path | None, payloads: Sequence[str], drives_file: Path | None, known: MotionLimits
+) -> tuple[PathDynamics | None, tuple[str, ...], Uncertainty | None]:
+    """Return the dynamics: identified, or the robot's inertias with stated drives; None without any."""
+    if folder is not None:
+        if drives_file is not None:
+            raise UsageError("--model and --drives both say what the drives are; take one of them away")
+        law, unsure = _identified(chain, folder, payloads)
+        return law, () if unsure else ("the model states no covariance: torques have no margin for it",), unsure
+    try:
+        stated = {} if drives_file is None else read_drives(drives_file, chain)
+        if known.friction is not None and not stated:
+            stated = {"Fv": known.friction[0], "Fc": known.friction[1]}
+        if chain.inertias is None:
+            return None, ("the robot's masses are not known: torques are not limited",), None
+        values = np.column_stack([stated.get(key, np.zeros(chain.n)) for key in DRIVES])
+    except RobotError as error:
+        raise UsageError(str(error)) from error
+    linear = [joint.kind == "prismatic" for joint in chain.joints]
+    model = IdentificationModel(tree(chain), drives.standard([" ".join(DRIVES)] * chain.n, linear=linear))
+    missing = [what for what, key in (("motor inertia", "Ia"), ("friction", "Fc")) if key not in stated]
+    note = (
+        f"{' and '.join(missing)} not known (no --model, no --drives): planned without, a real robot needs more torque"
+    )
+    law = of_standard(model, np.concatenate([standard_parameters(chain), values.ravel()]))
+    return law, (note,) if missing else (), None
+
+
+def _identified(chain: Chain, folder: Path, payloads: Sequence[str]) -> tuple[PathDynamics, Uncertainty | None]:
+    """Return an identified model with the payloads that are on board, and its uncertainty."""
+    refuse_currents(folder, "a motion plan")
+    arm, dynamics = read_dynamics(folder)
+    if arm.n != chain.n:
+        raise UsageError(f"{folder} is of a robot with {arm.n} joints, {chain.name} has {chain.n}")
+    model = dynamics.model
+    known = [label for label, coordinate in zip(model.tree.labels, model.tree.coordinates) if coordinate < 0]
+    if unknown := sorted(set(payloads) - set(known)):
+        raise UsageError(f"{folder}: no payload '{unknown[0]}' was identified; it knows {', '.join(known) or 'none'}")
+    if model.kind == "drive":
+        return of_standard(model, dynamics.values), None  # which says why that cannot be
+    values = np.array(dynamics.values)
+    values[: 10 * model.tree.bodies] *= carried_columns(model, payloads)
+    return of_standard(model, values), read_uncertainty(folder, Dynamics(model, values), payloads)
+
+
+def _guarded(bounds: Limits, margin: np.ndarray, chain: Chain) -> Limits:
+    """Return the limits with a margin (n,) of torque left free."""
+    if (margin >= bounds.torque).any():
+        j = int(np.argmax(margin / bounds.torque))
+        raise UsageError(
+            f"{chain.joint_names[j]}: the model's torque is uncertain by {margin[j]:.3g} along this motion, its limit "
+            f"is {bounds.torque[j]:.3g}; identify with a richer motion, or lower torque.deviations in the limits file"
+        )
+    return replace(bounds, torque=bounds.torque - margin)
+
+
+def _bounds(chain: Chain, known: MotionLimits, law: PathDynamics | None) -> tuple[np.ndarray, np.ndarray, Limits]:
+    """Return joint limits and the limits of timing."""
+    boxes = {one.order: one for one in known.constraints if isinstance(one, BoxLimit)}
+    free = np.full(chain.n, np.inf)
+    sizes = [boxes[order].upper if order in boxes else free for order in (1, 2)]
+    margin = known.margin or 0.0
+    if not 0 <= margin < 1:
+        raise UsageError(f"torque margin {margin:g}: expected a share of the limits from 0 to below 1")
+    torque = known.torque * (1 - margin) if law is not None else free
+    if not any(np.isfinite(x).any() for x in (*sizes, torque)):
+        raise UsageError(f"robot '{chain.name}' has no limits of speed, acceleration or torque; give --limits")
+    return known.positions.lower, known.positions.upper, Limits(sizes[0], sizes[1], torque)
+
+
+def _paths(chain: Chain, points: np.ndarray, lines: bool) -> tuple[list[JointPath], np.ndarray | None]:
+    if not lines:
+        return [spline(points)], None
+    start, found = checked(points)[0], []
+    for goal in forward(chain, points[1:]):
+        found.append(line(partial(forward, chain), partial(tool_jacobian, chain), start, goal))
+        start = found[-1].path(np.array([found[-1].path.length]))[0]
+    return [one.path for one in found], np.max([one.deviation for one in found], axis=0)
+
+
+def tool_jacobian(chain: Chain, q: np.ndarray) -> np.ndarray:
+    """Return the Jacobian of the tip by the joints, (m, 6, n)."""
+    walked = sweep(chain, q)
+    return joint_jacobian(chain, element_jacobian(chain, walked, walked.position)).transpose(2, 1, 0)
+
+
+def _duration(path: JointPath, limits: Limits, law: PathDynamics | None, lower, upper, known: MotionLimits) -> float:
+    check_within(path, lower, upper)
+    check_places(path, known)
+    return time_optimal(path, limits, law, grid=COARSE).duration

@@ -1,0 +1,126 @@
+"""A designed motion found again in a log, cut to whole periods, and averaged: less noise, and how much there was.
+
+What is written is a recording of one period that `calib identify` reads. A NumPy archive holds besides, per sample and
+joint, the variance of one sample over the periods (``variance_q``, ``variance_tau``, ...), and how many ``periods``
+there were: the mean's variance is that over their number.
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from calib import files
+from calib.data.recordings.recording import Joints, Recording
+from calib.data.recordings.recording_files import read_recording
+from calib.data.signals.resampling import resample
+from calib.errors import MeasurementError, UsageError
+from calib.procedure.excitation import coefficients
+from calib.procedure.excitation.coefficients import Periodic
+from trajectories.errors import BadInput
+from trajectories.recall import Averaged, Recalled, average, recall
+
+SUFFIXES = (".npz", ".csv")
+HEADERS = {"effort": "tau", "tau_link": "tau_link", "tau_motor": "tau_motor", "q_link": "q_link"}
+
+
+@dataclass(frozen=True, eq=False)
+class Recollection:
+    """Periods of a motion in a log, averaged.
+
+    Attributes:
+        motion: that was looked for; file: the log.
+        found: where it was.
+        averages: series of the recording (q, effort, v, ...) → mean and variance over the periods.
+        kind: of the effort, torque or current.
+        rate: [Hz]; a period holds a whole number of samples.
+        following: (n,) rms of measured minus commanded positions, after the best shift of whole samples [rad or m].
+    """
+
+    motion: Periodic
+    file: str
+    found: Recalled
+    averages: dict[str, Averaged]
+    kind: str
+    rate: float
+    following: np.ndarray
+
+
+def check_target(out: Path) -> None:
+    if out.suffix not in SUFFIXES or out.is_dir():
+        raise UsageError(f"--out {out}: give a file with the suffix {' or '.join(SUFFIXES)}")
+
+
+def find(folder: Path, log: str, skip: int = 0) -> Recollection:
+    """Find the motion of an excitation's folder in a log.
+
+    Args:
+        log: a recording, with a cut if wanted (``log.npz@0:90``).
+        skip: whole periods to leave out at the beginning: transients, a robot that warms up.
+
+    Raises:
+        UsageError, MeasurementError: for a folder or a log that is none, and where the motion is not in the log.
+    """
+    if skip < 0:
+        raise UsageError(f"--skip {skip}: expected a number of periods, 0 or more")
+    motion = coefficients.read(folder)
+    recording = read_recording(log, Joints(motion.joint_names))
+    rate, series = _longest(recording, motion.period)
+    count = round(motion.period * rate)
+    reference = motion.orders(np.arange(count) / rate)[0]
+    try:
+        found = recall(series["q"], reference, skip)
+        averages = {name: average(values, found) for name, values in series.items() if np.isfinite(values).all()}
+    except BadInput as error:
+        raise MeasurementError(str(error), recording.file) from error
+    error = averages["q"].mean - reference
+    return Recollection(
+        motion, recording.file, found, averages, recording.kind, rate, np.sqrt(np.mean(error**2, axis=0))
+    )
+
+
+def write(recollection: Recollection, out: Path) -> Path:
+    """Write one averaged period as a recording: CSV, or an archive with variances."""
+    averages, names = recollection.averages, recollection.motion.joint_names
+    called = HEADERS | {"q": "q", "v": "v", "effort": "tau" if recollection.kind == "torque" else "current"}
+    t = np.arange(recollection.found.period) / recollection.rate
+    if out.suffix == ".csv":
+        header = ["t", *(f"{called[name]}{j + 1}" for name in averages for j in range(len(names)))]
+        table = np.column_stack([t, *(one.mean for one in averages.values())])
+        return files.write_table(out, header, table.tolist())
+    arrays = {called[name]: one.mean for name, one in averages.items()}
+    arrays |= {f"variance_{called[name]}": one.variance for name, one in averages.items()}
+    buffer = io.BytesIO()
+    arrays |= {"t": t, "joint_names": np.array(names), "periods": np.array(recollection.found.periods)}
+    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
+    return files.write(out, buffer.getvalue())
+
+
+def lines(recollection: Recollection) -> list[str]:
+    """Return what a person wants to read."""
+    found, averages = recollection.found, recollection.averages
+    start = found.start / recollection.rate
+    unit = "N m" if recollection.kind == "torque" else "A"
+    result = [
+        f"{found.periods} whole periods of {recollection.motion.period:g} s in {recollection.file}, from {start:.3f} s "
+        f"on; each explains {min(found.likeness):.2%} of the motion at least",
+        f"{'joint':14} {'off command':>14} {'noise of q':>12} {f'noise of {unit}':>14} {'of the mean':>12}",
+    ]
+    noise, effort = np.sqrt(averages["q"].pooled), np.sqrt(averages["effort"].pooled)
+    rows = zip(recollection.motion.joint_names, recollection.following, noise, effort)
+    for name, following, one, two in rows:
+        result.append(f"{name:14} {following:14.3g} {one:12.3g} {two:14.3g} {two / np.sqrt(found.periods):12.3g}")
+    return result
+
+
+def _longest(recording: Recording, period: float) -> tuple[float, dict[str, np.ndarray]]:
+    """Return the longest part without gaps, on a grid of which a period holds a whole number of samples."""
+    own = 1.0 / float(np.median(np.diff(recording.t)))
+    rate = max(1, round(period * own)) / period
+    sampled = resample(recording, rate=rate)
+    longest = int(np.bincount(sampled.segment).argmax())
+    rows = sampled.segment == longest
+    return rate, {name: values[rows] for name, values in sampled.series.items()}

@@ -1,0 +1,61 @@
+"""What leaves a session: the calibrated robot in the forms others read."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from calib import files
+from calib.errors import RobotError, UsageError
+from calib.procedure.export import geometry
+
+COPIED = ("robot.toml", "joint_corrections.csv", "joint_corrections.txt")
+
+
+def deliver(fit: Path, source: Path, out: Path) -> list[str]:
+    """Write the calibrated robot into `out`: TOML, URDF (the source's own XML where it is one), joint offsets.
+
+    Args:
+        fit: the folder of the fit.
+        source: the robot's description.
+        out: folder for the files.
+
+    Returns:
+        What was written, in words.
+    """
+    for name in COPIED:
+        if (fit / name).exists():
+            files.write(out / name, (fit / name).read_bytes())
+        elif (out / name).exists():
+            os.unlink(out / name)
+    found = geometry.read(fit)
+    given = source.suffix == ".urdf"
+    for name, chain in (("robot.urdf", found.chain), ("robot_for_corrections.urdf", found.complete)):
+        if chain is None:
+            (out / name).unlink(missing_ok=True)
+        elif given:
+            geometry.export_urdf(found, source, out / name, chain is found.complete)
+        else:
+            written = (fit / name).read_text(encoding="utf-8")
+            geometry.check_readback(written, name, chain)
+            files.write(out / name, written)
+    made = (
+        "the given URDF with calibrated joint origins, all else kept" if given else "written from the calibrated table"
+    )
+    notes = [f"robot.urdf: {made}; Pinocchio reads the same poses to 1e-9"]
+    geometry.export_offsets(found, out / "joint_offsets.csv")
+    notes.append("robot.toml, joint_offsets.csv")
+    try:
+        geometry.export_ur_kinematics(found, out / "ur_kinematics.yaml")
+        flange = geometry.flange_note(found)
+        words = "ur_kinematics.yaml: for kinematics_params_file of ur_description"
+        notes.append(f"{words}; {flange}" if flange else words)
+    except (RobotError, UsageError):  # no UR arm
+        (out / "ur_kinematics.yaml").unlink(missing_ok=True)
+    if found.corrected:
+        words = (
+            "joint_corrections.csv: what a URDF cannot hold, on top of robot_for_corrections.urdf; formula in "
+            "joint_corrections.txt"
+        )
+        notes.append(f"{words}; {found.alone}" if found.alone else words)
+    return notes

@@ -1,0 +1,359 @@
+"""Nominal targets turned into the joint commands that put the real tool there.
+
+Frames are a matter of convention, since an arm that is measured from outside tells neither its base nor its flange from
+the placement of the instrument and of the target:
+
+    --frame base      targets stand in the base of the calibrated robot, as its robot.toml has it: base link and flange
+                      stay where the nominal description has them (the elements that cannot be told stay nominal)
+    --frame nominal   targets stand in the base of the nominal robot, placed in the cell where it fits the measurements
+                      best: commands change least on the whole
+    --frame NAME      targets stand in the frame of that instrument placement (a station of the fit)
+
+    --tool flange     targets are poses of the flange (the tip)
+    --tool NAME       of a target that was measured, as the fit has placed it in the flange
+    --tool x,y,z[,roll,pitch,yaw]   of a tool so placed in the flange [m, rad]
+
+Joint targets mean the pose that the nominal robot would have at these joints: with base and flange shared with the
+calibrated robot for ``base``; for the other two with its own best placement of base and target.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from calib.data.poses.target_files import Targets
+from calib.errors import UsageError
+from calib.geometry import inverse
+from calib.geometry.deflection import Deflection
+from calib.geometry.installation import Installation, see
+from calib.geometry.inverse import Goal
+from calib.geometry.parameters import layout
+from calib.geometry.spread import pose_sigmas
+from calib.procedure.kinematic_stage import robot_file
+from calib.procedure.kinematic_stage.tables import read_covariance
+from calib.robot.chain import Chain, sampling_limits
+from calib.transforms import from_xyz_rpy, invert, pose, rotation_vector
+
+TOLERANCE = (1e-6, 1e-5)  # position [m] and orientation [rad] that a command may leave; our choice, as what follows
+MOST = 0.2  # correction of one joint [rad or m] beyond which the arm is held back: it is near a singularity
+SINGULAR = 0.02  # singular values of the Jacobian, smallest over largest
+ASTRAY = 0.01  # further from a target than this no singularity is to blame [m]
+SLACK = 1e-9  # [rad or m]
+STARTS = 24  # random starts for each target without joints
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """What a fit's folder says of the arm in its cell.
+
+    Attributes:
+        cell: the calibrated installation, deflections included.
+        nominal: the nominal one, placed to fit the same measurements best; without stations where that is not known.
+        free, covariance: of the fit's parameters, see `read_covariance`.
+        unseen: rms error of the calibrated arm on poses that were not fitted [m]; None where there were none.
+        fitted: rms error on the fitted poses [m].
+    """
+
+    folder: Path
+    cell: Installation
+    nominal: Installation
+    free: np.ndarray
+    covariance: np.ndarray
+    unseen: float | None
+    fitted: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Commands:
+    """What to send for m targets.
+
+    Attributes:
+        q: (m, n) joint values [rad or m]; for a target that is not reached, as near as the arm came.
+        nominal: (m, n) those of the nominal robot.
+        reached: (m,).
+        reason: (m,) why not; "" where reached.
+        left, before: (m, 2) position [m] and orientation [rad] left at ``q``, and at ``nominal``; NaN for an
+            orientation that does not count.
+        sigma: (m, 2) of position [m] and orientation [rad] at ``q``.
+        dof: 6, 5 or 3.
+        notes: which frames were meant, and what is odd.
+    """
+
+    q: np.ndarray
+    nominal: np.ndarray
+    reached: np.ndarray
+    reason: tuple[str, ...]
+    left: np.ndarray
+    before: np.ndarray
+    sigma: np.ndarray
+    dof: int
+    notes: tuple[str, ...]
+
+
+def read(folder: str | Path) -> Fitted:
+    """Read the folder of a fit (or of a session that has one).
+
+    Raises:
+        UsageError: where it is none, or lacks something.
+    """
+    folder = Path(folder)
+    proof = folder / "5-validation" / "metrics.json"
+    if not (folder / "robot.toml").is_file() and (folder / "4-fit" / "robot.toml").is_file():
+        folder = folder / "4-fit"
+    if not (folder / "robot.toml").is_file():
+        raise UsageError(f"{folder} holds no robot.toml; give the folder that `calib fit --out` has written")
+    cell, nominal = robot_file.read(folder), robot_file.nominal(folder)
+    free, covariance = read_covariance(folder, cell)
+    unseen, fitted = _stated_errors(folder / "metrics.json", proof if proof.is_file() else folder / "metrics.json")
+    return Fitted(folder, cell, nominal, free, covariance, unseen, fitted)
+
+
+def _stated_errors(fit: Path, proof: Path) -> tuple[float | None, float | None]:
+    """Return the calibrated arm's rms errors on unseen and on fitted poses [m], from the metrics of fit and proof."""
+    try:
+        fitted, proved = (json.loads(path.read_text(encoding="utf-8")) for path in (fit, proof))
+        unseen = [_rms(found["calibrated"]) for found in proved["validation"].values()]
+        return (max(unseen) if unseen else None), _rms(fitted["fit"]["calibrated"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UsageError(f"{fit.parent}: its metrics cannot be read ({error}); fit again") from error
+
+
+def _rms(found: dict) -> float:
+    return 1e-3 * float((found["position_mm"] or found["distance_mm"])["rms"])
+
+
+def placements(fitted: Fitted, frame: str = "base", tool: str = "flange") -> tuple[Installation, Installation]:
+    """Return the nominal and the calibrated arm with one station and one tool each, seen from one frame.
+
+    Args:
+        fitted: see `read`.
+        frame, tool: as the module says.
+
+    Raises:
+        UsageError: for a frame or tool that the fit does not have.
+    """
+    cell, nominal = fitted.cell, fitted.nominal
+    where = _tool(cell, tool)
+    if frame == "base":
+        stations, behind = (np.eye(4), np.eye(4)), np.eye(4)
+    else:
+        k = _station(fitted, frame)
+        t = cell.tool_names.index(tool) if tool in cell.tool_names else 0
+        stations = nominal.stations[k], cell.stations[k]
+        behind = nominal.tools[t] @ invert(cell.tools[t])  # the nominal robot's flange need not be the calibrated one's
+        if frame == "nominal":
+            stations = np.eye(4), invert(stations[0]) @ stations[1]
+    tools = behind @ where, where
+    arms = replace(nominal, deflection=Deflection()), cell
+    one, two = (
+        replace(arm, stations=s[None], tools=t[None], station_names=(frame,), tool_names=(tool,))
+        for arm, s, t in zip(arms, stations, tools)
+    )
+    return one, two
+
+
+def _station(fitted: Fitted, frame: str) -> int:
+    names = fitted.cell.station_names
+    if frame not in ("nominal", *names):
+        raise UsageError(f"--frame {frame}: expected base, nominal, or a station of the fit ({', '.join(names)})")
+    if set(names) - set(fitted.nominal.station_names):
+        raise UsageError(
+            f"{fitted.folder} does not say where the nominal robot stood (it was fitted from an earlier fit's folder, "
+            "by an earlier version, or without an instrument): --frame base is left"
+        )
+    return 0 if frame == "nominal" else names.index(frame)
+
+
+def _tool(cell: Installation, tool: str) -> np.ndarray:
+    if tool == "flange":
+        return np.eye(4)
+    if tool in cell.tool_names:
+        return cell.tools[cell.tool_names.index(tool)]
+    try:
+        values = [float(part) for part in tool.split(",")]
+    except ValueError:
+        values = []
+    if len(values) not in (3, 6) or not np.isfinite(values).all():
+        names = ", ".join(cell.tool_names)
+        raise UsageError(f"--tool {tool}: expected flange, a tool of the fit ({names}), or x,y,z[,roll,pitch,yaw]")
+    return from_xyz_rpy(values[:3], values[3:] or [0.0, 0.0, 0.0])
+
+
+def compensate(
+    fitted: Fitted,
+    targets: Targets,
+    *,
+    frame: str = "base",
+    tool: str = "flange",
+    dof: int | None = None,
+    start: Sequence[float] | None = None,
+    tolerance: tuple[float, float] = TOLERANCE,
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> Commands:
+    """Return the joint commands that put the real tool on the targets.
+
+    The nominal robot says which configuration is meant; from there the calibrated one is led to the target, joints
+    moving as little as they can. Where one would move by more than `MOST`, the arm is near a singularity: it is held
+    back, and what is left is said.
+
+    Args:
+        fitted: see `read`.
+        targets: joints or poses.
+        frame, tool: as the module says.
+        dof: how much of a pose counts, see `calib.geometry.inverse.Goal`; None for all that the targets say and the arm
+            can do.
+        start: (n,) where a target without joints is sought from [rad or m]; None for the middle of the limits.
+        tolerance: position [m] and orientation [rad] that a command may leave.
+        seed: of further starts, where the first one fails.
+    """
+    say = progress or (lambda words: None)
+    one, two = placements(fitted, frame, tool)
+    count, notes = _dof(targets, one.chain, dof)
+    lower, upper = one.chain.lower, one.chain.upper
+    before = Goal(one, count, lower, upper)
+    after = Goal(two, count, lower, upper, torques_of(fitted))
+    say("the nominal robot at the targets")
+    wanted, q0 = _wanted(before, targets, start, seed)
+    say("the calibrated robot")
+    q = inverse.reach(after, wanted, q0)
+    q = inverse.nearest(after, wanted, np.clip(q0, lower, upper), q)
+    far = np.flatnonzero(np.abs(q - q0).max(axis=1, initial=0.0) > MOST)
+    q[far] = inverse.held_back(after, wanted[far], q0[far], MOST)
+    left = _sizes(inverse.differences(after, q, wanted))
+    reached = _within(left, tolerance) & ((q0 >= lower - SLACK) & (q0 <= upper + SLACK)).all(axis=1)
+    singular = inverse.conditions(after, q0) < SINGULAR
+    reason = tuple("" if good else _why(one.chain, *row) for good, *row in zip(reached, q0, q, left, singular))
+    say("sigmas")
+    sigma = _predicted_sigmas(fitted, q, frame, tool, after)
+    missed = _sizes(inverse.differences(after, np.clip(q0, lower, upper), wanted))
+    if count == 3:
+        sigma[:, 1] = np.nan
+    words = (frame_words(fitted, frame), tool_words(tool), *notes, *_turn_words(fitted, count))
+    return Commands(q, q0, reached, reason, left, missed, sigma, count, words)
+
+
+def _dof(targets: Targets, chain: Chain, asked: int | None) -> tuple[int, tuple[str, ...]]:
+    """Return how much of a pose counts, and what to say of it."""
+    given = 3 if targets.q is None and targets.rotation is None else 6
+    given = 3 if targets.position is not None and targets.rotation is None else given
+    able = 6 if chain.n >= 6 else 5 if chain.n == 5 else 3
+    if asked not in (None, *inverse.DOF):
+        raise UsageError(f"--dof {asked}: expected 6, 5 (free to turn about the tool's z), or 3")
+    if asked is not None and asked > given:
+        raise UsageError(f"{targets.file}: has positions without an orientation: --dof {asked} needs qx qy qz qw")
+    dof = asked or min(given, able)
+    what = {6: "position and orientation", 5: "position and the direction of the tool's z axis", 3: "position only"}
+    why = f", all that {chain.n} joints can do" if asked is None and able < given else ""
+    return dof, (f"what counts: {what[dof]}{why}",)
+
+
+def torques_of(fitted: Fitted) -> Callable[[np.ndarray], np.ndarray] | None:
+    """Return gravity torques as the fit took them, of the nominal arm; None where no deflection needs them."""
+    if not any(term.basis == "torque" for term in fitted.cell.deflection.terms):
+        return None
+    from calib.dynamics.gravity import gravity_torques
+
+    chain = fitted.nominal.chain
+    return lambda q: gravity_torques(chain, q)
+
+
+def _wanted(goal: Goal, targets: Targets, start: Sequence[float] | None, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the targets' poses (m, 4, 4) and the nominal robot's joints (m, n) there."""
+    if targets.position is None:
+        assert targets.q is not None
+        return see(goal.cell, targets.q).poses(), np.array(targets.q)
+    wanted = pose(targets.rotation, targets.position)
+    if targets.q is not None:
+        found = inverse.reach(goal, wanted, targets.q)
+        return wanted, inverse.nearest(goal, wanted, np.clip(targets.q, goal.lower, goal.upper), found)
+    lower, upper = sampling_limits(goal.cell.chain)
+    middle = 0.5 * (lower + upper) if start is None else np.asarray(start, dtype=float)
+    others = np.random.default_rng(seed).uniform(lower, upper, (STARTS, len(lower)))
+    return wanted, _sought(goal, wanted, middle, others)
+
+
+def _sought(goal: Goal, wanted: np.ndarray, start: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the nominal robot's joints (m, n): of several tries those nearest to `start`, by the largest change."""
+    best, cost = np.tile(start, (len(wanted), 1)), np.full(len(wanted), np.inf)
+    for first in (start, *others):
+        q = inverse.reach(goal, wanted, np.tile(first, (len(wanted), 1)))
+        met = _within(_sizes(inverse.differences(goal, q, wanted)), TOLERANCE)
+        far = np.where(met, np.abs(q - start).max(axis=1), np.inf)
+        better = far < cost
+        best[better], cost[better] = q[better], far[better]
+    return best
+
+
+def _sizes(difference: np.ndarray) -> np.ndarray:
+    """Return lengths (m, 2) of position and orientation differences; NaN where no orientation counts."""
+    position = np.linalg.norm(difference[:, :3], axis=1)
+    turn = np.linalg.norm(difference[:, 3:], axis=1) if difference.shape[1] > 3 else np.full(len(position), np.nan)
+    return np.stack([position, turn], axis=1)
+
+
+def _within(sizes: np.ndarray, tolerance: tuple[float, float]) -> np.ndarray:
+    return (sizes[:, 0] <= tolerance[0]) & ~(sizes[:, 1] > tolerance[1])
+
+
+def _why(chain: Chain, nominal: np.ndarray, q: np.ndarray, left: np.ndarray, singular: bool) -> str:
+    """Say why a target is not reached, from what is left there (2,) [m, rad]."""
+    rest = f"{1e3 * left[0]:.3g} mm" + ("" if np.isnan(left[1]) else f" and {1e3 * left[1]:.3g} mrad")
+    for name, value, low, high in zip(chain.joint_names, nominal, chain.lower, chain.upper):
+        if not low - SLACK <= value <= high + SLACK:
+            return f"the target itself is outside the limits {low:.4g} to {high:.4g} of {name} ({value:.4g})"
+    at = [name for name, v, j in zip(chain.joint_names, q, chain.joints) if v <= j.lower or v >= j.upper]
+    if at:
+        return f"{', '.join(at)} at a limit: {rest} left"
+    if singular and left[0] < ASTRAY:
+        return f"near a singularity, where joints would move by more than {MOST:g} rad or cannot follow: {rest} left"
+    return f"out of reach: {rest} left at the nearest pose found"
+
+
+def _predicted_sigmas(fitted: Fitted, q: np.ndarray, frame: str, tool: str, goal: Goal) -> np.ndarray:
+    """Return sigmas (m, 2) of the tool; where the fit did not place the tool, it counts as known."""
+    cell, free, covariance = fitted.cell, fitted.free, fitted.covariance
+    number = cell.tool_names.index(tool) if tool in cell.tool_names else 0
+    if tool not in cell.tool_names:
+        keep = ~np.isin(free, layout(cell).tool_index)
+        free, covariance = free[keep], covariance[np.ix_(keep, keep)]
+        cell = replace(cell, tools=np.repeat(goal.cell.tools, len(cell.tools), axis=0))
+    torque = None if goal.torques is None else goal.torques(q)
+    return pose_sigmas(cell, q, free, covariance, torque, -1 if frame == "base" else _station(fitted, frame), number)
+
+
+def frame_words(fitted: Fitted, frame: str) -> str:
+    """Say in which frame targets were taken to be, and how far its alternative is."""
+    if frame not in ("base", "nominal"):
+        return f"targets are in the instrument's frame, station '{frame}'"
+    words = {
+        "base": "targets are in the calibrated robot's base, as robot.toml has it (--frame base)",
+        "nominal": "targets are in the nominal robot's base where it fits the measurements best (--frame nominal)",
+    }[frame]
+    if set(fitted.cell.station_names) - set(fitted.nominal.station_names) or not len(fitted.nominal.stations):
+        return words
+    between = invert(fitted.nominal.stations[0]) @ fitted.cell.stations[0]
+    other = {"base": "the nominal robot's best base", "nominal": "the calibrated robot's base"}[frame]
+    shift, turn = np.linalg.norm(between[:3, 3]), np.linalg.norm(rotation_vector(between[:3, :3]))
+    return f"{words}; {other} stands {1e3 * shift:.2f} mm and {1e3 * turn:.2f} mrad from it"
+
+
+def _turn_words(fitted: Fitted, dof: int) -> tuple[str, ...]:
+    """Say where orientations count and were never measured."""
+    table = layout(fitted.cell)
+    measured = {table.names[k] for k in fitted.free if k in set(table.tool_index)}
+    if dof == 3 or any(name.rsplit(".", 1)[-1] in ("rx", "ry", "rz") for name in measured):
+        return ()
+    return ("the fit saw no orientations: how the flange is turned behind the last joint axis stays nominal",)
+
+
+def tool_words(tool: str) -> str:
+    """Say which tool stands at the targets."""
+    if tool == "flange":
+        return "what stands there is the flange (--tool)"
+    return f"what stands there is the tool '{tool}'"

@@ -1,0 +1,78 @@
+"""What `calib compensate` writes and says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from calib import files
+from calib.data.poses.target_files import Targets
+from calib.errors import UsageError
+from calib.procedure.kinematic_stage.compensation import Commands, Fitted
+from calib.procedure.kinematic_stage.folder import OURS
+
+SHOWN = 20  # targets that a message lists
+COLUMNS = (
+    "left [mm]", "left [mrad]", "before [mm]", "before [mrad]", "sigma [mm]", "sigma [mrad]", "unseen_rms [mm]",
+)  # fmt: skip
+
+
+def write(commands: Commands, fitted: Fitted, targets: Targets, out: Path, partial: bool = False) -> Path:
+    """Write COMMANDS.csv, see `calib.data.poses.target_files`.
+
+    Raises:
+        UsageError: where targets are not reached and `partial` does not allow that; nothing is written.
+    """
+    lost = np.flatnonzero(~commands.reached)
+    if len(lost) and (not partial or len(lost) == len(commands.q)):
+        shown = [f"  target {k + 1}: {commands.reason[k]}" for k in lost[:SHOWN]]
+        shown += [f"  and {len(lost) - SHOWN} more"] if len(lost) > SHOWN else []
+        advice = "" if len(lost) == len(commands.q) else "\n--partial writes the others, with these rows left empty"
+        head = f"{targets.file}: {len(lost)} of {len(commands.q)} targets are not reached; nothing was written"
+        raise UsageError("\n".join([head, *shown]) + advice)
+    names = targets.columns or fitted.cell.chain.joint_names
+    factors = np.array(targets.factors or [1.0] * len(names))
+    header = ("row", *names, "status", *COLUMNS, "reason")
+    unseen = None if fitted.unseen is None else 1e3 * fitted.unseen
+    rows = []
+    for k, good in enumerate(commands.reached):
+        q = (commands.q[k] / factors).tolist() if good else [None] * len(names)
+        numbers = np.concatenate([commands.left[k], commands.before[k], commands.sigma[k]])
+        cells = [None if np.isnan(value) else 1e3 * float(value) for value in numbers]
+        rows.append((k + 1, *q, "reached" if good else "not reached", *cells, unseen, commands.reason[k]))
+    return files.write_table(out, header, rows)
+
+
+def check_out(out: Path, targets: Path, fitted: Fitted) -> None:
+    """Refuse to write over the targets, or over a file of the fit."""
+    inside = out.resolve().parent == fitted.folder.resolve() and out.name in OURS
+    if out.is_dir() or inside or (out.exists() and targets.exists() and out.samefile(targets)):
+        what = "a folder" if out.is_dir() else "a file of the fit" if inside else "the file of targets"
+        raise UsageError(f"--out {out} is {what}; give another file to write to")
+
+
+def lines(commands: Commands, targets: Targets, fitted: Fitted) -> list[str]:
+    """Return what a person should know of the commands."""
+    good = commands.reached
+    result = [*commands.notes, *targets.notes]
+    result += [f"ignored columns of {targets.file}: {', '.join(targets.ignored)}"] if targets.ignored else []
+    result += [f"not reached: target {k + 1}: {commands.reason[k]}" for k in np.flatnonzero(~good)[:SHOWN]]
+    result += [f"not reached: {int((~good).sum()) - SHOWN} more"] if (~good).sum() > SHOWN else []
+    rms = {name: np.sqrt(np.mean(getattr(commands, name)[good] ** 2, axis=0)) for name in ("before", "left", "sigma")}
+    result += [
+        f"by the calibrated model, rms over {int(good.sum())} targets: {_pair(rms['before'])} without compensation, "
+        f"{_pair(rms['left'])} with it; sigma of the model {_pair(rms['sigma'])}"
+    ]
+    if fitted.unseen is not None:
+        result.append(f"what to expect of the real arm: {1e3 * fitted.unseen:.3g} mm rms, as on poses not fitted")
+    else:
+        known = "" if fitted.fitted is None else f" ({1e3 * fitted.fitted:.3g} mm rms on the fitted ones)"
+        result.append(f"the fit had no unseen poses{known}: nothing says what to expect of the real arm")
+    most = np.abs(commands.q - commands.nominal)[good].max(initial=0.0)
+    return [*result, f"joints move by {1e3 * most:.3g} mrad (mm) at most"]
+
+
+def _pair(values: np.ndarray) -> str:
+    turn = "" if np.isnan(values[1]) else f" and {1e3 * values[1]:.3g} mrad"
+    return f"{1e3 * values[0]:.3g} mm{turn}"

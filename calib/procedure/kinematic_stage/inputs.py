@@ -1,0 +1,260 @@
+"""What a fit works on: the robot, the rows it may learn from, and the rows it must not see."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from calib.data.poses.fit_options import FitOptions, check_files
+from calib.data.poses.measurements import PoseMeasurements, take
+from calib.data.poses.pose_files import joint_columns, read_measurements
+from calib.errors import MeasurementError, UsageError
+from calib.geometry.checks.orientations import check_orientations
+from calib.geometry.checks.repeatability import repeated_rows
+from calib.geometry.deflection import Deflection
+from calib.geometry.first_guess import check_scale
+from calib.procedure.kinematic_stage import robot_file
+from calib.procedure.kinematic_stage.copied_rows import repeated
+from calib.robot import description
+from calib.robot.chain import Chain, Joint
+from calib.robot.formats.markup import text
+from calib.robot.formats.urdf_tree import read as read_tree
+from calib.robot.kinematics import forward
+from calib.robot.load import load, resolve
+
+
+@dataclass(frozen=True)
+class Unseen:
+    """Rows kept from the fit.
+
+    Attributes:
+        block: the measurements; station and tool names are those of the fit unless ``own_frames``.
+        own_frames: True where base and tool placement are to be fitted on these rows.
+        held_out: True for a share of a fit file, False for a validation file.
+        seen: True where the same file was fitted on, so that its errors prove nothing.
+    """
+
+    block: PoseMeasurements
+    own_frames: bool = False
+    held_out: bool = False
+    seen: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Inputs:
+    """A robot and its measurements, divided.
+
+    Attributes:
+        chain: the nominal arm.
+        source: the file it came from.
+        fit: blocks to fit on.
+        unseen: by the name of the file they come from.
+        notes: what a user should know about how the files were understood.
+        known: deflections that came with the robot, from an earlier fit.
+    """
+
+    chain: Chain
+    source: Path
+    fit: tuple[PoseMeasurements, ...]
+    unseen: Mapping[str, Unseen] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    known: Deflection = field(default_factory=Deflection)
+
+
+def gather(
+    robot: str | Path,
+    files: Sequence[Path],
+    validate: Sequence[Path] = (),
+    *,
+    options: FitOptions | None = None,
+    holdout: float = 0.0,
+    stations: str = "each",
+    tools: str = "one",
+    refit_frames: bool = False,
+    base: str | None = None,
+    tip: str | None = None,
+    seed: int = 0,
+) -> Inputs:
+    """Read the robot and all files, name stations and tools, and set the unseen rows aside.
+
+    Args:
+        robot: see `calib.robot.load`.
+        files: to fit on.
+        validate: to validate on.
+        options: how files are read.
+        holdout: share of each fit file's poses kept aside: the last ones of ``default_rng(seed).permutation(poses)``.
+        stations: ``each`` file has a base placement of its own, or all share ``one``.
+        tools: all files share ``one`` tool (or one set of reflectors), or ``each`` has its own.
+        refit_frames: validation files get a base and tool placement of their own.
+        base, tip: links of a URDF.
+        seed: for the permutation.
+    """
+    options = options or FitOptions()
+    _choice(stations, ("each", "one"), "--stations")
+    _choice(tools, ("one", "each"), "--tools")
+    if not 0.0 <= holdout < 1.0:
+        raise UsageError(f"--holdout {holdout:g}: expected a share from 0 to below 1")
+    if not files:
+        raise UsageError("no measurement file given")
+    check_files(options, [*files, *validate])
+    chain, source = load_robot(robot, files[0], options, base, tip)
+    blocks = _named(
+        [(path, block) for path in files for block in read_file(path, chain, options)], options, stations, tools
+    )
+    unseen: dict[str, Unseen] = {}
+    fit = []
+    for block in blocks:
+        kept, aside = hold_out(block, holdout, seed)
+        fit.append(kept)
+        if aside is not None:
+            unseen[_free_name(unseen, block.file)] = Unseen(aside, held_out=True)
+    notes: list[str] = []
+    for path in validate:
+        for block in read_file(path, chain, options):
+            again = any(Path(path).resolve() == Path(other).resolve() for other in files)
+            if again:
+                notes.append(f"{block.file} is a fit file too: its errors there say nothing of unseen poses")
+            own = refit_frames
+            shared = block if own else _shared(block, fit, notes)
+            unseen[_free_name(unseen, block.file)] = Unseen(shared, own_frames=own, seen=again)
+    copied, told = repeated(fit, unseen)
+    notes += told
+    unseen = {name: replace(each, seen=each.seen or name in copied) for name, each in unseen.items()}
+    known = robot_file.read(source).deflection if source.suffix == ".toml" else Deflection()
+    if known.terms:
+        notes.append(f"{robot} brings {len(known.terms)} deflection terms of an earlier fit; they stay as they are")
+    return Inputs(chain, source, tuple(fit), unseen, tuple(notes), known)
+
+
+def load_robot(
+    robot: str | Path, measured: Path | None, options: FitOptions, base: str | None = None, tip: str | None = None
+) -> tuple[Chain, Path]:
+    """Return the chain `robot` names and its file; of a URDF, the chain of the joints that were measured."""
+    source = resolve(robot)
+    if source.suffix != ".urdf":
+        if base is None and tip is None and not options.beta:
+            return description.read(source, propose_beta=False), source
+        return load(robot, base, tip), source
+    names: list[str] = []
+    if measured is not None and tip is None:
+        known = read_tree(text(source)[0], str(source)).joints
+        wanted = [*joint_columns(measured), *options.for_file(measured).columns]
+        names = [name for name in dict.fromkeys(wanted) if name in known and known[name].actuated]
+    return load(robot, base, tip, names or None), source
+
+
+def read_file(path: Path, chain: Chain, options: FitOptions) -> list[PoseMeasurements]:
+    """Read one measurement file for a chain, held against its limits, its size and its orientations."""
+    limits, kinds = (chain.lower, chain.upper), joint_kinds(chain)
+    blocks = read_measurements(path, chain.joint_names, options.for_file(path), kinds=kinds, limits=limits)
+    for block in blocks:
+        check_scale(block, forward(chain, block.q))  # unseen files, too: the fit looks at its own only
+        check_orientations(chain, block)
+    return blocks
+
+
+def joint_kinds(chain: Chain) -> list[str]:
+    """Return URDF's names of the joints' kinds: a revolute joint of a URDF without limits is continuous there."""
+    return ["continuous" if chain.links and _unlimited(joint) else joint.kind for joint in chain.joints]
+
+
+def _unlimited(joint: Joint) -> bool:
+    return joint.kind == "revolute" and not np.isfinite([joint.lower, joint.upper]).any()
+
+
+def hold_out(block: PoseMeasurements, share: float, seed: int) -> tuple[PoseMeasurements, PoseMeasurements | None]:
+    """Divide a block into rows to fit and rows kept aside (None for a share of 0).
+
+    Poses are permuted, not rows: the reflectors of one pose stay together, and so do the two rows of a distance and the
+    cycles of a repeated pose.
+    """
+    if share == 0.0:
+        return block, None
+    unit = units(block)
+    count = int(unit.max()) + 1
+    held = round(share * count)
+    order = np.random.default_rng(seed).permutation(count)
+    if held == 0 or held == count:
+        raise MeasurementError(f"holding out a share of {share:g} of {count} poses leaves {held} of them", block.file)
+    aside = np.isin(unit, order[count - held :])
+    return take(block, np.flatnonzero(~aside)), take(block, np.flatnonzero(aside))
+
+
+def units(block: PoseMeasurements) -> np.ndarray:
+    """Return for each row the number (m,) of the pose (or measured pair) it belongs to, counted from 0.
+
+    Cycles of one repeated pose are one pose.
+    """
+    assert block.rows is not None and block.group is not None
+    labels = np.array(block.group if block.kind == "distance" else block.rows)
+    for cycles in repeated_rows(block) if block.kind in ("pose", "position") else []:
+        labels[np.isin(labels, labels[cycles])] = labels[cycles[0]]
+    _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
+    rank = np.empty(len(first), dtype=int)
+    rank[np.argsort(first)] = np.arange(len(first))
+    return rank[inverse]
+
+
+def pose_count(blocks: Sequence[PoseMeasurements]) -> int:
+    """Return how many robot poses the blocks hold (several reflectors seen at once are one pose)."""
+    return sum(len(np.unique(block.rows)) for block in blocks if block.rows is not None)
+
+
+def _choice(value: str, allowed: tuple[str, ...], option: str) -> None:
+    if value not in allowed:
+        raise UsageError(f"{option} {value}: expected one of {', '.join(allowed)}")
+
+
+def _named(
+    read: Sequence[tuple[Path, PoseMeasurements]], options: FitOptions, stations: str, tools: str
+) -> list[PoseMeasurements]:
+    """Name the stations and tools of the fit files as --stations and --tools say; no two things share a name."""
+    result, count, names = [], dict[str, int](), dict[Path, str]()
+    for path, block in read:
+        if tools == "each":
+            block = replace(block, tool_names=tuple(f"{path.stem} {name}" for name in block.tool_names))
+        if path not in names:
+            name = "station" if stations == "one" else block.station
+            if stations == "each" and not options.for_file(path).station:
+                count[name] = count.get(name, 0) + 1
+                name = f"{name} {count[name]}" if count[name] > 1 else name
+            names[path] = name
+        result.append(replace(block, station=names[path]))
+    targets = {name for block in result for name in block.tool_names}
+    return [replace(b, station=f"{b.station} station") if b.station in targets else b for b in result]
+
+
+def _free_name(taken: Mapping[str, Unseen], file: str) -> str:
+    """Return a file's name, or its path where a file of that name is there already."""
+    name = Path(file).name
+    number = 2
+    while name in taken:
+        name, number = (str(file), number) if str(file) not in taken else (f"{file} ({number})", number + 1)
+    return name
+
+
+def _shared(block: PoseMeasurements, fit: Sequence[PoseMeasurements], notes: list[str]) -> PoseMeasurements:
+    """Return a validation block seen from a station of the fit, with the fit's tools."""
+    first = fit[0]
+    if block.kind in ("pose", "position"):
+        stations = [other.station for other in fit if other.kind in ("pose", "position")]
+        if not stations:
+            raise UsageError(f"{block.file}: no fit file places the instrument; give --refit-frames")
+        if block.station not in stations:
+            block = replace(block, station=stations[0])
+            notes.append(
+                f"{block.file} is predicted from the station of the fit '{stations[0]}': if the instrument stood "
+                "elsewhere, give --refit-frames"
+            )
+    known = {name for other in fit for name in other.tool_names}
+    if not set(block.tool_names) <= known:
+        if len(block.tool_names) != len(first.tool_names):
+            found = ", ".join(block.tool_names)
+            raise UsageError(
+                f"{block.file}: tool {found} is none of the fit's ({', '.join(sorted(known))}); --refit-frames"
+            )
+        block = replace(block, tool_names=first.tool_names)
+    return block

@@ -1,0 +1,121 @@
+"""Choosing the poses to measure: a robot's observation Jacobian handed to the package `poses`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from calib.data.poses.fit_options import FitOptions
+from calib.data.poses.plans import read_poses, write_poses
+from calib.errors import UsageError
+from calib.geometry.observability import observation, targets_of
+from calib.procedure.kinematic_stage.inputs import joint_kinds, load_robot
+from calib.procedure.kinematic_stage.pose_limits import read_limits
+from calib.robot.chain import Chain
+from poses.indices import observability
+from poses.select import Selection, select
+from poses.space import SearchSpace, is_feasible
+
+Progress = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Chosen:
+    """A selection with what it was made for.
+
+    Attributes:
+        chain: the nominal arm.
+        selection: see `poses.select`.
+        parameters: how many the measurements can tell.
+        existing: index of the poses measured before alone; None without them, or where they are too few.
+        notes: what a user should know.
+    """
+
+    chain: Chain
+    selection: Selection
+    parameters: int
+    existing: float | None
+    notes: tuple[str, ...]
+
+
+def choose(
+    robot: str | Path,
+    m: int,
+    *,
+    kind: str = "pose",
+    tools: Sequence[Sequence[float]] = (),
+    index: Any = "O1",
+    method: Any = "detmax",
+    constraints: Path | None = None,
+    existing: Path | None = None,
+    candidates: int = 2000,
+    sigmas: tuple[float, float] | None = None,
+    base: str | None = None,
+    tip: str | None = None,
+    seed: int = 0,
+    map: Callable = map,
+    progress: Progress | None = None,
+) -> Chosen:
+    """Choose m poses at which the robot's geometry shows best.
+
+    Args:
+        robot: see `calib.robot.load`.
+        m: how many.
+        kind: what will be measured, ``pose`` or ``position``.
+        tools: places of the targets in the tip's frame [m].
+        index, method: see `poses.select.select`.
+        constraints: see `calib.procedure.kinematic_stage.pose_limits`.
+        existing: CSV of poses measured before, which count.
+        candidates: poses to draw.
+        sigmas: of a position [m] and an orientation [rad].
+        base, tip: links of a URDF.
+        seed: of everything random.
+        map: where parallel work runs (`calib.workers`).
+        progress: called with (done, total, what).
+    """
+    if m < 1:
+        raise UsageError(f"-m {m}: at least one pose has to be chosen")
+    chain, source = load_robot(robot, existing, FitOptions(), base, tip)
+    cell = targets_of(chain, tools)
+    jacobian, limits = observation(cell, kind, sigmas, seed), read_limits(constraints, cell, source)
+    space = SearchSpace(jacobian, limits.lower, limits.upper, None, limits.constraints, limits.feasible)
+    before = value = None
+    notes = list(limits.notes)
+    if existing is not None:
+        q = read_poses(existing, chain.joint_names, kinds=joint_kinds(chain), limits=(chain.lower, chain.upper))
+        before = jacobian(q)
+        value = observability(before, index) or None
+        if not is_feasible(space, q).all():
+            notes.append(f"{int((~is_feasible(space, q)).sum())} of the {len(q)} existing poses break the constraints")
+    found = select(
+        None, m, space=space, index=index, method=method, existing=before, count=candidates, seed=seed, map=map,
+        progress=progress,
+    )  # fmt: skip
+    return Chosen(chain, found, len(jacobian.free), value, tuple(notes))
+
+
+def write(chosen: Chosen, path: Path) -> Path:
+    """Write the chosen poses under the joints' names [rad or m]."""
+    assert chosen.selection.q is not None
+    return write_poses(path, chosen.selection.q, chosen.chain.joint_names, kinds=joint_kinds(chosen.chain))
+
+
+def table(chosen: Chosen) -> list[tuple[str, str]]:
+    """Return what the selection came to, as pairs of words and numbers."""
+    found = chosen.selection
+    rows = [
+        ("index", f"{found.index}" + (" (its ranking does not depend on units)" if found.index == "O1" else "")),
+        ("parameters that can be told", str(chosen.parameters)),
+        ("best of 1000 random sets", f"{found.random_baseline:.6g}"),
+    ]
+    if chosen.existing is not None:
+        rows.append(("existing poses alone", f"{chosen.existing:.6g}"))
+    rows += [
+        ("start of the search", f"{float(found.history[0]):.6g}"),
+        ("chosen poses", f"{found.value:.6g}"),
+        ("efficiency against the convex bound", f"{found.efficiency:.4f} (det^(1/p) over the candidates' bound)"),
+        ("seconds", f"{found.seconds:.2f}"),
+    ]
+    return rows

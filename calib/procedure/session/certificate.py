@@ -1,0 +1,162 @@
+"""The certificate of a session: both stages' findings gathered from its folders and printed on one page."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from datetime import datetime
+from pathlib import Path
+
+from calib import files
+from calib.procedure.report import fit_report, viewer
+from calib.procedure.report import page as certificate
+from calib.procedure.session.dynamics_steps import recordings
+from calib.procedure.session.folder import MARK, Session, fingerprint, read_state
+from calib.procedure.session.geometry_steps import measured_files, robot_file
+
+Say = Callable[[str], None]
+ROLES = {
+    "1-robot": "nominal robot", "3-measured": "measured", "4-fit": "fit", "6-excitation": "motion to record",
+    "7-recorded": "recorded", "8-dynamics": "identified model", "6-export": "calibrated robot",
+    "9-export": "calibrated robot",
+}  # fmt: skip
+
+
+def certify(session: Session, say: Say) -> list[str]:
+    """Print the certificate."""
+    from calib.procedure.report import dynamics_section, figures
+
+    say("drawing")
+    found = fit_report.read(session.path("4-fit"))
+    outside = json.loads(session.path("5-validation/metrics.json").read_text())
+    rows = session.path("5-validation/rows.json")
+    merged = {key: outside[key] for key in ("validation", "verdict", "reason")}
+    merged["warnings"] = [*found.metrics["warnings"], *outside["warnings"]]
+    sets = [*found.sets, *(json.loads(rows.read_text()) if rows.exists() and outside["validation"] else [])]
+    whole = replace(found, metrics=found.metrics | merged, sets=sets)
+    drawn = figures.draw(whole)
+    judged = [with_arrival(certificate.geometry_stage(whole, drawn), noticed(session, "3-measured", "validate"))]
+    notes = [f"geometry {outside['verdict']}: {outside['reason']}"]
+    if session.dynamic:
+        dynamics = dynamics_section.read(session.path("8-dynamics"))
+        exported = read_state(session)["steps"].get("export", {}).get("notes", [])
+        folders = session.path("8-dynamics"), session.path("6-excitation")
+        stage = dynamics_section.dynamics_stage(dynamics, *folders, exported)
+        judged.append(with_arrival(stage, noticed(session, "7-recorded", "predict")))
+        notes.append(f"dynamics {dynamics.verdict}: {dynamics.reason}")
+    told = simulated(session)
+    page = certificate.Page(
+        f"{'Simulated calibration' if told else 'Calibration'} of {session.settings.name}",
+        f"{'SIMULATED: ' if told else ''}{session.settings.instrument['name']}, {session.settings.created[:10]}",
+        setup(session, whole),
+        judged,
+        listed(session),
+    )
+    files.write(session.path("certificate.html"), certificate.render(page))
+    files.write_json(session.path("5-validation/report.json"), asdict(whole))
+    return [*notes, "certificate.html", viewer.write_beside(session.folder)]
+
+
+def noticed(session: Session, place: str, unseen: str) -> list[str]:
+    """Return what was said of files as they came: those to learn from, and those that the step `unseen` looked at."""
+    path = session.path(f"{place}/checked.txt")
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    files_there = measured_files(session)[1] if place == "3-measured" else recordings(session)[1]
+    said = read_state(session)["steps"].get(unseen, {}).get("notes", [])
+    names = tuple(f"{each.name}: " for each in files_there)
+    return [line for line in (*lines, *(note for note in said if names and note.startswith(names))) if line.strip()]
+
+
+def with_arrival(stage: certificate.Stage, lines: list[str]) -> certificate.Stage:
+    """Return a stage with what was noticed when its files came."""
+    if not lines:
+        return stage
+    return replace(stage, blocks=[*stage.blocks, certificate.Text("What was noticed when the files came", lines)])
+
+
+def simulated(session: Session) -> list[tuple[str, str]]:
+    """Return lines under Setup of a session whose files a simulated cell brought; none of a real one."""
+    path = session.path(MARK)
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    return [("simulated", line) for line in lines if line.strip()]
+
+
+def setup(session: Session, found: fit_report.Report) -> list[tuple[str, str]]:
+    """Return what stands under Setup on the certificate."""
+    settings, fitted = session.settings, measured_files(session)
+    instrument = settings.instrument
+    stated = f", σ {1e6 * instrument['sigma_position']:g} µm" if instrument["sigma_position"] else ", σ estimated"
+    turning = f", {1e3 * instrument['sigma_orientation']:g} mrad" if instrument["sigma_orientation"] else ""
+    return [
+        *simulated(session),
+        ("robot", f"{found.robot}, {found.base} to {found.tip}, {len(found.joints)} joints"),
+        ("description", settings.robot["given"]),
+        ("instrument", f"{instrument['name']}, measures {instrument['measures']}{stated}{turning}"),
+        ("session made", settings.created.replace("T", " ")),
+        ("measurements", dated([*fitted[0], *fitted[1]])),
+        ("pose plan", session_plan(session)),
+        ("model", found.metrics["model"]),
+        ("tolerance", certificate.tolerance(settings.fit["tolerance_mm"])),
+        *dynamic_setup(session),
+        ("seed", str(settings.seed)),
+        ("command", f"calib next {session.folder.name}"),
+        ("toolkit", certificate.versions()),
+    ]
+
+
+def dynamic_setup(session: Session) -> list[tuple[str, str]]:
+    """Return the dynamics' lines under Setup."""
+    if not session.dynamic:
+        return []
+    wanted, (training, unseen) = session.settings.dynamics, recordings(session)
+    allowed = wanted["tolerance_percent"]
+    torques = {
+        "motor": "motors'",
+        "link": "of sensors behind the gears",
+        "both": "motors' and of sensors behind the gears",
+    }
+    loads = ", ".join(f"{label} {mass:g} kg" for label, mass in wanted["payloads"].items())
+    rows = [
+        ("recordings", dated([*training, *unseen])),
+        ("torques", torques[wanted["torques"]]),
+        ("tolerance of torque", f"{allowed:g} % on unseen motion" if allowed else "none was given: pass below 10 %"),
+    ]
+    return [*rows, ("payloads", loads)] if loads else rows
+
+
+def dated(paths: list[Path]) -> str:
+    """Return names of files, and the day of the last."""
+    when = max((path.stat().st_mtime for path in paths), default=0.0)
+    day = datetime.fromtimestamp(when).strftime("%Y-%m-%d %H:%M") if when else "unknown"
+    return f"{', '.join(path.name for path in paths)}; files of {day}"
+
+
+def session_plan(session: Session) -> str:
+    """Return in a few words how the poses were chosen."""
+    path = session.path("2-poses/selection.json")
+    if not session.settings.poses["plan"] or not path.exists():
+        return "poses not planned here"
+    return str(json.loads(path.read_text()).get("words", "chosen by hand"))
+
+
+def listed(session: Session) -> list[tuple[str, str, str, str]]:
+    """Return the files the certificate rests on: name, what it is, bytes, SHA-256."""
+    wanted = [robot_file(session), *measured_files(session)[0], *measured_files(session)[1]]
+    wanted += [session.path("4-fit/estimate.csv"), session.path("4-fit/covariance.csv")]
+    if session.dynamic:
+        wanted += sorted(session.path("6-excitation").glob("*/trajectory.csv"))
+        wanted += [path for paths in recordings(session) for path in paths if path.is_file()]
+        wanted += [session.path(f"8-dynamics/{name}") for name in ("estimate.csv", "covariance.csv", "dynamics.json")]
+    wanted += sorted(path for path in session.path(session.export).glob("*") if path.is_file())
+    made = {name: mark for step in read_state(session)["steps"].values() for name, mark in step["outputs"].items()}
+    rows = []
+    for path in wanted:
+        name = path.relative_to(session.folder)
+        role = ROLES[name.parts[0]]
+        if path.name.lower().startswith("validation"):
+            role += ", unseen by the fit" if name.parts[0] == "3-measured" else ", unseen by the identification"
+        if name.parts[0] in ("4-fit", "8-dynamics", session.export) and made.get(str(name)) != fingerprint(path):
+            role = certificate.EDITED
+        rows.append((str(name), role, f"{path.stat().st_size}", fingerprint(path)))
+    return rows

@@ -1,0 +1,111 @@
+"""The guided procedure as the commands `calib new`, `next`, `status` and `redo` run it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import RenderableType
+from rich.markup import escape
+from rich.table import Table
+
+from calib.errors import UsageError
+from calib.procedure.excitation.limits import read_motion_limits
+from calib.procedure.session import instructions, steps
+from calib.procedure.session.folder import Session, create, locked, open_session
+from calib.procedure.session.outcome import verdict_of
+from calib.procedure.session.presets import instrument as instrument_named
+from calib.robot.load import load, resolve
+
+Say = Callable[[str], None]
+COLOURS = {"done": "green", "kept": "green", "ready": "cyan", "stale": "yellow", "waiting": "yellow", "after": "dim"}
+
+
+@dataclass(frozen=True)
+class Stop:
+    """Where `go_on` stopped: lines that say what to do now, and the verdict once there is one."""
+
+    lines: tuple[str, ...]
+    verdict: str = ""
+
+
+def begin(
+    folder: Path, robot: str, instrument: str, *, poses: int, validation: int, seed: int, base: str = "", tip: str = "",
+    tool: Sequence[float] | None = None, limits: Path | None = None, dynamics: bool = True, **motion: Any,
+) -> Session:  # fmt: skip
+    """Make a session for a robot, which is read once to see that it can be.
+
+    Args:
+        folder: new.
+        robot: see `calib.robot.load`.
+        instrument: a key of `calib.procedure.session.presets.INSTRUMENTS`.
+        poses, validation: how many to choose.
+        seed: of everything random.
+        base, tip: of a URDF, empty for its own.
+        tool: (3,) where the target roughly sits in the tip's frame [m].
+        limits: a file of limits, copied, that both poses and motions keep.
+        dynamics: identify the dynamics, too.
+        motion: other keys of ``[dynamics]``: ``torques``, ``payloads``, ``period`` …
+    """
+    if poses < 1 or validation < 0:
+        raise UsageError(f"--poses {poses} --validation {validation}: at least one pose, and no fewer than 0")
+    device, source = instrument_named(instrument), resolve(robot)
+    chain = load(robot, base or None, tip or None)
+    copied, named = {}, {}
+    if limits is not None:
+        read_motion_limits(limits, chain, source)
+        copied, named = {"limits.toml": limits}, {"limits": "limits.toml", "constraints": "limits.toml"}
+    place = {} if tool is None else {"tool": tuple(tool)}
+    return create(
+        folder, source, robot, copied, name=chain.name, seed=seed, instrument=device.label, measures=device.measures,
+        sigma_position=device.sigma_position, sigma_orientation=device.sigma_orientation, fit=poses,
+        validation=validation, base=base, tip=tip, dynamics=dynamics, **place, **named, **motion,
+    )  # fmt: skip
+
+
+def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "") -> Stop:
+    """Run what can be run, and say what to do then.
+
+    Args:
+        folder: of the session.
+        say, progress: lines that stay, and words that pass.
+        command: for the record.
+        again: name of a step to make again, with all that rests on it.
+    """
+    session = open_session(folder)
+    with locked(session, say):
+        if again:
+            steps.forget(session, steps.find(session, again))
+        state = steps.run_next(session, say, progress, command)
+    if state is not None:
+        return Stop(("", *instructions.asks(session, state)))
+    return Stop(ending(session), verdict_of(session))
+
+
+def ending(session: Session) -> tuple[str, ...]:
+    """Return what is said of a session that has come to its end: a failed one's robot is for inspection only."""
+    page, robot = session.path("certificate.html"), session.path(f"{session.export}/robot.urdf")
+    if verdict_of(session) == "fail":
+        return ("", f"certificate: {page}", f"verdict fail: exported for inspection only, do not use: {robot}")
+    return ("", f"done; certificate: {page}", f"robot: {robot}")
+
+
+def status_lines(folder: Path) -> Iterator[RenderableType]:
+    """Say how every step of a session stands, and what comes next."""
+    session = open_session(folder)
+    settings, found = session.settings, steps.states(session)
+    yield f"[bold]{escape(settings.name)}[/], {escape(settings.instrument['name'])}, made {settings.created[:10]}"
+    table = Table("", "step", "state", "", box=None, pad_edge=False)
+    for number, state in enumerate(found, 1):
+        colour = COLOURS[state.kind]
+        table.add_row(str(number), state.step.name, f"[{colour}]{state.kind}[/]", escape(state.words))
+    yield table
+    ahead = next((state for state in found if state.kind not in (steps.DONE, steps.KEPT)), None)
+    if ahead is None:
+        yield escape(f"certificate: {session.path('certificate.html')}")
+    elif ahead.kind == steps.WAITING:
+        yield from (escape(line) for line in instructions.asks(session, ahead))
+    else:
+        yield escape(f"next: calib next {folder}")

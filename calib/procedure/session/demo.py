@@ -1,0 +1,221 @@
+"""The demonstration: a session on a simulated cell, ended by a comparison with the truth it did not know."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from calib import files
+from calib.data.poses.plans import read_poses
+from calib.errors import SessionError, UsageError
+from calib.procedure.session import dynamics_steps, steps
+from calib.procedure.session.commands import begin
+from calib.procedure.session.folder import MARK, Session, locked, open_session
+from calib.procedure.session.outcome import verdict_of
+from calib.procedure.session.truth import TRUTH, against_truth, torques_against_truth
+from calib.robot import library
+from calib.robot.load import load
+from calib.simulation.cells import measured_files
+from calib.simulation.cells.cell import Cell, measure, wandering
+from calib.simulation.cells.virtual_arm import MovingArm, moving_arm, play, record
+from calib.simulation.cells.virtual_cells import virtual_cell
+
+Say = Callable[[str], None]
+FIT, VALIDATION, AGAIN = 40, 20, 3
+DRIFT = 10e-6  # how far the simulated instrument wanders over a series [m]
+MOTION = {"period": 10.0, "starts": 2, "evaluations": 150, "repeats": 2, "torques": "both"}  # little effort, for time
+SIMULATED = "simulated cell: {note}; nothing was measured on a robot"
+LOGS = (("training", 2), ("validation", 3))  # and the numbers of their noise
+
+
+@dataclass(frozen=True)
+class Found:
+    """What the demonstration came to: the session, its verdict ("" where it stopped), what to look at, and how long.
+
+    Attributes:
+        asks: what to do now, where it stopped for an engineer.
+        nominal, calibrated: errors against the hidden truth, rms [mm]; NaN where it stopped.
+        memory: largest resident set [MB].
+    """
+
+    session: Session
+    verdict: str
+    results: tuple[tuple[str, str], ...]
+    seconds: float
+    asks: tuple[str, ...] = ()
+    nominal: float = float("nan")
+    calibrated: float = float("nan")
+    memory: float = 0.0
+
+
+def run(
+    folder: Path, robot: str, seed: int, say: Say, progress: Say, *, dynamics: bool = True, guided: bool = False
+) -> Found:
+    """Calibrate a simulated robot in a session, and compare with its hidden truth.
+
+    Args:
+        folder: new; the session.
+        robot: of the library.
+        seed: of the robot's errors, the noise, the pose selection and the motions.
+        say, progress: lines that stay, and words that pass.
+        dynamics: identify them, too, where the library knows the robot's masses.
+        guided: stop where an engineer would; `bring_what_waits` then plays his part.
+    """
+    started = time.perf_counter()
+    cell = virtual_cell(robot, seed)
+    if dynamics and cell.nominal.inertias is None:
+        known = ", ".join(name for name in library.names() if load(name).inertias is not None)
+        say(
+            f"geometry only: the library holds no masses for {robot}, so its motion cannot be simulated (of {known} "
+            "it can)"
+        )
+        dynamics = False
+    motion = MOTION if dynamics else {}
+    session = begin(folder, robot, "cmm", poses=FIT, validation=VALIDATION, seed=seed, dynamics=dynamics, **motion)
+    say(f"the cell: {cell.note}")
+    with locked(session):
+        waiting = steps.run_next(session, say, progress, "calib demo")
+        while waiting is not None and waiting.kind == steps.WAITING and not guided:
+            bring_for(session, waiting.step.name, say)
+            waiting = steps.run_next(session, say, progress, "calib demo")
+    if waiting is not None:
+        if not guided:
+            raise SessionError(f"the demonstration stopped at {waiting.step.name}: {waiting.words}")
+        return Found(session, "", (), time.perf_counter() - started, stopped(session, waiting))
+    before, after = told_truth(session, cell, say)
+    seconds = time.perf_counter() - started
+    return Found(session, verdict_of(session), results(session), seconds, (), before, after, largest_memory())
+
+
+def largest_memory() -> float:
+    """Return the largest resident set of this process so far [MB]; Linux counts it in kB, macOS in bytes."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2.0**20 if sys.platform == "darwin" else 2.0**10)
+
+
+def stopped(session: Session, waiting: steps.State) -> tuple[str, ...]:
+    """Return what an engineer would be asked, and how to let the simulated cell do it."""
+    from calib.procedure.session.instructions import asks
+
+    folder = session.folder
+    return (
+        *asks(session, waiting),
+        f"(or let the simulated cell do it: calib demo --bring {folder}; then: calib next {folder})",
+    )
+
+
+def results(session: Session) -> tuple[tuple[str, str], ...]:
+    """Return what to look at."""
+    found = [
+        ("certificate", "certificate.html"),
+        ("plots", "4-fit"),
+        ("calibrated URDF", f"{session.export}/robot.urdf"),
+    ]
+    if session.dynamic:
+        found += [("motions", "6-excitation"), ("dynamics", "8-dynamics")]
+    return (*found, ("the session", "session.toml"))
+
+
+def told_truth(session: Session, cell: Cell, say: Say) -> tuple[float, float]:
+    """Say how far the outcome is from the hidden truth, write it down, and return the errors of the tool [mm]."""
+    before, after, bare = against_truth(session, cell)
+    lines = [
+        f"hidden truth, over {TRUTH} poses of the whole joint range: the tool is off by {before:.3f} mm rms with the "
+        f"nominal arm, {after:.3f} mm with the calibrated one"
+    ]
+    if bare > after:
+        lines[0] += f" ({bare:.3f} mm with its URDF alone, without the joint corrections)"
+    notes = [cell.note]
+    if session.dynamic:
+        arm = arm_of(session, cell)
+        found = torques_against_truth(session, cell, arm)
+        notes.append(arm.note)
+        lines.append(
+            f"hidden truth, on a motion nobody has seen: noise-free torques are predicted to {found.identified:.2f} % "
+            f"({found.nominal:.1f} % behind the gears by the nominal masses, with the true friction); of "
+            f"{found.count} base parameters {found.within:.0%} are within two sigmas of the truth"
+        )
+    files.write(session.path("truth.txt"), "\n".join([*notes, *lines]) + "\n")
+    for line in lines:
+        say(line)
+    return before, after
+
+
+def bring_what_waits(folder: Path, say: Say) -> None:
+    """Let the simulated cell bring what the session in `folder` waits for; compare a finished one with the truth.
+
+    Raises:
+        UsageError: where nothing is waited for, or the session's robot is none of the library.
+    """
+    session = open_session(folder)
+    if session.settings.robot["given"] not in library.names():
+        raise UsageError(
+            f"{folder} is about {session.settings.robot['given']}; the simulated cells are of "
+            f"{', '.join(library.names())}"
+        )
+    with locked(session, say):
+        waiting = next((state for state in steps.states(session) if state.kind not in (steps.DONE, steps.KEPT)), None)
+        if waiting is None:
+            told_truth(session, virtual_cell(session.settings.robot["given"], session.settings.seed), say)
+            return
+        if waiting.kind != steps.WAITING:
+            raise UsageError(f"{folder} waits for nothing; next: calib next {folder}")
+        bring_for(session, waiting.step.name, say)
+    say(f"next: calib next {folder}")
+
+
+def bring_for(session: Session, step: str, say: Say) -> None:
+    """Let the simulated cell do what a step waits for."""
+    seed = session.settings.seed
+    cell = virtual_cell(session.settings.robot["given"], seed)
+    if step in ("measure", "validate"):
+        bring(session, cell, seed)
+        say("    (the simulated cell measures both lists of poses)")
+    elif step in ("record", "predict"):
+        bring_logs(session, arm_of(session, cell), seed)
+        say("    (the simulated arm plays both motions)")
+    else:
+        raise SessionError(f"the demonstration cannot bring what {step} needs")
+
+
+def arm_of(session: Session, cell: Cell) -> MovingArm:
+    """Return the arm of a session's simulated cell as it moves."""
+    return moving_arm(cell, session.settings.robot["given"], session.settings.seed)
+
+
+def bring(session: Session, cell: Cell, seed: int) -> None:
+    """Let the simulated cell measure the planned poses, and three of them once more at the end; the CMM wanders."""
+    mark(session, cell.note)
+    kinds = [joint.kind for joint in cell.nominal.joints]
+    for number, (plan, name) in enumerate((("poses", "measured"), ("validation", "validation"))):
+        q = read_poses(session.path(f"2-poses/{plan}.csv"), cell.nominal.joint_names, kinds=kinds)
+        seen = wandering(measure(cell, q, np.random.default_rng([seed, number])), DRIFT, seed)
+        measured_files.write(seen, session.path(f"3-measured/{name}.csv"))
+        if plan == "poses":
+            again = measure(cell, q[:AGAIN], np.random.default_rng([seed, 7]))
+            measured_files.write(wandering(again, DRIFT, seed, begin=1.0), session.path("3-measured/drift.csv"))
+
+
+def mark(session: Session, note: str) -> None:
+    """Write down in the session that its files are a simulated cell's; the certificate says so."""
+    path, line = session.path(MARK), SIMULATED.format(note=note)
+    known = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    files.write(path, "\n".join([*known, *([line] if line not in known else [])]) + "\n")
+
+
+def bring_logs(session: Session, arm: MovingArm, seed: int) -> None:
+    """Let the simulated arm play the designed motions, and log them."""
+    mark(session, arm.note)
+    motions = dynamics_steps.designed_motions(session)
+    for name, number in LOGS:
+        if name not in motions:
+            continue
+        t = np.arange(round(motions[name].period * motions[name].rate) + 1) / motions[name].rate
+        reference = play(t, *motions[name].orders(t), motions[name].repeat)
+        recorded = record(arm, reference, np.random.default_rng([seed, number]))
+        measured_files.write_log(recorded, session.path(f"7-recorded/{name}.csv"))

@@ -1,0 +1,199 @@
+"""What the steps of a session's dynamics do: design motions, check their recordings, identify, predict other motion.
+
+The same functions as `calib excite` and `calib identify`; only the files are the session's.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from calib import files
+from calib.data.recordings.recording_files import read_recording
+from calib.identification.identify_options import FileSettings, IdentifyOptions, file_settings, read_options
+from calib.identification.settings import Payload
+from calib.procedure.dynamic_stage import identify as identifying
+from calib.procedure.dynamic_stage import validation
+from calib.procedure.excitation import coefficients
+from calib.procedure.excitation.coefficients import Periodic
+from calib.procedure.session import motion_check
+from calib.procedure.session.folder import Session
+from calib.robot.chain import Chain
+from calib.robot.load import load
+
+Say = Callable[[str], None]
+SUFFIXES = (".csv", ".npz", ".mcap", ".bag", ".db3")
+SHORTER, OTHER = (
+    0.8,
+    3,
+)  # the validation motion's period over the training's, and what is added to its seed (our choice)
+
+
+def recordings(session: Session) -> tuple[list[Path], list[Path]]:
+    """Return the logs people have brought: to learn from, and unseen (names starting with validation)."""
+    place = session.path("7-recorded")
+    found = [path for path in sorted(place.glob("*")) if _is_log(path)] if place.is_dir() else []
+    unseen = [path for path in found if path.name.lower().startswith("validation")]
+    return [path for path in found if path not in unseen], unseen
+
+
+def _is_log(path: Path) -> bool:
+    if path.name.startswith("."):
+        return False
+    return (path / "metadata.yaml").exists() if path.is_dir() else path.suffix.lower() in SUFFIXES
+
+
+def calibrated(session: Session) -> Chain:
+    """Return the arm with the session's calibrated geometry."""
+    return load(session.path("4-fit"))
+
+
+def options_of(session: Session) -> IdentifyOptions:
+    """Return how to identify: the options file's content, or what ``session.toml`` says; payloads by file name."""
+    wanted = session.settings.dynamics
+    options = read_options(session.path(wanted["options"]) if wanted["options"] else None)
+    settings = options.settings
+    if not wanted["options"]:
+        kind = wanted["torques"]
+        settings = replace(settings, kind=kind, friction=wanted["friction"], method=wanted["method"])
+    known = {label: Payload(float(mass)) for label, mass in wanted["payloads"].items()}
+    settings = replace(settings, payloads={**known, **settings.payloads}, seed=session.settings.seed)
+    own = dict(options.files)
+    for path in (*recordings(session)[0], *recordings(session)[1]):
+        carried = tuple(label for label in known if label.lower() in path.stem.lower())
+        if carried:
+            own[path.name] = replace(
+                own.get(path.name, FileSettings(options.every.recording, options.every.filter)), payload=carried
+            )
+    return replace(options, settings=settings, files=own)
+
+
+def excite(session: Session, say: Say) -> list[str]:
+    """Design the motion to learn from, and another one to validate on."""
+    from calib.procedure.excitation import design, design_folder
+    from calib.procedure.report import motion_figures
+
+    wanted, notes = session.settings.dynamics, []
+    limits = session.path(wanted["limits"]) if wanted["limits"] else None
+    names = ["training", "validation"] if wanted["validation"] else ["training"]
+    for name in names:
+        first = name == "training"
+        designed = design.excite(
+            session.path("4-fit"), limits=limits, period=wanted["period"] * (1.0 if first else SHORTER),
+            harmonics=wanted["harmonics"], rate=wanted["rate"], starts=wanted["starts"] if first else 1,
+            evaluations=wanted["evaluations"] if first else max(20, wanted["evaluations"] // 3),
+            seed=session.settings.seed + (0 if first else OTHER), repeat=wanted["repeats"],
+            progress=lambda words, name=name: say(f"{name} motion: {words}"),
+        )  # fmt: skip
+        if designed.found.interrupted:  # a session is resumed, not gone on with half a search
+            raise KeyboardInterrupt
+        design_folder.write_folder(designed, session.path("6-excitation") / name, motion_figures.write_design)
+        cond = designed.condition
+        notes.append(
+            f"{name}: {designed.period:g} s, condition number {cond['raw']:.3g} raw, {cond['normalised']:.3g} "
+            f"normalised, {len(designed.dynamics.exact.names)} columns; every limit is kept"
+        )
+        notes += [f"{name}: {note}" for note in designed.notes if first]
+    if limits is None:
+        notes.append("only the robot's own limits were kept: watch for collisions, or name a limits file")
+    return notes
+
+
+def record(session: Session, say: Say) -> list[str]:
+    """Check the recordings to learn from."""
+    cuts, notes = {}, []
+    for path in recordings(session)[0]:
+        say(f"reading {path.name}")
+        found, told = check_recording(session, path, "training")
+        cuts[path.name] = found
+        notes += told
+    files.write_json(session.path("7-recorded/cuts.json"), cuts)
+    files.write(session.path("7-recorded/checked.txt"), "\n".join(notes) + "\n")
+    return notes
+
+
+def check_recording(session: Session, path: Path, name: str) -> tuple[list[float] | None, list[str]]:
+    """Return from when to when the designed motion is in a recording [s] (None: all of it counts), and notes.
+
+    Raises:
+        MeasurementError: for what cannot be right: units, order of joints, another motion, reversed torques.
+    """
+    chain, options = calibrated(session), options_of(session)
+    own = file_settings(options, str(path))
+    recording = read_recording(str(path), identifying.joints_of(chain), own.recording)
+    rate = (len(recording) - 1) / max(recording.duration, 1e-9)
+    sensors = ", and sensors behind the gears" if recording.tau_link is not None else ""
+    notes = [f"{path.name}: {recording.duration:.1f} s at {rate:.4g} Hz, {recording.kind}s{sensors}"]
+    notes += [f"{path.name}: {note}" for note in recording.notes]
+    if not own.payload:  # the nominal masses hold no payload
+        motion_check.check_torques(recording, chain)
+    motions = designed_motions(session)
+    if name not in motions:
+        return None, notes
+    others = {other: motion for other, motion in motions.items() if other != name}
+    found = motion_check.find_motion(recording, motions[name], others, session.settings.dynamics["repeats"])
+    worst = max(found.tracking)
+    notes.append(
+        f"{path.name}: the {name} motion, {found.periods} times, from {found.start:.2f} s on; off its design by up to "
+        f"{1e3 * worst:.2g} mrad rms"
+    )
+    return [found.start, found.stop], notes + [f"{path.name}: {note}" for note in found.notes]
+
+
+def designed_motions(session: Session) -> dict[str, Periodic]:
+    """Return the session's motions by name; none where it does not plan."""
+    if not session.settings.dynamics["plan"]:
+        return {}
+    folders = {name: session.path(f"6-excitation/{name}") for name in ("training", "validation")}
+    return {name: coefficients.read(folder) for name, folder in folders.items() if folder.exists()}
+
+
+def cut_paths(paths: list[Path], cuts: dict[str, Any]) -> list[str]:
+    """Return paths with the cut that holds the motion."""
+    marked = {path: cuts.get(path.name) for path in paths}
+    return [str(path) if cut is None else f"{path}@{cut[0]:.6g}:{cut[1]:.6g}" for path, cut in marked.items()]
+
+
+def identify(session: Session, say: Say) -> list[str]:
+    """Identify base parameters and friction on the calibrated geometry; validation files are not looked at."""
+    from calib.procedure.dynamic_stage import folder as identification_outputs
+    from calib.procedure.report import identification_figures
+
+    cuts = json.loads(session.path("7-recorded/cuts.json").read_text(encoding="utf-8"))
+    given = identifying.gather(
+        session.path("4-fit"), cut_paths(recordings(session)[0], cuts), options=options_of(session),
+        seed=session.settings.seed, progress=say,
+    )  # fmt: skip
+    outcome = identifying.run(given, progress=say)
+    say("writing")
+    identification_outputs.write_folder(outcome, session.path("8-dynamics"), identification_figures.write)
+    found = outcome.found
+    raw, normalised = found.condition
+    own = next(iter(outcome.fit.values()))
+    notes = [
+        f"{len(found.names)} parameters by {found.fitted.method}, friction {found.climb.chosen or 'standard'}, "
+        "condition "
+        f"number {raw:.3g}, with unit columns {normalised:.3g}; {own.raw.total:.2f} % of the torque unexplained"
+    ]
+    return [*notes, *outcome.warnings]
+
+
+def predict(session: Session, say: Say) -> list[str]:
+    """Hold the identified model against motion it has not seen, and judge."""
+    cuts = json.loads(session.path("7-recorded/cuts.json").read_text(encoding="utf-8"))
+    training, unseen = recordings(session)
+    notes, aside = [], {}
+    for path in unseen:
+        aside[path.name], told = check_recording(session, path, "validation")
+        notes += told
+    say("predicting unseen motion")
+    given = identifying.gather(
+        session.path("4-fit"), cut_paths(training, cuts), cut_paths(unseen, aside), options=options_of(session),
+        seed=session.settings.seed, progress=say,
+    )  # fmt: skip
+    held = validation.hold(given, session.path("8-dynamics"), session.settings.dynamics["tolerance_percent"])
+    validation.write(held, session.path("8-dynamics/unseen"))
+    return [*notes, f"verdict {held.verdict.level}: {held.verdict.reason}", *held.warnings]

@@ -1,0 +1,165 @@
+"""Many sessions at once, one folder per robot: each goes on as far as it can, and none stops another."""
+
+from __future__ import annotations
+
+import json
+import time
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rich.console import RenderableType
+from rich.markup import escape
+from rich.table import Table
+
+from calib import files
+from calib.errors import CalibError, UsageError, exit_code
+from calib.procedure.session import instructions, steps
+from calib.procedure.session.folder import locked, open_session
+from calib.procedure.session.outcome import verdict_of
+
+LOG = "run.log"
+DONE, WAITS, FAILED = "done", "waits", "failed"
+COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red", DONE: "green", WAITS: "yellow", FAILED: "red"}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How one session ended.
+
+    Attributes:
+        folder: of the session.
+        state: `DONE`, `WAITS` or `FAILED`.
+        verdict: of a session that is done.
+        words: what it waits for, or what went wrong.
+        nominal, calibrated: position error on unseen poses, rms [mm]; None where there is none.
+        torque: unexplained on unseen motion [%]; None without dynamics.
+        seconds: of wall time.
+        code: exit code, as `calib next` would have.
+    """
+
+    folder: str
+    state: str
+    verdict: str = ""
+    words: str = ""
+    nominal: float | None = None
+    calibrated: float | None = None
+    torque: float | None = None
+    seconds: float = 0.0
+    code: int = 0
+
+
+def folders_of(given: Sequence[Path]) -> list[Path]:
+    """Return the sessions' folders of what was named: folders, or the ``session.toml`` in them.
+
+    Raises:
+        UsageError: for one that is named twice, or where nothing was.
+    """
+    found = [path.parent if path.name == "session.toml" else path for path in given]
+    real = [path.resolve() for path in found]
+    twice = [path for path, own in zip(found, real) if real.count(own) > 1]
+    if twice:
+        raise UsageError(f"{twice[0]} is named twice")
+    if not found:
+        raise UsageError("no session named; give folders or their session.toml")
+    return found
+
+
+def run(folders: Sequence[Path], map: Callable[..., Iterable[Any]], command: str) -> Iterable[Outcome]:
+    """Run every session as far as it goes, and yield the outcomes in order.
+
+    Args:
+        folders: of the sessions.
+        map: where they run (`calib.workers`).
+        command: for their records.
+    """
+    return map(partial(run_one, command=command), folders)
+
+
+def run_one(folder: Path, command: str = "calib run") -> Outcome:
+    """Run one session as far as it goes; what it says goes into its ``run.log``. Only Ctrl-C leaves this function."""
+    started, said = time.perf_counter(), []
+    try:
+        outcome = _go_on(folder, said.append, command)
+    except Exception as error:  # a robot that fails must not stop the others
+        code = exit_code(error)
+        words = str(error) if code is not None else f"{type(error).__name__}: {error} (see {LOG})"
+        if code is None:
+            said.append(traceback.format_exc())
+        said.append(f"failed: {words}")
+        outcome = Outcome(str(folder), FAILED, words=words, code=code or 1)
+    if (folder / "session.toml").exists():
+        with suppress(CalibError):  # a full disk, a folder that cannot be written: said already
+            files.write(folder / LOG, "\n".join(said) + "\n")
+    return replace(outcome, seconds=time.perf_counter() - started)
+
+
+def _go_on(folder: Path, say: Callable[[str], None], command: str) -> Outcome:
+    session = open_session(folder)
+    with locked(session, say):
+        waiting = steps.run_next(session, say, lambda words: None, command)
+    if waiting is not None:
+        for line in instructions.asks(session, waiting):
+            say(line)
+        return Outcome(
+            str(folder), WAITS, words=f"{waiting.words} (step {waiting.step.name}); {LOG} says what to bring"
+        )
+    verdict = verdict_of(session)
+    errors, torque = _figures(session.path("5-validation/metrics.json")), None
+    if session.dynamic:
+        unseen = json.loads(session.path("8-dynamics/unseen/report.json").read_text(encoding="utf-8"))
+        sets = (unseen["validation"] or unseen["fit"]).values()
+        torque = max((one["raw"]["relative_error_percent"]["total"] or 0.0 for one in sets), default=None)
+    return Outcome(str(folder), DONE, verdict, "", *errors, torque, code=1 if verdict == "fail" else 0)
+
+
+def _figures(path: Path) -> tuple[float | None, float | None]:
+    """Return rms errors on unseen rows [mm]: nominal and calibrated, of the worst file."""
+    table = json.loads(path.read_text(encoding="utf-8"))["validation"]
+    pairs = []
+    for found in table.values():
+        for key in ("position_mm", "distance_mm"):
+            if found["calibrated"].get(key):
+                pairs.append((found["nominal"][key]["rms"], found["calibrated"][key]["rms"]))
+                break
+    return max(pairs, key=lambda pair: pair[1]) if pairs else (None, None)
+
+
+def table(outcomes: Sequence[Outcome]) -> RenderableType:
+    """Return the summary, a line per robot: errors on unseen poses, rms, and on unseen motion."""
+    found = Table("session", "state", "verdict", box=None, pad_edge=False)
+    for name in ("nominal mm", "calibrated mm", "torque %", "s"):
+        found.add_column(name, justify="right", no_wrap=True)
+    names = [Path(one.folder).resolve().name for one in outcomes]
+    for one, name in zip(outcomes, names):
+        state, verdict = (f"[{COLOURS[x]}]{x}[/]" if x else "" for x in (one.state, one.verdict))
+        numbers = ["" if x is None else f"{x:.3g}" for x in (one.nominal, one.calibrated, one.torque)]
+        shown = name if names.count(name) == 1 else one.folder
+        found.add_row(escape(shown), state, verdict, *numbers, f"{one.seconds:.1f}")
+    return found
+
+
+def remarks(outcomes: Sequence[Outcome]) -> Iterator[str]:
+    """Say of every session that is not done what it waits for, or what went wrong."""
+    for one in outcomes:
+        if one.state != DONE:
+            yield f"{one.folder} {one.state}{' for ' if one.state == WAITS else ': '}{one.words}"
+
+
+def summary(outcomes: Sequence[Outcome], seconds: float) -> str:
+    """Return one line on all of them."""
+    counts = {state: sum(one.state == state for one in outcomes) for state in (DONE, WAITS, FAILED)}
+    judged = {level: sum(one.verdict == level for one in outcomes) for level in ("pass", "marginal", "fail")}
+    words = ", ".join(f"{count} {level}" for level, count in judged.items() if count)
+    parts = [f"{counts[DONE]} of {len(outcomes)} done" + (f" ({words})" if words else "")]
+    parts += [f"{counts[state]} {words}" for state, words in ((WAITS, "waiting"), (FAILED, "failed")) if counts[state]]
+    return f"{', '.join(parts)}; {seconds:.1f} s"
+
+
+def worst_code(outcomes: Sequence[Outcome]) -> int:
+    """Return the exit code of all: of the first kind that occurred out of 3, 2 (they failed), 1 (verdict fail), 0."""
+    return max((one.code for one in outcomes), default=0)

@@ -1,0 +1,280 @@
+"""What each step of a session does. The same functions as the scriptable commands; only the files are the session's."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from calib import files
+from calib.data.poses.fit_options import FileOptions, FitOptions, read_options
+from calib.data.poses.plans import check_against, read_poses, write_poses
+from calib.errors import RobotError, UsageError
+from calib.geometry.fit import polish_frames
+from calib.geometry.weighing import Settings as FitSettings
+from calib.geometry.weighing import combine
+from calib.procedure.kinematic_stage import fit as fitting
+from calib.procedure.kinematic_stage import folder as outputs
+from calib.procedure.kinematic_stage import inputs, proof
+from calib.procedure.kinematic_stage import robot_file as calibrated
+from calib.procedure.kinematic_stage import validation as comparing
+from calib.procedure.kinematic_stage.verdict import judge
+from calib.procedure.report import fit_certificate, fit_report
+from calib.procedure.session import arrival
+from calib.procedure.session.folder import Session
+from calib.procedure.session.outcome import mark_failed
+from calib.robot.chain import Chain
+
+Say = Callable[[str], None]
+
+
+def robot_file(session: Session) -> Path:
+    """Return the session's robot description."""
+    return session.path(session.settings.robot["file"])
+
+
+def chain_of(session: Session) -> Chain:
+    """Return the nominal arm."""
+    robot = session.settings.robot
+    options = options_of(session)
+    return inputs.load_robot(robot_file(session), None, options, robot["base"] or None, robot["tip"] or None)[0]
+
+
+def options_of(session: Session) -> FitOptions:
+    """Return the fit options, with the instrument's sigmas where a file states none."""
+    name, instrument = session.settings.fit["options"], session.settings.instrument
+    options = read_options(session.path(name) if name else None)
+    position, turn = instrument["sigma_position"], instrument["sigma_orientation"]
+
+    def stated(each: FileOptions) -> FileOptions:
+        if position and each.sigma_position is None:
+            each = replace(each, sigma_position=(position,) * 3)
+        return replace(each, sigma_orientation=(turn,) * 3) if turn and each.sigma_orientation is None else each
+
+    return replace(
+        options, every=stated(options.every), files={name: stated(each) for name, each in options.files.items()}
+    )
+
+
+def tolerance_of(session: Session) -> float | None:
+    """Return the largest rms on unseen poses that is good enough [m]; None where the session states none."""
+    return 1e-3 * session.settings.fit["tolerance_mm"] or None
+
+
+def measured_files(session: Session) -> tuple[list[Path], list[Path]]:
+    """Return the CSV files people have brought: for the fit, and for validation (names starting with it)."""
+    found = sorted(session.path("3-measured").glob("*.csv"))
+    unseen = [path for path in found if path.name.lower().startswith("validation")]
+    aside = [*unseen, *measured_again(session)]
+    return [path for path in found if path not in aside], unseen
+
+
+def measured_again(session: Session) -> list[Path]:
+    """Return the files of poses measured once more at the end (names starting with drift); they are not fitted."""
+    return [path for path in sorted(session.path("3-measured").glob("*.csv")) if path.name.lower().startswith("drift")]
+
+
+def describe(session: Session, say: Say) -> list[str]:
+    """Read the robot, and write down how it was understood."""
+    chain = chain_of(session)
+    lines = [f"{chain.name}: {chain.base} to {chain.tip}, {chain.n} joints, {len(chain.elements)} elements", ""]
+    for joint in chain.joints:
+        factor, unit = (180.0 / np.pi, "deg") if joint.kind == "revolute" else (1e3, "mm")
+        lines.append(f"{joint.name}: {joint.kind}, {factor * joint.lower:g} to {factor * joint.upper:g} {unit}")
+    lines += ["", "elements, base to tip [m, rad]"]
+    lines += [f"  {element.name:<24} {element.axis}  {element.value:.9g}" for element in chain.elements]
+    files.write(session.path("1-robot/summary.txt"), "\n".join(lines) + "\n")
+    return [lines[0]]
+
+
+def select(session: Session, say: Say) -> list[str]:
+    """Choose poses for the fit, and others at random for validation."""
+    from calib.procedure.session.pose_plan import plan
+
+    chain, wanted = chain_of(session), session.settings.poses
+    say("choosing poses")
+    chosen = plan(session, robot_file(session), chain, say)
+    kinds = [joint.kind for joint in chain.joints]
+    names = chain.joint_names
+    write_poses(session.path("2-poses/poses.csv"), chosen.fit, names, unit="deg", kinds=kinds)
+    notes = [f"{len(chosen.fit)} poses for the fit: {chosen.words}"]
+    if wanted["validation"]:
+        write_poses(session.path("2-poses/validation.csv"), chosen.validation, names, unit="deg", kinds=kinds)
+        notes.append(f"{len(chosen.validation)} poses for validation, at random")
+    if not wanted["constraints"]:
+        notes.append("only joint limits were kept: look at every pose for collisions, or name a constraints file")
+    notes += chosen.record["notes"]
+    files.write_json(session.path("2-poses/selection.json"), chosen.record)
+    return notes
+
+
+def planned(session: Session, chain: Chain, name: str) -> np.ndarray | None:
+    """Return the planned poses in ``2-poses``; None where there is no plan."""
+    path = session.path(f"2-poses/{name}.csv")
+    if not session.settings.poses["plan"] or not path.exists():
+        return None
+    return read_poses(path, chain.joint_names, kinds=[joint.kind for joint in chain.joints])
+
+
+def arrive(session: Session, say: Say) -> list[str]:
+    """Check the files that were brought for the fit."""
+    chain, notes = chain_of(session), []
+    fit, _ = measured_files(session)
+    plan = planned(session, chain, "poses")
+    for path in fit:
+        notes += check_file(session, chain, path, plan)
+    notes += drifts(session, chain)
+    files.write(session.path("3-measured/checked.txt"), "\n".join(notes) + "\n")
+    return notes
+
+
+def check_file(session: Session, chain: Chain, path: Path, plan: np.ndarray | None) -> list[str]:
+    """Return what is to be said of a measured file: rows, kind, what was ignored, missing poses.
+
+    Raises:
+        MeasurementError: for whatever cannot be right, with row and column.
+    """
+    notes = []
+    for block in inputs.read_file(path, chain, options_of(session)):
+        wanted = session.settings.instrument["measures"]
+        if wanted == "pose" and block.kind == "position":
+            notes.append(f"{path.name}: positions only, where the instrument gives poses")
+        ignored = f", ignored: {', '.join(block.ignored)}" if block.ignored else ""
+        notes.insert(0, f"{path.name}: {len(block)} rows of kind {block.kind}{ignored}")
+        notes += [f"{path.name}: {note}" for note in block.notes]
+        if plan is not None:
+            notes += [f"{path.name}: {note}" for note in (*check_against(plan, block), *arrival.readback(plan, block))]
+    return notes
+
+
+def drifts(session: Session, chain: Chain) -> list[str]:
+    """Return what poses that were measured more than once say of drift."""
+    options = options_of(session)
+    first, again = (
+        [block for path in paths for block in inputs.read_file(path, chain, options)]
+        for paths in (measured_files(session)[0], measured_again(session))
+    )
+    return arrival.drift(chain, first, again, session.settings.instrument["sigma_position"])
+
+
+def gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
+    """Return the robot with the fit's measurements, and with validation files if asked for."""
+    fit = session.settings.fit
+    chain = chain_of(session)
+    links = (chain.base, chain.tip) if robot_file(session).suffix == ".urdf" else (None, None)
+    return inputs.gather(
+        robot_file(session), measured_files(session)[0], validate, options=options_of(session),
+        stations=fit["stations"], refit_frames=fit["validation_frames"] == "own", base=links[0], tip=links[1],
+        seed=session.settings.seed,
+    )  # fmt: skip
+
+
+def fit(session: Session, say: Say) -> list[str]:
+    """Fit the geometry to the measured files; validation files are not looked at."""
+    settings = session.settings
+    outcome = fitting.run(
+        gathered(session), options_of(session), model=settings.fit["model"], loss=settings.fit["loss"],
+        tolerance=tolerance_of(session), seed=settings.seed, progress=say,
+    )  # fmt: skip
+    outputs.write_folder(outcome, session.path("4-fit"), fit_certificate.write)
+    count = len(outcome.climb.fit.free)
+    notes = [f"model {outcome.climb.chosen}, {count} parameters on {outcome.fit.poses} poses", *outcome.warnings]
+    if outcome.outliers:
+        named = ", ".join(each.words for each in outcome.outliers[:3])
+        advice = "" if settings.fit["loss"] != "none" else '; look at these rows, or set loss = "huber" in session.toml'
+        count = len({(each.file, each.row) for each in outcome.outliers})
+        notes.append(f"{count} row{'s do' if count > 1 else ' does'} not fit: {named}{advice}")
+    return notes
+
+
+def validate(session: Session, say: Say) -> list[str]:
+    """Hold the fitted robot against poses it has not seen, and judge."""
+    chain, unseen = chain_of(session), measured_files(session)[1]
+    folder, found, notes = session.path("5-validation"), fit_report.read(session.path("4-fit")), []
+    if not session.settings.poses["validation"] and not unseen:
+        files.write_json(folder / "metrics.json", _verdict(found.metrics, {}))
+        return ["no validation asked for: judged by cross-validation only"]
+    plan = planned(session, chain, "validation")
+    for path in unseen:
+        notes += check_file(session, chain, path, plan)
+    say("comparing on unseen poses")
+    given = gathered(session, unseen)
+    fitted, validation = compared(session, given)
+    asked = session.settings.fit["model"]
+    verdict = judge(fitted, validation, asked=asked, tolerance=tolerance_of(session), **found.judged)
+    clause, loud = comparing.urdf_alone(fitted, validation)
+    verdict = verdict if not clause else replace(verdict, reason=f"{verdict.reason}; {clause}")
+    warnings = [*loud, *fitting.elsewhere(fitted, validation), *proof.doubtful(validation)]
+    metrics: dict[str, object] = {"validation": {name: each.table() for name, each in validation.items()}}
+    metrics |= {"verdict": verdict.level, "reason": verdict.reason, "warnings": warnings}
+    sets = [fit_report.rows_of(name, each, each.proves) for name, each in validation.items()]
+    proof.write_errors(folder / "errors.csv", given.chain, validation)
+    files.write_json(folder / "rows.json", sets)
+    files.write_json(folder / "metrics.json", metrics)
+    return [*notes, f"verdict {verdict.level}: {verdict.reason}", *warnings]
+
+
+def compared(session: Session, given: inputs.Inputs) -> tuple[comparing.Comparison, dict[str, comparing.Comparison]]:
+    """Return nominal beside calibrated arm on fitted and on unseen rows."""
+    options, seed = options_of(session), session.settings.seed
+    loss = session.settings.fit["loss"]
+    settings = combine(FitSettings(), loss=loss, loss_scale=options.loss_scale)
+    torques = [fitting.gravity_of(given.chain, block) for block in given.fit]
+    nominal = polish_frames(fitting.install(given.chain, given.fit), given.fit, settings, torques).cell
+    cell = calibrated.read(session.path("4-fit"))
+    rigid = calibrated.rigid_chain(session.path("4-fit"))
+    alone = comparing.without_corrections(cell, rigid, given.fit, settings)
+    fitted = comparing.compare(nominal, cell, given.fit, torques, "fitted on these rows", False, seed, alone=alone)
+    unseen = {
+        name: comparing.compare_unseen(
+            nominal, cell, each, lambda block: fitting.gravity_of(given.chain, block), settings, seed, alone
+        )
+        for name, each in given.unseen.items()
+    }
+    return fitted, unseen
+
+
+def _verdict(metrics: dict, validation: dict) -> dict:
+    return {"validation": validation, "verdict": metrics["verdict"], "reason": metrics["reason"], "warnings": []}
+
+
+def export(session: Session, say: Say) -> list[str]:
+    """Put the calibrated robot into the forms others read; of a failed one the files say so."""
+    out = session.path(session.export)
+    lines = _exported(session, out, say)
+    return [*mark_failed(session, out), *lines]
+
+
+def _exported(session: Session, out: Path, say: Say) -> list[str]:
+    from calib.procedure.export.delivery import deliver
+
+    source = robot_file(session)
+    lines = deliver(session.path("4-fit"), source, out)
+    if not session.dynamic:
+        return lines
+    from calib.procedure.export.dynamics import deliver_dynamics
+
+    say("all parameters of possible bodies")
+    corrected = (out / "robot_for_corrections.urdf").exists()  # identified on another geometry than robot.urdf's
+    place = out / "dynamics" if corrected else out
+    try:
+        found = deliver_dynamics(session.path("8-dynamics"), source if source.suffix == ".urdf" else None, place)
+    except (RobotError, UsageError) as error:  # the geometry stands by itself
+        return [*lines, f"the dynamics were not exported: {error}"]
+    return [
+        *lines,
+        *([f"in {place.name}, on the geometry that joint corrections belong to:"] if corrected else []),
+        *found,
+    ]
+
+
+def clear_staging(session: Session) -> None:
+    """Remove what a killed command left beside its place."""
+    for path in session.folder.rglob(".*.part"):
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)

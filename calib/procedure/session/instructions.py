@@ -1,0 +1,109 @@
+"""What a session asks of people, in two lines: what to do at the robot, and which file to bring, in which form."""
+
+from __future__ import annotations
+
+from calib.errors import SessionError
+from calib.procedure.session import dynamics_steps, geometry_steps
+from calib.procedure.session.folder import Session
+from calib.procedure.session.steps import WAITING, State
+from calib.robot.chain import Chain
+
+
+def asks(session: Session, state: State) -> tuple[str, str]:
+    """Return two lines: what to do at the robot, and which file to bring, in which form."""
+    if state.kind == WAITING and state.step.name in ("record", "predict"):
+        return _play(session, state.step.name), _log(session, state.step.name)
+    if state.kind == WAITING and state.step.name in ("measure", "validate"):
+        name = "poses" if state.step.name == "measure" else "validation"
+        target = "measured.csv" if name == "poses" else "validation.csv"
+        both = name == "poses" and not geometry_steps.measured_files(session)[1]
+        return _at_the_robot(session, name, both), _form(session, target, both)
+    return f"step {state.step.name} needs {state.words}", f"put it into {session.folder} and run calib next again"
+
+
+def _at_the_robot(session: Session, name: str, both: bool) -> str:
+    path = session.path(f"2-poses/{name}.csv")
+    what = "pose" if session.settings.instrument["measures"] == "pose" else "position"
+    device = session.settings.instrument["name"]
+    if not session.settings.poses["plan"] or not path.exists():
+        return f"Measure the target's {what} with the {device} at poses all over the workspace."
+    count = sum(1 for _ in path.open()) - 1
+    return (
+        f"Drive the {count} poses of {path}{_and_validation(session) if both else ''}, let the arm settle, measure the "
+        f"target's {what} with the {device} and log the joint angles read back; the first three once more at the end "
+        "show drift "
+        "(into drift.csv, if you like)."
+    )
+
+
+def _and_validation(session: Session) -> str:
+    """Name the list of validation poses, so that the robot is visited once."""
+    path = session.path("2-poses/validation.csv")
+    if not session.settings.poses["validation"] or not path.exists():
+        return ""
+    return f" and, into a file of their own, the {sum(1 for _ in path.open()) - 1} of {path} (never fitted)"
+
+
+def _form(session: Session, target: str, both: bool) -> str:
+    joints = _chain(session).joint_names
+    full = session.settings.instrument["measures"] == "pose"
+    columns = ", ".join((*(f"{joint} [deg]" for joint in joints), *(f"{axis} [mm]" for axis in "xyz")))
+    quaternion = ", qx, qy, qz, qw" if full else ""
+    files = [str(session.path("3-measured") / target)]
+    if both and session.settings.poses["validation"]:
+        files.append(str(session.path("3-measured/validation.csv")))
+    each = f"Bring {' and '.join(files)}, one row per pose: {columns}{quaternion} (calib formats measurements)"
+    return f"{each}; then: calib next {session.folder}"
+
+
+def _play(session: Session, step: str) -> str:
+    """Return what is to be played and logged."""
+    wanted = session.settings.dynamics
+    names = _motions(session, step)
+    if not wanted["plan"]:
+        return "Record the robot moving in all its joints, in one motion to learn from and in another, unseen one."
+    file = "run.csv" if wanted["repeats"] > 1 else "trajectory.csv"
+    motions = " and, into a file of its own, ".join(str(session.path(f"6-excitation/{name}/{file}")) for name in names)
+    unseen = " (never learnt from)" if "validation" in names else ""
+    loads = ", ".join(f"'{label}' ({mass:g} kg)" for label, mass in wanted["payloads"].items())
+    again = f" Then once more with {loads} on the flange, the label in the file's name." if loads else ""
+    return (
+        f"Play {motions}{unseen}, {wanted['repeats']} times the motion each, at {wanted['rate']:g} Hz, from rest at "
+        "its "
+        "first row, before that at a low override, to see that the way is free; log joint positions and torques "
+        "all "
+        f"the while.{again if step == 'record' else ''}"
+    )
+
+
+def _motions(session: Session, step: str) -> list[str]:
+    """Return which of the motions are still to be recorded."""
+    training, unseen = dynamics_steps.recordings(session)
+    names = [] if step == "predict" or training else ["training"]
+    return names + (["validation"] if session.settings.dynamics["validation"] and not unseen else [])
+
+
+def _log(session: Session, step: str) -> str:
+    chain = _chain(session)
+    torques = session.settings.dynamics["torques"]
+    first, last = chain.joint_names[0], chain.joint_names[-1]
+    unit = ["N" if joint.kind == "prismatic" else "Nm" for joint in chain.joints]
+    place = ["m" if joint.kind == "prismatic" else "deg" for joint in chain.joints]
+    columns = [f"q_{first} [{place[0]}] to q_{last} [{place[-1]}]"]
+    if torques != "link":
+        columns.append(f"tau_{first} [{unit[0]}] to tau_{last} [{unit[-1]}]")
+    if torques != "motor":
+        columns.append(f"tau_link_{first} to tau_link_{last} (the sensors')")
+    files = " and ".join(str(session.path(f"7-recorded/{name}.csv")) for name in _motions(session, step))
+    return (
+        f"Bring {files}, one row per sample: t [s], {', '.join(columns)}; currents are i_{first} [A] …; .npz and ROS "
+        "bags "
+        f"are read, too (calib formats recordings); then: calib next {session.folder}"
+    )
+
+
+def _chain(session: Session) -> Chain:
+    try:
+        return geometry_steps.chain_of(session)
+    except Exception as error:
+        raise SessionError(f"the robot cannot be read: {error}") from error

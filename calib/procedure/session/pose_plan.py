@@ -1,0 +1,76 @@
+"""Which poses a session asks for: chosen ones for the fit, random ones within the same limits for validation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from calib.geometry.observability import observation, targets_of
+from calib.procedure.kinematic_stage import selection
+from calib.procedure.kinematic_stage.pose_limits import read_limits
+from calib.procedure.session.folder import Session
+from calib.robot.chain import Chain
+from poses.candidates import draw_candidates
+from poses.space import SearchSpace, is_feasible
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Poses for the fit (m, n) and for validation (v, n) [rad or m], and how they came about."""
+
+    fit: np.ndarray
+    validation: np.ndarray
+    words: str
+    record: dict[str, Any]
+
+
+def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], None]) -> Plan:
+    """Choose the poses that ``session.toml`` asks for."""
+    settings = session.settings
+    wanted, instrument = settings.poses, settings.instrument
+    constraints = session.path(wanted["constraints"]) if wanted["constraints"] else None
+    links = (chain.base, chain.tip) if robot_file.suffix == ".urdf" else (None, None)
+    stated = (instrument["sigma_position"], instrument["sigma_orientation"])
+    chosen = selection.choose(
+        robot_file, wanted["fit"], kind=instrument["measures"], tools=[instrument["tool"]], index=wanted["index"],
+        method=wanted["method"], constraints=constraints, sigmas=stated if all(stated) else None, base=links[0],
+        tip=links[1], seed=settings.seed, progress=lambda done, total, what: say(f"choosing poses: {what}"),
+    )  # fmt: skip
+    found = chosen.selection
+    assert found.q is not None
+    if found.interrupted:  # a session is resumed, not gone on with half a search
+        raise KeyboardInterrupt
+    gain = found.random_baseline / found.value if found.index == "cond" else found.value / found.random_baseline
+    words = (
+        f"{len(found.q)} poses by {found.method}, {found.index} = {found.value:.4g}, {gain:.2f} times the best of 1000 "
+        f"random sets, {100 * found.efficiency:.1f} % of the convex bound"
+    )
+    record = {
+        "words": words,
+        "index": found.index,
+        "method": found.method,
+        "value": found.value,
+        "efficiency": found.efficiency,
+        "random_baseline": found.random_baseline,
+        "parameters": chosen.parameters,
+        "seconds": found.seconds,
+        "seed": settings.seed,
+        "notes": list(chosen.notes),
+    }
+    return Plan(found.q, _unseen(session, robot_file, chain, wanted["validation"]), words, record)
+
+
+def _unseen(session: Session, robot_file: Any, chain: Chain, count: int) -> np.ndarray:
+    """Return random poses within limits and constraints (count, n), from another stream than the candidates'."""
+    if not count:
+        return np.zeros((0, chain.n))
+    name = session.settings.poses["constraints"]
+    cell = targets_of(chain, [session.settings.instrument["tool"]])
+    limits = read_limits(session.path(name) if name else None, cell, robot_file)
+    jacobian = observation(cell, session.settings.instrument["measures"])
+    space = SearchSpace(jacobian, limits.lower, limits.upper, None, limits.constraints, limits.feasible)
+    stream = np.random.default_rng([session.settings.seed, 1])
+    return draw_candidates(limits.lower, limits.upper, count, lambda q: is_feasible(space, q), seed=stream)

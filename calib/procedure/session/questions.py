@@ -1,0 +1,136 @@
+"""What `calib new` needs to know, by options or by questions at a terminal; every answer is checked as it comes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.errors import UsageError
+from calib.procedure.session.folder import TORQUES
+from calib.procedure.session.presets import INSTRUMENTS
+from calib.procedure.session.presets import instrument as instrument_named
+from calib.robot import library
+from calib.robot.load import resolve
+
+
+@dataclass(frozen=True)
+class Answers:
+    """Options of `calib new` as they were typed; None where nothing was said."""
+
+    robot: str | None = None
+    instrument: str | None = None
+    tool: str | None = None
+    limits: Path | None = None
+    dynamics: bool | None = None
+    payloads: tuple[str, ...] = ()
+    torques: str | None = None
+
+
+@dataclass(frozen=True)
+class Question:
+    """One question: which answer it is about, its words, what an empty answer means, and when it is put."""
+
+    name: str
+    words: str
+    default: str
+    open: Callable[[Answers], bool]
+
+
+def _unanswered(name: str) -> Callable[[Answers], bool]:
+    return lambda given: getattr(given, name) is None
+
+
+QUESTIONS = (
+    Question("robot", f"robot (.urdf, .toml, or {' '.join(library.names())})", "", _unanswered("robot")),
+    Question("instrument", f"instrument ({' '.join(INSTRUMENTS)})", "tracker", _unanswered("instrument")),
+    Question("tool", "where the target sits in the tip's frame, x,y,z [m]", "0.05,0,0.05", _unanswered("tool")),
+    Question("limits", "file of limits: obstacles, speeds (none: the robot's own)", "none", _unanswered("limits")),
+    Question("dynamics", "identify the dynamics, too (yes, no)", "yes", _unanswered("dynamics")),
+    Question(
+        "torques", "torques in the log (motor, link, both)", "motor",
+        lambda given: given.dynamics is not False and given.torques is None,
+    ),
+    Question(
+        "payloads", "payloads to record with as well, label=kg (none)", "none",
+        lambda given: given.dynamics is not False and not given.payloads,
+    ),
+)  # fmt: skip
+
+
+def with_answer(given: Answers, question: Question, text: str) -> Answers:
+    """Return the answers with one more.
+
+    Raises:
+        UsageError: where it cannot be one, with what can.
+    """
+    empty = text.lower() in ("", "none", "-")
+    if question.name == "dynamics":
+        if text.lower() not in ("yes", "no", "y", "n"):
+            raise UsageError(f"'{text}': yes or no")
+        return replace(given, dynamics=text.lower().startswith("y"))
+    values: dict[str, Any] = {"limits": None if empty else Path(text), "payloads": () if empty else tuple(text.split())}
+    found = replace(given, **{question.name: values.get(question.name, text)})
+    if question.name == "robot":
+        resolve(text) if text else _fail("a robot is needed")
+    checked(replace(found, robot=found.robot or "", instrument=found.instrument or "tracker"))
+    return found
+
+
+def _fail(words: str) -> None:
+    raise UsageError(words)
+
+
+def checked(given: Answers) -> dict[str, Any]:
+    """Return the arguments of `calib.procedure.session.commands.begin`.
+
+    Raises:
+        UsageError: for an answer that cannot be.
+    """
+    robot, instrument = given.robot, given.instrument
+    if robot is None or instrument is None:
+        raise UsageError("a robot and an instrument are needed")
+    instrument_named(instrument)
+    dynamics = given.dynamics is not False
+    result: dict[str, Any] = {"robot": robot, "instrument": instrument, "dynamics": dynamics}
+    if given.tool is not None:
+        result["tool"] = _place(given.tool)
+    if given.limits is not None:
+        if not given.limits.is_file():
+            raise UsageError(f"--limits {given.limits}: no such file")
+        result["limits"] = given.limits
+    if given.torques is not None:
+        if given.torques not in TORQUES:
+            raise UsageError(f"--torques {given.torques}: expected {', '.join(TORQUES)}")
+        result["torques"] = given.torques
+    if given.payloads:
+        result["payloads"] = dict(_payload(text) for text in given.payloads)
+    if not dynamics and (given.payloads or given.torques):
+        raise UsageError("--payload and --torques are about the dynamics, which --geometry-only leaves out")
+    return result
+
+
+def _place(text: str) -> tuple[float, ...]:
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != 3 or not np.isfinite(values).all():
+        raise UsageError(f"--tool {text}: expected x,y,z in metres")
+    if max(map(abs, values)) > 3.0:
+        raise UsageError(f"--tool {text}: {max(map(abs, values)):g} m from the flange? These look like mm; give metres")
+    return values
+
+
+def _payload(text: str) -> tuple[str, float]:
+    label, _, mass = text.partition("=")
+    try:
+        value = float(mass.removesuffix("kg"))
+    except ValueError:
+        value = float("nan")
+    if not label.isidentifier() or not 0.0 < value < 2000.0:
+        raise UsageError(f"--payload {text}: expected label=kg, e.g. loaded=3.28 (the label goes into the file's name)")
+    return label, value

@@ -1,0 +1,175 @@
+"""The walk: which steps there are, in their order, what each reads and what it makes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from calib.procedure.session import certificate, dynamics_steps, geometry_steps
+from calib.procedure.session.folder import MARK, Session
+from calib.procedure.session.outcome import PLACES
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step.
+
+    Attributes:
+        name, purpose: for people.
+        settings: sections of ``session.toml`` it depends on, or single keys of them (``dynamics.period``).
+        inputs: the files it reads, as they are now.
+        make: runs it; returns what is to be said.
+        outputs: names or patterns, relative to the session, of what it makes.
+        dynamic: whether only sessions with dynamics have it.
+    """
+
+    name: str
+    purpose: str
+    settings: tuple[str, ...]
+    inputs: Callable[[Session], list[Path]]
+    make: Callable[[Session, Say], list[str]]
+    outputs: tuple[str, ...]
+    dynamic: bool = False
+
+
+def _robot(session: Session) -> list[Path]:
+    return [geometry_steps.robot_file(session)]
+
+
+def _plan(session: Session) -> list[Path]:
+    name = session.settings.poses["constraints"]
+    return [*_robot(session), *([session.path(name)] if name else [])]
+
+
+def _arrived(session: Session) -> list[Path]:
+    brought = [*geometry_steps.measured_files(session)[0], *geometry_steps.measured_again(session)]
+    return [*_robot(session), session.path("2-poses/poses.csv"), *_options(session), *brought]
+
+
+def _options(session: Session) -> list[Path]:
+    name = session.settings.fit["options"]
+    return [session.path(name)] if name else []
+
+
+def _fitted(session: Session) -> list[Path]:
+    return [*_robot(session), *_options(session), *geometry_steps.measured_files(session)[0]]
+
+
+def _validated(session: Session) -> list[Path]:
+    fit = [session.path("4-fit") / name for name in ("robot.toml", "report.json")]
+    return [
+        *fit,
+        session.path("2-poses/validation.csv"),
+        *_options(session),
+        *geometry_steps.measured_files(session)[1],
+    ]
+
+
+def _excited(session: Session) -> list[Path]:
+    name = session.settings.dynamics["limits"]
+    return [session.path("4-fit/robot.toml"), *([session.path(name)] if name else [])]
+
+
+def _recorded(session: Session) -> list[Path]:
+    plan = session.path("6-excitation/training/trajectory.toml")
+    return [
+        session.path("4-fit/robot.toml"),
+        plan,
+        *_reading(session),
+        *files_of(dynamics_steps.recordings(session)[0]),
+    ]
+
+
+def _reading(session: Session) -> list[Path]:
+    name = session.settings.dynamics["options"]
+    return [session.path(name)] if name else []
+
+
+def _identified(session: Session) -> list[Path]:
+    own = [session.path("4-fit/robot.toml"), session.path("7-recorded/cuts.json"), *_reading(session)]
+    return [*own, *files_of(dynamics_steps.recordings(session)[0])]
+
+
+def _predicted(session: Session) -> list[Path]:
+    own = [session.path(f"8-dynamics/{name}") for name in ("robot.toml", "dynamics.json", "metrics.json")]
+    plan = session.path("6-excitation/validation/trajectory.toml")
+    training, unseen = dynamics_steps.recordings(session)
+    cuts = session.path("7-recorded/cuts.json")
+    return [*own, plan, cuts, *_reading(session), *files_of(training), *files_of(unseen)]
+
+
+def files_of(paths: list[Path]) -> list[Path]:
+    """Return the files behind paths, some of which are folders (ROS 2 bags)."""
+    return [each for path in paths for each in (sorted(p for p in path.rglob("*") if p.is_file()) or [path])]
+
+
+def _exported(session: Session) -> list[Path]:
+    own = [*_robot(session), session.path("4-fit/robot.toml"), session.path("4-fit/robot.urdf")]
+    identified = [session.path(f"8-dynamics/{name}") for name in ("dynamics.json", "estimate.csv", "covariance.csv")]
+    judged = [session.path(place) for place in PLACES.values()]  # a failed robot's files say so
+    return own + judged[:1] + ([*identified, *judged[1:]] if session.dynamic else [])
+
+
+def _certified(session: Session) -> list[Path]:
+    names = ["4-fit/report.json", "5-validation/metrics.json", f"{session.export}/robot.urdf", "2-poses/selection.json"]
+    names.append("3-measured/checked.txt")
+    if session.dynamic:
+        names += ["7-recorded/checked.txt"]
+        names += ["8-dynamics/metrics.json", "8-dynamics/estimate.csv", "8-dynamics/unseen/report.json"]
+    marked = [session.path(MARK)] if session.path(MARK).exists() else []
+    return [*(session.path(name) for name in names), *marked]
+
+
+PLAN = "plan validation period harmonics rate starts evaluations limits"
+MODEL = "torques friction method options payloads"
+
+
+def _keys(names: str) -> tuple[str, ...]:
+    return tuple(f"dynamics.{name}" for name in names.split())
+
+
+STEPS = (
+    Step("describe", "read the robot", ("robot",), _robot, geometry_steps.describe, ("1-robot/summary.txt",)),
+    Step(
+        "select", "choose the poses to measure", ("robot", "instrument", "poses", "seed"), _plan, geometry_steps.select,
+        ("2-poses/poses.csv", "2-poses/validation.csv", "2-poses/selection.json"),
+    ),
+    Step(
+        "measure", "check what was measured", ("robot", "instrument", "poses", "fit"), _arrived, geometry_steps.arrive,
+        ("3-measured/checked.txt",),
+    ),
+    Step("fit", "fit the geometry", ("robot", "instrument", "fit", "seed"), _fitted, geometry_steps.fit, ("4-fit/*",)),
+    Step(
+        "validate", "hold it against unseen poses", ("robot", "instrument", "poses", "fit", "seed"), _validated,
+        geometry_steps.validate, ("5-validation/metrics.json", "5-validation/errors.csv", "5-validation/rows.json"),
+    ),
+    Step(
+        "excite", "design the motions to record", (*_keys(PLAN), "seed"), _excited, dynamics_steps.excite,
+        ("6-excitation/*/*",), True,
+    ),
+    Step(
+        "record", "check what was recorded", _keys("plan repeats torques options payloads"), _recorded,
+        dynamics_steps.record, ("7-recorded/checked.txt", "7-recorded/cuts.json"), True,
+    ),
+    Step(
+        "identify", "identify the dynamics", (*_keys(MODEL), "seed"), _identified, dynamics_steps.identify,
+        ("8-dynamics/*",), True,
+    ),
+    Step(
+        "predict", "hold it against unseen motion",
+        (*_keys(f"plan validation repeats tolerance_percent {MODEL}"), "seed"), _predicted, dynamics_steps.predict,
+        ("8-dynamics/unseen/*",), True,
+    ),
+    Step(
+        "export", "write the calibrated robot", ("robot",), _exported, geometry_steps.export,
+        ("6-export/*", "9-export/*", "9-export/dynamics/*"),
+    ),
+    Step(
+        "certificate", "print the certificate",
+        ("name", "created", "instrument", "poses", "fit", *_keys("torques payloads tolerance_percent")), _certified,
+        certificate.certify, ("certificate.html",),
+    ),
+)  # fmt: skip

@@ -1,0 +1,208 @@
+"""How a session's steps stand: what is stale, what waits for people, and how the next one is run.
+
+A step is current while its inputs' fingerprints are those recorded when it was made. Outputs that a person has replaced
+are kept and said. Before a step runs, it is marked as running; a killed one is found marked and made again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+from calib.errors import SessionError
+from calib.procedure.report import page
+from calib.procedure.session import dynamics_steps, geometry_steps
+from calib.procedure.session.folder import EXPORT, Session, fingerprint, read_state, write_state
+from calib.procedure.session.step_list import STEPS, Step
+
+Say = Callable[[str], None]
+DONE, READY, WAITING, STALE, KEPT, AFTER = "done", "ready", "waiting", "stale", "kept", "after"
+PLANS = ("poses.csv", "validation.csv", "selection.json", "trajectory.toml")  # there only where we plan
+
+
+@dataclass(frozen=True)
+class State:
+    """How a step stands, and why."""
+
+    step: Step
+    kind: str
+    words: str
+
+
+def walk(session: Session) -> tuple[Step, ...]:
+    """Return the steps of a session."""
+    return tuple(step for step in STEPS if session.dynamic or not step.dynamic)
+
+
+def find(session: Session, name: str) -> Step:
+    """Return a step by its name or number.
+
+    Raises:
+        SessionError: with the names there are.
+    """
+    own = walk(session)
+    for number, step in enumerate(own, 1):
+        if name in (step.name, str(number)):
+            return step
+    if name in (step.name for step in STEPS):
+        raise SessionError(
+            f"this session is about geometry only; for '{name}' write wanted = true under [dynamics] in session.toml"
+        )
+    raise SessionError(f"no step '{name}'; there are {', '.join(step.name for step in own)}")
+
+
+def states(session: Session) -> list[State]:
+    """Return how every step stands."""
+    recorded, result, current = read_state(session), [], True
+    for step in walk(session):
+        state = _state(session, step, recorded) if current else _behind(session, step, recorded)
+        result.append(state)
+        current = current and state.kind in (DONE, KEPT)
+    return result
+
+
+def _behind(session: Session, step: Step, recorded: dict[str, Any]) -> State:
+    words = "made before; an earlier step comes first" if step.name in recorded["steps"] else "comes later"
+    return State(step, AFTER, words)
+
+
+def _state(session: Session, step: Step, recorded: dict[str, Any]) -> State:
+    entry = recorded["steps"].get(step.name)
+    if missing := _missing(session, step):
+        return State(step, WAITING, missing)
+    if recorded.get("running") == step.name:
+        return State(step, READY, "was interrupted; will be made again")
+    if entry is None:
+        return State(step, READY, step.purpose)
+    if changes := _changes(entry["inputs"], _inputs(session, step)):
+        if used := _used(session, step):
+            return State(step, KEPT, f"{changes}; kept, since {used}")
+        return State(step, STALE, changes)
+    gone = [name for name in entry["outputs"] if not session.path(name).exists()]
+    if gone:
+        return State(step, STALE, f"{gone[0]} is gone")
+    replaced = [name for name, mark in entry["outputs"].items() if fingerprint(session.path(name)) != mark]
+    by_hand = f"; replaced by hand: {', '.join(replaced)}" if replaced else ""
+    return State(step, DONE, f"{entry['finished'][:16].replace('T', ' ')}{by_hand}")
+
+
+def _used(session: Session, step: Step) -> str:
+    """Say why a plan is not replaced: people have worked to it."""
+    if step.name == "select" and geometry_steps.measured_files(session)[0]:
+        return "files were measured to it (calib redo select: new poses)"
+    if step.name == "excite" and any(dynamics_steps.recordings(session)):
+        return "files were recorded to it (calib redo excite: new motions)"
+    return ""
+
+
+def _missing(session: Session, step: Step) -> str:
+    """Say which of people's files a step waits for."""
+    fit, unseen = geometry_steps.measured_files(session)
+    if step.name == "measure" and not fit:
+        return "a file of measured poses"
+    if step.name == "validate" and session.settings.poses["validation"] and not unseen:
+        return "a file of measured validation poses"
+    if step.name in ("record", "predict"):
+        training, unseen = dynamics_steps.recordings(session)
+        if step.name == "record" and not training:
+            return "a recording of the training motion"
+        if step.name == "predict" and session.settings.dynamics["validation"] and not unseen:
+            return "a recording of the validation motion"
+    absent = [path for path in step.inputs(session) if not path.exists()]
+    own = [path for path in absent if not path.name.startswith(PLANS)]
+    return f"{own[0].relative_to(session.folder)}, which is missing" if own else ""
+
+
+def _inputs(session: Session, step: Step) -> dict[str, str]:
+    """Return the fingerprints of what a step depends on."""
+    marks = {str(path.relative_to(session.folder)): fingerprint(path) for path in step.inputs(session) if path.exists()}
+    for setting in step.settings:
+        section, _, key = setting.partition(".")
+        if section == "dynamics" and not session.dynamic:
+            continue
+        values = getattr(session.settings, section)
+        place = f"session.toml [{section}] {key}".rstrip()
+        marks[place] = json.dumps(values[key] if key else values, sort_keys=True)
+    return marks
+
+
+def _changes(before: dict[str, str], now: dict[str, str]) -> str:
+    """Say what differs between two sets of fingerprints."""
+    changed = [name for name in now if name in before and before[name] != now[name]]
+    added, gone = sorted(set(now) - set(before)), sorted(set(before) - set(now))
+    parts = [f"{name} has changed" for name in changed]
+    parts += [f"{name} is new" for name in added] + [f"{name} is gone" for name in gone]
+    return ", ".join(parts)
+
+
+def run_next(session: Session, say: Say, progress: Say, command: str = "calib next") -> State | None:
+    """Run every step that can run, up to the next one that waits for people; return that one, None at the end.
+
+    The session has to be locked.
+    """
+    geometry_steps.clear_staging(session)
+    move_export(session)
+    while True:
+        state = next((each for each in states(session) if each.kind not in (DONE, KEPT)), None)
+        if state is None or state.kind == WAITING:
+            return state
+        _run(session, state.step, say, progress, command)
+
+
+def _run(session: Session, step: Step, say: Say, progress: Say, command: str) -> None:
+    number = walk(session).index(step) + 1
+    recorded = read_state(session)
+    recorded["steps"].pop(step.name, None)
+    write_state(session, recorded | {"running": step.name})
+    inputs, started = _inputs(session, step), time.perf_counter()
+    progress(step.purpose)
+    try:
+        notes = step.make(session, progress)
+    except BaseException:
+        write_state(session, recorded)
+        raise
+    produced = sorted({path for name in step.outputs for path in session.folder.glob(name) if path.is_file()})
+    recorded["steps"][step.name] = {
+        "finished": datetime.now().astimezone().isoformat(timespec="seconds"),
+        "seconds": round(time.perf_counter() - started, 2),
+        "command": command,
+        "seed": session.settings.seed,
+        "toolkit": page.versions(),
+        "inputs": inputs,
+        "outputs": {str(path.relative_to(session.folder)): fingerprint(path) for path in produced},
+        "notes": notes,
+    }
+    recorded.pop("running", None)
+    write_state(session, recorded)
+    say(f"{number} {step.name}: {notes[0] if notes else 'done'}")
+    for note in notes[1:]:
+        say(f"    {note}")
+
+
+def forget(session: Session, step: Step) -> None:
+    """Let a step and all behind it be made again."""
+    recorded = read_state(session)
+    own = walk(session)
+    for later in own[own.index(step) :]:
+        recorded["steps"].pop(later.name, None)
+    write_state(session, recorded)
+
+
+def move_export(session: Session) -> None:
+    """Let the export follow where it stands in the walk, once dynamics are switched on or off in ``session.toml``."""
+    before, now = session.path(EXPORT[not session.dynamic]), session.path(session.export)
+    if (now.is_dir() and any(now.iterdir())) or not before.is_dir():
+        return
+    recorded = read_state(session)
+    if now.is_dir():
+        now.rmdir()
+    os.replace(before, now)
+    for key in ("outputs", "inputs"):
+        for entry in recorded["steps"].values():
+            entry[key] = {name.replace(f"{before.name}/", f"{now.name}/", 1): mark for name, mark in entry[key].items()}
+    write_state(session, recorded)

@@ -1,0 +1,352 @@
+"""A `Chain` to URDF: a new file, or the calibrated geometry put into the file one has.
+
+`edit` changes the attributes of ``<origin>`` in the text and nothing else, byte for byte: comments, transmissions,
+simulator tags, meshes, order and blanks stay. With F_k(q) the nominal chain's frame behind its k-th moving element and
+L_k(q) the frame of the URDF link behind its k-th moving joint, both in the base,
+
+    X_k = F_k(q)⁻¹ L_k(q)       has to be the same for every q: both describe the same axes;
+    L'_k = F'_k X_k             where the link has to stand on the calibrated chain F';
+    O'_k = (L'_{k-1} C_k)⁻¹ L'_k  at q = 0, the new origin, C_k being the fixed joints in between, which stay.
+
+Conventions (ours): the base link stays where the nominal chain has its base, so the first joint's origin takes what the
+chain says about the base; the fixed joints behind the last moving one stay as they are unless the calibrated chain has
+other elements there (owner n), which the first fixed joint towards the tip then takes up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib import files
+from calib.errors import RobotError
+from calib.robot.chain import AXES, Chain, Element, random_joints
+from calib.robot.formats.markup import edited, insert_child, set_attributes, text
+from calib.robot.formats.urdf import drive, ends
+from calib.robot.formats.urdf_tree import UNLIMITED, JointTag, Tree
+from calib.robot.formats.urdf_tree import read as read_tree
+from calib.robot.kinematics import forward
+from calib.transforms import invert, pose, to_xyz_rpy
+
+SAME_ROBOT = 1e-6
+UNCHANGED = 1e-12
+WRITTEN = 1e-9
+
+
+def edit_file(source: str | Path, target: str | Path, nominal: Chain, calibrated: Chain) -> Path:
+    """Write `source` with the calibrated geometry to `target`, in the encoding the source declares."""
+    content, encoding = text(source)
+    return files.write(target, edit(content, nominal, calibrated, str(source)).encode(encoding))
+
+
+def edit(source: str, nominal: Chain, calibrated: Chain, where: str = "URDF") -> str:
+    """Return the URDF text with the calibrated geometry in its joint origins (equations above).
+
+    Args:
+        source: the text of a URDF that describes the nominal robot.
+        nominal: the chain before calibration; read from this URDF, or an MDH table of the same robot.
+        calibrated: the same chain with other values.
+        where: names the text in messages.
+
+    Raises:
+        RobotError: where the URDF does not describe the nominal robot (naming the joint and the difference), or where
+            the calibrated chain is not the nominal one with other values.
+    """
+    _check_pair(nominal, calibrated)
+    tree = read_tree(source, where)
+    path = _matching_path(tree, nominal)
+    q = np.vstack([np.zeros(nominal.n), random_joints(nominal, 7, 1)])
+    links = link_frames(tree, path, nominal, q)
+    frames, calibrated_frames = moving_frames(nominal, q), moving_frames(calibrated, q)
+    base = _base_offset(tree, path, nominal, frames, links)
+    offsets = invert(frames[:, 0]) @ base @ links[:, 0]
+    wanted = invert(base) @ calibrated_frames @ offsets[:, None]
+    origins = _origins(tree, path, wanted[:, 0])
+    origins |= _tip_origin(tree, path, nominal, calibrated, base @ links[-1, 0], base @ wanted[-1, 0])
+    changes = []
+    for name, origin in origins.items():
+        changes += _change(source, tree.joints[name], origin)
+    result = edited(source, changes)
+    written = read_tree(result, where)
+    error = np.abs(link_frames(written, [written.joints[joint.name] for joint in path], nominal, q) - wanted).max()
+    if error > WRITTEN:
+        raise RobotError(
+            f"{where}: the edited text does not read back as the calibrated robot (difference {error:.2g})"
+        )
+    return result
+
+
+def write_new(chain: Chain) -> str:
+    """Return a URDF of any chain, with a link frame behind each moving element.
+
+    Constant elements are folded into the joint origins. Limits are kept; where velocity or effort is not known 1e9
+    stands, since URDF demands a number. A body of unknown inertia has none. Pinocchio reads the same kinematics.
+    """
+    lines = [
+        '<?xml version="1.0"?>',
+        f"<robot name={quoteattr(chain.name)}>",
+        f"  <link name={quoteattr(chain.base)}/>",
+    ]
+    parent, first, before = chain.base, set(chain.moving.tolist()), np.eye(4)
+    for k, element in enumerate(chain.elements):
+        before = (
+            before @ (np.eye(4) if element.placement is None else element.placement) @ _motion(element, element.value)
+        )
+        if element.joint is None:
+            continue
+        main = k in first
+        if main and element.ratio != 1.0:
+            raise RobotError(f"element '{element.name}': a URDF joint moves by q itself, not by {element.ratio:g} q")
+        child = _link_name(chain, k, main)
+        lines += _link_lines(child, chain.inertias[element.joint] if main and chain.inertias is not None else None)
+        lines += _joint_lines(chain, element, main, parent, child, before)
+        parent, before = child, np.eye(4)
+    if parent != chain.tip:
+        lines += [
+            f"  <link name={quoteattr(chain.tip)}/>",
+            f'  <joint name={quoteattr(chain.tip + "_fixed")} type="fixed">',
+        ]
+        lines += [*_placed(parent, chain.tip, before @ chain.tail), "  </joint>"]
+    return "\n".join([*lines, "</robot>"]) + "\n"
+
+
+def moving_frames(chain: Chain, q: np.ndarray) -> np.ndarray:
+    """Return the frames behind every moving element, followers included: (moving, m, 4, 4)."""
+    frame, frames = np.eye(4), []
+    for element in chain.elements:
+        if element.placement is not None:
+            frame = frame @ element.placement
+        amount = element.value if element.joint is None else element.value + element.ratio * q[:, element.joint]
+        frame = frame @ _motion(element, amount)
+        if element.joint is not None:
+            frames.append(frame)
+    return np.array(frames)
+
+
+def link_frames(tree: Tree, path: Sequence[JointTag], chain: Chain, q: np.ndarray) -> np.ndarray:
+    """Return the frames of the links behind the moving joints of a path, (moving, m, 4, 4), in the path's first link.
+
+    Args:
+        path: joints base to tip.
+        chain: whose joints, in the order of the actuated ones of the path, q belongs to.
+        q: (m, n) [rad or m].
+    """
+    index = {joint.name: j for j, joint in enumerate(joint for joint in path if joint.actuated)}
+    frame, frames = np.broadcast_to(np.eye(4), (len(q), 4, 4)), []
+    for joint in path:
+        frame = frame @ joint.origin
+        if joint.moves:
+            leader, ratio, offset = drive(tree, joint)
+            amount = ratio * q[:, index[leader]] + offset
+            frame = frame @ _screw(joint.axis, amount, joint.kind == "prismatic")
+            frames.append(frame)
+    return np.array(frames)
+
+
+def _screw(axis: np.ndarray, amount: np.ndarray, slides: bool) -> np.ndarray:
+    steps = np.multiply.outer(amount, axis)
+    return pose(position=steps) if slides else pose(Rotation.from_rotvec(steps).as_matrix())
+
+
+def _motion(element: Element, amount: float | np.ndarray) -> np.ndarray:
+    """Return exp(sign · axis · amount), (4, 4) or (m, 4, 4)."""
+    axis = element.sign * np.eye(3)[AXES.index(element.axis) % 3]
+    return _screw(axis, np.asarray(amount, dtype=float), element.axis[0] == "t")
+
+
+def _check_pair(nominal: Chain, calibrated: Chain) -> None:
+    """Refuse a calibrated chain that is not the nominal one with other values."""
+    one, two = (
+        [(element.axis, element.joint, element.ratio) for element in chain.elements if element.joint is not None]
+        for chain in (nominal, calibrated)
+    )
+    if nominal.joint_names != calibrated.joint_names or one != two:
+        raise RobotError(
+            f"the calibrated chain '{calibrated.name}' (joints {', '.join(calibrated.joint_names)}) does not move as "
+            f"the nominal '{nominal.name}' (joints {', '.join(nominal.joint_names)}); give the one it was fitted from"
+        )
+
+
+def _matching_path(tree: Tree, nominal: Chain) -> list[JointTag]:
+    """Return the URDF's joints from the one link before the first moving joint to the tip, matching the chain's.
+
+    Joints are matched by name, or, where the URDF has none of the names, in the order of its longest chain.
+    """
+    names = nominal.joint_names
+    named = any(name in tree.joints for name in names)
+    tip = nominal.tip if nominal.tip in tree.bodies else None
+    if tip is None:
+        tip = ends(tree, tree.roots[0], None, names)[1] if named else ends(tree)[1]
+    path = tree.ancestry(tip)
+    if named and names[0] in tree.joints:
+        behind = [joint.name for joint in path]
+        path = path[behind.index(names[0]) :] if names[0] in behind else path
+    found = tuple(joint.name for joint in path if joint.actuated)
+    moving = sum(element.joint is not None for element in nominal.elements)
+    if len(found) != nominal.n or (named and found != names) or sum(joint.moves for joint in path) != moving:
+        raise RobotError(
+            f"{tree.where}: its joints to '{tip}' are {', '.join(found)}; the nominal robot '{nominal.name}' has "
+            f"{', '.join(names)}: not the same arm"
+        )
+    while not path[0].moves:
+        path = path[1:]
+    return path
+
+
+def _base_offset(tree: Tree, path: list[JointTag], nominal: Chain, frames: np.ndarray, links: np.ndarray) -> np.ndarray:
+    """Return the pose (4, 4) of the path's first link in the chain's base, checking that the robots are the same.
+
+    The chain's base is the link of that name where there is one; else whichever link fixed to the foot fits best.
+    """
+    foot = path[0].parent
+    top = foot
+    while top in tree.above and tree.above[top].kind == "fixed":
+        top = tree.above[top].parent
+    body = dict(tree.rigid(top))
+    names = [nominal.base] if nominal.base in body else list(body)
+    worst, best = np.full(len(path), np.inf), np.eye(4)
+    for name in names:
+        offset = invert(body[name]) @ body[foot]
+        seen = invert(frames) @ offset @ links
+        spread = np.abs(seen - seen[:, :1]).max(axis=(1, 2, 3))
+        if spread.max() < worst.max():
+            worst, best = spread, offset
+    if worst.max() > SAME_ROBOT:
+        k = int(np.argmax(worst > SAME_ROBOT))
+        joint = [joint for joint in path if joint.moves][k]
+        raise RobotError(
+            f"{tree.where}, line {joint.node.line}: this URDF does not describe the nominal robot '{nominal.name}': at "
+            f"joint '{joint.name}' the link moves against the chain's frame by up to {worst[k]:.3g} (m or rad) over "
+            f"random postures; give the URDF of the same nominal robot, with the same base, joint signs and lengths"
+        )
+    return best
+
+
+def _origins(tree: Tree, path: list[JointTag], wanted: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the new origins (4, 4) by joint name; `wanted` (moving, 4, 4) are the links' frames at q = 0."""
+    frame, origins, k = np.eye(4), {}, 0
+    for joint in path:
+        if not joint.moves:
+            frame = frame @ joint.origin
+            continue
+        _, _, offset = drive(tree, joint)
+        stance = _screw(joint.axis, np.asarray(offset), joint.kind == "prismatic")
+        origins[joint.name] = invert(frame) @ wanted[k] @ invert(stance)
+        frame, k = wanted[k], k + 1
+    return origins
+
+
+def _tip_origin(
+    tree: Tree, path: list[JointTag], nominal: Chain, calibrated: Chain, last: np.ndarray, wanted: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Return the new origin of the first fixed joint behind the last moving one, where the chain changed there.
+
+    Args:
+        last, wanted: (4, 4), the last moving link at q = 0 in the chain's base, before and after.
+    """
+    zero = np.zeros((1, nominal.n))
+    ends = [invert(moving_frames(chain, zero)[-1, 0]) @ forward(chain, zero)[0] for chain in (nominal, calibrated)]
+    if np.abs(ends[0] - ends[1]).max() < UNCHANGED:
+        return {}
+    place = max(k for k, joint in enumerate(path) if joint.moves) + 1
+    if place == len(path):
+        raise RobotError(
+            f"{tree.where}: the calibrated chain differs behind the last joint, where the URDF has no fixed joint to "
+            f"'{nominal.tip}' that could take it; add one, or leave the elements of the tool to the tool"
+        )
+    rest = np.eye(4)
+    for joint in path[place + 1 :]:
+        rest = rest @ joint.origin
+    tip = last @ path[place].origin @ rest
+    offset = invert(forward(nominal, zero)[0]) @ tip
+    return {path[place].name: invert(wanted) @ forward(calibrated, zero)[0] @ offset @ invert(rest)}
+
+
+def _change(source: str, joint: JointTag, origin: np.ndarray) -> list[tuple[int, int, str]]:
+    """Return the changes that write a new origin; what is the same to 1e-12 stays as it is written."""
+    xyz, rpy = to_xyz_rpy(origin)
+    values = {}
+    if np.abs(xyz - joint.origin[:3, 3]).max() > UNCHANGED:
+        values["xyz"] = _numbers(xyz)
+    if np.abs(origin[:3, :3] - joint.origin[:3, :3]).max() > UNCHANGED:
+        values["rpy"] = _numbers(rpy)
+    if not values:
+        return []
+    node = joint.node.first("origin")
+    if node is not None:
+        return set_attributes(source, node, values)
+    return insert_child(source, joint.node, f'<origin xyz="{_numbers(xyz)}" rpy="{_numbers(rpy)}"/>')
+
+
+def _numbers(values: np.ndarray) -> str:
+    """Return numbers in full (repr), what is below 1e-15 as 0."""
+    return " ".join("0" if abs(value) < 1e-15 else repr(value) for value in values.tolist())
+
+
+def _link_name(chain: Chain, k: int, main: bool) -> str:
+    """Return the name of the link behind moving element k: the chain's, where that is not taken by base or tip.
+
+    The tip's name may go to the last link where nothing follows it.
+    """
+    element = chain.elements[k]
+    assert element.joint is not None
+    fallback = f"{chain.joint_names[element.joint]}_link" if main else f"{element.name}_link"
+    name = chain.links[element.joint] if main and chain.links else fallback
+    last = k == len(chain.elements) - 1 and np.array_equal(chain.tail, np.eye(4))
+    return fallback if name == chain.base or (name == chain.tip and not last) else name
+
+
+def _placed(parent: str, child: str, origin: np.ndarray) -> list[str]:
+    xyz, rpy = to_xyz_rpy(origin)
+    return [
+        f"    <parent link={quoteattr(parent)}/>",
+        f"    <child link={quoteattr(child)}/>",
+        f'    <origin xyz="{_numbers(xyz)}" rpy="{_numbers(rpy)}"/>',
+    ]
+
+
+def _joint_lines(chain: Chain, element: Element, main: bool, parent: str, child: str, origin: np.ndarray) -> list[str]:
+    """Return one moving <joint>; a second element of a joint becomes a mimic joint."""
+    assert element.joint is not None
+    joint = chain.joints[element.joint]
+    free = not np.isfinite([joint.lower, joint.upper]).any()
+    kind = "prismatic" if element.axis[0] == "t" else "continuous" if free else "revolute"
+    axis = element.sign * np.eye(3)[AXES.index(element.axis) % 3]
+    ends = "" if kind == "continuous" else f'lower="{_limit(joint.lower)}" upper="{_limit(joint.upper)}" '
+    lines = [f'  <joint name={quoteattr(joint.name if main else element.name)} type="{kind}">']
+    lines += [*_placed(parent, child, origin), f'    <axis xyz="{_numbers(axis)}"/>']
+    lines += [f'    <limit {ends}velocity="{_limit(joint.velocity)}" effort="{_limit(joint.effort)}"/>']
+    if not main:
+        lines += [f'    <mimic joint={quoteattr(joint.name)} multiplier="{element.ratio!r}" offset="0"/>']
+    return [*lines, "  </joint>"]
+
+
+def _limit(value: float) -> str:
+    return repr(float(np.clip(value, -UNLIMITED, UNLIMITED)))
+
+
+def _link_lines(name: str, body: np.ndarray | None) -> list[str]:
+    """Return one <link>, with its inertia about the centre of mass where it is known."""
+    if body is None or not body.any():
+        return [f"  <link name={quoteattr(name)}/>"]
+    mass = body[9]
+    centre = body[6:9] / mass if mass else np.zeros(3)
+    x, y, z = centre
+    steiner = mass * np.array([y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y])
+    moments = " ".join(
+        f'{key}="{value!r}"'
+        for key, value in zip(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), (body[:6] - steiner).tolist(), strict=True)
+    )
+    return [
+        f"  <link name={quoteattr(name)}>",
+        "    <inertial>",
+        f'      <origin xyz="{_numbers(centre)}" rpy="0 0 0"/>',
+        f'      <mass value="{float(mass)!r}"/>',
+        f"      <inertia {moments}/>",
+        "    </inertial>",
+        "  </link>",
+    ]

@@ -1,0 +1,256 @@
+"""A robot with known parameters in closed loop: drives, friction, sampled controller, encoders, noise.
+
+    (M(q) + Ia) a + c(q, v) + g(q) + Fv v + Fc tanh(v / v0) + off = tau + push,    tau held for one control period,
+
+integrated by the classical Runge-Kutta form at the controller's rate, in more steps where the smoothed sign of Coulomb
+friction is stiff (`kernels`): no chatter at rest, and no other model than the one that is identified. At every instant
+that is recorded the equation holds to rounding for the true q, v, a and the torque.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.arrays import frozen, shaped
+from calib.dynamics.bodies import Tree
+from calib.dynamics.drives import Term
+from calib.errors import CalibError, NotConverged
+from calib.simulation.loop.controllers import Controller
+from calib.simulation.loop.references import Reference
+
+_TURNS = ((1, 2, 0), (2, 0, 1), (0, 1, 2))  # which old axes are the new x, y, z, by moving axis
+_CODES = {"sign": 0, "speed": 1, "cubic": 2, "stribeck": 3}  # as in `kernels`
+Packed = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+SIMULATED = ("acceleration", "velocity", "one", *_CODES)
+
+
+@dataclass(frozen=True, eq=False)
+class Plant:
+    """A robot to simulate.
+
+    Attributes:
+        tree: its bodies.
+        terms: its drives; shapes out of `SIMULATED`, signs with a smoothing above zero.
+        parameters: (10 B + k,) standard parameters of the bodies, then one value per term. Any values that give a
+            positive definite inertia will do: base parameters, zeros for the others, too.
+    """
+
+    tree: Tree
+    terms: tuple[Term, ...]
+    parameters: np.ndarray
+
+    def __post_init__(self) -> None:
+        size = 10 * self.tree.bodies + len(self.terms)
+        object.__setattr__(self, "parameters", frozen(shaped(self.parameters, (size,), "parameters of the plant")))
+        for one in self.terms:
+            if one.shape not in SIMULATED:
+                raise CalibError(f"term '{one.name}': the simulator knows {', '.join(SIMULATED)}, not '{one.shape}'")
+            if one.shape in ("sign", "stribeck") and not one.settings[-1] > 0.0:
+                raise CalibError(
+                    f"term '{one.name}': an exact sign cannot be integrated; give a smoothing v0 of some 0.01 rad/s"
+                )
+
+
+@dataclass(frozen=True, eq=False)
+class Sensing:
+    """What the controller and the log see.
+
+    Attributes:
+        sigma_q: (n,) white noise of every measured position [rad or m].
+        quantum: (n,) resolution of the encoders [rad or m]; 0 for none.
+        sigma_tau: (n,) white noise of the recorded torque [N m or N]; it does not act.
+        push: (n,) torque that acts and is not recorded: ripple, cables, all that no model holds [N m or N].
+        push_band: cut-off of the first-order low-pass that colours it, σ kept [Hz]; None: white.
+        every: control periods per recorded sample.
+    """
+
+    sigma_q: np.ndarray | float = 0.0
+    quantum: np.ndarray | float = 0.0
+    sigma_tau: np.ndarray | float = 0.0
+    push: np.ndarray | float = 0.0
+    push_band: float | None = None
+    every: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A simulated motion; M samples.
+
+    Attributes:
+        t: (M,) [s].
+        q, v, a: (M, n) the truth.
+        measured: (M, n) positions as the encoder gave them.
+        tau: (M, n) torques as recorded, with `Sensing.sigma_tau`.
+        torque: (M, n) torques that acted.
+    """
+
+    t: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    measured: np.ndarray
+    tau: np.ndarray
+    torque: np.ndarray
+
+
+def simulate(
+    plant: Plant,
+    controller: Controller,
+    reference: Reference,
+    sensing: Sensing | None = None,
+    seed: int | np.random.Generator = 0,
+    start: tuple[np.ndarray, np.ndarray] | None = None,
+    push: np.ndarray | None = None,
+) -> Run:
+    """Let the robot follow a reference.
+
+    Args:
+        reference: sampled at the controller's rate, which is taken from it.
+        seed: of all noise; the same seed gives the same run to the last bit.
+        start: q, v (n,) at the first instant; None: on the reference.
+        push: (N, n) torque that acts besides, at the reference's instants [N m or N]; None for none.
+
+    Raises:
+        CalibError: where the inertia is not positive definite, or friction too stiff for the rate.
+        NotConverged: where the loop is unstable.
+    """
+    from calib.simulation.loop import loop_kernels
+
+    sensing = Sensing() if sensing is None else sensing
+    n, count = plant.tree.n, len(reference.t)
+    rng = np.random.default_rng(seed)
+    noise = {name: np.broadcast_to(getattr(sensing, name), (n,)) for name in ("sigma_q", "push", "sigma_tau")}
+    drawn = {name: _draw(rng, size, count) for name, size in noise.items()}
+    if sensing.push_band is not None:
+        drawn["push"] = _coloured(drawn["push"], 2.0 * np.pi * sensing.push_band * reference.period)
+    if push is not None:
+        own = shaped(push, reference.q.shape, "push")
+        drawn["push"] = np.ascontiguousarray(own + drawn["push"] if len(drawn["push"]) else own)
+    q, v = (np.array(x, dtype=float) for x in (start if start is not None else (reference.q[0], reference.v[0])))
+    out = np.empty((5, -(-count // sensing.every), n))
+    model = np.empty((0, 0)) if controller.model is None else _body(plant.tree, controller.model)
+    status, reached = loop_kernels.closed_loop(
+        *_packed(plant), model, controller.rows, controller.sampled(reference), drawn["sigma_q"],
+        np.ascontiguousarray(np.broadcast_to(sensing.quantum, (n,)), dtype=float), drawn["push"], reference.period,
+        controller.smoothing(reference.period), controller.delay, sensing.every, q, v, out,
+    )  # fmt: skip
+    if status != loop_kernels.FINE:
+        raise _failure(status, reached * reference.period)
+    heard = drawn["sigma_tau"][:: sensing.every] if len(drawn["sigma_tau"]) else 0.0
+    t = reference.t[:: sensing.every]
+    motion = [frozen(x) for x in out]
+    return Run(t, motion[0], motion[1], motion[2], motion[3], frozen(out[4] + heard), motion[4])
+
+
+def forward_dynamics(plant: Plant, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> np.ndarray:
+    """Return the accelerations (N, n) under torques (N, n) of the drives, friction and motor inertia included."""
+    from calib.simulation.loop import loop_kernels
+
+    q, v, tau = (np.ascontiguousarray(shaped(x, (len(q), plant.tree.n), "states")) for x in (q, v, tau))
+    out = np.empty_like(q)
+    failed = loop_kernels.forward_dynamics(*_packed(plant), q, v, tau, out)
+    if failed >= 0:
+        raise CalibError(f"sample {failed}: the inertia matrix is not positive definite")
+    return out
+
+
+def with_parameters(plant: Plant, parameters: np.ndarray) -> Plant:
+    """Return the plant with other parameters."""
+    return replace(plant, parameters=parameters)
+
+
+def inertia_diagonal(plant: Plant, q: np.ndarray) -> np.ndarray:
+    """Return the mean diagonal (n,) of the inertia, motors' included, over configurations (N, n)."""
+    from calib.dynamics import rigid_body
+    from calib.dynamics.drives import added_inertia
+
+    bodies = 10 * plant.tree.bodies
+    inertia = rigid_body.mass_matrix(plant.tree, plant.parameters[:bodies], np.asarray(q, dtype=float))
+    added = added_inertia(plant.terms, plant.parameters[bodies:], plant.tree.n)
+    return np.einsum("kii->i", inertia) / len(inertia) + np.diag(added)
+
+
+def _draw(rng: np.random.Generator, sigma: np.ndarray, count: int) -> np.ndarray:
+    """Return white noise (count, n), or no rows where there is none."""
+    if not np.any(sigma):
+        return np.empty((0, len(sigma)))
+    return rng.standard_normal((count, len(sigma))) * sigma
+
+
+def _coloured(white: np.ndarray, step: float) -> np.ndarray:
+    """Return x_k = p x_{k-1} + √(1 - p²) w_k, p = exp(-step), as wide as the white noise w (N, n)."""
+    from scipy.signal import lfilter
+
+    pole = float(np.exp(-step))
+    return np.ascontiguousarray(lfilter([np.sqrt(1.0 - pole**2)], [1.0, -pole], white, axis=0))
+
+
+def _packed(plant: Plant) -> Packed:
+    """Return tree, body, linear, kinds and acts as the kernels lay them out."""
+    bodies, n = plant.tree.bodies, plant.tree.n
+    parents = np.where(plant.tree.parents < 0, bodies, plant.tree.parents)
+    links = np.column_stack([parents, plant.tree.kinds, plant.tree.coordinates]).astype(np.int64)
+    linear, acts = _drives(plant.terms, plant.parameters[10 * bodies :], n)
+    kinds = np.array([[row, code] for row, code, *_ in acts], dtype=np.int64).reshape(-1, 2)
+    values = np.array([[amount, *settings, *weights] for _, _, amount, settings, weights in acts])
+    body = _body(plant.tree, plant.parameters[: 10 * bodies])
+    return np.ascontiguousarray(links), body, linear, kinds, values.reshape(-1, 4 + n)
+
+
+def _body(tree: Tree, parameters: np.ndarray) -> np.ndarray:
+    """Return placements and parameters between frames turned so that each joint moves about or along z."""
+    result = np.zeros((tree.bodies + 1, 23))
+    result[-1, :3] = -tree.gravity
+    turns = [np.eye(3)[:, _TURNS[axis]] for axis in tree.axes]
+    for i, parent in enumerate(tree.parents):
+        before = np.eye(3) if parent < 0 else turns[parent].T
+        result[i, :9] = (before @ tree.placements[i, :3, :3] @ turns[i]).ravel()
+        result[i, 9:12] = before @ tree.placements[i, :3, 3]
+        result[i, 12:22] = parameters[10 * i : 10 * i + 10][tree.order[i]]
+    result[:-1, 22] = tree.scales
+    return result
+
+
+def _drives(terms: Sequence[Term], values: np.ndarray, n: int) -> tuple[np.ndarray, list]:
+    """Return linear (n, 2 n + 1) and the acts: row, code, amount, three settings, weights (n,)."""
+    linear, acts = np.zeros((n, 2 * n + 1)), []
+    for one, value in zip(terms, values, strict=True):
+        for row, motion in one.acts:
+            if one.shape == "one":
+                linear[row, 2 * n] += value
+                continue
+            weights = np.zeros(n)
+            for joint, weight in motion:
+                weights[joint] += weight
+            if one.shape in _CODES:
+                settings = [0.0] * (3 - len(one.settings)) + list(one.settings)
+                acts.append((row, _CODES[one.shape], value, settings, weights))
+            else:
+                first = 0 if one.shape == "acceleration" else n
+                linear[row, first : first + n] += value * weights
+    return linear, acts
+
+
+def _failure(status: int, time: float) -> CalibError:
+    """Return what went wrong at `time` [s]."""
+    from calib.simulation.loop import loop_kernels
+
+    if status == loop_kernels.SINGULAR:
+        return CalibError(
+            f"at {time:.4g} s the inertia matrix is not positive definite: these parameters belong to no possible "
+            "robot there; use a physically consistent estimate, or start from regular inertia"
+        )
+    if status == loop_kernels.STIFF:
+        return CalibError(
+            f"at {time:.4g} s friction at rest is too stiff for the control period, by more than "
+            f"{loop_kernels.MOST} steps: "
+            "smooth the sign over a larger velocity, or give the joint its motor inertia"
+        )
+    return NotConverged(
+        f"the loop diverged at {time:.4g} s: these gains do not hold this robot at this rate; lower kp and kd "
+        "(are they in the unit of the torque?), or the delay",
+        None,
+    )

@@ -1,0 +1,123 @@
+"""Sampled joint controllers: PD and PID with feed-forward, cascade P-PI, computed torque.
+
+    tau = clip(kp e + kd (share v_r - v_m) + ki ∫ e + ahead),    e = q_r - q_m,
+
+v_m the backward difference of measured positions at the control rate (BIRDy's choice), through a first-order low-pass
+where one is given. A cascade P-PI is the same law with other names. Computed torque puts a model around it:
+tau = M(q_m) (a_r + kp e + …) + c(q_m, v_m) + g(q_m) + ahead, so its gains are 1/s² and 1/s.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.arrays import frozen, shaped
+from calib.errors import CalibError
+from calib.simulation.loop.references import Reference
+
+
+@dataclass(frozen=True, eq=False)
+class Controller:
+    """One controller for n joints.
+
+    Attributes:
+        kp, kd, ki: (n,) [N m/rad, N m s/rad, N m/(rad s)], or the like for a prismatic joint; for computed torque
+            [1/s², 1/s, 1/s³].
+        share: (n,) of the reference's velocity that the velocity loop sees: 1 in a PD, less in some cascades.
+        limit: (n,) largest torque.
+        windup: (n,) largest integral of the error [rad s].
+        ahead: (N, n) torque added open loop, at the reference's instants; None for none.
+        model: (10 B,) standard parameters of the controller's own model (computed torque); None for none.
+        delay: control periods from measurement to torque.
+        cutoff: of the low-pass on the measured velocity [Hz]; None for none.
+    """
+
+    kp: np.ndarray
+    kd: np.ndarray
+    ki: np.ndarray
+    share: np.ndarray
+    limit: np.ndarray
+    windup: np.ndarray
+    ahead: np.ndarray | None = None
+    model: np.ndarray | None = None
+    delay: int = 0
+    cutoff: float | None = None
+
+    def __post_init__(self) -> None:
+        n = len(np.atleast_1d(self.kp))
+        for name in ("kp", "kd", "ki", "share", "limit", "windup"):
+            value = np.broadcast_to(np.asarray(getattr(self, name), dtype=float), (n,))
+            object.__setattr__(self, name, frozen(np.array(value)))
+        if self.delay < 0:
+            raise CalibError(f"a delay of {self.delay} control periods is none")
+
+    @property
+    def rows(self) -> np.ndarray:
+        """(6, n), as the kernel reads them."""
+        return np.array([self.kp, self.kd, self.ki, self.share, self.limit, self.windup])
+
+    def smoothing(self, period: float) -> float:
+        """Return the weight of a new velocity in the low-pass."""
+        return 1.0 if self.cutoff is None else float(1.0 - np.exp(-2.0 * np.pi * self.cutoff * period))
+
+    def sampled(self, reference: Reference) -> np.ndarray:
+        """Return position, velocity, torque ahead and acceleration ahead, (4, N, n)."""
+        ahead = np.zeros_like(reference.q) if self.ahead is None else self.ahead
+        return np.array([reference.q, reference.v, shaped(ahead, reference.q.shape, "torque ahead"), reference.a])
+
+
+def pd(kp: np.ndarray, kd: np.ndarray, limit: np.ndarray | float = np.inf, ki: np.ndarray | float = 0.0) -> Controller:
+    """Return a PD (or PID) controller."""
+    return Controller(kp, kd, np.asarray(ki), np.asarray(1.0), np.asarray(limit), np.asarray(np.inf))
+
+
+def cascade(
+    position: np.ndarray, velocity: np.ndarray, reset: np.ndarray | float = np.inf, limit: np.ndarray | float = np.inf,
+    share: float = 1.0,
+) -> Controller:  # fmt: skip
+    """Return a cascade P-PI: v_c = share v_r + P e, tau = K [(v_c - v) + ∫ (v_c - v) / Ti], as the one law it is.
+
+    (v_c - v) integrates to share q_r - q + P ∫ e (start aside): with share = 1 that is kp = K (P + 1/Ti), kd = K,
+    ki = K P / Ti. Another share with an integral part is not of this form.
+
+    Args:
+        position: P (n,) [1/s].
+        velocity: K (n,) [N m s/rad].
+        reset: Ti (n,) [s]; infinite for a plain P-P cascade.
+    """
+    if share != 1.0 and np.isfinite(reset).any():
+        raise CalibError("a cascade with an integral takes the whole velocity of the reference: share = 1")
+    position, velocity = np.asarray(position, dtype=float), np.asarray(velocity, dtype=float)
+    ki = velocity * position / np.asarray(reset, dtype=float)
+    kp = velocity * (position + 1.0 / np.asarray(reset, dtype=float))
+    return Controller(kp, velocity, ki, np.asarray(share), np.asarray(limit), np.asarray(np.inf))
+
+
+def computed_torque(
+    model: np.ndarray, frequency: float, damping: float, n: int, limit: np.ndarray | float = np.inf
+) -> Controller:
+    """Return a computed-torque controller whose errors obey ë + 2 ζ ω ė + ω² e = 0 where its model holds.
+
+    Args:
+        model: (10 B,) standard parameters; the drives' inertias and friction are those of the plant.
+        frequency: ω [rad/s].
+    """
+    kp, kd = np.full(n, frequency**2), np.full(n, 2 * damping * frequency)
+    return Controller(kp, kd, np.zeros(n), np.ones(n), np.asarray(limit), np.asarray(np.inf), model=frozen(model))
+
+
+def with_feedforward(controller: Controller, ahead: np.ndarray) -> Controller:
+    """Return the controller with a torque (N, n) added open loop."""
+    return replace(controller, ahead=frozen(ahead))
+
+
+def scaled(controller: Controller, factor: np.ndarray | float) -> Controller:
+    """Return the controller with all gains times `factor`, (n,) or one: the same bandwidth on another inertia."""
+    return replace(controller, kp=controller.kp * factor, kd=controller.kd * factor, ki=controller.ki * factor)
+
+
+def slower(controller: Controller, factor: float) -> Controller:
+    """Return the controller with its bandwidth divided by `factor`: kp by factor², kd by factor, ki by factor³."""
+    return replace(controller, kp=controller.kp / factor**2, kd=controller.kd / factor, ki=controller.ki / factor**3)

@@ -1,0 +1,165 @@
+"""The last word on feasibility: a motion evaluated anew, densely, with an allowance for what lies between the instants.
+
+Positions and derivatives come from the family's own formula, not from the optimiser's tables. Between two instants dt
+apart a function rises above both by at most max|f''| dt² / 8. For limits on d^r q / dt^r that maximum is bounded by the
+coefficients (*proved*); for torques, places and distances it is estimated as twice the second difference on the spot
+(*estimated*: our choice; a jump between two instants, as of Coulomb friction, needs no allowance beyond it).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from trajectories.basis import Family, Motion
+from trajectories.constraints import BoxLimit, Constraint
+from trajectories.design.problem import Problem
+from trajectories.design.search import Found, one_start
+from trajectories.errors import NothingFeasible
+
+BLOCK = 2000
+
+
+@dataclass(frozen=True)
+class Margin:
+    """What is left of one limit.
+
+    Attributes:
+        name, label, unit: of the constraint and of its column.
+        margin: least distance to the limit over all times [unit], the allowance taken off; negative: broken.
+        share: the same over the constraint's scale.
+        time: where [s].
+        allowance: for what lies between the instants [unit].
+        proved: whether the allowance is a bound or an estimate.
+    """
+
+    name: str
+    label: str
+    unit: str
+    margin: float
+    share: float
+    time: float
+    allowance: float
+    proved: bool
+
+
+@dataclass(frozen=True)
+class Verification:
+    """Margins of all columns of all constraints.
+
+    Attributes:
+        instants: how many were looked at over the period.
+        rest: largest velocity and acceleration at the start [per s, per s²].
+    """
+
+    margins: tuple[Margin, ...]
+    instants: int
+    rest: tuple[float, float]
+
+    @property
+    def feasible(self) -> bool:
+        return all(one.margin >= 0 for one in self.margins)
+
+    @property
+    def worst(self) -> dict[str, Margin]:
+        """The smallest margin of each constraint, by its name."""
+        result: dict[str, Margin] = {}
+        for one in self.margins:
+            if one.name not in result or one.share < result[one.name].share:
+                result[one.name] = one
+        return result
+
+
+def dense_motion(family: Family, x: np.ndarray, times: np.ndarray, factor: float = 1.0) -> Motion:
+    """Return the motion at times [s] of the stretched motion, from the family's own formula."""
+    orders = [family.evaluate(x, times / factor, order) / factor**order for order in range(4)]
+    return Motion(times, *orders)
+
+
+def verify(
+    family: Family, x: np.ndarray, constraints: Sequence[Constraint], *, factor: float = 1.0, instants: int = 5000
+) -> Verification:
+    """Check a motion against constraints at `instants` over one period, and between them.
+
+    Args:
+        factor: on the family's period.
+    """
+    period = family.period * factor
+    step = period / instants
+    times = step * np.arange(instants + 1)
+    motion = dense_motion(family, x, times, factor)
+    found = [one for constraint in constraints for one in _margins(family, x, constraint, motion, step, factor)]
+    return Verification(tuple(found), instants, (float(np.abs(motion.v[0]).max()), float(np.abs(motion.a[0]).max())))
+
+
+def ensured(
+    problem: Problem,
+    found: Found,
+    constraints: Sequence[Constraint] | None = None,
+    instants: int = 5000,
+    rounds: int = 3,
+) -> tuple[Found, Verification]:
+    """Return a motion that passes `verify`: where `found` does not, it is searched again from there, further inside.
+
+    Args:
+        constraints: to verify against; default the problem's.
+
+    Raises:
+        NothingFeasible: where that does not help.
+    """
+    checked = problem.constraints if constraints is None else constraints
+    spent, report = found.evaluations, verify(problem.family, found.x, checked, factor=found.factor, instants=instants)
+    tighter = problem
+    for _ in range(rounds):
+        if report.feasible:
+            return replace(found, evaluations=spent), report
+        lacking = max(-one.share for one in report.margins)
+        # four times closer between the samples, and a little further inside (our choice)
+        tightening = tighter.tightening + min(1.2 * lacking, 0.01) + 1e-4
+        tighter = replace(tighter, samples=2 * tighter.samples, tightening=tightening)
+        y = np.append(found.x, found.factor) if problem.free_period else found.x
+        again = one_start(tighter, 240, "slsqp", found.seed, y)
+        spent += again.evaluations
+        if isinstance(again, Found):
+            found = replace(
+                again, history=found.history, seconds=found.seconds + again.seconds,
+                interrupted=found.interrupted or again.interrupted,
+            )  # fmt: skip
+            report = verify(problem.family, found.x, checked, factor=found.factor, instants=instants)
+    if not report.feasible:
+        worst = min(report.margins, key=lambda one: one.share)
+        raise NothingFeasible(
+            f"feasible at the samples, but between them the {worst.name} limit ({worst.label}) is broken by "
+            f"{-worst.margin:.3g} {worst.unit} at t = {worst.time:.3g} s; take more samples or a wider limit",
+            worst.name, -worst.margin, worst.unit,
+        )  # fmt: skip
+    return replace(found, evaluations=spent), report
+
+
+def _margins(
+    family: Family, x: np.ndarray, constraint: Constraint, motion: Motion, step: float, factor: float
+) -> list[Margin]:
+    starts = range(0, len(motion), BLOCK)
+    values = np.concatenate([constraint.values(motion.part(np.arange(len(motion))[s : s + BLOCK])) for s in starts])
+    proved = isinstance(constraint, BoxLimit)
+    if isinstance(constraint, BoxLimit):
+        curve = family.largest(x, constraint.order + 2) / factor ** (constraint.order + 2)
+        allowance = np.broadcast_to(np.tile(curve[constraint.joints], 2) * step**2 / 8, values.shape)
+    else:
+        bend = np.abs(np.diff(values, 2, axis=0))
+        bend = np.concatenate([bend[-1:], bend, bend[:1]])  # periodic
+        allowance = np.maximum(bend, np.maximum(np.roll(bend, 1, 0), np.roll(bend, -1, 0))) / 4
+    reached = values + allowance
+    rows = np.argmax(reached, axis=0)
+    result = []
+    for k, (row, label) in enumerate(zip(rows, constraint.labels)):
+        margin = -float(reached[row, k])
+        result.append(
+            Margin(
+                constraint.name, label, constraint.unit, margin, margin / float(constraint.scale[k]),
+                float(motion.times[row]), float(allowance[row, k]), proved,
+            )
+        )  # fmt: skip
+    return result

@@ -1,0 +1,44 @@
+"""The dynamics that give a timed path its torques, and the largest velocities, accelerations and torques."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from trajectories.errors import BadInput
+
+
+class Law(Protocol):
+    """The dynamics of a robot, as `calib.dynamics.path_dynamics.PathDynamics` has it; arrays (N, n)."""
+
+    def along(
+        self, q: np.ndarray, slope: np.ndarray, curvature: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]: ...
+    def friction(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray: ...
+    def torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """Largest moduli (n,), each above zero, infinite where there is no limit.
+
+    Attributes:
+        velocity, acceleration: [rad/s or m/s, and per s].
+        torque: [N m or N].
+    """
+
+    velocity: np.ndarray
+    acceleration: np.ndarray
+    torque: np.ndarray
+
+    def __post_init__(self) -> None:
+        for name in ("velocity", "acceleration", "torque"):
+            values = np.asarray(getattr(self, name), dtype=float)
+            if values.shape != np.shape(self.velocity) or values.ndim != 1:
+                raise BadInput(f"{name} limits: expected one per joint, found shape {values.shape}")
+            if not (values > 0).all():
+                j = int(np.argmin(np.where(np.isnan(values), -np.inf, values)))
+                raise BadInput(f"{name} limit of joint {j + 1} is {values[j]:g}: it has to be above zero")
+            object.__setattr__(self, name, values)

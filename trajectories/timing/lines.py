@@ -1,0 +1,119 @@
+"""Straight tool lines as joint paths, by inverse kinematics along the line. Knows no robot: callables in, a path out.
+
+The tool's position is linear in σ = 0 … 1, its orientation turns about one axis (R = R_0 exp(σ log(R_0ᵀ R_1))). At each
+sample damped least squares (Wampler 1986; Nakamura & Hanafusa 1986) meets the pose, and J's null space pulls to the
+posture at the start:
+
+    Δq = J⁺ e + (1 - J⁺ J)(q_start - q),    J⁺ = Jᵀ (J Jᵀ + λ² 1)⁻¹,    e = [Δp; Δφ]
+
+iterated until both are at rest, so that q is a smooth function of σ. A quintic spline joins the samples; they are made
+denser until the tool keeps to the line between them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from trajectories.errors import BadInput, NothingFeasible
+from trajectories.timing.path import SAME, Path, through
+
+SAMPLES, MOST, STEPS = 41, 641, 400
+REACHED, KEPT = 1e-9, 1e-6  # [m and rad] of the pose at the samples, and between them
+LARGEST = 0.2  # [rad or m] of a step of any joint
+
+Forward = Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """A tool line as a joint path.
+
+    Attributes:
+        path: the joints' path.
+        deviation: (2,) largest distance from the line [m] and from its orientation [rad], between the samples.
+    """
+
+    path: Path
+    deviation: np.ndarray
+
+
+def line(forward: Forward, jacobian: Forward, start: np.ndarray, goal: np.ndarray) -> Line:
+    """Return the joint path on which the tool runs straight from its pose at `start` to the pose `goal`.
+
+    Args:
+        forward: q (m, n) to tool poses (m, 4, 4).
+        jacobian: q (m, n) to (m, 6, n), [v; ω] of the tool in the base frame.
+        start: (n,) joint values [rad or m].
+        goal: (4, 4).
+
+    Raises:
+        NothingFeasible: where the line leaves what the arm can reach: how far along it, by how much.
+    """
+    start = np.asarray(start, dtype=float)
+    first = forward(start[None])[0]
+    if np.linalg.norm(_error(first[None], np.asarray(goal)[None])) <= SAME:
+        raise BadInput("the tool line has no length: both ends have the same tool pose; take one of them away")
+    count = SAMPLES
+    while True:
+        share = np.linspace(0, 1, count)
+        q = _follow(forward, jacobian, start, _targets(first, goal, share))
+        length = np.linalg.norm(np.diff(q, axis=0), axis=1).sum()
+        path = through(q, share * length)
+        between = (share[1:] + share[:-1]) / 2
+        error = np.abs(_error(forward(path(between * length)), _targets(first, goal, between)))
+        deviation = np.array([np.linalg.norm(error[:, :3], axis=1).max(), np.linalg.norm(error[:, 3:], axis=1).max()])
+        if deviation.max() <= KEPT or 2 * count > MOST:
+            return Line(path, deviation)
+        count = 2 * count - 1
+
+
+def _follow(forward: Forward, jacobian: Forward, start: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """Return joint values (m, n) at the targets (m, 4, 4), one after the other."""
+    q, found = start.copy(), [start]
+    for k, target in enumerate(targets[1:], 1):
+        q, error = _reach(forward, jacobian, q, start, target)
+        if not np.abs(error).max() <= REACHED:
+            short, turn = float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))
+            raise NothingFeasible(
+                f"no tool line: at {k / (len(targets) - 1):.0%} of it the arm stays {1e3 * short:.3g} mm and "
+                f"{np.degrees(turn):.3g} deg short (out of reach, or the elbow has to flip); take waypoints nearer "
+                "to each other, another posture at the start, or joint motion",
+                "reach", short, "m",
+            )  # fmt: skip
+        found.append(q)
+    return np.array(found)
+
+
+def _reach(forward: Forward, jacobian: Forward, q: np.ndarray, rest: np.ndarray, target: np.ndarray):
+    """Return joint values (n,) at a target pose and what is left of the error (6,)."""
+    error = np.full(6, np.inf)
+    for _ in range(STEPS):
+        error = _error(forward(q[None]), target[None])[0]
+        J = jacobian(q[None])[0]
+        damping = min(1e-2 * float(error @ error), 1e-2) + 1e-14
+        inverse = J.T @ np.linalg.inv(J @ J.T + damping * np.eye(6))
+        pull = rest - q
+        step = inverse @ error + pull - inverse @ (J @ pull)
+        size = np.abs(step).max()
+        q = q + step * min(1.0, LARGEST / max(size, 1e-300))
+        if size <= 1e-11:
+            break
+    return q, _error(forward(q[None]), target[None])[0]
+
+
+def _targets(first: np.ndarray, goal: np.ndarray, share: np.ndarray) -> np.ndarray:
+    turn = Rotation.from_matrix(first[:3, :3].T @ goal[:3, :3]).as_rotvec()
+    poses = np.tile(np.eye(4), (len(share), 1, 1))
+    poses[:, :3, 3] = first[:3, 3] + share[:, None] * (goal[:3, 3] - first[:3, 3])
+    poses[:, :3, :3] = first[:3, :3] @ Rotation.from_rotvec(share[:, None] * turn).as_matrix()
+    return poses
+
+
+def _error(poses: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """Return [Δp; Δφ] (m, 6) in the base frame, from poses to targets."""
+    turn = Rotation.from_matrix(targets[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
+    return np.concatenate([targets[:, :3, 3] - poses[:, :3, 3], turn], axis=1)

@@ -1,0 +1,111 @@
+"""Speed along a path: profiles s(t) with s̈ constant between grid points, so that x = ṡ² is linear in s there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from trajectories.timing.path import Path
+from trajectories.track import Track
+
+SMALLEST = 1e-9  # share of a speed that stands for "just after rest", where friction has its direction already
+TorqueLaw = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """A speed profile.
+
+    Attributes:
+        s: (K + 1,) grid on the path, rising from 0.
+        x: (K + 1,) ṡ² [1/s² in units of s]; zero at rest.
+    """
+
+    s: np.ndarray
+    x: np.ndarray
+
+    @property
+    def u(self) -> np.ndarray:
+        """(K,) s̈ between grid points: Δx / (2 Δs)."""
+        return np.diff(self.x) / (2 * np.diff(self.s))
+
+    @property
+    def times(self) -> np.ndarray:
+        """(K + 1,) when the grid points are passed [s]: Δt = 2 Δs / (ṡ_k + ṡ_{k+1})."""
+        speed = np.sqrt(self.x)
+        return np.append(0.0, np.cumsum(2 * np.diff(self.s) / (speed[:-1] + speed[1:])))
+
+    @property
+    def duration(self) -> float:
+        return float(self.times[-1])
+
+    def slower(self, factor: float) -> Profile:
+        """Return the profile `factor` times slower."""
+        return Profile(self.s, self.x / factor**2)
+
+    def at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return s, ṡ, s̈, each (N,), at times [s]."""
+        starts = self.times
+        k = np.clip(np.searchsorted(starts, times, side="right") - 1, 0, len(self.s) - 2)
+        since, speed, u = times - starts[k], np.sqrt(self.x[k]), self.u[k]
+        s = np.minimum(self.s[k] + since * (speed + since * u / 2), self.s[k + 1])
+        return s, np.maximum(speed + since * u, 0.0), u
+
+
+@dataclass(frozen=True, eq=False)
+class Sampled:
+    """A motion along a path at places dense on it.
+
+    Attributes:
+        s: (N,) the places.
+        weights: (N,) seconds that each stands for; they sum to the duration.
+        q, v, a, tau: (N, n); tau None without a law of torques.
+    """
+
+    s: np.ndarray
+    weights: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    tau: np.ndarray | None
+
+
+def dense(path: Path, profile: Profile, torque: TorqueLaw | None, per_interval: int = 8) -> Sampled:
+    """Sample every interval of a profile with both of its ends: s̈, and friction's direction, jump to the next one.
+
+    At rest friction takes the direction of the motion that begins or ends there: the larger torque.
+    """
+    share = np.linspace(1e-6, 1 - 1e-6, per_interval)
+    s = profile.s[:-1, None] + share * np.diff(profile.s)[:, None]
+    x = profile.x[:-1, None] + share * np.diff(profile.x)[:, None]
+    speed = np.sqrt(np.maximum(x, SMALLEST**2 * profile.x.max()))
+    trapezoid = np.ones(per_interval)
+    trapezoid[[0, -1]] = 0.5
+    weights = np.diff(profile.times)[:, None] * trapezoid / (per_interval - 1)
+    u = np.repeat(profile.u, per_interval)
+    q, v, a = moved(path, s.ravel(), speed.ravel(), u)
+    return Sampled(s.ravel(), weights.ravel(), q, v, a, None if torque is None else torque(q, v, a))
+
+
+def moved(path: Path, s: np.ndarray, speed: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return q = Φ, v = Φ' ṡ, a = Φ' s̈ + Φ'' ṡ², each (N, n)."""
+    slope = path(s, 1)
+    return path(s), slope * speed[:, None], slope * u[:, None] + path(s, 2) * (speed**2)[:, None]
+
+
+def track(path: Path, profile: Profile, rate: float, torque: TorqueLaw | None = None) -> Track:
+    """Return the motion at a controller's rate [Hz]; its duration has to be a whole number of samples.
+
+    Torques at rest are those just after the start and just before the end.
+    """
+    count = round(profile.duration * rate)
+    times = np.arange(count + 1) / rate
+    s, speed, u = profile.at(np.minimum(times, profile.duration))
+    speed[[0, -1]] = np.sqrt(profile.x[[0, -1]])
+    q, v, a = moved(path, s, speed, u)
+    if torque is None:
+        return Track(rate, q, v, a)
+    barely = np.maximum(speed, SMALLEST * speed.max())
+    return Track(rate, q, v, a, torque(q, path(s, 1) * barely[:, None], a))

@@ -1,0 +1,225 @@
+"""The convex step of timing: rows a u + b x + c within limits on every interval, and the fastest profile within.
+
+Controllable speeds come from toppra (Pham & Pham 2018), imported at the first call; the pass forward is our own, since
+on two variables with x given it is the smallest of a few quotients, and toppra's gives away 1e-4 of x at every step.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from trajectories.errors import BadInput, NothingFeasible
+from trajectories.timing.limits import Law, Limits
+from trajectories.timing.path import Path
+from trajectories.timing.profile import Profile
+
+INSIDE = 1e-6  # of an interval: rows of an end are taken just inside it
+CREEP = 1e-3  # [rad/s or m/s] of the fastest joint: a speed at which friction is Coulomb's alone
+AGREED = 0.1  # relative, of x in two rounds, from where on the tangent is taken
+STEP = 1e-3  # relative, of the difference that gives a tangent
+UNBOUNDED = 100.0  # [rad/s or m/s] of the fastest joint: a bound where no joint has a velocity limit
+
+
+@dataclass(frozen=True, eq=False)
+class Bounded:
+    """Rows |a u + b x + c| ≤ 1 for each of K intervals, both ends, and 0 ≤ x ≤ top.
+
+    Attributes:
+        a, b, c: (2, K, m) at the left and the right end; x at the right end is x + 2 Δ u.
+        top: (K + 1,).
+    """
+
+    a: np.ndarray
+    b: np.ndarray
+    c: np.ndarray
+    top: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """What does not change from round to round.
+
+    Attributes:
+        s: (K + 1,) the grid.
+        q, slope, curvature: (2, K, n) at both ends of the intervals.
+        A, B, G: (2, K, n) the dynamics there; zero without.
+        limits: see `trajectories.timing.time_scaling.Limits`.
+    """
+
+    s: np.ndarray
+    q: np.ndarray
+    slope: np.ndarray
+    curvature: np.ndarray
+    A: np.ndarray
+    B: np.ndarray
+    G: np.ndarray
+    limits: Limits
+
+    @classmethod
+    def of(cls, path: Path, s: np.ndarray, limits: Limits, law: Law | None) -> Rows:
+        steps = np.diff(s)
+        ends = np.concatenate([s[:-1] + INSIDE * steps, s[1:] - INSIDE * steps])
+        shape = (2, len(steps), path.n)
+        geometry = [path(ends, order) for order in range(3)]
+        dynamics = [np.zeros_like(geometry[0])] * 3 if law is None else list(law.along(*geometry))
+        q, slope, curvature, A, B, G = (x.reshape(shape) for x in (*geometry, *dynamics))
+        return cls(s, q, slope, curvature, A, B, G, limits)
+
+    def speed(self, fastest_joint: float) -> float:
+        """Return the x at which no joint moves faster than this anywhere [rad/s or m/s]."""
+        return (fastest_joint / np.abs(self.slope).max()) ** 2
+
+    def top(self, tight: np.ndarray) -> np.ndarray:
+        """Return the largest x (K + 1,) that the velocity limits allow: min_j (v_max / Φ')²."""
+        with np.errstate(divide="ignore"):
+            ends = ((self.limits.velocity * tight / np.abs(self.slope)) ** 2).min(axis=2)
+        return np.minimum(np.minimum(np.append(ends[0], np.inf), np.append(np.inf, ends[1])), self.speed(UNBOUNDED))
+
+    def bounded(self, friction: tuple[np.ndarray, np.ndarray], tight: Mapping[str, np.ndarray]) -> Bounded:
+        """Return the rows as shares of the limits.
+
+        Args:
+            friction: slope and value (2, K, n) of friction as a line in x.
+            tight: (K, n) by kind of limit, the share of it that may be used on each interval.
+        """
+        pushing, turning = np.isfinite(self.limits.torque), np.isfinite(self.limits.acceleration)
+        torque = (self.limits.torque * tight["torque"])[:, pushing]
+        bend = (self.limits.acceleration * tight["acceleration"])[:, turning]
+        parts = (
+            (self.A, self.slope),
+            (self.B + friction[0], self.curvature),
+            (self.G + friction[1], np.zeros_like(self.q)),
+        )
+        a, b, c = (np.concatenate([one[..., pushing] / torque, two[..., turning] / bend], axis=2) for one, two in parts)
+        return Bounded(a, b, c, self.top(tight["velocity"]))
+
+    def friction(
+        self, law: Law | None, x: np.ndarray | None, before: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return slope and value at x = 0 of friction as a line in x, each (2, K, n).
+
+        Args:
+            x: (K + 1,) the profile of the last round; None: friction at a creeping speed.
+            before: the profile of the round before that; where both agree, the line is the tangent at x, elsewhere and
+                for None the secant from creeping to x, which at rest never asks for more than friction does.
+        """
+        if law is None:
+            return np.zeros_like(self.q), np.zeros_like(self.q)
+        creep = np.full(2 * len(self.s) - 2, self.speed(CREEP))
+        if x is None:
+            value = self._rubbing(law, creep, 0.0)
+            return np.zeros_like(self.q), value.reshape(self.q.shape)
+        u = np.tile(np.diff(x) / (2 * np.diff(self.s)), 2)
+        near = np.zeros(len(x), dtype=bool) if before is None else np.abs(x - before) <= AGREED * x
+        tangent = np.concatenate([near[:-1], near[1:]])
+        here = np.maximum(np.concatenate([x[:-1], x[1:]]), 2 * creep)
+        low, high = np.where(tangent, (1 - STEP) * here, creep), np.where(tangent, (1 + STEP) * here, here)
+        below, above = (self._rubbing(law, place, u) for place in (low, high))
+        slope = (above - below) / (high - low)[:, None]
+        return slope.reshape(self.q.shape), (below - slope * low[:, None]).reshape(self.q.shape)
+
+    def _rubbing(self, law: Law, x: np.ndarray, u: np.ndarray | float) -> np.ndarray:
+        q, slope, curvature = (y.reshape(-1, y.shape[2]) for y in (self.q, self.slope, self.curvature))
+        pull = np.broadcast_to(u, x.shape)[:, None]
+        return law.friction(q, slope * np.sqrt(x)[:, None], slope * pull + curvature * x[:, None])
+
+
+def fastest(rows: Bounded, s: np.ndarray) -> Profile:
+    """Return the fastest profile from rest to rest.
+
+    Raises:
+        NothingFeasible: where no speed can be kept from some grid point on.
+    """
+    most = controllable(rows, s)
+    if not np.isfinite(most).all():
+        k = int(np.flatnonzero(~np.isfinite(most)).max())
+        raise NothingFeasible(
+            f"no motion: no speed at {s[k] / s[-1]:.0%} of the path lets the robot stop at its end within the limits",
+            "torque", float("nan"), "N m",
+        )  # fmt: skip
+    x = np.zeros(len(s))
+    for k, step in enumerate(np.diff(s)):
+        x[k + 1] = min(max(x[k] + 2 * step * _largest(rows, k, x[k], step), 0.0), most[k + 1])
+    x[-1] = 0.0
+    if (x[1:-1] <= 0).any():
+        k = int(np.argmax(x[1:-1] <= 0)) + 1
+        raise NothingFeasible(
+            f"no motion: it comes to a stop at {s[k] / s[-1]:.0%} of the path, within the limits it has",
+            "torque", float("nan"), "N m",
+        )  # fmt: skip
+    return Profile(s, x)
+
+
+def _largest(rows: Bounded, k: int, x: float, step: float) -> float:
+    """Return the largest u on interval k at speed x."""
+    a = np.concatenate([rows.a[0, k], rows.a[1, k] + 2 * step * rows.b[1, k]])
+    rest = np.concatenate([rows.b[0, k] * x + rows.c[0, k], rows.b[1, k] * x + rows.c[1, k]])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        upper = np.where(a == 0, np.inf, (np.sign(a) - rest) / a)
+    return float(min(upper.min(initial=np.inf), (rows.top[k + 1] - x) / (2 * step)))
+
+
+def controllable(rows: Bounded, s: np.ndarray) -> np.ndarray:
+    """Return the largest x (K + 1,) at each grid point from which the end is reached at rest; NaN where there is none.
+
+    u and x are handed over in units of a typical x, without which the linear programs fail where speeds are large.
+    """
+    try:
+        from toppra.algorithm import TOPPRA
+    except ImportError as error:
+        raise BadInput(
+            "timing needs toppra: pip install toppra (on macOS and Windows it builds from source)"
+        ) from error
+    size = np.abs(rows.b).max(axis=(0, 2), initial=1e-12)
+    unit = float(np.median(np.minimum(rows.top[1:], 2.0 / size)))
+    scaled = Bounded(unit * rows.a, unit * rows.b, rows.c, rows.top / unit)
+    quiet = logging.getLogger("toppra")
+    level = quiet.level
+    quiet.setLevel(logging.CRITICAL)
+    try:
+        found = TOPPRA([_constraint(scaled, s)], _Interval(s), gridpoints=s, solver_wrapper="seidel")
+        most: Any = found.compute_controllable_sets(0.0, 0.0)
+    finally:
+        quiet.setLevel(level)
+    return unit * np.where(most[:, 0] > most[:, 1], np.nan, most[:, 1])
+
+
+class _Interval:
+    """What toppra asks of a path whose constraints are given."""
+
+    dof = 1
+
+    def __init__(self, s: np.ndarray):
+        self.path_interval = np.array([s[0], s[-1]])
+        self.duration = float(s[-1])
+
+
+def _constraint(rows: Bounded, s: np.ndarray) -> Any:
+    """Return the rows as toppra's canonical constraint."""
+    from toppra.constraint import LinearConstraint
+
+    steps = np.diff(s)[:, None]
+    a = np.concatenate([rows.a[0], rows.a[1] + 2 * steps * rows.b[1]], axis=1)
+    b = np.concatenate([rows.b[0], rows.b[1]], axis=1)
+    c = np.concatenate([rows.c[0], rows.c[1]], axis=1)
+    m = a.shape[1]
+    both = np.concatenate([np.eye(m), -np.eye(m)])
+    limit = np.ones(2 * m)
+    speeds = np.column_stack([np.zeros(len(s)), rows.top])
+    last = [np.vstack([x, x[-1:]]) for x in (a, b, c)]
+
+    class Given(LinearConstraint):
+        def __init__(self) -> None:
+            super().__init__()
+            self.identical = True
+
+        def compute_constraint_params(self, path: Any, gridpoints: Any, *args: Any, **kwargs: Any) -> Any:
+            rows_given = (*last, both, limit) if m else (None,) * 5
+            return (*rows_given, None, speeds)
+
+    return Given()

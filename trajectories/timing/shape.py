@@ -1,0 +1,114 @@
+"""The outer loop: a path's own parameters φ chosen for a shorter time, its waypoints kept.
+
+A spline through m waypoints has freedom left: the spacing of its knots (m - 2 ratios), and a via point in the middle of
+each interval that may leave the first spline by `stray` (n each). The duration is continuous in φ but not smooth, since
+which limit is active changes; the search goes by linear models over a simplex (Powell 1994, nlopt's COBYLA: of three
+tried it took the fewest evaluations for what it found). Where velocity limits rule, a few percent are there to be had.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from trajectories.errors import BadInput, NothingFeasible
+from trajectories.timing.path import Path, checked, spline
+
+RATIO = 3.0  # knots lie at most this factor nearer or further apart than by chord length
+STEP = 0.3  # first step, of the range -1 to 1
+
+Timer = Callable[[Path], float]
+
+
+@dataclass(frozen=True, eq=False)
+class Shaped:
+    """What the search found.
+
+    Attributes:
+        path: the fastest path.
+        phi: (p,) its parameters, each from -1 to 1.
+        before, after: durations [s] of φ = 0 and of `path`.
+        evaluations: paths timed; `refused`: how many of them had no timing within the limits.
+    """
+
+    path: Path
+    phi: np.ndarray
+    before: float
+    after: float
+    evaluations: int
+    refused: int
+
+
+def count(waypoints: np.ndarray, stray: float) -> int:
+    """Return how many parameters φ the path has."""
+    m, n = np.shape(waypoints)
+    return m - 2 + ((m - 1) * n if stray > 0 else 0)
+
+
+def build(waypoints: np.ndarray, phi: np.ndarray, stray: float = 0.0) -> Path:
+    """Return the path of parameters φ: log ratios of knot intervals, then offsets of the via points over `stray`."""
+    points = checked(waypoints)
+    m, n = points.shape
+    factors = RATIO ** np.append(0.0, np.asarray(phi)[: m - 2])
+    if stray <= 0:
+        return spline(points, factors)
+    first = spline(points)
+    middle = first((first.knots[:-1] + first.knots[1:]) / 2) + stray * np.reshape(phi[m - 2 :], (m - 1, n))
+    both = np.empty((2 * m - 1, n))
+    both[::2], both[1::2] = points, middle
+    return spline(both, np.repeat(factors, 2))
+
+
+def shorten(
+    waypoints: np.ndarray,
+    timer: Timer,
+    evaluations: int = 150,
+    stray: float = 0.0,
+    progress: Callable[[int, float], None] | None = None,
+) -> Shaped:
+    """Return the path through the waypoints with the shortest time that so many evaluations find.
+
+    Args:
+        timer: duration [s] of a path; raises `NothingFeasible` or `BadInput` where it has none.
+        stray: how far a via point may leave the first spline [rad or m]; 0 for none.
+        progress: called with evaluations and the best duration; Ctrl-C keeps the best so far.
+    """
+    import nlopt
+
+    if not (np.isfinite(stray) and stray >= 0) or evaluations < 1:
+        raise BadInput(f"stray {stray:g}, {evaluations} evaluations: expected zero or more, and one or more")
+    p = count(waypoints, stray)
+    first = build(waypoints, np.zeros(p), stray)
+    before = timer(first)
+    best, tally = [before, np.zeros(p)], [1, 0]
+
+    def duration(phi: np.ndarray, _: np.ndarray) -> float:
+        tally[0] += 1
+        try:
+            found = timer(build(waypoints, phi, stray))
+        except (NothingFeasible, BadInput):
+            tally[1] += 1
+            return 10 * before
+        if found < best[0]:
+            best[:] = [found, phi.copy()]
+        if progress is not None:
+            progress(tally[0], best[0])
+        return found
+
+    if p:
+        search = nlopt.opt(nlopt.LN_COBYLA, p)
+        search.set_lower_bounds(np.full(p, -1.0))
+        search.set_upper_bounds(np.full(p, 1.0))
+        search.set_initial_step(STEP)
+        search.set_maxeval(evaluations)
+        search.set_xtol_abs(1e-4)
+        search.set_min_objective(duration)
+        try:
+            search.optimize(np.zeros(p))
+        except (KeyboardInterrupt, nlopt.ForcedStop):
+            pass
+        except nlopt.RoundoffLimited:
+            pass
+    return Shaped(build(waypoints, best[1], stray), best[1], before, best[0], tally[0], tally[1])

@@ -1,0 +1,207 @@
+"""Time-optimal timing of a path under velocity, acceleration and torque limits, viscous friction included.
+
+    |Φ' ṡ| ≤ v_max,    |Φ' s̈ + Φ'' ṡ²| ≤ a_max,    |A s̈ + B ṡ² + Γ + f(Φ, Φ' ṡ)| ≤ τ_max
+
+With u = s̈, x = ṡ² all is affine but friction f (Bobrow, Dubowsky, Gibson 1985). It is replaced by a line in x that
+meets it at the profile x_k of the round before: the secant from rest where rounds differ much (feasible from any x_k,
+and for viscous friction it halves the error of log x), else the tangent (Newton's step). A plain fixed point, which
+holds f, runs away where friction itself limits the speed. Each round is solved by reachability (Pham & Pham 2018,
+toppra): backwards the controllable speeds, forwards the largest acceleration. Rows of an interval stand for both of its
+ends (interpolation scheme), with friction's direction inside the interval.
+
+What comes out is held against the full inverse dynamics between the grid points; where a limit is crossed there, it is
+tightened on that interval by the excess and the path is timed again, until none is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from trajectories.errors import BadInput, NothingFeasible
+from trajectories.timing.limits import Law, Limits
+from trajectories.timing.path import Path, reversals
+from trajectories.timing.profile import Profile, Sampled, dense, moved
+from trajectories.timing.reachability import Rows, fastest
+
+GRID, PER_SPAN, MOST = 400, 200, 2400  # intervals, in all and between two knots
+ROUNDS = 25
+SETTLED = 1e-4  # mean relative change of x at which friction counts as settled
+ACTIVE = 0.01  # of a limit: nearer than that it is active
+
+
+@dataclass(frozen=True, eq=False)
+class Timing:
+    """A timed path.
+
+    Attributes:
+        path, profile, limits: what moves, how fast, within what.
+        sampled: the motion between the grid points too, with full inverse dynamics.
+        iterations: rounds of reachability.
+        tightened: largest share by which a limit was narrowed to keep it between the grid points.
+        history: durations of the rounds [s].
+    """
+
+    path: Path
+    profile: Profile
+    limits: Limits
+    sampled: Sampled
+    iterations: int
+    tightened: float
+    history: tuple[float, ...] = field(default=())
+
+    @property
+    def duration(self) -> float:
+        return self.profile.duration
+
+    @property
+    def used(self) -> dict[str, np.ndarray]:
+        """Share of each limit in use, (N, n) per kind of limit; 1 is the limit."""
+        return shares(self.sampled, self.limits)
+
+    @property
+    def margins(self) -> dict[str, np.ndarray]:
+        """What is left of each limit, (n,) as a share of it; 1 where there is no limit."""
+        return {name: 1.0 - values.max(axis=0) for name, values in self.used.items()}
+
+    @property
+    def active_share(self) -> float:
+        """Share of the time in which some limit is within `ACTIVE` of being reached."""
+        near = np.max([values.max(axis=1) for values in self.used.values()], axis=0) >= 1 - ACTIVE
+        return float(self.sampled.weights @ near / self.sampled.weights.sum())
+
+
+def time_optimal(
+    path: Path, limits: Limits, law: Law | None = None, *, rate: float | None = None, grid: int | None = None
+) -> Timing:
+    """Return the fastest motion from rest to rest along a path.
+
+    Args:
+        law: the robot's dynamics; None: kinematic limits alone.
+        rate: of a controller [Hz]: the duration is rounded up to whole samples.
+        grid: intervals on the path; None: see `grid_points`.
+
+    Raises:
+        NothingFeasible: where the torque limits do not even hold the robot: which joint, where, by how much.
+    """
+    if law is None and np.isfinite(limits.torque).any():
+        raise BadInput("torque limits need the robot's dynamics; leave them infinite, or give a model")
+    s = grid_points(path, grid)
+    if law is not None:
+        check_holding(path, limits, law, s)
+    rows = Rows.of(path, s, limits, law)
+    tight = {name: np.ones((len(s) - 1, path.n)) for name in ("velocity", "acceleration", "torque")}
+    history: list[float] = []
+    best = last = x = before = None
+    excess: dict[str, np.ndarray] = {}
+    for _ in range(ROUNDS):
+        profile = _round(rows, law, x, before, tight)
+        rounded = profile if rate is None else profile.slower(_whole(profile.duration, rate))
+        sampled = dense(path, rounded, None if law is None else law.torque)
+        last = Timing(path, rounded, limits, sampled, 0, 0.0)
+        excess = {name: _per_interval(values, len(s) - 1) - 1 for name, values in shares(sampled, limits).items()}
+        kept = all(values.max() <= 0 for values in excess.values())
+        settled = x is not None and np.abs(profile.x - x).mean() <= SETTLED * x.mean()
+        history.append(profile.duration)
+        x, before = profile.x, x
+        if kept and (best is None or rounded.duration < best.duration):
+            best = last
+        if settled and kept:
+            break
+        if settled or len(history) > ROUNDS // 2:
+            for name, values in excess.items():
+                tight[name] = tight[name] * np.where(values > 0, 1 - 1.1 * np.clip(values, 1e-6, 0.2), 1.0)
+    if best is None and last is not None:
+        best = _slowed_down(last, law, rate)
+    if best is None:
+        raise _not_settled(excess)
+    narrowed = 1 - min(float(values.min()) for values in tight.values())
+    return replace(best, iterations=len(history), tightened=narrowed, history=tuple(history))
+
+
+def _slowed_down(timing: Timing, law: Law | None, rate: float | None) -> Timing | None:
+    """Return the timing a little slower, up to 1 %, so that it keeps the limits; None where that does not help."""
+    for factor in 1 + 1e-5 * 2.0 ** np.arange(11):
+        profile = timing.profile.slower(factor)
+        profile = profile if rate is None else profile.slower(_whole(profile.duration, rate))
+        slower = replace(
+            timing, profile=profile, sampled=dense(timing.path, profile, None if law is None else law.torque)
+        )
+        if all(margin.min() >= 0 for margin in slower.margins.values()):
+            return slower
+    return None
+
+
+def _per_interval(values: np.ndarray, count: int) -> np.ndarray:
+    """Return the largest of each interval (count, n) of what `dense` sampled (N, n)."""
+    return values.reshape(count, -1, values.shape[1]).max(axis=1)
+
+
+def _round(rows: Rows, law: Law | None, x: np.ndarray | None, before: np.ndarray | None, tight: dict) -> Profile:
+    """Return the fastest profile with friction as a line; by secants alone where tangents leave nothing feasible."""
+    try:
+        return fastest(rows.bounded(rows.friction(law, x, before), tight), rows.s)
+    except NothingFeasible:
+        return fastest(rows.bounded(rows.friction(law, x, None), tight), rows.s)
+
+
+def shares(sampled: Sampled, limits: Limits) -> dict[str, np.ndarray]:
+    """Return the shares of the limits in use, (N, n) each; kinds of limit that no joint has are left out."""
+    found = {"velocity": sampled.v, "acceleration": sampled.a, "torque": sampled.tau}
+    sizes = {"velocity": limits.velocity, "acceleration": limits.acceleration, "torque": limits.torque}
+    return {
+        name: np.abs(values) / sizes[name]
+        for name, values in found.items()
+        if values is not None and np.isfinite(sizes[name]).any()
+    }
+
+
+def check_holding(path: Path, limits: Limits, law: Law, s: np.ndarray) -> None:
+    """Refuse a path on which the torque limits do not hold the robot still, or do not move it slowly.
+
+    A motion that swings through such a place can exist; it could not be stopped there, nor rehearsed (our choice).
+    """
+    q, v, _ = moved(path, s, np.full(len(s), 1e-9), np.zeros(len(s)))
+    still = np.zeros_like(q)
+    gravity = law.torque(q, still, still)
+    for torque, doing in ((gravity, "hold still"), (gravity + law.friction(q, v, still), "move slowly")):
+        excess = np.abs(torque) - limits.torque
+        if excess.max() > 0:
+            k, j = (int(i) for i in np.unravel_index(np.argmax(excess), excess.shape))
+            raise NothingFeasible(
+                f"no motion: to {doing} at {s[k] / path.length:.0%} of the path, joint {j + 1} needs "
+                f"{abs(torque[k, j]):.4g} N m and its limit is {limits.torque[j]:.4g} ({excess[k, j]:.3g} too little); "
+                "take another path, a smaller payload, or check the limits",
+                f"torque of joint {j + 1}", float(excess[k, j]), "N m",
+            )  # fmt: skip
+
+
+def grid_points(path: Path, count: int | None = None) -> np.ndarray:
+    """Return a grid on the path: even in time where it starts and stops, and with its knots and turning points.
+
+    Args:
+        count: intervals; None: `GRID`, or `PER_SPAN` between knots where these are many.
+    """
+    count = count or int(np.clip(PER_SPAN * (len(path.knots) - 1), GRID, MOST))
+    even = np.linspace(0, 1, count + 1)
+    s = path.length * (1 - np.cos(np.pi * even)) / 2
+    extra = np.concatenate([reversals(path, s), path.knots if len(path.knots) < count / 4 else []])
+    s = np.unique(np.concatenate([s, extra[(extra > 0) & (extra < path.length)]]))
+    s = s[np.append(True, np.diff(s) > 1e-7 * path.length)]
+    return np.append(s[:-1], path.length)
+
+
+def _whole(duration: float, rate: float) -> float:
+    """Return the factor ≥ 1 that makes a duration a whole number of samples."""
+    return np.ceil(duration * rate - 1e-9) / (duration * rate)
+
+
+def _not_settled(excess: dict[str, np.ndarray]) -> NothingFeasible:
+    name = max(excess, key=lambda key: float(excess[key].max()))
+    worst, j = float(excess[name].max()), int(excess[name].max(axis=0).argmax())
+    return NothingFeasible(
+        f"the timing did not settle: the {name} of joint {j + 1} stays {worst:.2g} of its limit beyond it between grid "
+        "points; a path with gentler bends, or more grid points, may help",
+        f"{name} of joint {j + 1}", worst, "of the limit",
+    )  # fmt: skip
