@@ -1,4 +1,4 @@
-"""Puts this folder on the path (``from differences import check``) and says where the real recordings are.
+"""Where the real recordings are.
 
 They live outside the repository: ``CALIB_DATA``, default ``../shared/data``. Tests that need them are skipped, with the
 reason, where the folder is absent.

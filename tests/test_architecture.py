@@ -156,9 +156,3 @@ def test_the_command_line_starts_light():
     code = f"import sys, calib.cli; print([name for name in {heavy} if name in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
-
-
-def test_test_modules_have_names_of_their_own():
-    """Pytest puts every test folder on the path: of two modules with one name, one hides the other."""
-    names = [path.name for path in Path(__file__).parent.rglob("*.py") if path.name != "conftest.py"]
-    assert sorted(set(names)) == sorted(names)

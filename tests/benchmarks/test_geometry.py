@@ -5,18 +5,14 @@ python -m pytest tests/benchmarks/test_geometry.py -o addopts= --benchmark-group
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from scipy.optimize import least_squares
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "geometry"))
 from planted import cell, load, measure, perturb, random_joints
+from scipy.optimize import least_squares
 
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit, fit_with_prior, polish_frames

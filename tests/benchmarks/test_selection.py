@@ -3,13 +3,8 @@
 Set OPENBLAS_NUM_THREADS=1 on a shared machine: matrices this small lose by threads, under load by a factor of thirty.
 """
 
-import sys
-from pathlib import Path
-
-import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "poses"))
 import poses_arm
+import pytest
 
 from poses.convex import bound
 from poses.select import select

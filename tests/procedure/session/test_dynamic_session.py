@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sessions import edit, go_on
 
 from calib import cli
 from calib.errors import MeasurementError
@@ -18,8 +19,6 @@ from calib.procedure.session import commands, demo, instructions, steps
 from calib.procedure.session.commands import begin
 from calib.procedure.session.folder import Session, open_session
 from calib.simulation.cells.virtual_cells import virtual_cell
-
-from .conftest import edit, go_on
 
 QUICK = {"period": 6.0, "starts": 1, "evaluations": 40, "repeats": 2, "rate": 250.0}
 

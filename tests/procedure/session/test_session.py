@@ -12,14 +12,13 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+from sessions import edit, go_on, quiet
 
 from calib import cli
 from calib.errors import CalibError, MeasurementError, SessionError
 from calib.procedure.session import certificate, instructions, outcome, steps
 from calib.procedure.session.folder import Session, locked, open_session, read_state
 from calib.robot.load import load
-
-from .conftest import edit, go_on, quiet
 
 pytestmark = pytest.mark.usefixtures("plain")
 

@@ -4,26 +4,12 @@ import shutil
 from pathlib import Path
 
 import pytest
+from sessions import edit, go_on
 
-from calib.procedure.session import demo, steps
+from calib.procedure.session import demo
 from calib.procedure.session.commands import begin
-from calib.procedure.session.folder import Session, locked, open_session
+from calib.procedure.session.folder import Session, open_session
 from calib.simulation.cells.virtual_cells import virtual_cell
-
-
-def quiet(words: str) -> None:
-    """Say nothing."""
-
-
-def go_on(session: Session) -> steps.State | None:
-    with locked(session, quiet):
-        return steps.run_next(open_session(session.folder), quiet, quiet)
-
-
-def edit(path: Path, old: str, new: str) -> None:
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new, 1))
 
 
 @pytest.fixture(scope="session")

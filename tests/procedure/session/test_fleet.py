@@ -10,14 +10,13 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from sessions import edit
 
 from calib import cli
 from calib.errors import MeasurementError, NotConverged, Unidentifiable, UsageError, exit_code
 from calib.procedure.session import fleet
 
-from .conftest import edit
-
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture

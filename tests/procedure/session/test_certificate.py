@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from sessions import go_on
 
 from calib.errors import CalibError
 from calib.procedure.report import figures, fit_report, geometry_figures, style
 from calib.procedure.report import page as certificate
 from calib.procedure.session.folder import Session
-
-from .conftest import go_on
 
 
 class References(HTMLParser):

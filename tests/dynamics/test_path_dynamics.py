@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import arms
 import numpy as np
 import pinocchio
 import pytest
-from dynamics import arms
 
 from calib.dynamics import base, drives, friction
 from calib.dynamics.bodies import standard_parameters, tree

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import csv
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import differences
 import numpy as np
-import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "identification"))
 import planted_motion as planted
+import pytest
 
 from calib import cli, files
 from calib.data.poses.measurements import PoseMeasurements

@@ -16,7 +16,7 @@ from calib.robot.formats import urdf
 from calib.robot.kinematics import forward
 from calib.robot.load import load
 
-README = (Path(__file__).parents[2] / "README.md").read_text()
+README = (Path(__file__).parents[3] / "README.md").read_text()
 
 
 def test_demo_of_the_lwr4plus(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
