@@ -15,7 +15,7 @@ from calib.data.poses.measurements import PoseMeasurements
 from calib.geometry.checks import repeatability
 from calib.geometry.installation import Installation, see
 from calib.procedure.kinematic_stage import inputs
-from calib.procedure.kinematic_stage import iso9283 as stated
+from calib.procedure.report.page import iso9283_tables
 from calib.robot.load import load
 from calib.simulation.cells.cell import Instrument, measure
 from calib.simulation.cells.virtual_cells import perturbed_cell
@@ -133,7 +133,7 @@ def test_the_fit_states_them_beside_its_own_errors(files, capsys):
     noise = 0.02 * (1.596 + 3 * 0.673)
     assert iso["repeatability_mm"]["mean"] == pytest.approx(noise, rel=0.2)
     assert iso["accuracy_mm"]["calibrated"]["mean"] < 0.3 * iso["accuracy_mm"]["nominal"]["mean"]
-    (table,) = stated.blocks(found)
+    (table,) = iso9283_tables(found)
     assert len(table.rows) == 5 and "100 and more" in table.note
 
 

@@ -125,7 +125,7 @@ def _killed_at(session: Session, name: str) -> int:
     """Run `calib next` in a process of its own and kill it while it is in a step; return its exit code."""
     code = (
         "import sys, time\n"
-        "from calib.procedure import steps\n"
+        "from calib.procedure.session import steps\n"
         "from dataclasses import replace\n"
         "def slow(session, say):\n"
         "    (session.folder / '.4-fit.x.part').mkdir(exist_ok=True)\n"
