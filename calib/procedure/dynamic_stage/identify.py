@@ -10,10 +10,10 @@ import numpy as np
 
 from calib.data.recordings.recording import Joints, Recording
 from calib.data.recordings.recording_files import read_recording
-from calib.data.recordings.reference_files import with_reference
 from calib.data.signals.decimation import SHARE
 from calib.data.signals.motion import FilterOptions, Motion, make_motion, sample
 from calib.data.signals.persistency import ExcitationReport, repeats, report_excitation
+from calib.data.signals.reference_files import with_reference
 from calib.data.signals.resampling import Resampled
 from calib.errors import UsageError
 from calib.identification.cases import Case, case_names, make_case, row_labels
