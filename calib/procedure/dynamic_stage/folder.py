@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.loop_tables import loop_table, write_instrumental
 from calib.procedure.dynamic_stage.tracking import tracking_table
+from calib.procedure.dynamic_stage.verdict import resting_parameters
 from calib.procedure.kinematic_stage import robot_file
 from calib.robot import description
 
@@ -194,6 +196,7 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
         "filters": {case.name: filter_table(case.motion) for case in (*outcome.inputs.cases, *outcome.inputs.unseen)},
         "geometry": geometry_tables.metrics(outcome.carried, outcome.geometries),
         "repeated": dict(outcome.repeated),
+        "resting": asdict(resting_parameters(found)),
         "warnings": list(outcome.warnings),
         "verdict": outcome.verdict.level,
         "reason": outcome.verdict.reason,

@@ -146,7 +146,8 @@ STEPS = (
     ),
     SessionStep(
         "validate", "hold it against unseen poses", ("robot", "instrument", "poses", "fit", "seed"), _validated,
-        geometry_steps.validate, ("5-validation/metrics.json", "5-validation/errors.csv", "5-validation/rows.json"),
+        geometry_steps.validate,
+        ("5-validation/metrics.json", "5-validation/errors.csv", "5-validation/rows.json", "5-validation/report.json"),
     ),
     SessionStep(
         "excite", "design the motions to record", (*_keys(PLAN), "seed"), _excited, dynamics_steps.excite,
