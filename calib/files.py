@@ -76,11 +76,13 @@ def _not_finite(value: Any, place: str) -> Iterator[str]:
 def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> Path:
     """Write a CSV table; floats with 12 significant digits, so that a table read back serves as the value.
 
-    Cells with commas, quotes or line breaks are quoted, those of the header too: names come from people's files.
+    Cells with commas, quotes or line breaks are quoted, those of the header too: names come from people's files. So is
+    a whole header that would be taken for one with other separators, or for a comment.
     """
     text = io.StringIO()
     lines = csv.writer(text, lineterminator="\n")
-    lines.writerow(header)
+    misread = header[0].startswith("#") or any(mark in name for name in header for mark in ";\t")
+    (csv.writer(text, lineterminator="\n", quoting=csv.QUOTE_ALL) if misread else lines).writerow(header)
     lines.writerows([f"{cell:.12g}" if isinstance(cell, float) else cell for cell in row] for row in rows)
     return write(path, text.getvalue())
 
