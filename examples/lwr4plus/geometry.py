@@ -28,7 +28,7 @@ from calib.robot import mdh
 from calib.robot.chain import Chain, element_index, random_joints
 from calib.robot.kinematics import jacobian
 from calib.simulation.cells import lwr4plus
-from calib.simulation.cells.cell import Instrument, measure, true_poses
+from calib.simulation.cells.cell import SimulatedInstrument, measure, true_poses
 from calib.simulation.cells.virtual_cells import lwr4plus_cell, rigid
 from calib.transforms import invert
 from poses.candidates import draw_candidates
@@ -253,7 +253,7 @@ def base_leds(poses: np.ndarray, seed: int) -> dict[str, float]:
     """
     q, result = random_joints(lwr4plus.nominal_chain(), 500, 99), {}
     for name, frame in (("tool only", None), ("tool and base", np.eye(4))):
-        cell = lwr4plus_cell(Instrument(base_frame=frame), hidden=0.0)
+        cell = lwr4plus_cell(SimulatedInstrument(base_frame=frame), hidden=0.0)
         measured = measure(cell, poses, [seed, 3])
         found = fit(polish_frames(install(cell.nominal, [measured]), [measured]).cell, [measured])
         seen = see(found.cell, q).poses()[:, :3, 3]

@@ -19,13 +19,13 @@ from calib.errors import UsageError
 from calib.identification.cases import Case, case_names, make_case, row_labels
 from calib.identification.friction.passivity import driven
 from calib.identification.gains import DriveGains
-from calib.identification.geometry_uncertainty import Propagation, propagate
+from calib.identification.geometry_uncertainty import GeometryUncertainty, propagate
 from calib.identification.identify import Identification, identify
 from calib.identification.identify_options import FileSettings, IdentifyOptions, file_settings
 from calib.identification.prediction import Dynamics, predict
 from calib.identification.scores import Score, score
-from calib.identification.settings import Settings
-from calib.identification.two_geometries import Comparison, compare
+from calib.identification.settings import IdentificationSettings
+from calib.identification.two_geometries import GeometryComparison, compare
 from calib.procedure.dynamic_stage.gains import FoundGains, find_gains, relative_warnings
 from calib.procedure.dynamic_stage.tracking import Tracking, track
 from calib.procedure.dynamic_stage.verdict import (
@@ -108,8 +108,8 @@ class IdentificationOutcome:
     verdict: Verdict
     seed: int = 0
     extra: Mapping[str, object] = field(default_factory=dict)
-    carried: Propagation | None = None
-    geometries: Comparison | None = None
+    carried: GeometryUncertainty | None = None
+    geometries: GeometryComparison | None = None
     tracking: Tracking = field(default_factory=Tracking)
 
 
@@ -254,7 +254,9 @@ def tolerated(verdict: Verdict, proofs: Mapping[str, Score], tolerance: float) -
     return replace(verdict, level="fail", reason=f"{verdict.reason}; above the tolerance of {tolerance:g} %")
 
 
-def carry(inputs: IdentificationInputs, found: Identification, say: Progress) -> tuple[Propagation, Comparison | None]:
+def carry(
+    inputs: IdentificationInputs, found: Identification, say: Progress
+) -> tuple[GeometryUncertainty, GeometryComparison | None]:
     """Return what the geometry's uncertainty adds to the estimate, and the estimate on the nominal geometry beside."""
     carried = propagate(found, inputs.chain, inputs.cases, inputs.geometry, say)
     if inputs.nominal is None:
@@ -268,7 +270,7 @@ def with_choices(options: IdentifyOptions, method: str | None, friction: str | N
     from calib.identification.friction.friction_ladder import NAMES
     from calib.identification.methods.least_squares import METHODS
 
-    settings: Settings = replace(options.settings, seed=seed)
+    settings: IdentificationSettings = replace(options.settings, seed=seed)
     for value, allowed, key in ((method, METHODS, "method"), (friction, NAMES, "friction")):
         if value is None:
             continue

@@ -268,7 +268,7 @@ def _coulomb_shift(cases: Sequence[Case], found: Identification) -> list[str]:
     """
     if found.settings.kind != "motor":
         return []
-    richer = {joint for one in found.climb.terms for joint, _ in one.acts}
+    richer = {joint for one in found.friction.terms for joint, _ in one.acts}
     index = {j: found.names.index(f"Fc{j + 1}") for j in range(cases[0].motion.n) if f"Fc{j + 1}" in found.names}
     estimate = found.fitted.estimate
     shift, sigma, percent = standstill_shift(found, cases), estimate.sigma, 0.01 * np.abs(estimate.values)

@@ -12,7 +12,7 @@ from calib.dynamics import base as base_parameters
 from calib.dynamics import drives
 from calib.dynamics.base import BaseModel
 from calib.dynamics.bodies import standard_parameters, tree, with_gravity
-from calib.dynamics.drives import Term
+from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.shapes import V0
 from calib.errors import UsageError
@@ -109,7 +109,7 @@ def _dynamics(
     return ExcitedModel(BaseModel(smooth, found), BaseModel(model, found), chosen, covariance, friction, notes)
 
 
-def _smoothed(one: Term) -> Term:
+def _smoothed(one: DriveTerm) -> DriveTerm:
     return replace(one, settings=(max(SMOOTH, one.settings[0]),)) if one.shape == "sign" else one
 
 

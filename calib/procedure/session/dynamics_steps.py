@@ -174,7 +174,7 @@ def identify(session: Session, say: Say) -> list[str]:
     raw, normalised = found.condition
     own = next(iter(outcome.fit.values()))
     notes = [
-        f"{len(found.names)} parameters by {found.fitted.method}, friction {found.climb.chosen or 'standard'}, "
+        f"{len(found.names)} parameters by {found.fitted.method}, friction {found.friction.chosen or 'standard'}, "
         "condition "
         f"number {raw:.3g}, with unit columns {normalised:.3g}; {own.raw.total:.2f} % of the torque unexplained"
     ]
