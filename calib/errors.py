@@ -68,6 +68,19 @@ class NotConverged(CalibError):
         super().__init__(message)
 
 
+class TaskLost(CalibError):
+    """A task of many whose worker process died, also when it was tried again; the others' results are good.
+
+    Attributes:
+        number: of the task, from 0.
+        task: what the function was given.
+    """
+
+    def __init__(self, message: str, number: int = 0, task: object = None):
+        self.number, self.task = number, task
+        super().__init__(message)
+
+
 class SessionError(CalibError):
     """A session folder that is busy, damaged, or not in the state a command needs."""
 

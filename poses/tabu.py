@@ -47,7 +47,7 @@ class TabuRule:
 DEFAULT_RULE = TabuRule()
 
 
-def tabu_search(
+def tabu(
     space: SearchSpace,
     m: int,
     index: Index = "O1",

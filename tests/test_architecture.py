@@ -31,6 +31,8 @@ HOMES = {
     "jinja2": ["calib.procedure."],
     "dask": ["calib.workers"],
     "distributed": ["calib.workers"],
+    "cloudpickle": ["calib.workers"],
+    "threadpoolctl": ["calib.workers"],
     "typer": ["calib.cli", "calib.cli."],
     "click": ["calib.cli", "calib.cli."],
     "rich": ["calib.cli", "calib.cli.", "calib.procedure."],

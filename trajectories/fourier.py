@@ -68,7 +68,7 @@ class Fourier:
         return self.variables(drawn)
 
 
-def fourier_family(
+def fourier(
     harmonics: int | Sequence[int],
     period: float,
     joints: int | None = None,

@@ -112,11 +112,11 @@ def select(
 
     targets = [numbers(text, 3, "--tool") for text in tool or []]
     sigmas = None if sigma is None else numbers(sigma, 2, "--sigma")
-    with work.workers(workers) as mapped, progress() as say:
+    with work.workers(workers) as crew, progress() as say:
         chosen = selection.choose(
             robot, m, kind=kind, tools=targets, index=index, method=method, constraints=constraints, existing=existing,
             candidates=candidates, sigmas=(sigmas[0], sigmas[1]) if sigmas else None, base=base, tip=tip, seed=seed,
-            map=mapped, progress=lambda done, total, what: say(f"{what} ({done} of {total})"),
+            map=crew.map, progress=lambda done, total, what: say(f"{what} ({done} of {total})"),
         )  # fmt: skip
     selection.write(chosen, out)
     console = make_console()

@@ -51,12 +51,12 @@ def excite(
 
     design_folder.check_target(out)
     stands = None if start is None else numbers(start, start.count(",") + 1, "--start")
-    with work.workers(workers) as mapped, progress() as say:
+    with work.workers(workers) as crew, progress() as say:
         designed = design.excite(
             robot, model=model, limits=limits, goals=goal or [], hard=hard or [], period=period, harmonics=harmonics,
             family=family, drives_=drives, rate=rate, starts=starts, evaluations=evaluations, front=front, start=stands,
             repeat=repeat, slower=slower, existing=existing or [], lock=lock or [], base=base, tip=tip, seed=seed,
-            map=mapped, progress=say,
+            map=crew.map, progress=say,
         )  # fmt: skip
         say("writing")
         design_folder.write_folder(designed, out, motion_figures.write_design)

@@ -167,12 +167,14 @@ def run_sessions(
     from calib.procedure.session import fleet
 
     folders, started, outcomes = fleet.folders_of(sessions), time.perf_counter(), []
-    with told() as (console, say, progress), work.workers(workers) as mapped:
+    with told() as (console, say, progress), work.workers(workers) as crew:
         progress(f"running {len(folders)} sessions")
-        for outcome in fleet.run(folders, mapped, f"calib run --workers {workers}"):
+        for outcome in fleet.run(folders, crew, f"calib run --workers {workers}"):
             outcomes.append(outcome)
-            say(f"{outcome.folder}: {outcome.state}{f', {outcome.verdict}' if outcome.verdict else ''}")
+            say(fleet.line(outcome))
             progress(f"{len(outcomes)} of {len(folders)} sessions")
+    places = [str(folder) for folder in folders]
+    outcomes.sort(key=lambda one: places.index(one.folder))
     console.print(fleet.table(outcomes))
     for line in fleet.remarks(outcomes):
         console.print(line, soft_wrap=True, markup=False)

@@ -29,15 +29,16 @@ from calib.data.recordings.recording import Recording
 from calib.data.signals.decimation import decimate
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics.bodies import standard_parameters
+from calib.errors import TaskLost
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit
 from calib.identification import geometry_uncertainty, reweighted
 from calib.identification.cases import Case, make_case
 from calib.identification.identify import Identification, common_decimator, find_base, identify
-from calib.identification.settings import IdentificationSettings, Payload, make_model
+from calib.identification.settings import Payload, Settings, make_model
 from calib.robot.chain import Chain, random_joints
 from calib.simulation.cells import known_robots
-from calib.simulation.cells.cell import Cell, SimulatedInstrument, measure
+from calib.simulation.cells.cell import Cell, Instrument, measure
 from calib.simulation.cells.virtual_cells import lwr4plus_cell
 from calib.simulation.loop.references import Reference, random_fourier
 from calib.workers import workers
@@ -63,8 +64,8 @@ class Setup:
     poses: int
 
     @property
-    def instrument(self) -> SimulatedInstrument:
-        return SimulatedInstrument(self.name, self.position, self.orientation)
+    def instrument(self) -> Instrument:
+        return Instrument(self.name, self.position, self.orientation)
 
 
 SETUPS = (
@@ -88,7 +89,7 @@ class World:
     """
 
     cell: Cell
-    settings: IdentificationSettings
+    settings: Settings
     motion: Reference
     clean: list[np.ndarray]
     names: tuple[str, ...]
@@ -100,7 +101,7 @@ class World:
 def world(setup: Setup, kind: str, seed: int) -> World:
     """Return the truth of a setup; the arm's CAD inertias are the true ones."""
     cell = lwr4plus_cell(setup.instrument, hidden=0.0)
-    settings = IdentificationSettings(
+    settings = Settings(
         kind=kind, sets=(SETS[kind],), friction="standard", essential="none", prior="none",
         payloads={PAYLOAD: Payload()},
     )  # fmt: skip
@@ -113,9 +114,7 @@ def world(setup: Setup, kind: str, seed: int) -> World:
     return World(cell, settings, motion, clean, base.names, base.transform @ values, noise, poses)
 
 
-def true_torques(
-    true: Chain, settings: IdentificationSettings, motion: Reference
-) -> tuple[np.ndarray, list[np.ndarray]]:
+def true_torques(true: Chain, settings: Settings, motion: Reference) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return the true standard parameters, and the torques without and with the payload (N, n)."""
     known, model = known_robots.truth("lwr4plus"), make_model(true, settings)
     drives = [drive_values(known)[name] for name in model.names[10 * model.tree.bodies :]]
@@ -175,21 +174,24 @@ def once(given: World, seed: list[int]) -> np.ndarray:
 def coverage(setup: Setup, kind: str, runs: int, seed: int, where: str | None) -> dict[str, Any]:
     """Return how often the intervals hold the truth, pooled and by parameter."""
     given, start = world(setup, kind, seed), time.perf_counter()
-    with workers(where) as mapped:
-        found = []
-        for number, one in enumerate(mapped(partial(once, given), [[seed, k] for k in range(runs)]), start=1):
-            found.append(one)
+    results = {}
+    with workers(where) as crew:
+        for number, one in crew.completed(partial(once, given), [[seed, k] for k in range(runs)]):
+            if isinstance(one, TaskLost):
+                print(f"\n{one}", file=sys.stderr)
+                continue
+            results[number] = one
             spent = time.perf_counter() - start
-            print(f"\r{setup.name}: {number} of {runs}, {spent:.0f} s", end="", file=sys.stderr, flush=True)
+            print(f"\r{setup.name}: {len(results)} of {runs}, {spent:.0f} s", end="", file=sys.stderr, flush=True)
     print(file=sys.stderr)
-    off, torque, geometry = np.abs(np.stack(found, axis=1))
+    off, torque, geometry = np.abs(np.stack([results[number] for number in sorted(results)], axis=1))
     with_it, without = off <= WITHIN * np.hypot(torque, geometry), off <= WITHIN * torque
     share = np.mean(geometry, axis=0) / np.mean(torque, axis=0)
     over = share > 1.0
     grows = np.hypot(1.0, share) - 1.0
     names = given.names
     return {
-        "runs": runs, "parameters": len(names),
+        "runs": len(results), "parameters": len(names),
         "pooled": {"with": float(with_it.mean()), "without": float(without.mean())},
         "geometry_exceeds_torque": {
             "parameters": [name for name, yes in zip(names, over) if yes],

@@ -36,8 +36,8 @@ def prepare(folder: Path, number: int) -> None:
 def timed(folders: list[Path], processes: int) -> tuple[float, list[float | None]]:
     """Return wall seconds and the calibrated errors [mm]."""
     started = time.perf_counter()
-    with workers(processes) as mapped:
-        outcomes = list(fleet.run(folders, mapped, "benchmark"))
+    with workers(processes) as crew:
+        outcomes = sorted(fleet.run(folders, crew, "benchmark"), key=lambda one: one.folder)
     print(fleet.summary(outcomes, time.perf_counter() - started))
     return time.perf_counter() - started, [one.calibrated for one in outcomes]
 

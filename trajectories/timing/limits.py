@@ -21,7 +21,7 @@ class Law(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class TimingLimits:
+class Limits:
     """Largest moduli (n,), each above zero, infinite where there is no limit.
 
     Attributes:

@@ -5,22 +5,22 @@ from __future__ import annotations
 import json
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from rich.console import RenderableType
 from rich.markup import escape
 from rich.table import Table
 
 from calib import files
-from calib.errors import CalibError, UsageError, exit_code
+from calib.errors import CalibError, TaskLost, UsageError, exit_code
 from calib.procedure.session import instructions, steps
 from calib.procedure.session.folder import locked, open_session
 from calib.procedure.session.outcome import verdict_of
+from calib.workers import Workers
 
 LOG = "run.log"
 DONE, WAITS, FAILED = "done", "waits", "failed"
@@ -28,7 +28,7 @@ COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red", DONE: "green", 
 
 
 @dataclass(frozen=True)
-class FleetRow:
+class Outcome:
     """How one session ended.
 
     Attributes:
@@ -69,18 +69,22 @@ def folders_of(given: Sequence[Path]) -> list[Path]:
     return found
 
 
-def run(folders: Sequence[Path], map: Callable[..., Iterable[Any]], command: str) -> Iterable[FleetRow]:
-    """Run every session as far as it goes, and yield the outcomes in order.
+def run(folders: Sequence[Path], workers: Workers, command: str) -> Iterator[Outcome]:
+    """Run every session as far as it goes, and yield each outcome when its session ends.
 
     Args:
         folders: of the sessions.
-        map: where they run (`calib.workers`).
+        workers: where they run; on other machines the folders must have the same paths.
         command: for their records.
     """
-    return map(partial(run_one, command=command), folders)
+    sent = folders if workers.here else [folder.absolute() for folder in folders]
+    for number, outcome in workers.completed(partial(run_one, command=command), sent):
+        name = str(folders[number])
+        lost = isinstance(outcome, TaskLost)
+        yield Outcome(name, FAILED, words=str(outcome), code=2) if lost else replace(outcome, folder=name)
 
 
-def run_one(folder: Path, command: str = "calib run") -> FleetRow:
+def run_one(folder: Path, command: str = "calib run") -> Outcome:
     """Run one session as far as it goes; what it says goes into its ``run.log``. Only Ctrl-C leaves this function."""
     started, said = time.perf_counter(), []
     try:
@@ -91,21 +95,21 @@ def run_one(folder: Path, command: str = "calib run") -> FleetRow:
         if code is None:
             said.append(traceback.format_exc())
         said.append(f"failed: {words}")
-        outcome = FleetRow(str(folder), FAILED, words=words, code=code or 1)
+        outcome = Outcome(str(folder), FAILED, words=words, code=code or 1)
     if (folder / "session.toml").exists():
         with suppress(CalibError):  # a full disk, a folder that cannot be written: said already
             files.write(folder / LOG, "\n".join(said) + "\n")
     return replace(outcome, seconds=time.perf_counter() - started)
 
 
-def _go_on(folder: Path, say: Callable[[str], None], command: str) -> FleetRow:
+def _go_on(folder: Path, say: Callable[[str], None], command: str) -> Outcome:
     session = open_session(folder)
     with locked(session, say):
         waiting = steps.run_next(session, say, lambda words: None, command)
     if waiting is not None:
         for line in instructions.asks(session, waiting):
             say(line)
-        return FleetRow(
+        return Outcome(
             str(folder), WAITS, words=f"{waiting.words} (step {waiting.step.name}); {LOG} says what to bring"
         )
     verdict = verdict_of(session)
@@ -114,7 +118,7 @@ def _go_on(folder: Path, say: Callable[[str], None], command: str) -> FleetRow:
         unseen = json.loads(session.path("8-dynamics/unseen/report.json").read_text(encoding="utf-8"))
         sets = (unseen["validation"] or unseen["fit"]).values()
         torque = max((one["raw"]["relative_error_percent"]["total"] or 0.0 for one in sets), default=None)
-    return FleetRow(str(folder), DONE, verdict, "", *errors, torque, code=1 if verdict == "fail" else 0)
+    return Outcome(str(folder), DONE, verdict, "", *errors, torque, code=1 if verdict == "fail" else 0)
 
 
 def _figures(path: Path) -> tuple[float | None, float | None]:
@@ -129,7 +133,15 @@ def _figures(path: Path) -> tuple[float | None, float | None]:
     return max(pairs, key=lambda pair: pair[1]) if pairs else (None, None)
 
 
-def table(outcomes: Sequence[FleetRow]) -> RenderableType:
+def line(one: Outcome) -> str:
+    """Return one session's end in a line."""
+    errors = one.nominal is not None and f"{one.nominal:.3g} → {one.calibrated:.3g} mm"
+    torque = one.torque is not None and f"torque {one.torque:.3g} %"
+    words = [word for word in (one.state, one.verdict, errors, torque, f"{one.seconds:.1f} s") if word]
+    return f"{one.folder}: {', '.join(words)}"
+
+
+def table(outcomes: Sequence[Outcome]) -> RenderableType:
     """Return the summary, a line per robot: errors on unseen poses, rms, and on unseen motion."""
     found = Table("session", "state", "verdict", box=None, pad_edge=False)
     for name in ("nominal mm", "calibrated mm", "torque %", "s"):
@@ -143,14 +155,14 @@ def table(outcomes: Sequence[FleetRow]) -> RenderableType:
     return found
 
 
-def remarks(outcomes: Sequence[FleetRow]) -> Iterator[str]:
+def remarks(outcomes: Sequence[Outcome]) -> Iterator[str]:
     """Say of every session that is not done what it waits for, or what went wrong."""
     for one in outcomes:
         if one.state != DONE:
             yield f"{one.folder} {one.state}{' for ' if one.state == WAITS else ': '}{one.words}"
 
 
-def summary(outcomes: Sequence[FleetRow], seconds: float) -> str:
+def summary(outcomes: Sequence[Outcome], seconds: float) -> str:
     """Return one line on all of them."""
     counts = {state: sum(one.state == state for one in outcomes) for state in (DONE, WAITS, FAILED)}
     judged = {level: sum(one.verdict == level for one in outcomes) for level in ("pass", "marginal", "fail")}
@@ -160,6 +172,6 @@ def summary(outcomes: Sequence[FleetRow], seconds: float) -> str:
     return f"{', '.join(parts)}; {seconds:.1f} s"
 
 
-def worst_code(outcomes: Sequence[FleetRow]) -> int:
+def worst_code(outcomes: Sequence[Outcome]) -> int:
     """Return the exit code of all: of the first kind that occurred out of 3, 2 (they failed), 1 (verdict fail), 0."""
     return max((one.code for one in outcomes), default=0)

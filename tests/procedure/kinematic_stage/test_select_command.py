@@ -9,8 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib import workers
-from calib.errors import UsageError
 from calib.geometry.observability import observation, targets_of
 from calib.procedure.kinematic_stage import selection
 from calib.procedure.kinematic_stage.pose_limits import read_limits
@@ -133,11 +131,6 @@ def test_nothing_feasible_says_so(cell, calib):
     assert "0 " in err
 
 
-def test_processes_map_in_order():
-    with workers.workers(2) as mapped:
-        assert list(mapped(pow, [2, 3, 5], [2, 2, 2])) == [4, 9, 25]
-
-
 def test_what_is_sent_to_other_processes_pickles(cell):
     Path("c.toml").write_text(CONSTRAINTS)
     arm = targets_of(load("ur5"))
@@ -146,18 +139,3 @@ def test_what_is_sent_to_other_processes_pickles(cell):
     copy, again = pickle.loads(pickle.dumps((limits, seen)))
     assert np.array_equal(again(q), seen(q))
     assert np.array_equal(copy.feasible(q), limits.feasible(q))
-
-
-def test_workers_are_a_number_or_an_address():
-    with workers.workers() as mapped:
-        assert mapped is map
-    for wrong in ("many", "0", "-1"):
-        with pytest.raises(UsageError), workers.workers(wrong):
-            pass
-
-
-def test_dask_maps_in_order():
-    distributed = pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
-    local = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": None}
-    with distributed.LocalCluster(**local) as cluster, workers.workers(cluster.scheduler_address) as mapped:
-        assert list(mapped(pow, [2, 3], [2, 2])) == [4, 9]

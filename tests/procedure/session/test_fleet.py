@@ -6,15 +6,18 @@ import pickle
 import runpy
 import shutil
 import sys
+from collections.abc import Callable, Generator, Iterable
 from functools import partial
 from pathlib import Path
 
+import dask_cluster
 import pytest
 from sessions import edit
 
 from calib import cli
-from calib.errors import MeasurementError, NotConverged, Unidentifiable, UsageError, exit_code
+from calib.errors import MeasurementError, NotConverged, TaskLost, Unidentifiable, UsageError, exit_code
 from calib.procedure.session import fleet
+from calib.workers import Workers, workers
 
 ROOT = Path(__file__).parents[3]
 
@@ -43,7 +46,8 @@ def test_one_that_fails_stops_none(cells: Path, capsys: pytest.CaptureFixture) -
 def test_a_failing_verdict_is_code_1(cells: Path) -> None:
     path = cells / "a/5-validation/metrics.json"
     path.write_text(path.read_text().replace('"verdict": "', '"verdict": "fail", "was": "'))
-    assert [one.code for one in fleet.run([cells / "a", cells / "c"], map, "test")] == [1, 0]
+    with workers() as crew:
+        assert [one.code for one in fleet.run([cells / "a", cells / "c"], crew, "test")] == [1, 0]
 
 
 def test_an_unforeseen_error_stops_none_either(cells: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -51,6 +55,29 @@ def test_an_unforeseen_error_stops_none_either(cells: Path, monkeypatch: pytest.
     one = fleet.run_one(cells / "a")
     assert one.state == fleet.FAILED and one.code == 1 and "ZeroDivisionError" in one.words
     assert "Traceback" in (cells / "a/run.log").read_text() and not (cells / "a/session.lock").exists()
+
+
+def test_a_robot_whose_process_dies_is_one_that_failed(cells: Path) -> None:
+    def stream(function: Callable, tasks: Iterable[tuple], near: Callable[[int], bool]) -> Generator:
+        _, given = tasks
+        yield 1, function(*given), None
+        yield 0, None, TaskLost("task 1 is lost: 3 processes died of it")
+
+    found = list(fleet.run([cells / "c", cells / "d"], Workers(stream), "test"))
+    assert [(one.folder, one.state, one.code) for one in found] == [(str(cells / x), "failed", 2) for x in "dc"]
+    assert "3 processes died" in found[1].words and "is lost" not in found[0].words
+
+
+def test_a_fleet_on_a_cluster(cells: Path, tmp_path: Path, monkeypatch, capsys: pytest.CaptureFixture) -> None:
+    """Folders named from here are found there; each robot is said when it is done, the table in the order given."""
+    monkeypatch.chdir(cells)
+    with dask_cluster.running(tmp_path, workers=2) as cluster:
+        assert cli.run(["run", "d", "c", "a", "--workers", cluster.address]) == 2
+    said = capsys.readouterr().out
+    assert "1 of 3 done" in said and "a: done, " in said and " mm, " in said and "d failed: " in said
+    table = said[said.index("session ") :].splitlines()
+    assert [line.split()[0] for line in table[1:4]] == ["d", "c", "a"]
+    assert "Bring " in (cells / "c/run.log").read_text()
 
 
 def test_what_workers_get_pickles(cells: Path) -> None:

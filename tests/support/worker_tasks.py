@@ -1,0 +1,87 @@
+"""Tasks for the tests of `calib.workers`; other processes import them from here."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+from calib.errors import MeasurementError
+
+SECONDS = 30.0  # that a busy machine may take
+
+
+def square(x: int) -> int:
+    return x * x
+
+
+def wait_for(path: Path) -> None:
+    until = time.monotonic() + SECONDS
+    while not path.exists():
+        assert time.monotonic() < until, f"{path} did not come"
+        time.sleep(0.01)
+
+
+def complain(row: int) -> None:
+    raise MeasurementError("cannot be", "log.csv", row)
+
+
+class Awkward(Exception):
+    """Cannot be pickled and read back."""
+
+    def __init__(self, one: int, two: int) -> None:
+        super().__init__(f"{one} and {two}")
+
+
+def complain_awkwardly(x: int) -> None:
+    raise Awkward(x, x)
+
+
+def wait_or_square(task: tuple[Path, int]) -> int:
+    path, x = task
+    if x == 0:
+        wait_for(path)
+    return x * x
+
+
+def late_first(x: int) -> int:
+    time.sleep(1.0 if x == 0 else 0.0)
+    return x
+
+
+def threads(_: int) -> list[int]:
+    import numba
+    import numpy
+    from threadpoolctl import threadpool_info
+
+    assert numpy
+    return [numba.get_num_threads(), *(pool["num_threads"] for pool in threadpool_info())]
+
+
+def die_at_first(path: Path) -> str:
+    if not path.exists():
+        path.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return path.name
+
+
+def die_of_two(x: int) -> int:
+    if x == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return x
+
+
+def pid_a_little_later(x: int) -> int:
+    time.sleep(0.1)
+    return os.getpid()
+
+
+def until_told(folder: Path) -> str:
+    """Wait like a search that hands back the best so far after Ctrl-C."""
+    (folder / f"{os.getpid()}.pid").touch()
+    try:
+        time.sleep(2 * SECONDS)
+    except KeyboardInterrupt:
+        return "so far"
+    return "to the end"

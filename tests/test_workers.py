@@ -1,0 +1,255 @@
+"""Parallel work: results as they come, whoever dies; the same for this process, processes, and a real Dask cluster."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import suppress
+from itertools import islice
+from pathlib import Path
+
+import dask_cluster
+import pytest
+from worker_tasks import (
+    SECONDS,
+    Awkward,
+    complain,
+    complain_awkwardly,
+    die_at_first,
+    die_of_two,
+    late_first,
+    pid_a_little_later,
+    square,
+    threads,
+    wait_or_square,
+)
+
+from calib import workers as work
+from calib.errors import CalibError, MeasurementError, TaskLost, UsageError
+from calib.workers import Workers, workers
+
+
+@pytest.fixture(scope="module")
+def crews(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Workers]]:
+    with (
+        dask_cluster.running(tmp_path_factory.mktemp("dask"), workers=2) as cluster,
+        workers() as here,
+        workers(2) as processes,
+        workers(cluster.address) as dask,
+    ):
+        yield {"here": here, "processes": processes, "dask": dask}
+
+
+EVERYWHERE = pytest.mark.parametrize("where", ["here", "processes", "dask"])
+IN_PARALLEL = pytest.mark.parametrize("where", ["processes", "dask"])
+
+
+@EVERYWHERE
+def test_results_in_order_or_each_once(crews: dict[str, Workers], where: str) -> None:
+    assert list(crews[where].map(pow, [2, 3, 5], [1, 2, 3])) == [2, 9, 125]
+    assert sorted(crews[where].completed(square, range(20))) == [(i, i * i) for i in range(20)]
+    assert list(crews[where].completed(square, [])) == []
+
+
+@EVERYWHERE
+def test_what_a_task_raises_is_raised_here(crews: dict[str, Workers], where: str) -> None:
+    for run in (crews[where].map, crews[where].completed):
+        with pytest.raises(MeasurementError) as caught:
+            list(run(complain, [7, 7]))
+        assert (caught.value.row, caught.value.file) == (7, "log.csv")
+        with pytest.raises((Awkward, RuntimeError), match="1 and 1"):
+            list(run(complain_awkwardly, [1]))
+    assert list(crews[where].map(square, [3])) == [9]
+
+
+@IN_PARALLEL
+def test_results_come_as_tasks_complete(crews: dict[str, Workers], where: str, tmp_path: Path) -> None:
+    """The first task ends only once the results of all others are here."""
+    seen = []
+    for number, _ in crews[where].completed(wait_or_square, [(tmp_path / "go", x) for x in range(6)]):
+        seen.append(number)
+        if len(seen) == 5:
+            (tmp_path / "go").touch()
+    assert seen == [1, 2, 3, 4, 5, 0]
+
+
+@EVERYWHERE
+def test_of_a_million_tasks_few_are_taken_at_once(crews: dict[str, Workers], where: str) -> None:
+    taken = []
+    tasks = (taken.append(x) or x for x in range(1_000_000))
+    assert len(list(islice(crews[where].completed(square, tasks), 5))) == 5
+    assert len(taken) <= 5 + 2 * 2
+
+
+@IN_PARALLEL
+def test_results_that_wait_for_their_turn_are_few(
+    crews: dict[str, Workers], where: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(work, "AHEAD", 8)
+    taken = []
+    results = crews[where].map(late_first, (taken.append(x) or x for x in range(40)))
+    assert next(results) == 0 and len(taken) <= 8 + 2
+    assert list(results) == list(range(1, 40))
+
+
+@IN_PARALLEL
+def test_workers_use_one_thread_each(crews: dict[str, Workers], where: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
+    with workers(2) as fresh:
+        found = list((fresh if where == "processes" else crews[where]).map(threads, range(2)))
+    assert all(len(counts) > 1 and set(counts) == {1} for counts in found)
+    assert os.environ["OPENBLAS_NUM_THREADS"] == "2"
+
+
+def test_a_task_whose_process_is_killed_is_tried_again(crews: dict[str, Workers], tmp_path: Path) -> None:
+    tasks = [tmp_path / f"{x}" for x in range(3)]
+    assert sorted(crews["processes"].completed(die_at_first, tasks)) == [(x, f"{x}") for x in range(3)]
+
+
+def test_a_task_lost_for_good_costs_no_other_result(crews: dict[str, Workers]) -> None:
+    found = dict(crews["processes"].completed(die_of_two, range(5)))
+    lost = found.pop(2)
+    assert found == {0: 0, 1: 1, 3: 3, 4: 4}
+    assert isinstance(lost, TaskLost) and (lost.number, lost.task) == (2, 2)
+    assert "task 3 (2) is lost: 3 processes died of it, the last by signal 9" in str(lost)
+
+
+def test_in_order_a_lost_task_is_raised_in_its_place() -> None:
+    def stream(function: Callable, tasks: Iterable[tuple], near: Callable[[int], bool]) -> Generator:
+        yield 1, None, TaskLost("task 2 is lost", 1)
+        yield 2, 4, None
+        yield 0, 0, None
+
+    results = Workers(stream).map(square, range(3))
+    assert next(results) == 0
+    with pytest.raises(TaskLost, match="task 2"):
+        next(results)
+
+
+def test_a_cluster_loses_workers_and_no_result(tmp_path: Path) -> None:
+    """Of two workers one is killed in the middle; then a task kills whoever runs it, twice; then the scheduler goes."""
+    with dask_cluster.running(tmp_path, workers=2, failures=1) as cluster, workers(cluster.address) as crew:
+        pids = {worker.pid: worker for worker in cluster.workers}
+        seen, killed = list[tuple[int, int]](), 0
+        for number, pid in crew.completed(pid_a_little_later, range(16)):
+            seen.append((number, pid))
+            if len({pid for _, pid in seen}) == 2 and not killed:
+                pids[pid].kill()
+                killed = len(seen)
+        assert 2 <= killed <= 8 and len({pid for _, pid in seen[killed + 1 :]}) == 1
+        assert sorted(number for number, _ in seen) == list(range(16))
+        cluster.add(2)
+        found = dict(crew.completed(die_of_two, range(5)))
+        lost = found.pop(2)
+        assert found == {0: 0, 1: 1, 3: 3, 4: 4}
+        assert isinstance(lost, TaskLost) and (lost.number, lost.task) == (2, 2) and "2 workers died" in str(lost)
+        results = crew.completed(pid_a_little_later, range(100))
+        assert next(results)[0] == 0
+        cluster.scheduler.kill()
+        started = time.monotonic()
+        with pytest.raises(CalibError, match="is gone"):
+            list(results)
+        with pytest.raises(CalibError, match="is gone"):
+            list(crew.map(square, [1]))
+    assert time.monotonic() - started < SECONDS
+
+
+def test_a_cluster_without_workers_is_not_waited_for_long(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(work, "NO_WORKERS", 1.0)
+    alone = dask_cluster.running(tmp_path, workers=0)
+    complaint = pytest.raises(CalibError, match="has had no workers for 1 s")
+    with alone as cluster, workers(cluster.address) as crew, complaint:
+        list(crew.completed(square, range(3)))
+
+
+def test_where_nothing_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(work, "ANSWER", 1.0)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        port = silent.getsockname()[1]
+        for wrong in (f"tcp://127.0.0.1:{port}", "tcp://127.0.0.1:1", "tcp://127.0.0.1", "smoke://127.0.0.1:8786"):
+            with pytest.raises(UsageError, match="no Dask scheduler answers at"), workers(wrong):
+                pass
+
+
+@pytest.mark.parametrize("wrong", ["many", "0", "-1", "1.5", ""])
+def test_workers_are_a_number_or_an_address(wrong: str) -> None:
+    with pytest.raises(UsageError, match="expected a number of processes or an address"), workers(wrong):
+        pass
+
+
+def test_this_process_takes_one_task_at_a_time() -> None:
+    taken = []
+    with workers("1") as crew:
+        results = crew.map(square, (taken.append(x) or x for x in (2, 3)))
+        assert (next(results), taken) == (4, [2])
+
+
+SCRIPT = """
+import sys
+from pathlib import Path
+from calib import workers as work
+from worker_tasks import until_told
+if {guard}:
+    work.GRACE = 0.5
+    with work.workers(2) as crew:
+        for result in crew.{run}(until_told, [Path(sys.argv[1])] * 9):
+            print(result, flush=True)
+"""
+
+
+def script(folder: Path, run: str = "map", guard: str = "__name__ == '__main__'") -> subprocess.Popen:
+    (folder / "script.py").write_text(SCRIPT.format(run=run, guard=guard))
+    return subprocess.Popen(
+        [sys.executable, str(folder / "script.py"), str(folder)], text=True, start_new_session=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+    )  # fmt: skip
+
+
+def pids_in(folder: Path) -> list[int]:
+    """Return the processes at work, once there are two."""
+    until = time.monotonic() + SECONDS
+    while len(found := list(folder.glob("*.pid"))) < 2:
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    return [int(path.stem) for path in found]
+
+
+def assert_gone(pids: list[int]) -> None:
+    until = time.monotonic() + SECONDS
+    for pid in pids:
+        with suppress(ProcessLookupError):
+            while time.monotonic() < until:
+                os.kill(pid, 0)
+                time.sleep(0.02)
+            raise AssertionError(f"process {pid} is still there")
+
+
+@pytest.mark.parametrize(("run", "kill"), [("map", os.killpg), ("completed", os.kill)])
+def test_after_ctrl_c_tasks_under_way_hand_back_what_they_have(tmp_path: Path, run: str, kill) -> None:
+    """Whether the terminal's group gets it, or this process alone; no further task begins."""
+    running = script(tmp_path, run)
+    pids = pids_in(tmp_path)
+    kill(running.pid, signal.SIGINT)
+    out, err = running.communicate(timeout=SECONDS)
+    assert out.count("so far") == 2 and "KeyboardInterrupt" in err and running.returncode != 0
+    assert len(list(tmp_path.glob("*.pid"))) == 2
+    assert_gone(pids)
+
+
+def test_no_process_outlives_its_parent(tmp_path: Path) -> None:
+    running = script(tmp_path)
+    pids = pids_in(tmp_path)
+    running.kill()
+    assert_gone(pids)
+    running.communicate(timeout=SECONDS)
+
+
+def test_a_script_that_starts_itself_again_is_told(tmp_path: Path) -> None:
+    running = script(tmp_path, guard="True")
+    _, err = running.communicate(timeout=SECONDS)
+    assert "CalibError: worker processes end as they start" in err and "lacks if __name__" in err
