@@ -6,8 +6,9 @@ raise their own subclasses of `ValueError`.
 
 from __future__ import annotations
 
+import difflib
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -83,6 +84,13 @@ class TaskLost(CalibError):
 
 class SessionError(CalibError):
     """A session folder that is busy, damaged, or not in the state a command needs."""
+
+
+def suggestion(word: str, words: Collection[str]) -> str:
+    """Return `` (did you mean '...'?)`` for the most similar of `words`, or nothing."""
+    lower = {str(other).lower(): other for other in words}
+    close = difflib.get_close_matches(word.lower(), lower, 1, 0.6)
+    return f" (did you mean '{lower[close[0]]}'?)" if close else ""
 
 
 def exit_code(error: Exception) -> int | None:

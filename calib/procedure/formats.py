@@ -76,7 +76,7 @@ def describe(topic: str) -> str:
         raise UsageError(f"no format '{topic}'; there are {', '.join(TOPICS)}")
     parts = [_plain(import_module(name).__doc__ or "") for name in TOPICS[topic][1]]
     if topic == "session":
-        from calib.procedure.session.folder import example
+        from calib.procedure.session.settings import example
 
         parts.append(f"session.toml, as calib new writes it:\n\n{example()}")
     return "\n\n".join(part.strip() for part in parts) + "\n"

@@ -7,7 +7,7 @@ import tomllib
 import pytest
 
 from calib.procedure.formats import TOPICS
-from calib.procedure.session.folder import example
+from calib.procedure.session.settings import example
 
 
 def test_every_format_has_its_documentation(calib):

@@ -48,7 +48,7 @@ def certify(session: Session, say: Say) -> list[str]:
     told = simulated(session)
     page = certificate.Page(
         f"{'Simulated calibration' if told else 'Calibration'} of {session.settings.name}",
-        f"{'SIMULATED: ' if told else ''}{session.settings.instrument['name']}, {session.settings.created[:10]}",
+        f"{'SIMULATED: ' if told else ''}{session.settings.instrument.name}, {session.settings.created[:10]}",
         setup(session, whole),
         judged,
         listed(session),
@@ -86,18 +86,18 @@ def setup(session: Session, found: fit_report.Report) -> list[tuple[str, str]]:
     """Return what stands under Setup on the certificate."""
     settings, fitted = session.settings, measured_files(session)
     instrument = settings.instrument
-    stated = f", σ {1e6 * instrument['sigma_position']:g} µm" if instrument["sigma_position"] else ", σ estimated"
-    turning = f", {1e3 * instrument['sigma_orientation']:g} mrad" if instrument["sigma_orientation"] else ""
+    stated = f", σ {1e6 * instrument.sigma_position:g} µm" if instrument.sigma_position else ", σ estimated"
+    turning = f", {1e3 * instrument.sigma_orientation:g} mrad" if instrument.sigma_orientation else ""
     return [
         *simulated(session),
         ("robot", f"{found.robot}, {found.base} to {found.tip}, {len(found.joints)} joints"),
-        ("description", settings.robot["given"]),
-        ("instrument", f"{instrument['name']}, measures {instrument['measures']}{stated}{turning}"),
+        ("description", settings.robot.given),
+        ("instrument", f"{instrument.name}, measures {instrument.measures}{stated}{turning}"),
         ("session made", settings.created.replace("T", " ")),
         ("measurements", dated([*fitted[0], *fitted[1]])),
         ("pose plan", session_plan(session)),
         ("model", found.metrics["model"]),
-        ("tolerance", certificate.tolerance(settings.fit["tolerance_mm"])),
+        ("tolerance", certificate.tolerance(settings.fit.tolerance_mm)),
         *dynamic_setup(session),
         ("seed", str(settings.seed)),
         ("command", f"calib next {session.folder.name}"),
@@ -110,16 +110,16 @@ def dynamic_setup(session: Session) -> list[tuple[str, str]]:
     if not session.dynamic:
         return []
     wanted, (training, unseen) = session.settings.dynamics, recordings(session)
-    allowed = wanted["tolerance_percent"]
+    allowed = wanted.tolerance_percent
     torques = {
         "motor": "motors'",
         "link": "of sensors behind the gears",
         "both": "motors' and of sensors behind the gears",
     }
-    loads = ", ".join(f"{label} {mass:g} kg" for label, mass in wanted["payloads"].items())
+    loads = ", ".join(f"{label} {mass:g} kg" for label, mass in wanted.payloads.items())
     rows = [
         ("recordings", dated([*training, *unseen])),
-        ("torques", torques[wanted["torques"]]),
+        ("torques", torques[wanted.torques]),
         ("tolerance of torque", f"{allowed:g} % on unseen motion" if allowed else "none was given: pass below 10 %"),
     ]
     return [*rows, ("payloads", loads)] if loads else rows
@@ -135,7 +135,7 @@ def dated(paths: list[Path]) -> str:
 def session_plan(session: Session) -> str:
     """Return in a few words how the poses were chosen."""
     path = session.path("2-poses/selection.json")
-    if not session.settings.poses["plan"] or not path.exists():
+    if not session.settings.poses.plan or not path.exists():
         return "poses not planned here"
     return str(json.loads(path.read_text()).get("words", "chosen by hand"))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,14 @@ from calib.procedure.session import instructions, steps
 from calib.procedure.session.folder import Session, create, locked, open_session
 from calib.procedure.session.outcome import verdict_of
 from calib.procedure.session.presets import instrument as instrument_named
+from calib.procedure.session.settings import (
+    DynamicsSection,
+    FitSection,
+    InstrumentSection,
+    PosesSection,
+    RobotSection,
+    SessionSettings,
+)  # fmt: skip
 from calib.robot.load import load, resolve
 
 Say = Callable[[str], None]
@@ -53,16 +61,19 @@ def begin(
         raise UsageError(f"--poses {poses} --validation {validation}: at least one pose, and no fewer than 0")
     device, source = instrument_named(instrument), resolve(robot)
     chain = load(robot, base or None, tip or None)
-    copied, named = {}, {}
+    copied, named = ({}, "") if limits is None else ({"limits.toml": limits}, "limits.toml")
     if limits is not None:
         read_motion_limits(limits, chain, source)
-        copied, named = {"limits.toml": limits}, {"limits": "limits.toml", "constraints": "limits.toml"}
-    place = {} if tool is None else {"tool": tuple(tool)}
-    return create(
-        folder, source, robot, copied, name=chain.name, seed=seed, instrument=device.label, measures=device.measures,
-        sigma_position=device.sigma_position, sigma_orientation=device.sigma_orientation, fit=poses,
-        validation=validation, base=base, tip=tip, dynamics=dynamics, **place, **named, **motion,
+    measured = InstrumentSection(device.label, device.measures, device.sigma_position, device.sigma_orientation)
+    if tool is not None:
+        x, y, z = (float(value) for value in tool)
+        measured = replace(measured, tool=(x, y, z))
+    wanted = SessionSettings(
+        chain.name, "", seed, RobotSection("", robot, base, tip), measured,
+        PosesSection(poses, validation, constraints=named), FitSection(),
+        DynamicsSection(wanted=dynamics, limits=named, **motion),
     )  # fmt: skip
+    return create(folder, source, wanted, copied)
 
 
 def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "") -> Stop:
@@ -96,7 +107,7 @@ def status_lines(folder: Path) -> Iterator[RenderableType]:
     """Say how every step of a session stands, and what comes next."""
     session = open_session(folder)
     settings, found = session.settings, steps.states(session)
-    yield f"[bold]{escape(settings.name)}[/], {escape(settings.instrument['name'])}, made {settings.created[:10]}"
+    yield f"[bold]{escape(settings.name)}[/], {escape(settings.instrument.name)}, made {settings.created[:10]}"
     table = Table("", "step", "state", "", box=None, pad_edge=False)
     for number, state in enumerate(found, 1):
         colour = COLOURS[state.kind]

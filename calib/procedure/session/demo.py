@@ -153,15 +153,14 @@ def bring_what_waits(folder: Path, say: Say) -> None:
         UsageError: where nothing is waited for, or the session's robot is none of the library.
     """
     session = open_session(folder)
-    if session.settings.robot["given"] not in library.names():
+    if session.settings.robot.given not in library.names():
         raise UsageError(
-            f"{folder} is about {session.settings.robot['given']}; the simulated cells are of "
-            f"{', '.join(library.names())}"
+            f"{folder} is about {session.settings.robot.given}; the simulated cells are of {', '.join(library.names())}"
         )
     with locked(session, say):
         waiting = next((state for state in steps.states(session) if state.kind not in (steps.DONE, steps.KEPT)), None)
         if waiting is None:
-            told_truth(session, virtual_cell(session.settings.robot["given"], session.settings.seed), say)
+            told_truth(session, virtual_cell(session.settings.robot.given, session.settings.seed), say)
             return
         if waiting.kind != steps.WAITING:
             raise UsageError(f"{folder} waits for nothing; next: calib next {folder}")
@@ -172,7 +171,7 @@ def bring_what_waits(folder: Path, say: Say) -> None:
 def bring_for(session: Session, step: str, say: Say) -> None:
     """Let the simulated cell do what a step waits for."""
     seed = session.settings.seed
-    cell = virtual_cell(session.settings.robot["given"], seed)
+    cell = virtual_cell(session.settings.robot.given, seed)
     if step in ("measure", "validate"):
         bring(session, cell, seed)
         say("    (the simulated cell measures both lists of poses)")
@@ -185,7 +184,7 @@ def bring_for(session: Session, step: str, say: Say) -> None:
 
 def arm_of(session: Session, cell: Cell) -> MovingArm:
     """Return the arm of a session's simulated cell as it moves."""
-    return moving_arm(cell, session.settings.robot["given"], session.settings.seed)
+    return moving_arm(cell, session.settings.robot.given, session.settings.seed)
 
 
 def bring(session: Session, cell: Cell, seed: int) -> None:

@@ -54,12 +54,12 @@ def calibrated(session: Session) -> Chain:
 def options_of(session: Session) -> IdentifyOptions:
     """Return how to identify: the options file's content, or what ``session.toml`` says; payloads by file name."""
     wanted = session.settings.dynamics
-    options = read_options(session.path(wanted["options"]) if wanted["options"] else None)
+    options = read_options(session.path(wanted.options) if wanted.options else None)
     settings = options.settings
-    if not wanted["options"]:
-        kind = wanted["torques"]
-        settings = replace(settings, kind=kind, friction=wanted["friction"], method=wanted["method"])
-    known = {label: Payload(float(mass)) for label, mass in wanted["payloads"].items()}
+    if not wanted.options:
+        kind = wanted.torques
+        settings = replace(settings, kind=kind, friction=wanted.friction, method=wanted.method)
+    known = {label: Payload(float(mass)) for label, mass in wanted.payloads.items()}
     settings = replace(settings, payloads={**known, **settings.payloads}, seed=session.settings.seed)
     own = dict(options.files)
     for path in (*recordings(session)[0], *recordings(session)[1]):
@@ -77,15 +77,15 @@ def excite(session: Session, say: Say) -> list[str]:
     from calib.procedure.report import motion_figures
 
     wanted, notes = session.settings.dynamics, []
-    limits = session.path(wanted["limits"]) if wanted["limits"] else None
-    names = ["training", "validation"] if wanted["validation"] else ["training"]
+    limits = session.path(wanted.limits) if wanted.limits else None
+    names = ["training", "validation"] if wanted.validation else ["training"]
     for name in names:
         first = name == "training"
         designed = design.excite(
-            session.path("4-fit"), limits=limits, period=wanted["period"] * (1.0 if first else SHORTER),
-            harmonics=wanted["harmonics"], rate=wanted["rate"], starts=wanted["starts"] if first else 1,
-            evaluations=wanted["evaluations"] if first else max(20, wanted["evaluations"] // 3),
-            seed=session.settings.seed + (0 if first else OTHER), repeat=wanted["repeats"],
+            session.path("4-fit"), limits=limits, period=wanted.period * (1.0 if first else SHORTER),
+            harmonics=wanted.harmonics, rate=wanted.rate, starts=wanted.starts if first else 1,
+            evaluations=wanted.evaluations if first else max(20, wanted.evaluations // 3),
+            seed=session.settings.seed + (0 if first else OTHER), repeat=wanted.repeats,
             progress=lambda words, name=name: say(f"{name} motion: {words}"),
         )  # fmt: skip
         if designed.found.interrupted:  # a session is resumed, not gone on with half a search
@@ -134,7 +134,7 @@ def check_recording(session: Session, path: Path, name: str) -> tuple[list[float
     if name not in motions:
         return None, notes
     others = {other: motion for other, motion in motions.items() if other != name}
-    found = motion_check.find_motion(recording, motions[name], others, session.settings.dynamics["repeats"])
+    found = motion_check.find_motion(recording, motions[name], others, session.settings.dynamics.repeats)
     worst = max(found.tracking)
     notes.append(
         f"{path.name}: the {name} motion, {found.periods} times, from {found.start:.2f} s on; off its design by up to "
@@ -145,7 +145,7 @@ def check_recording(session: Session, path: Path, name: str) -> tuple[list[float
 
 def designed_motions(session: Session) -> dict[str, Periodic]:
     """Return the session's motions by name; none where it does not plan."""
-    if not session.settings.dynamics["plan"]:
+    if not session.settings.dynamics.plan:
         return {}
     folders = {name: session.path(f"6-excitation/{name}") for name in ("training", "validation")}
     return {name: coefficients.read(folder) for name, folder in folders.items() if folder.exists()}
@@ -194,6 +194,6 @@ def predict(session: Session, say: Say) -> list[str]:
         session.path("4-fit"), cut_paths(training, cuts), cut_paths(unseen, aside), options=options_of(session),
         seed=session.settings.seed, progress=say,
     )  # fmt: skip
-    held = validation.hold(given, session.path("8-dynamics"), session.settings.dynamics["tolerance_percent"])
+    held = validation.hold(given, session.path("8-dynamics"), session.settings.dynamics.tolerance_percent)
     validation.write(held, session.path("8-dynamics/unseen"))
     return [*notes, f"verdict {held.verdict.level}: {held.verdict.reason}", *held.warnings]

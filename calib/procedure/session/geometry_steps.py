@@ -33,21 +33,21 @@ Say = Callable[[str], None]
 
 def robot_file(session: Session) -> Path:
     """Return the session's robot description."""
-    return session.path(session.settings.robot["file"])
+    return session.path(session.settings.robot.file)
 
 
 def chain_of(session: Session) -> Chain:
     """Return the nominal arm."""
     robot = session.settings.robot
     options = options_of(session)
-    return inputs.load_robot(robot_file(session), None, options, robot["base"] or None, robot["tip"] or None)[0]
+    return inputs.load_robot(robot_file(session), None, options, robot.base or None, robot.tip or None)[0]
 
 
 def options_of(session: Session) -> FitOptions:
     """Return the fit options, with the instrument's sigmas where a file states none."""
-    name, instrument = session.settings.fit["options"], session.settings.instrument
+    name, instrument = session.settings.fit.options, session.settings.instrument
     options = read_options(session.path(name) if name else None)
-    position, turn = instrument["sigma_position"], instrument["sigma_orientation"]
+    position, turn = instrument.sigma_position, instrument.sigma_orientation
 
     def stated(each: FileOptions) -> FileOptions:
         if position and each.sigma_position is None:
@@ -61,7 +61,7 @@ def options_of(session: Session) -> FitOptions:
 
 def tolerance_of(session: Session) -> float | None:
     """Return the largest rms on unseen poses that is good enough [m]; None where the session states none."""
-    return 1e-3 * session.settings.fit["tolerance_mm"] or None
+    return 1e-3 * session.settings.fit.tolerance_mm or None
 
 
 def measured_files(session: Session) -> tuple[list[Path], list[Path]]:
@@ -101,10 +101,10 @@ def select(session: Session, say: Say) -> list[str]:
     names = chain.joint_names
     write_poses(session.path("2-poses/poses.csv"), chosen.fit, names, unit="deg", kinds=kinds)
     notes = [f"{len(chosen.fit)} poses for the fit: {chosen.words}"]
-    if wanted["validation"]:
+    if wanted.validation:
         write_poses(session.path("2-poses/validation.csv"), chosen.validation, names, unit="deg", kinds=kinds)
         notes.append(f"{len(chosen.validation)} poses for validation, at random")
-    if not wanted["constraints"]:
+    if not wanted.constraints:
         notes.append("only joint limits were kept: look at every pose for collisions, or name a constraints file")
     notes += chosen.record["notes"]
     files.write_json(session.path("2-poses/selection.json"), chosen.record)
@@ -114,7 +114,7 @@ def select(session: Session, say: Say) -> list[str]:
 def planned(session: Session, chain: Chain, name: str) -> np.ndarray | None:
     """Return the planned poses in ``2-poses``; None where there is no plan."""
     path = session.path(f"2-poses/{name}.csv")
-    if not session.settings.poses["plan"] or not path.exists():
+    if not session.settings.poses.plan or not path.exists():
         return None
     return read_poses(path, chain.joint_names, kinds=[joint.kind for joint in chain.joints])
 
@@ -139,7 +139,7 @@ def check_file(session: Session, chain: Chain, path: Path, plan: np.ndarray | No
     """
     notes = []
     for block in inputs.read_file(path, chain, options_of(session)):
-        wanted = session.settings.instrument["measures"]
+        wanted = session.settings.instrument.measures
         if wanted == "pose" and block.kind == "position":
             notes.append(f"{path.name}: positions only, where the instrument gives poses")
         ignored = f", ignored: {', '.join(block.ignored)}" if block.ignored else ""
@@ -157,7 +157,7 @@ def drifts(session: Session, chain: Chain) -> list[str]:
         [block for path in paths for block in inputs.read_file(path, chain, options)]
         for paths in (measured_files(session)[0], measured_again(session))
     )
-    return arrival.drift(chain, first, again, session.settings.instrument["sigma_position"])
+    return arrival.drift(chain, first, again, session.settings.instrument.sigma_position)
 
 
 def gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
@@ -167,7 +167,7 @@ def gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
     links = (chain.base, chain.tip) if robot_file(session).suffix == ".urdf" else (None, None)
     return inputs.gather(
         robot_file(session), measured_files(session)[0], validate, options=options_of(session),
-        stations=fit["stations"], refit_frames=fit["validation_frames"] == "own", base=links[0], tip=links[1],
+        stations=fit.stations, refit_frames=fit.validation_frames == "own", base=links[0], tip=links[1],
         seed=session.settings.seed,
     )  # fmt: skip
 
@@ -176,7 +176,7 @@ def fit(session: Session, say: Say) -> list[str]:
     """Fit the geometry to the measured files; validation files are not looked at."""
     settings = session.settings
     outcome = fitting.run(
-        gathered(session), options_of(session), model=settings.fit["model"], loss=settings.fit["loss"],
+        gathered(session), options_of(session), model=settings.fit.model, loss=settings.fit.loss,
         tolerance=tolerance_of(session), seed=settings.seed, progress=say,
     )  # fmt: skip
     outputs.write_folder(outcome, session.path("4-fit"), fit_certificate.write)
@@ -184,7 +184,7 @@ def fit(session: Session, say: Say) -> list[str]:
     notes = [f"model {outcome.climb.chosen}, {count} parameters on {outcome.fit.poses} poses", *outcome.warnings]
     if outcome.outliers:
         named = ", ".join(each.words for each in outcome.outliers[:3])
-        advice = "" if settings.fit["loss"] != "none" else '; look at these rows, or set loss = "huber" in session.toml'
+        advice = "" if settings.fit.loss != "none" else '; look at these rows, or set loss = "huber" in session.toml'
         count = len({(each.file, each.row) for each in outcome.outliers})
         notes.append(f"{count} row{'s do' if count > 1 else ' does'} not fit: {named}{advice}")
     return notes
@@ -194,7 +194,7 @@ def validate(session: Session, say: Say) -> list[str]:
     """Hold the fitted robot against poses it has not seen, and judge."""
     chain, unseen = chain_of(session), measured_files(session)[1]
     folder, found, notes = session.path("5-validation"), fit_report.read(session.path("4-fit")), []
-    if not session.settings.poses["validation"] and not unseen:
+    if not session.settings.poses.validation and not unseen:
         files.write_json(folder / "metrics.json", _verdict(found.metrics, {}))
         return ["no validation asked for: judged by cross-validation only"]
     plan = planned(session, chain, "validation")
@@ -203,7 +203,7 @@ def validate(session: Session, say: Say) -> list[str]:
     say("comparing on unseen poses")
     given = gathered(session, unseen)
     fitted, validation = compared(session, given)
-    asked = session.settings.fit["model"]
+    asked = session.settings.fit.model
     verdict = judge(fitted, validation, asked=asked, tolerance=tolerance_of(session), **found.judged)
     clause, loud = comparing.urdf_alone(fitted, validation)
     verdict = verdict if not clause else replace(verdict, reason=f"{verdict.reason}; {clause}")
@@ -220,7 +220,7 @@ def validate(session: Session, say: Say) -> list[str]:
 def compared(session: Session, given: inputs.Inputs) -> tuple[comparing.Comparison, dict[str, comparing.Comparison]]:
     """Return nominal beside calibrated arm on fitted and on unseen rows."""
     options, seed = options_of(session), session.settings.seed
-    loss = session.settings.fit["loss"]
+    loss = session.settings.fit.loss
     settings = combine(FitSettings(), loss=loss, loss_scale=options.loss_scale)
     torques = [fitting.gravity_of(given.chain, block) for block in given.fit]
     nominal = polish_frames(fitting.install(given.chain, given.fit), given.fit, settings, torques).cell

@@ -23,9 +23,9 @@ def asks(session: Session, state: State) -> tuple[str, str]:
 
 def _at_the_robot(session: Session, name: str, both: bool) -> str:
     path = session.path(f"2-poses/{name}.csv")
-    what = "pose" if session.settings.instrument["measures"] == "pose" else "position"
-    device = session.settings.instrument["name"]
-    if not session.settings.poses["plan"] or not path.exists():
+    what = "pose" if session.settings.instrument.measures == "pose" else "position"
+    device = session.settings.instrument.name
+    if not session.settings.poses.plan or not path.exists():
         return f"Measure the target's {what} with the {device} at poses all over the workspace."
     count = sum(1 for _ in path.open()) - 1
     return (
@@ -39,18 +39,18 @@ def _at_the_robot(session: Session, name: str, both: bool) -> str:
 def _and_validation(session: Session) -> str:
     """Name the list of validation poses, so that the robot is visited once."""
     path = session.path("2-poses/validation.csv")
-    if not session.settings.poses["validation"] or not path.exists():
+    if not session.settings.poses.validation or not path.exists():
         return ""
     return f" and, into a file of their own, the {sum(1 for _ in path.open()) - 1} of {path} (never fitted)"
 
 
 def _form(session: Session, target: str, both: bool) -> str:
     joints = _chain(session).joint_names
-    full = session.settings.instrument["measures"] == "pose"
+    full = session.settings.instrument.measures == "pose"
     columns = ", ".join((*(f"{joint} [deg]" for joint in joints), *(f"{axis} [mm]" for axis in "xyz")))
     quaternion = ", qx, qy, qz, qw" if full else ""
     files = [str(session.path("3-measured") / target)]
-    if both and session.settings.poses["validation"]:
+    if both and session.settings.poses.validation:
         files.append(str(session.path("3-measured/validation.csv")))
     each = f"Bring {' and '.join(files)}, one row per pose: {columns}{quaternion} (calib formats measurements)"
     return f"{each}; then: calib next {session.folder}"
@@ -60,15 +60,15 @@ def _play(session: Session, step: str) -> str:
     """Return what is to be played and logged."""
     wanted = session.settings.dynamics
     names = _motions(session, step)
-    if not wanted["plan"]:
+    if not wanted.plan:
         return "Record the robot moving in all its joints, in one motion to learn from and in another, unseen one."
-    file = "run.csv" if wanted["repeats"] > 1 else "trajectory.csv"
+    file = "run.csv" if wanted.repeats > 1 else "trajectory.csv"
     motions = " and, into a file of its own, ".join(str(session.path(f"6-excitation/{name}/{file}")) for name in names)
     unseen = " (never learnt from)" if "validation" in names else ""
-    loads = ", ".join(f"'{label}' ({mass:g} kg)" for label, mass in wanted["payloads"].items())
+    loads = ", ".join(f"'{label}' ({mass:g} kg)" for label, mass in wanted.payloads.items())
     again = f" Then once more with {loads} on the flange, the label in the file's name." if loads else ""
     return (
-        f"Play {motions}{unseen}, {wanted['repeats']} times the motion each, at {wanted['rate']:g} Hz, from rest at "
+        f"Play {motions}{unseen}, {wanted.repeats} times the motion each, at {wanted.rate:g} Hz, from rest at "
         "its "
         "first row, before that at a low override, to see that the way is free; log joint positions and torques "
         "all "
@@ -80,12 +80,12 @@ def _motions(session: Session, step: str) -> list[str]:
     """Return which of the motions are still to be recorded."""
     training, unseen = dynamics_steps.recordings(session)
     names = [] if step == "predict" or training else ["training"]
-    return names + (["validation"] if session.settings.dynamics["validation"] and not unseen else [])
+    return names + (["validation"] if session.settings.dynamics.validation and not unseen else [])
 
 
 def _log(session: Session, step: str) -> str:
     chain = _chain(session)
-    torques = session.settings.dynamics["torques"]
+    torques = session.settings.dynamics.torques
     first, last = chain.joint_names[0], chain.joint_names[-1]
     unit = ["N" if joint.kind == "prismatic" else "Nm" for joint in chain.joints]
     place = ["m" if joint.kind == "prismatic" else "deg" for joint in chain.joints]

@@ -31,12 +31,12 @@ def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], N
     """Choose the poses that ``session.toml`` asks for."""
     settings = session.settings
     wanted, instrument = settings.poses, settings.instrument
-    constraints = session.path(wanted["constraints"]) if wanted["constraints"] else None
+    constraints = session.path(wanted.constraints) if wanted.constraints else None
     links = (chain.base, chain.tip) if robot_file.suffix == ".urdf" else (None, None)
-    stated = (instrument["sigma_position"], instrument["sigma_orientation"])
+    stated = (instrument.sigma_position, instrument.sigma_orientation)
     chosen = selection.choose(
-        robot_file, wanted["fit"], kind=instrument["measures"], tools=[instrument["tool"]], index=wanted["index"],
-        method=wanted["method"], constraints=constraints, sigmas=stated if all(stated) else None, base=links[0],
+        robot_file, wanted.fit, kind=instrument.measures, tools=[instrument.tool], index=wanted.index,
+        method=wanted.method, constraints=constraints, sigmas=stated if all(stated) else None, base=links[0],
         tip=links[1], seed=settings.seed, progress=lambda done, total, what: say(f"choosing poses: {what}"),
     )  # fmt: skip
     found = chosen.selection
@@ -60,17 +60,17 @@ def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], N
         "seed": settings.seed,
         "notes": list(chosen.notes),
     }
-    return Plan(found.q, _unseen(session, robot_file, chain, wanted["validation"]), words, record)
+    return Plan(found.q, _unseen(session, robot_file, chain, wanted.validation), words, record)
 
 
 def _unseen(session: Session, robot_file: Any, chain: Chain, count: int) -> np.ndarray:
     """Return random poses within limits and constraints (count, n), from another stream than the candidates'."""
     if not count:
         return np.zeros((0, chain.n))
-    name = session.settings.poses["constraints"]
-    cell = targets_of(chain, [session.settings.instrument["tool"]])
+    name = session.settings.poses.constraints
+    cell = targets_of(chain, [session.settings.instrument.tool])
     limits = read_limits(session.path(name) if name else None, cell, robot_file)
-    jacobian = observation(cell, session.settings.instrument["measures"])
+    jacobian = observation(cell, session.settings.instrument.measures)
     space = SearchSpace(jacobian, limits.lower, limits.upper, None, limits.constraints, limits.feasible)
     stream = np.random.default_rng([session.settings.seed, 1])
     return draw_candidates(limits.lower, limits.upper, count, lambda q: is_feasible(space, q), seed=stream)

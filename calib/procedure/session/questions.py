@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from calib.errors import UsageError
-from calib.procedure.session.folder import TORQUES
 from calib.procedure.session.presets import INSTRUMENTS
 from calib.procedure.session.presets import instrument as instrument_named
+from calib.procedure.session.settings import TORQUES
 from calib.robot import library
 from calib.robot.load import resolve
 

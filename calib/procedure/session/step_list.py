@@ -40,7 +40,7 @@ def _robot(session: Session) -> list[Path]:
 
 
 def _plan(session: Session) -> list[Path]:
-    name = session.settings.poses["constraints"]
+    name = session.settings.poses.constraints
     return [*_robot(session), *([session.path(name)] if name else [])]
 
 
@@ -50,7 +50,7 @@ def _arrived(session: Session) -> list[Path]:
 
 
 def _options(session: Session) -> list[Path]:
-    name = session.settings.fit["options"]
+    name = session.settings.fit.options
     return [session.path(name)] if name else []
 
 
@@ -69,7 +69,7 @@ def _validated(session: Session) -> list[Path]:
 
 
 def _excited(session: Session) -> list[Path]:
-    name = session.settings.dynamics["limits"]
+    name = session.settings.dynamics.limits
     return [session.path("4-fit/robot.toml"), *([session.path(name)] if name else [])]
 
 
@@ -84,7 +84,7 @@ def _recorded(session: Session) -> list[Path]:
 
 
 def _reading(session: Session) -> list[Path]:
-    name = session.settings.dynamics["options"]
+    name = session.settings.dynamics.options
     return [session.path(name)] if name else []
 
 

@@ -10,7 +10,7 @@ import json
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Any
 
@@ -22,6 +22,7 @@ from calib.procedure.session.step_list import STEPS, Step
 
 Say = Callable[[str], None]
 DONE, READY, WAITING, STALE, KEPT, AFTER = "done", "ready", "waiting", "stale", "kept", "after"
+SETTINGS = "session.toml"
 PLANS = ("poses.csv", "validation.csv", "selection.json", "trajectory.toml")  # there only where we plan
 
 
@@ -105,13 +106,13 @@ def _missing(session: Session, step: Step) -> str:
     fit, unseen = geometry_steps.measured_files(session)
     if step.name == "measure" and not fit:
         return "a file of measured poses"
-    if step.name == "validate" and session.settings.poses["validation"] and not unseen:
+    if step.name == "validate" and session.settings.poses.validation and not unseen:
         return "a file of measured validation poses"
     if step.name in ("record", "predict"):
         training, unseen = dynamics_steps.recordings(session)
         if step.name == "record" and not training:
             return "a recording of the training motion"
-        if step.name == "predict" and session.settings.dynamics["validation"] and not unseen:
+        if step.name == "predict" and session.settings.dynamics.validation and not unseen:
             return "a recording of the validation motion"
     absent = [path for path in step.inputs(session) if not path.exists()]
     own = [path for path in absent if not path.name.startswith(PLANS)]
@@ -121,23 +122,34 @@ def _missing(session: Session, step: Step) -> str:
 def _inputs(session: Session, step: Step) -> dict[str, str]:
     """Return the fingerprints of what a step depends on."""
     marks = {str(path.relative_to(session.folder)): fingerprint(path) for path in step.inputs(session) if path.exists()}
+    settings = asdict(session.settings)
     for setting in step.settings:
         section, _, key = setting.partition(".")
         if section == "dynamics" and not session.dynamic:
             continue
-        values = getattr(session.settings, section)
-        place = f"session.toml [{section}] {key}".rstrip()
+        values = settings[section]
+        place = f"{SETTINGS} [{section}] {key}".rstrip()
         marks[place] = json.dumps(values[key] if key else values, sort_keys=True)
     return marks
 
 
 def _changes(before: dict[str, str], now: dict[str, str]) -> str:
     """Say what differs between two sets of fingerprints."""
-    changed = [name for name in now if name in before and before[name] != now[name]]
+    changed = [name for name in now if name in before and not _same(name, before[name], now[name])]
     added, gone = sorted(set(now) - set(before)), sorted(set(before) - set(now))
     parts = [f"{name} has changed" for name in changed]
     parts += [f"{name} is new" for name in added] + [f"{name} is gone" for name in gone]
     return ", ".join(parts)
+
+
+def _same(name: str, before: str, now: str) -> bool:
+    """Compare two fingerprints; those of settings by value, so that 3 is 3.0."""
+    if before == now or not name.startswith(SETTINGS):
+        return before == now
+    try:
+        return json.loads(before) == json.loads(now)
+    except ValueError:
+        return False
 
 
 def run_next(session: Session, say: Say, progress: Say, command: str = "calib next") -> State | None:

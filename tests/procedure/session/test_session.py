@@ -199,8 +199,9 @@ def test_what_arrives_is_checked(measured: Session, change, message: str, capsys
     [
         ("schema = 2", "schema = 3", "newer version"),
         ("schema = 2", "schema = 0", "not known"),
-        ('model = "auto"', "model = 3", r"\[fit\] model = 3: expected str"),
-        ('loss = "none"', 'los = "none"', r"\[fit\] loss is missing"),
+        ('model = "auto"', "model = 3", r"fit.model: expected one of auto, .*, found 3"),
+        ('loss = "none"', 'los = "none"', r"fit: there is no key 'los' \(did you mean 'loss'\?\)"),
+        ('loss = "none"', "", "fit.loss is missing; its default is 'none'"),
         ("[poses]", "[poses", "is no TOML"),
         ("seed = 1", 'seed = "one"', "seed"),
     ],
@@ -250,7 +251,7 @@ def test_a_session_made_before_tolerances_is_read(planned: Session) -> None:
     lines = path.read_text().splitlines()
     start = next(k for k, line in enumerate(lines) if line.startswith("tolerance_mm"))
     path.write_text("\n".join(lines[:start] + lines[start + 2 :]) + "\n")
-    assert open_session(planned.folder).settings.fit["tolerance_mm"] == 0.0
+    assert open_session(planned.folder).settings.fit.tolerance_mm == 0.0
     edit(path, "[dynamics]", "tolerance_mm = -1.0\n\n[dynamics]")
     with pytest.raises(SessionError, match="expected 0 or more"):
         open_session(planned.folder)

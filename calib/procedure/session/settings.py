@@ -1,0 +1,275 @@
+"""The settings of a session, ``session.toml``: what is to be calibrated, with what, how.
+
+Lengths in m, angles in rad. Every key, what it may be, its default and its comment stand here and nowhere else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from operator import attrgetter
+from pathlib import Path, PurePath
+from textwrap import wrap
+from typing import Annotated, Any, get_args, get_type_hints
+
+import tomlkit
+from tomlkit.items import Comment, Trivia
+
+from calib.config import (
+    About,
+    Checked,
+    Expect,
+    Flag,
+    Name,
+    NotNegative,
+    OneOf,
+    Positive,
+    Real,
+    Text,
+    Whole,
+    parse,
+    read_toml,
+    shown,
+    strict,
+)  # fmt: skip
+from calib.data.poses.fit_options import LOSSES, MODELS
+from calib.errors import SessionError
+from calib.identification.friction.friction_ladder import NAMES as FRICTION
+from calib.identification.methods.least_squares import METHODS
+from poses.indices import Index
+from poses.select import Method
+
+SCHEMA = 2
+READ = (1, SCHEMA)  # a session of schema 1 knows no dynamics; it goes on as geometry alone
+TORQUES = ("motor", "link", "both")
+MOST_SAMPLES = 20_000_000  # of a designed motion (our choice): 160 MB per joint and derivative
+LATER = {("fit", "tolerance_mm")}  # keys that sessions made before do not have
+FILES = ("robot.file", "poses.constraints", "fit.options", "dynamics.limits", "dynamics.options")
+COLUMN, WIDTH = 41, 118  # where comments begin and end
+_HEAD = (
+    "A calibration session; see `calib status` and `calib next`. Lengths in m, angles in rad.",
+    "Change what you like: steps made from something that changed are shown as stale and made again.",
+)
+
+
+def _beside(value: Any) -> Any:
+    """Refuse a path from the root, and one that no file system takes."""
+    if isinstance(value, str) and (PurePath(value).is_absolute() or len(value) > 200 or "\0" in value):
+        raise ValueError(f"expected a file beside session.toml, found {shown(value)}; copy it there and give its name")
+    return value
+
+
+Beside = Annotated[str, Expect("the name of a file beside session.toml, or an empty text"), Checked(_beside)]
+
+
+@strict
+@dataclass(frozen=True)
+class RobotSection:
+    """Which robot."""
+
+    file: Annotated[Name, Checked(_beside)]
+    given: Annotated[Text, About("what it was called")] = ""
+    base: Annotated[Text, About("URDF: the link the arm starts at, empty: the root")] = ""
+    tip: Annotated[Text, About("URDF: the link the arm ends at, empty: the longest chain's end")] = ""
+
+
+@strict
+@dataclass(frozen=True)
+class InstrumentSection:
+    """What measures, and how well."""
+
+    name: Text
+    measures: Annotated[str, OneOf(("pose", "position")), About("pose (with orientation) or position")]
+    sigma_position: Annotated[NotNegative, About("of one measurement, per axis; 0: to be estimated")] = 0.0
+    sigma_orientation: NotNegative = 0.0
+    tool: Annotated[
+        tuple[float, float, float],
+        Expect("three numbers [m]"),
+        About("where the target roughly sits in the tip's frame; only pose selection uses it"),
+    ] = (0.05, 0.0, 0.05)
+
+
+@strict
+@dataclass(frozen=True)
+class PosesSection:
+    """Which poses to measure."""
+
+    fit: Annotated[int, Whole(1), About("how many poses to choose for the fit")] = 30
+    validation: Annotated[int, Whole(0), About("how many more to measure and never fit; 0: no validation")] = 15
+    plan: Annotated[Flag, About("false: measured files hold other poses than those chosen here")] = True
+    index: Annotated[str, OneOf(get_args(Index))] = "O1"
+    method: Annotated[str, OneOf(get_args(Method))] = "detmax"
+    constraints: Annotated[Beside, About("a TOML file beside this one; see `calib formats constraints`")] = ""
+
+
+@strict
+@dataclass(frozen=True)
+class FitSection:
+    """How to fit and to judge the geometry."""
+
+    model: Annotated[str, OneOf(MODELS), About(f"or {', '.join(MODELS[1:])}")] = "auto"
+    loss: Annotated[str, OneOf(LOSSES), About("or auto, huber, cauchy")] = "none"
+    options: Annotated[
+        Beside, About("a TOML file beside this one: column names, units; see `calib formats options`")
+    ] = ""
+    stations: Annotated[
+        str, OneOf(("each", "one")), About("each measured file has its own base placement, or one for all")
+    ] = "each"
+    validation_frames: Annotated[
+        str, OneOf(("fit", "own")), About("own: base and tool placement are fitted anew on validation files")
+    ] = "fit"
+    tolerance_mm: Annotated[
+        NotNegative,
+        About(
+            "largest rms [mm] on unseen poses that is good enough: above it the verdict is fail; 0: none, and pass "
+            "only means better than the nominal robot"
+        ),
+    ] = 0.0
+
+
+@strict
+@dataclass(frozen=True)
+class DynamicsSection:
+    """Whether and how to identify and to judge the dynamics."""
+
+    wanted: Annotated[Flag, About("false: geometry only")] = True
+    plan: Annotated[Flag, About("false: recorded files hold other motions than those designed here")] = True
+    validation: Annotated[Flag, About("false: no second motion is designed or asked for")] = True
+    period: Annotated[Positive, About("of the designed motion [s]; the validation motion's is 0.8 of it")] = 20.0
+    harmonics: Annotated[int, Whole(1), About("frequencies per joint")] = 5
+    rate: Annotated[float, Real(above=0, most=1e5, unit="Hz"), About("of the controller [Hz]")] = 1000.0
+    repeats: Annotated[int, Whole(1), About("how often the robot plays each motion")] = 3
+    starts: Annotated[int, Whole(1), About("random starts of the search for a motion")] = 4
+    evaluations: Annotated[int, Whole(1), About("most per start")] = 400
+    limits: Annotated[Beside, About("a TOML file beside this one; see `calib formats limits`")] = ""
+    torques: Annotated[
+        str,
+        OneOf(TORQUES),
+        About("motor, link, or both: sensors behind the gears beside the motors' torques"),
+    ] = "motor"
+    friction: Annotated[
+        str, OneOf(FRICTION), About("or standard, or one rung of the ladder; see calib identify --friction")
+    ] = "auto"
+    method: Annotated[str, OneOf(METHODS), About("or ols, irls, tls")] = "wls"
+    options: Annotated[Beside, About("a TOML file beside this one; see `calib formats identify-options`")] = ""
+    tolerance_percent: Annotated[
+        NotNegative, About("largest torque error on unseen motion that is good enough; 0: none")
+    ] = 0.0
+    payloads: Annotated[
+        Mapping[str, Annotated[float, Real(above=0, words="its mass [kg], a number above 0")]],
+        About("label = mass [kg] of bodies at the flange: loaded = 3.28"),
+    ] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.period * self.rate * self.repeats > MOST_SAMPLES:
+            raise ValueError(
+                f"period {self.period:g} s at rate {self.rate:g} Hz, {self.repeats} times: more than "
+                f"{MOST_SAMPLES:.0e} samples"
+            )
+
+
+@strict
+@dataclass(frozen=True)
+class SessionSettings:
+    """What ``session.toml`` says, section by section."""
+
+    name: Text
+    created: Text
+    seed: Annotated[int, Whole(0), About("of pose selection, cross-validation and everything else random")]
+    robot: RobotSection
+    instrument: InstrumentSection
+    poses: PosesSection
+    fit: FitSection
+    dynamics: DynamicsSection
+    schema: Annotated[int, Whole(1)] = SCHEMA
+
+
+def read_settings(path: Path) -> SessionSettings:
+    """Read ``session.toml``; one of schema 1 gets no dynamics, missing keys of [dynamics] their defaults.
+
+    Raises:
+        SessionError: where it was made by a newer version, is damaged, or a value cannot be.
+    """
+    table = read_toml(path, SessionError)
+    check_schema(path, table.get("schema"))
+    if table["schema"] == 1:
+        table.setdefault("dynamics", {"wanted": False})
+    found = parse(SessionSettings, table, str(path), SessionError)
+    for section in ("robot", "instrument", "poses", "fit"):
+        for key in fields(getattr(found, section)):
+            if key.name not in table[section] and (section, key.name) not in LATER:
+                raise SessionError(f"{path}: {section}.{key.name} is missing; its default is {key.default!r}")
+    for key in FILES:
+        name = attrgetter(key)(found)
+        if name and (path.parent / name).is_dir():
+            raise SessionError(f"{path}: {key}: expected a file, found the folder '{name}'")
+    return found
+
+
+def check_schema(path: Path, found: Any) -> None:
+    """Refuse the schema of another version.
+
+    Raises:
+        SessionError: with what to do.
+    """
+    if found in READ and type(found) is int:
+        return
+    if isinstance(found, int) and found > SCHEMA:
+        raise SessionError(f"{path}: schema {found} was made by a newer version; this one reads {SCHEMA}: upgrade")
+    if found is None:
+        raise SessionError(f"{path} states no schema: was it cut short as it was copied? Copy the session again")
+    known = " and ".join(map(str, READ))
+    raise SessionError(
+        f"{path}: schema {shown(found)} is not known to this version, which reads {known}; make a new session"
+    )
+
+
+def written(settings: SessionSettings) -> str:
+    """Return ``session.toml``: these settings, every key with its comment."""
+    document = tomlkit.document()
+    for line in _HEAD:
+        document.add(tomlkit.comment(line))
+    document.add("schema", tomlkit.item(settings.schema))
+    _fill(document, settings)
+    return tomlkit.dumps(document)
+
+
+def _fill(table: Any, section: Any) -> None:
+    """Add the keys of a section to a table of the document, comments in one column; tables come last."""
+    hints = get_type_hints(type(section), include_extras=True)
+    for key in fields(section):
+        value = getattr(section, key.name)
+        about = next((one.words for one in getattr(hints[key.name], "__metadata__", ()) if isinstance(one, About)), "")
+        if is_dataclass(value) or isinstance(value, Mapping):
+            inner = tomlkit.table()
+            if about:
+                inner.comment(about)
+                inner.trivia.comment_ws = "  "
+            if is_dataclass(value):
+                _fill(inner, value)
+            else:
+                inner.update(value)
+            table.add(tomlkit.nl())
+            table.add(key.name, inner)
+        elif key.name != "schema":
+            _add(table, key.name, tomlkit.item(list(value) if isinstance(value, tuple) else value), about)
+
+
+def _add(table: Any, key: str, item: Any, about: str) -> None:
+    """Add a key with its comment behind it, wrapped into lines below where it is long."""
+    first, *rest = wrap(about, WIDTH - COLUMN) or [""]
+    if first:
+        item.comment(first)
+        item.trivia.comment_ws = " " * max(2, COLUMN - 2 - len(f"{key} = {item.as_string()}"))
+    table.add(key, item)
+    for line in rest:
+        table.add(Comment(Trivia(indent=" " * (COLUMN - 2), comment=f"# {line}")))
+
+
+def example() -> str:
+    """Return a ``session.toml`` with every key."""
+    return written(
+        SessionSettings(
+            "", "", 0, RobotSection(""), InstrumentSection("", "pose"), PosesSection(), FitSection(), DynamicsSection()
+        )
+    )
