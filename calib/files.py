@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import math
 import os
@@ -72,19 +74,17 @@ def _not_finite(value: Any, place: str) -> Iterator[str]:
 
 
 def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> Path:
-    """Write a CSV table; floats with 12 significant digits, so that a table read back serves as the value."""
-    lines = [",".join(header)]
-    lines += [",".join(_cell(cell) for cell in row) for row in rows]
-    return write(path, "\n".join(lines) + "\n")
+    """Write a CSV table; floats with 12 significant digits, so that a table read back serves as the value.
 
-
-def _cell(value: Any) -> str:
-    if value is None:
-        return ""
-    if isinstance(value, float):
-        return f"{value:.12g}"
-    text = str(value)
-    return '"' + text.replace('"', '""') + '"' if any(mark in text for mark in ',"\n') else text
+    Cells with commas, quotes or line breaks are quoted, those of the header too: names come from people's files. So is
+    a whole header that would be taken for one with other separators, or for a comment.
+    """
+    text = io.StringIO()
+    lines = csv.writer(text, lineterminator="\n")
+    misread = header[0].startswith("#") or any(mark in name for name in header for mark in ";\t")
+    (csv.writer(text, lineterminator="\n", quoting=csv.QUOTE_ALL) if misread else lines).writerow(header)
+    lines.writerows([f"{cell:.12g}" if isinstance(cell, float) else cell for cell in row] for row in rows)
+    return write(path, text.getvalue())
 
 
 def _umask() -> int:

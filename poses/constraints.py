@@ -14,33 +14,35 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from poses.space import Constraint
+from poses.space import PoseConstraint
 
 Tool = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 ToolJacobian = Callable[[np.ndarray], np.ndarray]
 
 
-def height(tool: Tool, lowest: float, highest: float = np.inf, jacobian: ToolJacobian | None = None) -> Constraint:
+def height(tool: Tool, lowest: float, highest: float = np.inf, jacobian: ToolJacobian | None = None) -> PoseConstraint:
     """Keep lowest ≤ z ≤ highest [m] of the tool's point."""
     limits = tuple((sign, bound) for sign, bound in ((-1.0, lowest), (1.0, highest)) if np.isfinite(bound))
     slope = None if jacobian is None else partial(_height_gradient, jacobian, limits)
-    return Constraint("height", partial(_height, tool, limits), slope)
+    return PoseConstraint("height", partial(_height, tool, limits), slope)
 
 
-def axis_distance(tool: Tool, least: float, jacobian: ToolJacobian | None = None) -> Constraint:
+def axis_distance(tool: Tool, least: float, jacobian: ToolJacobian | None = None) -> PoseConstraint:
     """Keep d_xy = √(x² + y²) ≥ least [m], written least² − x² − y² ≤ 0, which is smooth on the axis too."""
     slope = None if jacobian is None else partial(_axis_gradient, tool, jacobian)
-    return Constraint("distance from the axis", partial(_axis, tool, least), slope)
+    return PoseConstraint("distance from the axis", partial(_axis, tool, least), slope)
 
 
-def reach(tool: Tool, most: float, centre: ArrayLike = (0, 0, 0), jacobian: ToolJacobian | None = None) -> Constraint:
+def reach(
+    tool: Tool, most: float, centre: ArrayLike = (0, 0, 0), jacobian: ToolJacobian | None = None
+) -> PoseConstraint:
     """Keep the tool's point within `most` [m] of a centre (3,) [m]: ‖x − c‖² − most² ≤ 0."""
     point = np.asarray(centre, dtype=float)
     slope = None if jacobian is None else partial(_reach_gradient, tool, jacobian, point)
-    return Constraint("reach", partial(_reach, tool, most, point), slope)
+    return PoseConstraint("reach", partial(_reach, tool, most, point), slope)
 
 
-def orientation(tool: Tool, camera: ArrayLike, roll: tuple[float, float], pitch: tuple[float, float]) -> Constraint:
+def orientation(tool: Tool, camera: ArrayLike, roll: tuple[float, float], pitch: tuple[float, float]) -> PoseConstraint:
     """Keep roll and pitch of the tool seen from the camera within limits [rad].
 
     R_camera^T R = Rot_z(yaw) Rot_y(pitch) Rot_x(roll). The convention is our reading of Table 1, which does not state
@@ -51,12 +53,12 @@ def orientation(tool: Tool, camera: ArrayLike, roll: tuple[float, float], pitch:
         camera: (3, 3) orientation of the camera in the tool's reference frame.
         roll, pitch: (lowest, highest) [rad].
     """
-    return Constraint("orientation", partial(_orientation, tool, np.asarray(camera, dtype=float), roll, pitch))
+    return PoseConstraint("orientation", partial(_orientation, tool, np.asarray(camera, dtype=float), roll, pitch))
 
 
 def line_of_sight(
     tool: Tool, instrument: ArrayLike, axis: ArrayLike, half_angle: float, jacobian: ToolJacobian | None = None
-) -> Constraint:
+) -> PoseConstraint:
     """Keep the instrument in the target's cone of acceptance: cos(half_angle) − (R a)·u ≤ 0, u = (s − x)/‖s − x‖.
 
     Args:
@@ -69,7 +71,7 @@ def line_of_sight(
     station, facing = np.asarray(instrument, dtype=float), np.asarray(axis, dtype=float)
     facing = facing / np.linalg.norm(facing)
     slope = None if jacobian is None else partial(_sight_gradient, tool, jacobian, station, facing)
-    return Constraint("line of sight", partial(_sight, tool, station, facing, half_angle), slope)
+    return PoseConstraint("line of sight", partial(_sight, tool, station, facing, half_angle), slope)
 
 
 def _height(tool, limits, q):

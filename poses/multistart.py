@@ -17,7 +17,7 @@ def random_starts(q: np.ndarray, m: int, count: int, seed: int) -> list[np.ndarr
     return [q[g.choice(len(q), m, replace=False)] for g in np.random.default_rng(seed).spawn(count)]
 
 
-def multistart(
+def multistart_search(
     space: SearchSpace,
     starts: Sequence[np.ndarray],
     index: Index = "O1",

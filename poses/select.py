@@ -19,9 +19,9 @@ from poses.exchange import detmax, exchanged, greedy, kicked
 from poses.indices import Index, merit, observability
 from poses.information import Candidates, checked, log_det, prepared
 from poses.local import Improved, improved
-from poses.multistart import multistart, random_starts
+from poses.multistart import multistart_search, random_starts
 from poses.space import SearchSpace, is_feasible
-from poses.tabu import DEFAULT_RULE, TabuRule, tabu
+from poses.tabu import DEFAULT_RULE, TabuRule, tabu_search
 
 Method = Literal["detmax", "local", "multistart", "tabu"]
 Progress = Callable[[int, int, str], None]
@@ -74,7 +74,7 @@ class _Chosen:
 
 
 @dataclass(frozen=True)
-class _Task:
+class _Request:
     """What every method needs: the candidates, their relaxation, and the request."""
 
     jacobians: np.ndarray
@@ -89,7 +89,7 @@ class _Task:
     progress: Progress
 
 
-def select(
+def select_poses(
     jacobians: ArrayLike | None,
     m: int,
     *,
@@ -148,7 +148,7 @@ def select(
     report = progress or (lambda done, total, message: None)
     report(0, 1, "convex bound")
     candidates = prepared(array, m, before)
-    task = _Task(array, joints, candidates, relaxed(candidates, m), m, index, seed, before, space, report)
+    task = _Request(array, joints, candidates, relaxed(candidates, m), m, index, seed, before, space, report)
     baseline = random_baseline(array, m, index, before, seed=seed)
     if method == "tabu":
         chosen = _tabu(task, rule)
@@ -202,7 +202,7 @@ def _candidates(
     return array, joints
 
 
-def _exchange(task: _Task, kicks: int) -> _Chosen:
+def _exchange(task: _Request, kicks: int) -> _Chosen:
     """Choose among the candidates; after Ctrl-C return the best so far."""
     candidates, m, p = task.candidates, task.m, task.jacobians.shape[2]
     whole = Pool(candidates.z, candidates.known)
@@ -248,7 +248,7 @@ def _exchange(task: _Task, kicks: int) -> _Chosen:
     return chosen
 
 
-def _by_index(task: _Task, members: tuple[int, ...]) -> _Chosen:
+def _by_index(task: _Request, members: tuple[int, ...]) -> _Chosen:
     """Go on from the D-optimal set by exchanges for another index."""
     p = task.jacobians.shape[2]
     past = np.zeros((0, p)) if task.before is None else task.before.reshape(-1, p)
@@ -263,7 +263,7 @@ def _by_index(task: _Task, members: tuple[int, ...]) -> _Chosen:
     return _Chosen(best[-1][0], None, tuple(value for _, value in best), len(best), interrupted)
 
 
-def _continuous(task: _Task, chosen: _Chosen, starts: int, evaluations: int, map: Callable) -> _Chosen:
+def _continuous(task: _Request, chosen: _Chosen, starts: int, evaluations: int, map: Callable) -> _Chosen:
     """Improve the exchanged set, and random ones beside it, over all joint values."""
     space, joints = task.space, task.q
     if space is None or joints is None:
@@ -278,25 +278,25 @@ def _continuous(task: _Task, chosen: _Chosen, starts: int, evaluations: int, map
             done[0] = number + 1
             task.progress(number + 1, starts, "local searches")
 
-        run = multistart(space, sets, task.index, task.before, evaluations=evaluations, map=map, report=report)
+        run = multistart_search(space, sets, task.index, task.before, evaluations=evaluations, map=map, report=report)
     return _of(run)
 
 
-def _tabu(task: _Task, rule: TabuRule) -> _Chosen:
+def _tabu(task: _Request, rule: TabuRule) -> _Chosen:
     if task.space is None:
         raise BadInput("tabu draws its own poses: give space")
 
     def report(chosen: int, _: float) -> None:
         task.progress(chosen, task.m, "poses constructed")
 
-    return _of(tabu(task.space, task.m, task.index, task.before, seed=task.seed, rule=rule, report=report))
+    return _of(tabu_search(task.space, task.m, task.index, task.before, seed=task.seed, rule=rule, report=report))
 
 
 def _of(run: Improved) -> _Chosen:
     return _Chosen(None, run.q, run.history, run.evaluations, run.interrupted)
 
 
-def _selection(task: _Task, chosen: _Chosen, method: Method, baseline: float, began: float) -> Selection:
+def _selection(task: _Request, chosen: _Chosen, method: Method, baseline: float, began: float) -> Selection:
     indices, q = None, chosen.q
     if q is None:
         indices = np.array(sorted(chosen.members or ()))

@@ -14,7 +14,7 @@ STEP = 1e-5
 
 
 @dataclass(frozen=True)
-class Constraint:
+class PoseConstraint:
     """Inequalities a pose must keep.
 
     Attributes:
@@ -45,7 +45,7 @@ class SearchSpace:
     lower: np.ndarray
     upper: np.ndarray
     jacobian_product: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
-    constraints: tuple[Constraint, ...] = ()
+    constraints: tuple[PoseConstraint, ...] = ()
     feasible: Callable[[np.ndarray], np.ndarray] | None = None
 
     def __post_init__(self):
@@ -78,7 +78,7 @@ def product(space: SearchSpace, q: np.ndarray, G: np.ndarray) -> np.ndarray:
     return np.einsum("mrp,mkrp->mk", G, central_difference(space.jacobian, q))
 
 
-def constraint_gradient(constraint: Constraint, q: np.ndarray) -> np.ndarray:
+def constraint_gradient(constraint: PoseConstraint, q: np.ndarray) -> np.ndarray:
     """Return ∂c/∂q (m, k, n)."""
     if constraint.gradient is not None:
         return np.asarray(constraint.gradient(q), dtype=float)

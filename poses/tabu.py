@@ -47,7 +47,7 @@ class TabuRule:
 DEFAULT_RULE = TabuRule()
 
 
-def tabu(
+def tabu_search(
     space: SearchSpace,
     m: int,
     index: Index = "O1",

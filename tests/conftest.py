@@ -9,7 +9,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 from recordings import DATA
+
+# the same inputs in every run; `pytest --hypothesis-profile=search` looks for new ones
+settings.register_profile(
+    "fixed", deadline=None, max_examples=25, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.register_profile("search", deadline=None, max_examples=2000)
+settings.load_profile("fixed")
 
 
 @pytest.fixture

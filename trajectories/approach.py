@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 
 from trajectories.errors import BadInput
-from trajectories.track import Track
+from trajectories.setpoints import Setpoints
 
 KINDS: tuple[str, ...] = ("velocity", "acceleration", "jerk")
 
 
-def approach(
+def straight_approach(
     start: np.ndarray, goal: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray, jerk: np.ndarray, rate: float
-) -> Track:
+) -> Setpoints:
     """Return the fastest approach from rest to rest, its duration rounded up to whole samples.
 
     Args:
@@ -37,14 +37,14 @@ def approach(
     _check(start, goal, bounds, rate)
     if np.array_equal(start, goal):
         still = np.zeros((1, len(start)))
-        return Track(rate, start[None, :].copy(), still, still.copy())
+        return Setpoints(rate, start[None, :].copy(), still, still.copy())
     found = _trajectory(start, goal, bounds)
     count = max(math.ceil(found.duration * rate - 1e-9), 1)
     stretch = count / rate / found.duration
     rows = [found.at_time(min(t, found.duration)) for t in np.arange(count + 1) / rate / stretch]
     q, v, a = (np.array([row[order] for row in rows]) for order in range(3))
     q[[0, -1]], v[[0, -1]] = (start, goal), 0.0
-    return Track(rate, q, v / stretch, a / stretch**2)
+    return Setpoints(rate, q, v / stretch, a / stretch**2)
 
 
 def _trajectory(start: np.ndarray, goal: np.ndarray, bounds: dict[str, np.ndarray]) -> Any:

@@ -21,7 +21,7 @@ ORDERS = ("position", "velocity", "acceleration", "jerk")
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class SampledMotion:
     """Samples of a motion.
 
     Attributes:
@@ -42,9 +42,9 @@ class Motion:
     def orders(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         return self.q, self.v, self.a, self.jerk
 
-    def part(self, rows: np.ndarray) -> Motion:
+    def part(self, rows: np.ndarray) -> SampledMotion:
         """Return the samples of the given indices."""
-        return Motion(self.times[rows], *(x[rows] for x in self.orders))
+        return SampledMotion(self.times[rows], *(x[rows] for x in self.orders))
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,13 +72,13 @@ class Basis:
     def n(self) -> int:
         return len(self.used)
 
-    def motion(self, x: np.ndarray) -> Motion:
+    def motion(self, x: np.ndarray) -> SampledMotion:
         """Return the motion of variables x (p,)."""
         spread = np.zeros(self.used.shape)
         spread[self.used] = x
         n, _, count, c = self.tables.shape
         moved = (self.tables.reshape(n, 4 * count, c) @ spread[:, :, None]).reshape(n, 4, count)
-        return Motion(self.times, *(self.offsets + moved.transpose(1, 2, 0)))
+        return SampledMotion(self.times, *(self.offsets + moved.transpose(1, 2, 0)))
 
     def adjoint(self, slopes: np.ndarray) -> np.ndarray:
         """Return gradients by x (m, p) of m functions with slopes (m, 4, N, n) by q, v, a and jerk."""

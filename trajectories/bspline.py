@@ -77,7 +77,7 @@ class BSpline:
         return self.variables([m + s * rng.normal(size=c) for c, m, s in zip(self.counts, centre, amplitude)])
 
 
-def bspline(
+def bspline_family(
     points: int | Sequence[int],
     period: float,
     joints: int | None = None,
@@ -92,7 +92,7 @@ def bspline(
 
     Args:
         degree: 5 or more, so that the jerk has no kinks.
-        period, joints, rest, start, held, rate: as of `trajectories.fourier.fourier`.
+        period, joints, rest, start, held, rate: as of `trajectories.fourier.fourier_family`.
     """
     counts = tuple(int(k) for k in (np.full(joints or 0, points) if np.ndim(points) == 0 else points))  # type: ignore[arg-type]
     if not counts or any(c != 1 and c <= degree for c in counts) or max(counts) == 1:

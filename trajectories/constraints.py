@@ -18,7 +18,7 @@ from typing import Protocol
 
 import numpy as np
 
-from trajectories.basis import ORDERS, Motion
+from trajectories.basis import ORDERS, SampledMotion
 from trajectories.errors import BadInput
 
 Regressor = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -26,7 +26,7 @@ Product = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], tuple[np.nd
 UNITS = ("rad", "rad/s", "rad/s²", "rad/s³")
 
 
-class Constraint(Protocol):
+class MotionConstraint(Protocol):
     """Values (N, k), feasible where ≤ 0, that depend on one sample each.
 
     Attributes:
@@ -46,8 +46,8 @@ class Constraint(Protocol):
     def scale(self) -> np.ndarray: ...
     @property
     def groups(self) -> np.ndarray: ...
-    def values(self, motion: Motion) -> np.ndarray: ...
-    def slopes(self, motion: Motion, weights: np.ndarray) -> np.ndarray:
+    def values(self, motion: SampledMotion) -> np.ndarray: ...
+    def slopes(self, motion: SampledMotion, weights: np.ndarray) -> np.ndarray:
         """Return the slopes (4, N, n) of Σ weights (N, k) · values by q, v, a, jerk."""
         ...
 
@@ -102,11 +102,11 @@ class BoxLimit:
     def groups(self) -> np.ndarray:
         return np.tile(np.arange(len(self.joints)), 2)
 
-    def values(self, motion: Motion) -> np.ndarray:
+    def values(self, motion: SampledMotion) -> np.ndarray:
         x = motion.orders[self.order][:, self.joints]
         return np.concatenate([x - self.upper[self.joints], self.lower[self.joints] - x], axis=1)
 
-    def slopes(self, motion: Motion, weights: np.ndarray) -> np.ndarray:
+    def slopes(self, motion: SampledMotion, weights: np.ndarray) -> np.ndarray:
         result = np.zeros((4, *motion.q.shape))
         k = len(self.joints)
         result[self.order][:, self.joints] = weights[:, :k] - weights[:, k:]
@@ -159,14 +159,14 @@ class TorqueLimit:
     def groups(self) -> np.ndarray:
         return np.tile(np.arange(len(self.joints)), 2)
 
-    def values(self, motion: Motion) -> np.ndarray:
+    def values(self, motion: SampledMotion) -> np.ndarray:
         Y = self.regressor(motion.q, motion.v, motion.a)[:, self.joints]
         torque, bound = Y @ self.parameters, (1 - self.margin) * self.limits[self.joints]
         if self.covariance is not None:
             bound = bound - self.deviations * np.sqrt(np.einsum("njb,njb->nj", Y @ self.covariance, Y))
         return np.concatenate([torque - bound, -torque - bound], axis=1)
 
-    def slopes(self, motion: Motion, weights: np.ndarray) -> np.ndarray:
+    def slopes(self, motion: SampledMotion, weights: np.ndarray) -> np.ndarray:
         k = len(self.joints)
         G = np.zeros((*motion.q.shape, len(self.parameters)))
         G[:, self.joints] = (weights[:, :k] - weights[:, k:])[:, :, None] * self.parameters
@@ -207,7 +207,7 @@ def box_limits(
 
 
 def gathered(
-    constraint: Constraint, motion: Motion, sharpness: float, tightening: float = 0.0
+    constraint: MotionConstraint, motion: SampledMotion, sharpness: float, tightening: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the smoothed constraints c (r,), their slopes (r, 4, N, n) by the motion, and max g / scale + tightening.
 

@@ -68,7 +68,7 @@ class Fourier:
         return self.variables(drawn)
 
 
-def fourier(
+def fourier_family(
     harmonics: int | Sequence[int],
     period: float,
     joints: int | None = None,

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from trajectories.errors import BadInput
-from trajectories.track import Track
+from trajectories.setpoints import Setpoints
 
 DIGITS = 9  # after the point: 1e-9 rad, and whole nanoseconds
 
 
-def joint_trajectory(track: Track, joint_names: Sequence[str], every: int = 1, frame: str = "") -> dict[str, Any]:
+def joint_trajectory(track: Setpoints, joint_names: Sequence[str], every: int = 1, frame: str = "") -> dict[str, Any]:
     """Return the message as plain dictionaries; joints in rad or m, effort in N m or N where torques are known.
 
     Args:
@@ -61,7 +61,7 @@ def to_yaml(message: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _point(track: Track, k: int) -> dict[str, Any]:
+def _point(track: Setpoints, k: int) -> dict[str, Any]:
     nanoseconds = round(k / track.rate * 1e9)
     efforts = track.tau[k] if track.tau is not None else []
     return {

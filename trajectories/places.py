@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trajectories.basis import Motion
+from trajectories.basis import SampledMotion
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +53,7 @@ class Workspace:
     def groups(self) -> np.ndarray:
         return np.arange(len(self.labels))
 
-    def values(self, motion: Motion) -> np.ndarray:
+    def values(self, motion: SampledMotion) -> np.ndarray:
         x = self.points(motion.q)
         found = []
         if self.radius is not None:
@@ -62,7 +62,7 @@ class Workspace:
         found += [x[..., 2] - self.highest] if self.highest is not None else []
         return np.concatenate(found, axis=1)
 
-    def slopes(self, motion: Motion, weights: np.ndarray) -> np.ndarray:
+    def slopes(self, motion: SampledMotion, weights: np.ndarray) -> np.ndarray:
         x, k = self.points(motion.q), len(self.names)
         G = np.zeros_like(x)
         parts = dict(zip(self._kinds, np.split(weights, len(self._kinds), axis=1)))
@@ -99,10 +99,10 @@ class Clearance:
     def groups(self) -> np.ndarray:
         return np.zeros(len(self.labels), dtype=int)
 
-    def values(self, motion: Motion) -> np.ndarray:
+    def values(self, motion: SampledMotion) -> np.ndarray:
         return self.least - self.distances(motion.q)
 
-    def slopes(self, motion: Motion, weights: np.ndarray) -> np.ndarray:
+    def slopes(self, motion: SampledMotion, weights: np.ndarray) -> np.ndarray:
         result = np.zeros((4, *motion.q.shape))
         result[0] = -self.product(motion.q, weights)
         return result

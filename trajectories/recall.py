@@ -62,7 +62,7 @@ class Averaged:
         return self.variance.mean(axis=0)
 
 
-def recall(recorded: np.ndarray, reference: np.ndarray, skip: int = 0, likeness: float = LIKENESS) -> Recalled:
+def find_periods(recorded: np.ndarray, reference: np.ndarray, skip: int = 0, likeness: float = LIKENESS) -> Recalled:
     """Find a periodic motion in a recording.
 
     Args:

@@ -166,8 +166,11 @@ def _open(path: str | Path, headed: bool) -> tuple[IO[str], str, list[str]]:
             if text.startswith("#"):
                 comment = text
             elif text:
-                separator = _separator(text)
-                first = next(csv.reader([line.strip("\r\n")], delimiter=separator, skipinitialspace=True))
+                while line.count('"') % 2 and (more := file.readline()):  # a quoted name that holds a line break
+                    line += more
+                separator = _separator(line.strip())
+                lines = line.strip("\r\n").splitlines(keepends=True)
+                first = next(csv.reader(lines, delimiter=separator, skipinitialspace=True))
                 if _headless(first, path) or not headed:
                     file.seek(place)
                     first = _comment_header(comment, separator, len(first), path) if headed else first
@@ -188,6 +191,7 @@ def _headless(cells: Sequence[str], path: str | Path) -> bool:
 
 
 def _separator(line: str) -> str:
+    line = re.sub(r'"[^"]*"', "", line)
     if not any(mark in line for mark in ",;\t") and all(_is_number(cell) for cell in line.split()):
         return " "  # numpy's savetxt
     return next((mark for mark in "\t;" if mark in line), ",")

@@ -133,7 +133,7 @@ class BaseModel:
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
+class States:
     """States over which columns are compared, random or recorded.
 
     Attributes:
@@ -155,18 +155,18 @@ def random_samples(
     seed: int | np.random.Generator = 0,
     lower: np.ndarray | None = None,
     upper: np.ndarray | None = None,
-) -> Samples:
+) -> States:
     """Draw states: q uniform within its limits (default ±π), v and a uniform within ±3 per s and ±3 per s²."""
     rng, n = np.random.default_rng(seed), model.tree.n
     low = np.full(n, -np.pi) if lower is None else lower
     q = rng.uniform(low, np.full(n, np.pi) if upper is None else upper, (count, n))
     v, a, load = rng.uniform(-3.0, 3.0, (3, count, n))
     remembering = sum(len(one.acts) for one in model.columns if one.form.remembers)
-    return Samples(q, v, a, load, rng.uniform(-1.0, 1.0, (remembering, count)))
+    return States(q, v, a, load, rng.uniform(-1.0, 1.0, (remembering, count)))
 
 
 def find(
-    model: IdentificationModel, samples: Samples | None = None, loads: Loads | None = None, tolerance: float = 1e-6
+    model: IdentificationModel, samples: States | None = None, loads: Loads | None = None, tolerance: float = 1e-6
 ) -> Base:
     """Choose the base columns of a model.
 
@@ -184,7 +184,7 @@ def find(
     return _describe(model, split, factor, len(cases) * len(samples.q))
 
 
-def regroup(base: Base, model: IdentificationModel, samples: Samples | None = None, loads: Loads | None = None) -> Base:
+def regroup(base: Base, model: IdentificationModel, samples: States | None = None, loads: Loads | None = None) -> Base:
     """Recompute K on another geometry (the calibrated chain), the columns kept: W_dropped ≈ W_kept K, least squares.
 
     The remainder says how well that holds over the samples. Columns without effect on the nominal chain (on the
@@ -224,7 +224,7 @@ def preference(model: IdentificationModel) -> np.ndarray:
     return np.array([*first, *range(inertial, model.p), *late, *fixed], dtype=int)
 
 
-def r_factor(model: IdentificationModel, samples: Samples, loads: Loads = (None,)) -> np.ndarray:
+def r_factor(model: IdentificationModel, samples: States, loads: Loads = (None,)) -> np.ndarray:
     """Return the R factor (p, p) of the observation matrix over samples and load cases, block by block.
 
     One triangle per torque row is updated with the columns that row can see at all (a joint does not feel the links

@@ -24,7 +24,7 @@ MOTOR_SIDE = {"Ia": "acceleration", "Fvm": "velocity", "Fcm": "sign", "offm": "o
 
 
 @dataclass(frozen=True)
-class Term:
+class DriveTerm:
     """One column.
 
     Attributes:
@@ -64,14 +64,14 @@ class Term:
         return self.form.unit_linear if self.linear else self.form.unit
 
 
-def term(name: str, shape: str, joint: int, *settings: float, side: str = "motor", linear: bool = False) -> Term:
+def term(name: str, shape: str, joint: int, *settings: float, side: str = "motor", linear: bool = False) -> DriveTerm:
     """Return the term of one joint that sees its own motion."""
-    return Term(name, shape, ((joint, ((joint, 1.0),)),), tuple(map(float, settings)), side, linear)
+    return DriveTerm(name, shape, ((joint, ((joint, 1.0),)),), tuple(map(float, settings)), side, linear)
 
 
 def standard(
     sets: Sequence[str], v0: float | Sequence[float] = V0, linear: Sequence[bool] | None = None
-) -> tuple[Term, ...]:
+) -> tuple[DriveTerm, ...]:
     """Return the terms of n joints, joint after joint.
 
     Args:
@@ -93,16 +93,16 @@ def standard(
     return tuple(result)
 
 
-def without_effect(label: str) -> tuple[Term, ...]:
+def without_effect(label: str) -> tuple[DriveTerm, ...]:
     """Return the seven drive parameters of a fixed body: the papers count them, they move nothing."""
     named = {"Ia": "acceleration"} | LINK_SIDE | MOTOR_SIDE
     return tuple(
-        Term(name + label, shape, (), (V0,) if shape == "sign" else (), "link" if name in LINK_SIDE else "motor")
+        DriveTerm(name + label, shape, (), (V0,) if shape == "sign" else (), "link" if name in LINK_SIDE else "motor")
         for name, shape in named.items()
     )
 
 
-def coupled(first: int, second: int, v0: float = V0, label: str | None = None) -> tuple[Term, ...]:
+def coupled(first: int, second: int, v0: float = V0, label: str | None = None) -> tuple[DriveTerm, ...]:
     """Return Iam, Fvm, Fcm of a gear whose motor turns with the sum of two joints (the TX40 wrist: 4, 5).
 
         tau_first += Iam a_second + Fvm v_second + Fcm sign(v_first + v_second), and the other way round
@@ -113,13 +113,13 @@ def coupled(first: int, second: int, v0: float = V0, label: str | None = None) -
     crossed = ((first, ((second, 1.0),)), (second, ((first, 1.0),)))
     total: Motion = ((first, 1.0), (second, 1.0))
     return (
-        Term(f"Iam{label}", "acceleration", crossed),
-        Term(f"Fvm{label}", "velocity", crossed),
-        Term(f"Fcm{label}", "sign", ((first, total), (second, total)), (v0,)),
+        DriveTerm(f"Iam{label}", "acceleration", crossed),
+        DriveTerm(f"Fvm{label}", "velocity", crossed),
+        DriveTerm(f"Fcm{label}", "sign", ((first, total), (second, total)), (v0,)),
     )
 
 
-def added_inertia(terms: Iterable[Term], values: np.ndarray, n: int) -> np.ndarray:
+def added_inertia(terms: Iterable[DriveTerm], values: np.ndarray, n: int) -> np.ndarray:
     """Return the constant inertia (n, n) that acceleration terms add to the bodies': diag(Ia) and couplings."""
     result = np.zeros((n, n))
     for one, value in zip(terms, values, strict=True):
@@ -130,7 +130,7 @@ def added_inertia(terms: Iterable[Term], values: np.ndarray, n: int) -> np.ndarr
     return result
 
 
-def fill(terms: Sequence[Term], out: np.ndarray, motions: Sequence[np.ndarray | None], states: np.ndarray) -> None:
+def fill(terms: Sequence[DriveTerm], out: np.ndarray, motions: Sequence[np.ndarray | None], states: np.ndarray) -> None:
     """Write the columns of terms into out (k, n, N), zero on entry.
 
     Args:
@@ -145,7 +145,9 @@ def fill(terms: Sequence[Term], out: np.ndarray, motions: Sequence[np.ndarray | 
         state += own
 
 
-def acting(one: Term, motions: Sequence[np.ndarray | None], states: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+def acting(
+    one: DriveTerm, motions: Sequence[np.ndarray | None], states: np.ndarray
+) -> Iterator[tuple[int, np.ndarray]]:
     """Yield each torque row that a term acts on, and its column there (N,).
 
     Args:
@@ -158,7 +160,7 @@ def acting(one: Term, motions: Sequence[np.ndarray | None], states: np.ndarray) 
 
 
 def slopes(
-    terms: Sequence[Term], motions: Sequence[np.ndarray], weights: np.ndarray, out: Sequence[np.ndarray]
+    terms: Sequence[DriveTerm], motions: Sequence[np.ndarray], weights: np.ndarray, out: Sequence[np.ndarray]
 ) -> None:
     """Add the slopes of Σ weights · columns by q, v, a to out, three arrays (n, N); weights (k, n, N)."""
     for weight, one in zip(weights, terms, strict=True):
@@ -171,7 +173,7 @@ def slopes(
                     target[joint] += share * weight[row] * part
 
 
-def friction_states(terms: Sequence[Term], q: np.ndarray) -> np.ndarray:
+def friction_states(terms: Sequence[DriveTerm], q: np.ndarray) -> np.ndarray:
     """Return the stop operators' states (s, N) of one uninterrupted record q (n, N), at rest and unstressed at first.
 
         z_k = clip(z_{k-1} + (x_k - x_{k-1}) / width, -1, 1):
@@ -188,7 +190,7 @@ def friction_states(terms: Sequence[Term], q: np.ndarray) -> np.ndarray:
     return np.array(found).reshape(len(found), q.shape[1])
 
 
-def _join(one: Term, motion: Motion, motions: Sequence[np.ndarray | None], state: np.ndarray | None) -> Joined:
+def _join(one: DriveTerm, motion: Motion, motions: Sequence[np.ndarray | None], state: np.ndarray | None) -> Joined:
     """Return what a term sees: weighted sums of q, v, a; of the load, that of the row's first joint."""
     if one.form.loaded and motions[3] is None:
         raise CalibError(f"term '{one.name}' needs the transmitted torque: give load (N, n), measured or predicted")

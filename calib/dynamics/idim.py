@@ -20,7 +20,7 @@ import numpy as np
 from calib.arrays import shaped
 from calib.dynamics import drives, rigid_body
 from calib.dynamics.bodies import Tree, tree, with_payload
-from calib.dynamics.drives import Term
+from calib.dynamics.drives import DriveTerm
 from calib.dynamics.shapes import V0
 from calib.errors import CalibError
 from calib.robot.chain import Chain
@@ -40,7 +40,7 @@ class IdentificationModel:
     """
 
     tree: Tree
-    terms: tuple[Term, ...] = ()
+    terms: tuple[DriveTerm, ...] = ()
     kind: str = "motor"
 
     def __post_init__(self) -> None:
@@ -65,7 +65,7 @@ class IdentificationModel:
         return own if self.kind == "drive" else self.tree.units + own
 
     @property
-    def columns(self) -> tuple[Term, ...]:
+    def columns(self) -> tuple[DriveTerm, ...]:
         """The terms this kind of rows can see."""
         hidden = {"link": "motor", "drive": "link"}.get(self.kind)
         return tuple(one for one in self.terms if one.side != hidden)
@@ -175,7 +175,7 @@ def friction_states(model: IdentificationModel, q: np.ndarray) -> np.ndarray:
     return drives.friction_states(model.columns, np.ascontiguousarray(shaped(q, (None, model.tree.n), "q").T))
 
 
-def with_terms(model: IdentificationModel, *terms: Term) -> IdentificationModel:
+def with_terms(model: IdentificationModel, *terms: DriveTerm) -> IdentificationModel:
     """Return the model with more drive terms behind its own."""
     return replace(model, terms=(*model.terms, *terms))
 

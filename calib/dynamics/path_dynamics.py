@@ -20,7 +20,7 @@ from calib.arrays import frozen, shaped
 from calib.dynamics import drives, rigid_body
 from calib.dynamics.base import BaseModel, to_standard
 from calib.dynamics.bodies import Tree
-from calib.dynamics.drives import Term
+from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import CalibError
 
@@ -45,7 +45,7 @@ class PathDynamics:
 
     regressor: Regressor
     parameters: np.ndarray
-    terms: tuple[Term, ...]
+    terms: tuple[DriveTerm, ...]
     amounts: np.ndarray
     tree: Tree
     bodies: np.ndarray
@@ -135,13 +135,13 @@ def _is_friction(model: IdentificationModel) -> np.ndarray:
     return np.concatenate([bodies, np.array([one.shape not in AFFINE for one in model.columns], dtype=bool)])
 
 
-def _valued(model: IdentificationModel, values: np.ndarray) -> tuple[tuple[Term, ...], np.ndarray]:
+def _valued(model: IdentificationModel, values: np.ndarray) -> tuple[tuple[DriveTerm, ...], np.ndarray]:
     """Return the drive terms with a value and an exact sign, and the values."""
     found = [(one, x) for one, x in zip(model.columns, values[10 * model.tree.bodies :]) if x]
     return tuple(_sharp(one) for one, _ in found), np.array([x for _, x in found], dtype=float)
 
 
-def _sharp(one: Term) -> Term:
+def _sharp(one: DriveTerm) -> DriveTerm:
     """Return the term with Coulomb's sign as it is, not smoothed: at low speed the larger torque."""
     if one.shape not in SMOOTHED:
         return one
@@ -150,7 +150,7 @@ def _sharp(one: Term) -> Term:
     return replace(one, settings=tuple(settings))
 
 
-def _stressed(terms: Sequence[Term], v: np.ndarray) -> np.ndarray:
+def _stressed(terms: Sequence[DriveTerm], v: np.ndarray) -> np.ndarray:
     """Return states (s, N) of stop operators that slide in the direction of their motion; v (n, N)."""
     found = [
         np.sign(sum((weight * v[j] for j, weight in motion), np.zeros(v.shape[1])))

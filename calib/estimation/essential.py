@@ -27,7 +27,7 @@ class Rule(Enum):
 
 
 @dataclass(frozen=True)
-class Step:
+class EliminationStep:
     """One parameter left out.
 
     Attributes:
@@ -65,8 +65,8 @@ class Elimination:
     base: LinearFit
     essential: LinearFit
     kept: np.ndarray
-    steps: tuple[Step, ...]
-    refused: Step | None
+    steps: tuple[EliminationStep, ...]
+    refused: EliminationStep | None
 
 
 def eliminate(
@@ -128,12 +128,14 @@ def nested_test(base: LinearFit, gone: Sequence[int]) -> tuple[float, float]:
     return f, float(scipy.stats.f.sf(f, len(x), base.estimate.dof))
 
 
-def _step(base: LinearFit, current: LinearFit, smaller: LinearFit, worst: int, gone: list[int], listed: bool) -> Step:
+def _step(
+    base: LinearFit, current: LinearFit, smaller: LinearFit, worst: int, gone: list[int], listed: bool
+) -> EliminationStep:
     rsd = current.estimate.rsd
     f, p = nested_test(current, [worst])
     f_total, p_total = nested_test(base, gone)
     spread = float(rsd.max() / rsd.min()) if rsd.min() > 0.0 else np.inf
-    return Step(
+    return EliminationStep(
         current.estimate.names[worst], float(rsd[worst]), spread, f, p, f_total, p_total,
         smaller.estimate.residual_std, listed,
     )  # fmt: skip
@@ -147,7 +149,7 @@ def _next(current: LinearFit, keep: Sequence[str], drop: Sequence[str]) -> int |
     return max(candidates, key=lambda k: rsd[k]) if candidates else None
 
 
-def _refused(step: Step, rule: Rule, ratio: float, level: float) -> bool:
+def _refused(step: EliminationStep, rule: Rule, ratio: float, level: float) -> bool:
     even = step.ratio < ratio
     needed = step.p < level or step.p_total < level
     return {Rule.RSD: even, Rule.F: needed, Rule.BOTH: even or needed}[rule]

@@ -36,7 +36,7 @@ from calib.estimation.triangles import (
 
 
 @dataclass(frozen=True, eq=False)
-class Strength:
+class InstrumentStrength:
     """How well instruments stand for the columns.
 
     Attributes:
@@ -62,7 +62,7 @@ class Strength:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class ExogeneityTest:
     """A test of the claim that W is uncorrelated with the noise, hence least squares unbiased.
 
     Attributes:
@@ -171,7 +171,7 @@ def settled(before: LinearFit, now: LinearFit, change: float = 0.025, residual: 
     return bool(np.all(moved <= allowed) and abs(sizes[1] - sizes[0]) <= residual * sizes[0])
 
 
-def strength(problem: Instruments, std: np.ndarray | None = None) -> Strength:
+def strength(problem: Instruments, std: np.ndarray | None = None) -> InstrumentStrength:
     """Return what the instruments tell about the columns; all measures from one R factor.
 
     Args:
@@ -190,7 +190,7 @@ def strength(problem: Instruments, std: np.ndarray | None = None) -> Strength:
     with np.errstate(divide="ignore", invalid="ignore"):
         first = np.where(gone > 0.0, both / gone, np.inf) * (rows - p) / p
         donald = float((rows - p) / p * np.divide(least, 1.0 - least))
-    return Strength(
+    return InstrumentStrength(
         problem.names,
         correlations,
         _shea(explained / norms, factor[:, p : 2 * p] / norms),
@@ -200,7 +200,7 @@ def strength(problem: Instruments, std: np.ndarray | None = None) -> Strength:
     )
 
 
-def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1.0) -> Verdict:
+def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1.0) -> ExogeneityTest:
     """Test whether W is uncorrelated with the noise (Durbin, Wu, Hausman), by augmented regression and QR.
 
     With V = W - P_Z W the part of the columns that the instruments do not explain, y = W x + V δ + e; the claim is
@@ -228,10 +228,10 @@ def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: f
     target = factor[:, -1]
     first, second = _rss(whole, target), _rss(columns[:, split.kept], target)
     f = (first - second) / k / (second / (rows - p - k)) / inflation if second > 0.0 else np.inf
-    return Verdict(float(f), (k, dof), float(scipy.stats.f.sf(f, k, dof)))
+    return ExogeneityTest(float(f), (k, dof), float(scipy.stats.f.sf(f, k, dof)))
 
 
-def hausman(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1.0) -> Verdict:
+def hausman(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1.0) -> ExogeneityTest:
     """Test the same claim by the distance of two estimates (Hausman 1978): (b_IV - b_LS)ᵀ (S_IV - S_LS)⁺ (…) ~ χ²(k).
 
     Both covariances with the σ² of least squares, so that their difference is never negative: with λ the canonical
@@ -254,7 +254,7 @@ def hausman(problem: Instruments, std: np.ndarray | None = None, inflation: floa
     variance = _rss(factor[:, p : 2 * p], factor[:, -1]) / (rows - p)
     distance = (vt @ upper @ (instrumental - ordinary))[open_]
     chi = float(np.sum(distance**2 * lam[open_] ** 2 / gap[open_]) / variance / inflation)
-    return Verdict(chi, (k, 0), float(scipy.stats.chi2.sf(chi, k)))
+    return ExogeneityTest(chi, (k, 0), float(scipy.stats.chi2.sf(chi, k)))
 
 
 def projected(problem: Instruments, std: np.ndarray | None = None) -> np.ndarray:

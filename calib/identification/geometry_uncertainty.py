@@ -39,7 +39,7 @@ from calib.identification.cases import Case
 from calib.identification.identify import Identification, common_decimator
 from calib.identification.prediction import carried_columns
 from calib.identification.reweighted import cut, estimator, inverted, stacked, weights
-from calib.identification.rows import Rows, segments
+from calib.identification.rows import ObservationRows, segments
 from calib.identification.settings import make_model
 from calib.robot.chain import Chain
 
@@ -54,7 +54,7 @@ Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
-class Propagation:
+class GeometryUncertainty:
     """The estimate's sensitivity to the geometry and what it adds to the covariance.
 
     Attributes:
@@ -119,7 +119,7 @@ def propagate(
     cases: Sequence[Case],
     covariance: np.ndarray | None = None,
     progress: Progress | None = None,
-) -> Propagation:
+) -> GeometryUncertainty:
     """Carry the covariance of a chain into the dynamics identified on it.
 
     Args:
@@ -136,7 +136,7 @@ def propagate(
         geometry = frozen(matrix[:, :count] @ covariance @ matrix[:, :count].T)
         own = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
         deviations[:count] = np.where(own > 0.0, own, np.nan)
-    return Propagation(
+    return GeometryUncertainty(
         found.names, (*chain.names, *TILTS), (*chain.units, *("rad" for _ in TILTS)), matrix,
         found.fitted.estimate.covariance, deviations, geometry, felt, left,
     )  # fmt: skip
@@ -158,7 +158,7 @@ def sensitivity(
     decimator = common_decimator(cases, found.settings)
     step = -(-sum(len(case.motion) for case in cases) // SAMPLES)
     pulled = np.zeros((p, count))
-    used: list[Rows] = []
+    used: list[ObservationRows] = []
     changes: list[np.ndarray] = []
     for part, case in zip(found.rows, cases):
         for number, (own, span) in enumerate(pieces(case, decimator, step)):

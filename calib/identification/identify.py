@@ -18,15 +18,19 @@ from calib.estimation.essential import Elimination, Rule, eliminate
 from calib.estimation.linear import LinearFit, ridge
 from calib.estimation.triangles import Triangles, combine, condition_numbers, retriangulate
 from calib.identification.cases import Case
-from calib.identification.friction.friction_ladder import Climb, Ground, Rung, climb
+from calib.identification.friction.friction_ladder import (
+    FrictionCandidates,
+    FrictionSelection,
+    select_friction,
+)
 from calib.identification.friction.ripple import Ripple, find_all
 from calib.identification.friction.time_folds import estimate
 from calib.identification.loop.bias import LoopTest, require_loop, try_loop
-from calib.identification.methods.least_squares import Fitted, fit_rows, residual_inflation, scaled
+from calib.identification.methods.least_squares import MethodEstimate, fit_rows, residual_inflation, scaled
 from calib.identification.prediction import Dynamics, predict, transmitted
 from calib.identification.prior import Prior, bounded, find_prior
-from calib.identification.rows import Rows, extend, observe, observe_terms, pool, triangulate, with_blocks
-from calib.identification.settings import Settings, make_model, per_joint
+from calib.identification.rows import ObservationRows, extend, observe, observe_terms, pool, triangulate, with_blocks
+from calib.identification.settings import IdentificationSettings, make_model, per_joint
 from calib.robot.chain import Chain, sampling_limits
 
 CONDITION = 150.0  # of the observation matrix, unit columns, from which on the prior is used
@@ -43,7 +47,7 @@ class Identification:
         base: which columns were kept of the standard model, and what they stand for.
         fitted: the estimate of base parameters and friction.
         elimination: the way to the essential ones; None where not asked for.
-        climb: the friction ladder.
+        friction: which richer friction the unseen time rewarded.
         settings: how.
         rows: what was learnt from.
         condition: of the observation matrix of the base parameters, in its units and with columns of unit norm.
@@ -54,11 +58,11 @@ class Identification:
 
     dynamics: Dynamics
     base: Base
-    fitted: Fitted
+    fitted: MethodEstimate
     elimination: Elimination | None
-    climb: Climb
-    settings: Settings
-    rows: tuple[Rows, ...]
+    friction: FrictionSelection
+    settings: IdentificationSettings
+    rows: tuple[ObservationRows, ...]
     condition: tuple[float, float]
     prior: Prior | None = None
     ripples: tuple[Ripple, ...] = ()
@@ -67,17 +71,13 @@ class Identification:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the estimate's parameters: base ones, then richer friction."""
-        return (*self.base.names, *(one.name for one in self.climb.terms))
-
-    @property
-    def rungs(self) -> tuple[Rung, ...]:
-        return self.climb.rungs
+        return (*self.base.names, *(one.name for one in self.friction.terms))
 
 
 def identify(
     chain: Chain,
     cases: Sequence[Case],
-    settings: Settings | None = None,
+    settings: IdentificationSettings | None = None,
     nominal: Chain | None = None,
     progress: Progress | None = None,
 ) -> Identification:
@@ -89,7 +89,7 @@ def identify(
         nominal: the chain that base columns are chosen on; None: `chain`.
         progress: called with a few words at each stage.
     """
-    settings, say = settings or Settings(), progress or (lambda words: None)
+    settings, say = settings or IdentificationSettings(), progress or (lambda words: None)
     if not cases:
         raise UsageError("no recording to identify from")
     settings = require_loop(settings) if settings.method == "iv" else settings
@@ -111,11 +111,11 @@ def identify(
     prior = _prior(chain, model, base, rows, cases, std, tau, settings)
     known = None if prior is None else prior.rows
     n = chain.n
-    ground = Ground(
+    ground = FrictionCandidates(
         cases, rows, loads, decimator, std, tau, np.array(per_joint(settings.v0, n, "v0")),
         np.array([joint.kind == "prismatic" for joint in chain.joints]), known,
     )  # fmt: skip
-    climbed = climb(ground, friction, progress) if settings.kind == "motor" else Climb((), (), ())
+    climbed = select_friction(ground, friction, progress) if settings.kind == "motor" else FrictionSelection((), (), ())
     say("estimate")
     full = [
         extend(part, climbed.terms, observe_terms(climbed.terms, case, decimator, load))
@@ -148,7 +148,7 @@ def identify(
 
 
 def _with_payloads(
-    standard: np.ndarray, model: IdentificationModel, cases: Sequence[Case], settings: Settings
+    standard: np.ndarray, model: IdentificationModel, cases: Sequence[Case], settings: IdentificationSettings
 ) -> np.ndarray:
     """Return the standard parameters with those of payloads that no case carries, where they are known."""
     result = np.array(standard)
@@ -160,7 +160,11 @@ def _with_payloads(
 
 
 def find_base(
-    chain: Chain, model: IdentificationModel, settings: Settings, nominal: Chain | None, cases: Sequence[Case]
+    chain: Chain,
+    model: IdentificationModel,
+    settings: IdentificationSettings,
+    nominal: Chain | None,
+    cases: Sequence[Case],
 ) -> Base:
     """Return base columns chosen on the nominal chain and regrouped on the calibrated one."""
     loads = tuple(dict.fromkeys(tuple(sorted(case.carried)) for case in cases))
@@ -171,7 +175,7 @@ def find_base(
     return found if nominal is None else bases.regroup(found, model, samples, loads)
 
 
-def common_decimator(cases: Sequence[Case], settings: Settings) -> Decimator:
+def common_decimator(cases: Sequence[Case], settings: IdentificationSettings) -> Decimator:
     """Return the filter of all rows: the widest of the cases' bands; where that makes too many rows, of every second,
     third, ... one alone.
 
@@ -190,7 +194,7 @@ def common_decimator(cases: Sequence[Case], settings: Settings) -> Decimator:
     return replace(widest, factor=one_in * widest.factor)
 
 
-def repeats_noise(cases: Sequence[Case], settings: Settings) -> np.ndarray | None:
+def repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> np.ndarray | None:
     """Return the noise (rows,) that repeats of the motion told, its mean square over cases by length; None: not asked.
 
     Raises:
@@ -220,7 +224,9 @@ def repeats_noise(cases: Sequence[Case], settings: Settings) -> np.ndarray | Non
     return np.asarray(np.sqrt(np.average(squares, axis=0, weights=[len(case.motion) for case in cases])))
 
 
-def first_fit(rows: Sequence[Rows], noise: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def first_fit(
+    rows: Sequence[ObservationRows], noise: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return standard deviation and inflation of the residuals (rows,), and values (b,) of a fit that always exists."""
     count = rows[0].target.shape[1]
     data = pool(triangulate(rows), count)
@@ -236,8 +242,8 @@ def first_fit(rows: Sequence[Rows], noise: np.ndarray | None = None) -> tuple[np
 
 
 def _prior(
-    chain: Chain, model: IdentificationModel, base: Base, rows: Sequence[Rows], cases: Sequence[Case],
-    std: np.ndarray, tau: np.ndarray, settings: Settings,
+    chain: Chain, model: IdentificationModel, base: Base, rows: Sequence[ObservationRows], cases: Sequence[Case],
+    std: np.ndarray, tau: np.ndarray, settings: IdentificationSettings,
 ) -> Prior | None:  # fmt: skip
     """Return the prior, where it is asked for or the motion is too poor to do without."""
     if settings.prior == "none" or settings.method != "wls" or settings.kind == "drive":
@@ -250,8 +256,12 @@ def _prior(
 
 
 def _estimate(
-    rows: Sequence[Rows], climbed: Climb, settings: Settings, prior: Prior | None, noise: np.ndarray | None
-) -> tuple[Fitted, tuple[float, float]]:
+    rows: Sequence[ObservationRows],
+    climbed: FrictionSelection,
+    settings: IdentificationSettings,
+    prior: Prior | None,
+    noise: np.ndarray | None,
+) -> tuple[MethodEstimate, tuple[float, float]]:
     """Return the final fit; richer friction keeps the ridge that the evidence chose."""
     data = triangulate(rows)
     fitted = fit_rows(rows, data, settings.method, prior is None, noise)
@@ -291,7 +301,9 @@ def _bounded(drawn: LinearFit, data: Triangles, std: np.ndarray, mean: np.ndarra
     return replace(drawn, estimate=replace(drawn.estimate, values=values))
 
 
-def _essential(fitted: Fitted, settings: Settings, prior: Prior | None, bias: LoopTest) -> Elimination | None:
+def _essential(
+    fitted: MethodEstimate, settings: IdentificationSettings, prior: Prior | None, bias: LoopTest
+) -> Elimination | None:
     """Return the elimination; none where the data alone do not determine the base parameters."""
     if settings.essential == "none" or prior is not None:
         return None
@@ -321,7 +333,7 @@ def _require_motion(cases: Sequence[Case]) -> None:
         )
 
 
-def _require_enough(rows: Sequence[Rows], base: Base) -> None:
+def _require_enough(rows: Sequence[ObservationRows], base: Base) -> None:
     count = sum(int(part.present.sum()) for part in rows)
     if count < 2 * base.b:
         raise MeasurementError(

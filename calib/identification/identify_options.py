@@ -75,14 +75,14 @@ from calib.data.recordings.recording import parse_cut
 from calib.data.recordings.recording_options import RecordingOptions
 from calib.data.signals.decimation import KINDS as DECIMATORS
 from calib.data.signals.motion import FilterOptions
-from calib.dynamics.drives import Term, term
+from calib.dynamics.drives import DriveTerm, term
 from calib.dynamics.idim import KINDS
 from calib.dynamics.shapes import SHAPES
 from calib.errors import CalibError, UsageError
 from calib.identification.friction.friction_ladder import NAMES
 from calib.identification.loop.loop_settings import parse_loop
 from calib.identification.methods.least_squares import METHODS
-from calib.identification.settings import PRIORS, RULES, WEIGHTS, Coupling, Payload, Settings
+from calib.identification.settings import PRIORS, RULES, WEIGHTS, Coupling, IdentificationSettings, Payload
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class IdentifyOptions:
         source: the file, for messages.
     """
 
-    settings: Settings = field(default_factory=Settings)
+    settings: IdentificationSettings = field(default_factory=IdentificationSettings)
     every: FileSettings = field(default_factory=FileSettings)
     files: Mapping[str, FileSettings] = field(default_factory=dict)
     slow: float | tuple[float, ...] | None = None
@@ -146,7 +146,7 @@ def parse_options(table: Mapping[str, Any], source: str = "options") -> Identify
     """Return the options that a parsed TOML table holds; `source` is for messages."""
     values.known(table, {*_SETTINGS, *_OWN, *_FILE, *_TABLES}, source)
     chosen = {_FIELD.get(key, key): _SETTINGS[key](table[key], f"{source}: {key}") for key in table if key in _SETTINGS}
-    settings = Settings(
+    settings = IdentificationSettings(
         **chosen,
         couplings=tuple(_coupling(v, f"{source}: coupling") for v in _list(table, "coupling", source)),
         terms=tuple(_term(v, f"{source}: term") for v in _list(table, "term", source)),
@@ -169,7 +169,7 @@ def parse_options(table: Mapping[str, Any], source: str = "options") -> Identify
     return IdentifyOptions(settings, every, files, source=source, **rest)
 
 
-def _file(table: Mapping[str, Any], base: FileSettings, settings: Settings, place: str) -> FileSettings:
+def _file(table: Mapping[str, Any], base: FileSettings, settings: IdentificationSettings, place: str) -> FileSettings:
     result = base
     if "recording" in table:
         result = replace(result, recording=_recording(table["recording"], base.recording, f"{place}: recording"))
@@ -224,7 +224,7 @@ def _coupling(value: Any, place: str) -> Coupling:
     return Coupling(found["joints"], found.get("label", ""))
 
 
-def _term(value: Any, place: str) -> Term:
+def _term(value: Any, place: str) -> DriveTerm:
     parsers = {
         "name": values.text, "shape": values.one_of(*SHAPES), "joint": _whole(1, 99), "settings": _numbers,
         "side": values.one_of("motor", "link"),
@@ -342,7 +342,7 @@ _OWN: dict[str, Callable[[Any, str], Any]] = {
 }
 _FILE = ("recording", "filter", "gains")
 _TABLES = ("coupling", "term", "payload", "files", "gain_identification", "loop")
-assert {_FIELD.get(key, key) for key in _SETTINGS} <= {f.name for f in fields(Settings)}
+assert {_FIELD.get(key, key) for key in _SETTINGS} <= {f.name for f in fields(IdentificationSettings)}
 
 
 def file_settings(options: IdentifyOptions, path: str) -> FileSettings:

@@ -40,7 +40,7 @@ import numpy as np
 
 from calib.dynamics.base import Base, expressions
 from calib.dynamics.bodies import tree, with_gravity, with_payload
-from calib.dynamics.drives import Term
+from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import RobotError, UsageError
 from calib.identification.prediction import Dynamics
@@ -185,7 +185,7 @@ def from_table(chain: Chain, table: Mapping[str, Any]) -> Dynamics:
     return Dynamics(model, values)
 
 
-def _term(entry: Mapping[str, Any]) -> Term:
+def _term(entry: Mapping[str, Any]) -> DriveTerm:
     acts = tuple((int(row), tuple((int(j), float(w)) for j, w in motion)) for row, motion in entry["acts"])
     settings = tuple(float(x) for x in entry["settings"])
-    return Term(entry["name"], entry["shape"], acts, settings, entry["side"], bool(entry["linear"]))
+    return DriveTerm(entry["name"], entry["shape"], acts, settings, entry["side"], bool(entry["linear"]))

@@ -10,7 +10,7 @@ import numpy as np
 from calib.data.signals.motion import moving
 from calib.identification.cases import Case
 from calib.identification.identify import Identification, common_decimator
-from calib.identification.rows import Rows, observe, thinned
+from calib.identification.rows import ObservationRows, observe, thinned
 from calib.identification.settings import make_model
 from calib.robot.chain import Chain
 
@@ -34,7 +34,7 @@ def estimator(found: Identification) -> Estimator:
     """Return how an identification weighed its rows, and what it knew beforehand."""
     fitted = found.fitted
     p = fitted.pooled.parameters
-    drawn = fitted.method == "wls" and (found.prior is not None or len(found.climb.terms) > 0)
+    drawn = fitted.method == "wls" and (found.prior is not None or len(found.friction.terms) > 0)
     deviation = np.ones(len(fitted.std)) if fitted.method == "ols" else np.array(fitted.std)
     if not drawn:
         return Estimator(deviation, np.zeros((p, p)), np.zeros(p))
@@ -45,7 +45,7 @@ def estimator(found: Identification) -> Estimator:
     return Estimator(deviation, posterior - own[:p, :p], posterior @ fitted.estimate.values - own[:p, p])
 
 
-def estimate(how: Estimator, all_rows: Sequence[Rows]) -> tuple[np.ndarray, np.ndarray]:
+def estimate(how: Estimator, all_rows: Sequence[ObservationRows]) -> tuple[np.ndarray, np.ndarray]:
     """Return φ (p,) from rows, and A⁻¹ (p, p)."""
     normal, right = np.array(how.prior), np.array(how.pull)
     for part in all_rows:
@@ -57,7 +57,7 @@ def estimate(how: Estimator, all_rows: Sequence[Rows]) -> tuple[np.ndarray, np.n
     return inverse @ right, inverse
 
 
-def rows_on(found: Identification, chain: Chain, cases: Sequence[Case]) -> list[Rows]:
+def rows_on(found: Identification, chain: Chain, cases: Sequence[Case]) -> list[ObservationRows]:
     """Return the rows of an identification as another geometry would have given them; friction's columns stay."""
     model, decimator = make_model(chain, found.settings), common_decimator(cases, found.settings)
     result = []
@@ -78,7 +78,7 @@ def standstill_shift(found: Identification, cases: Sequence[Case]) -> np.ndarray
     return estimate(how, faster)[0] - estimate(how, found.rows)[0]
 
 
-def cut(rows: Rows, own: slice) -> Rows:
+def cut(rows: ObservationRows, own: slice) -> ObservationRows:
     """Return some of the rows."""
     return replace(
         rows, matrix=rows.matrix[own], target=rows.target[own], present=rows.present[own], block=rows.block[own]
@@ -91,10 +91,10 @@ def inverted(matrix: np.ndarray) -> np.ndarray:
     return np.linalg.inv(matrix * np.outer(unit, unit)) * np.outer(unit, unit)
 
 
-def stacked(rows: Rows) -> np.ndarray:
+def stacked(rows: ObservationRows) -> np.ndarray:
     return rows.matrix.reshape(-1, rows.matrix.shape[2])
 
 
-def weights(how: Estimator, rows: Rows, by: np.ndarray | None = None) -> np.ndarray:
+def weights(how: Estimator, rows: ObservationRows, by: np.ndarray | None = None) -> np.ndarray:
     """Return 1 / deviation (or 1 / `by`) of each row, all stacked; zero where nothing was learnt."""
     return (rows.present / (how.deviation if by is None else by)).ravel()

@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.data.signals.decimation import Decimator, decimate, decimate_blocks, kept
 from calib.dynamics import drives, rigid_body
-from calib.dynamics.drives import Term
+from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.estimation.triangles import Triangles, absorb, empty, retriangulate
 from calib.identification.cases import Case
@@ -20,7 +20,7 @@ MARGIN = 2  # thinned samples beside a cut between blocks that share a filter wi
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class ObservationRows:
     """M thinned samples of one case.
 
     Attributes:
@@ -43,7 +43,7 @@ class Rows:
 
 def observe(
     model: IdentificationModel, columns: np.ndarray, case: Case, decimator: Decimator, load: np.ndarray | None = None
-) -> Rows:
+) -> ObservationRows:
     """Return the rows of a case in the model's `columns`, filtered and thinned by `decimator`.
 
     Args:
@@ -70,7 +70,7 @@ def observe(
 
 
 def observe_terms(
-    terms: Sequence[Term], case: Case, decimator: Decimator, load: np.ndarray | None = None
+    terms: Sequence[DriveTerm], case: Case, decimator: Decimator, load: np.ndarray | None = None
 ) -> np.ndarray:
     """Return the columns of drive terms alone, (M, n, k), filtered and thinned; for a model of kind ``motor``.
 
@@ -84,14 +84,14 @@ def observe_terms(
     return out
 
 
-def term_columns(one: Term, case: Case, load: np.ndarray | None = None) -> Iterator[tuple[int, np.ndarray]]:
+def term_columns(one: DriveTerm, case: Case, load: np.ndarray | None = None) -> Iterator[tuple[int, np.ndarray]]:
     """Yield the torque rows that a drive term acts on, each with its column (N,) at the full rate."""
     motion = case.motion
     motions = [motion.q.T, motion.v.T, motion.a.T, None if load is None else load.T]
     return drives.acting(one, motions, segmented_states([one], case))
 
 
-def segmented_states(terms: Sequence[Term], case: Case) -> np.ndarray:
+def segmented_states(terms: Sequence[DriveTerm], case: Case) -> np.ndarray:
     """Return the states (s, N) of friction with memory; each segment starts unstressed."""
     parts = [drives.friction_states(terms, case.motion.q[a:b].T) for a, b in segments(case.motion.segment)]
     return np.concatenate(parts, axis=1)
@@ -103,7 +103,7 @@ def segments(segment: np.ndarray) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in pairwise(edges)]
 
 
-def extend(rows: Rows, terms: Sequence[Term], columns: np.ndarray) -> Rows:
+def extend(rows: ObservationRows, terms: Sequence[DriveTerm], columns: np.ndarray) -> ObservationRows:
     """Return rows with more columns (M, rows, k) behind their own."""
     if not terms:
         return rows
@@ -115,7 +115,7 @@ def extend(rows: Rows, terms: Sequence[Term], columns: np.ndarray) -> Rows:
     )
 
 
-def with_blocks(all_rows: Sequence[Rows], count: int) -> list[Rows]:
+def with_blocks(all_rows: Sequence[ObservationRows], count: int) -> list[ObservationRows]:
     """Number the time blocks of all cases: contiguous, about `count` in all, at least one per case.
 
     Samples within `MARGIN` of a cut get -1: the filter's window reaches over it.
@@ -133,7 +133,7 @@ def with_blocks(all_rows: Sequence[Rows], count: int) -> list[Rows]:
     return result
 
 
-def triangulate(all_rows: Sequence[Rows]) -> Triangles:
+def triangulate(all_rows: Sequence[ObservationRows]) -> Triangles:
     """Return the triangles of all rows, one group per (block, row): group = block · rows + row.
 
     The last block holds the samples beside cuts.
@@ -191,12 +191,14 @@ def _block(
     return full.transpose(2, 1, 0)[columns, rows]
 
 
-def _rows(names: Sequence[str], units: Sequence[str], matrix: np.ndarray, case: Case, decimator: Decimator) -> Rows:
+def _rows(
+    names: Sequence[str], units: Sequence[str], matrix: np.ndarray, case: Case, decimator: Decimator
+) -> ObservationRows:
     segment = case.motion.segment
     target = decimate(case.target, decimator, segment)
     present = thinned(case.present, segment, decimator)
     rate = case.motion.rate / decimator.factor
-    return Rows(tuple(names), tuple(units), matrix, target, present, np.zeros(len(target), dtype=int), rate)
+    return ObservationRows(tuple(names), tuple(units), matrix, target, present, np.zeros(len(target), dtype=int), rate)
 
 
 def thinned(mask: np.ndarray, segment: np.ndarray, decimator: Decimator) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.dynamics import drives
 from calib.dynamics.bodies import tree, with_gravity, with_payload
-from calib.dynamics.drives import Term
+from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.shapes import V0
 from calib.errors import UsageError
@@ -47,7 +47,7 @@ class Payload:
 
 
 @dataclass(frozen=True)
-class Settings:
+class IdentificationSettings:
     """The choices of an identification; the defaults suit a serial arm with motor torques.
 
     Attributes:
@@ -76,7 +76,7 @@ class Settings:
     v0: tuple[float, ...] = (V0,)
     kind: str = "motor"
     couplings: tuple[Coupling, ...] = ()
-    terms: tuple[Term, ...] = ()
+    terms: tuple[DriveTerm, ...] = ()
     friction: str = "auto"
     method: str = "wls"
     weights: str = "residuals"
@@ -95,7 +95,7 @@ class Settings:
     seed: int = 0
 
 
-def make_model(chain: Chain, settings: Settings) -> IdentificationModel:
+def make_model(chain: Chain, settings: IdentificationSettings) -> IdentificationModel:
     """Return the model of a chain: its bodies, payloads at its tip, and the drives' standard terms."""
     bodies = tree(chain)
     if settings.gravity is not None:
@@ -113,7 +113,7 @@ def make_model(chain: Chain, settings: Settings) -> IdentificationModel:
     return IdentificationModel(bodies, tuple(own), settings.kind)
 
 
-def _check_joints(n: int, settings: Settings) -> None:
+def _check_joints(n: int, settings: IdentificationSettings) -> None:
     """Refuse couplings and terms of joints that the robot does not have, and a joint coupled with itself."""
     named: list[tuple[str, tuple[int, ...]]] = [
         (f"coupling: joints {[j + 1 for j in one.joints]}", one.joints) for one in settings.couplings

@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.arrays import frozen
 from calib.identification.cases import Case
-from calib.identification.geometry_uncertainty import Propagation
+from calib.identification.geometry_uncertainty import GeometryUncertainty
 from calib.identification.identify import Identification
 from calib.identification.reweighted import cut, estimate, estimator, rows_on, stacked, weights
 from calib.robot.chain import Chain
@@ -18,7 +18,7 @@ CHUNK = 2000  # thinned samples at a time, where each needs its own line of a ma
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class GeometryComparison:
     """Two estimates from the same torques, on two geometries.
 
     Attributes:
@@ -43,7 +43,9 @@ class Comparison:
         return np.where(self.values[1] == 0.0, np.nan, found)
 
 
-def compare(found: Identification, carried: Propagation, nominal: Chain, cases: Sequence[Case]) -> Comparison:
+def compare(
+    found: Identification, carried: GeometryUncertainty, nominal: Chain, cases: Sequence[Case]
+) -> GeometryComparison:
     """Estimate the same columns from the same torques on the nominal geometry, and say how far apart the two are.
 
     Both by weighted least squares with the same weights; the difference is added to the estimate that there is.
@@ -63,7 +65,7 @@ def compare(found: Identification, carried: Propagation, nominal: Chain, cases: 
             spread_of = np.tile(noise, len(one.target[part]))
             alone += np.sum((gain * spread_of) ** 2, axis=1)
             apart += np.sum(((gain - ours) * spread_of) ** 2, axis=1)
-    return Comparison(
+    return GeometryComparison(
         found.names, found.fitted.estimate.units, frozen(np.stack([values + first - second, values])),
         frozen(np.stack([np.sqrt(alone), carried.sigma])), frozen(np.sqrt(apart)),
     )  # fmt: skip

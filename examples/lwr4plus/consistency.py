@@ -35,10 +35,10 @@ from calib.geometry.fit import fit
 from calib.identification import geometry_uncertainty, reweighted
 from calib.identification.cases import Case, make_case
 from calib.identification.identify import Identification, common_decimator, find_base, identify
-from calib.identification.settings import Payload, Settings, make_model
+from calib.identification.settings import IdentificationSettings, Payload, make_model
 from calib.robot.chain import Chain, random_joints
 from calib.simulation.cells import known_robots
-from calib.simulation.cells.cell import Cell, Instrument, measure
+from calib.simulation.cells.cell import Cell, SimulatedInstrument, measure
 from calib.simulation.cells.virtual_cells import lwr4plus_cell
 from calib.simulation.loop.references import Reference, random_fourier
 from calib.workers import workers
@@ -64,8 +64,8 @@ class Setup:
     poses: int
 
     @property
-    def instrument(self) -> Instrument:
-        return Instrument(self.name, self.position, self.orientation)
+    def instrument(self) -> SimulatedInstrument:
+        return SimulatedInstrument(self.name, self.position, self.orientation)
 
 
 SETUPS = (
@@ -89,7 +89,7 @@ class World:
     """
 
     cell: Cell
-    settings: Settings
+    settings: IdentificationSettings
     motion: Reference
     clean: list[np.ndarray]
     names: tuple[str, ...]
@@ -101,7 +101,7 @@ class World:
 def world(setup: Setup, kind: str, seed: int) -> World:
     """Return the truth of a setup; the arm's CAD inertias are the true ones."""
     cell = lwr4plus_cell(setup.instrument, hidden=0.0)
-    settings = Settings(
+    settings = IdentificationSettings(
         kind=kind, sets=(SETS[kind],), friction="standard", essential="none", prior="none",
         payloads={PAYLOAD: Payload()},
     )  # fmt: skip
@@ -114,7 +114,9 @@ def world(setup: Setup, kind: str, seed: int) -> World:
     return World(cell, settings, motion, clean, base.names, base.transform @ values, noise, poses)
 
 
-def true_torques(true: Chain, settings: Settings, motion: Reference) -> tuple[np.ndarray, list[np.ndarray]]:
+def true_torques(
+    true: Chain, settings: IdentificationSettings, motion: Reference
+) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return the true standard parameters, and the torques without and with the payload (N, n)."""
     known, model = known_robots.truth("lwr4plus"), make_model(true, settings)
     drives = [drive_values(known)[name] for name in model.names[10 * model.tree.bodies :]]

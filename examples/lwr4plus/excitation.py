@@ -38,13 +38,13 @@ from calib.procedure.excitation.limits import Points
 from calib.procedure.report.style import save
 from calib.robot.chain import Chain
 from calib.simulation.cells import known_robots, lwr4plus
-from trajectories.basis import Motion
+from trajectories.basis import SampledMotion
 from trajectories.constraints import TorqueLimit, box_limits
 from trajectories.design.objectives import Excitation, TorqueSlack, condition_numbers
 from trajectories.design.optimise import design
-from trajectories.design.problem import Goal, Problem
+from trajectories.design.problem import AttainmentGoal, ExcitationProblem
 from trajectories.design.verify import dense_motion, ensured
-from trajectories.fourier import fourier
+from trajectories.fourier import fourier_family
 from trajectories.places import Workspace
 
 HARMONICS, RATE, SEEDS = 5, 20.0, 20
@@ -96,7 +96,7 @@ def torque(where: str, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarra
     return motor.sharp.regressor(q, v, a) @ motor.values
 
 
-def problem(where: str, kind: str, period: float, which: str, harmonics: int) -> Problem:
+def problem(where: str, kind: str, period: float, which: str, harmonics: int) -> ExcitationProblem:
     """Return the design problem of trajectory A, B or D."""
     chain, own, motor = geometry(where), plant(where, kind), plant(where, "motor")
     velocity, effort = (np.array([getattr(joint, key) for joint in chain.joints]) for key in ("velocity", "effort"))
@@ -106,20 +106,20 @@ def problem(where: str, kind: str, period: float, which: str, harmonics: int) ->
         TorqueLimit(motor.smooth.regressor, motor.smooth.regressor_gradient, motor.values, effort),
         Workspace(tool, tool.product, radius=0.3, lowest=-0.2),
     )
-    family = fourier(harmonics, period, chain.n, rate=1000.0)
+    family = fourier_family(harmonics, period, chain.n, rate=1000.0)
     objective = Excitation("logdet", sigmas=own.sigma) if which == "D" else Excitation("cond", "raw")
-    spot = Problem(family, own.smooth.regressor, own.smooth.regressor_gradient, ((objective, 1.0),), limits)
+    spot = ExcitationProblem(family, own.smooth.regressor, own.smooth.regressor_gradient, ((objective, 1.0),), limits)
     if which != "B":
         return spot
     rows = len(own.sigma)  # motor torques are the last seven rows
     slacks = [TorqueSlack((j,), own.values, np.resize(effort, rows)) for j in (rows - 2, rows - 1)]
-    return replace(spot, goals=(Goal(objective, 35.0), *(Goal(one, 0.9) for one in slacks)))
+    return replace(spot, goals=(AttainmentGoal(objective, 35.0), *(AttainmentGoal(one, 0.9) for one in slacks)))
 
 
 def designed(
     where: str, kind: str, period: float, which: str, starts: int, seed: int, evaluations: int,
     harmonics: int = HARMONICS,
-) -> Motion:  # fmt: skip
+) -> SampledMotion:  # fmt: skip
     """Return a designed motion, verified between its samples."""
     spot = problem(where, kind, period, which, harmonics)
     found, proof = ensured(spot, design(spot, starts=starts, evaluations=evaluations, seed=seed))
@@ -127,7 +127,7 @@ def designed(
     return dense_motion(spot.family, found.x, np.arange(0.0, period, 1.0 / RATE))
 
 
-def judged(where: str, kind: str, motion: Motion) -> dict[str, Any]:
+def judged(where: str, kind: str, motion: SampledMotion) -> dict[str, Any]:
     """Return what a motion tells: condition numbers, torque shares, RSD and its two factors, errors over seeds."""
     own = plant(where, kind)
     Y = own.sharp.regressor(motion.q, motion.v, motion.a)
@@ -153,7 +153,7 @@ def judged(where: str, kind: str, motion: Motion) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _stribeck(where: str, own: Plant, motion: Motion, rng: np.random.Generator) -> np.ndarray:
+def _stribeck(where: str, own: Plant, motion: SampledMotion, rng: np.random.Generator) -> np.ndarray:
     """Return friction (rows, N) on the motors' rows that no model knows: b_j Fc_j exp(-(v/v_s)²) sign v."""
     amount = rng.uniform(0.0, STRIBECK, 7) * np.array(known_robots.truth("lwr4plus")["drives"]["Fc"])
     bump = amount * np.exp(-((motion.v / SLOW) ** 2)) * np.tanh(motion.v / 0.01)
@@ -163,7 +163,9 @@ def _stribeck(where: str, own: Plant, motion: Motion, rng: np.random.Generator) 
     return result
 
 
-def baselines(where: str, kind: str, period: float, seed: int, draws: int) -> dict[str, tuple[Motion, dict[str, Any]]]:
+def baselines(
+    where: str, kind: str, period: float, seed: int, draws: int
+) -> dict[str, tuple[SampledMotion, dict[str, Any]]]:
     """Return per kind of moves the draw whose σ are in the middle of all."""
     found = {}
     for shape, cut in (("minimum jerk", period), ("trapezoidal", period), ("trapezoidal", None)):
@@ -194,7 +196,7 @@ def summarised(rows: dict[str, dict[str, Any]], against: str) -> None:
         row["median_error"] = {key: float(np.median(np.array(x)[told])) for key, x in row["error"].items()}
 
 
-def estimates(motions: dict[str, Motion], kind: str = "both") -> dict[str, Any]:
+def estimates(motions: dict[str, SampledMotion], kind: str = "both") -> dict[str, Any]:
     """Identify the calibrated arm from each motion with CAD and with calibrated geometry: relative errors [%]."""
     truth, rows = plant("ID", kind), dict[str, Any]()
     for name, motion in motions.items():
@@ -213,10 +215,10 @@ def estimates(motions: dict[str, Motion], kind: str = "both") -> dict[str, Any]:
     return {"names": list(truth.sharp.names), "rows": rows}
 
 
-def study(full: bool, seed: int) -> tuple[dict[str, Any], dict[str, Motion]]:
+def study(full: bool, seed: int) -> tuple[dict[str, Any], dict[str, SampledMotion]]:
     kind, period = ("both", 25.0) if full else ("motor", 25.0)
     starts, evaluations, draws = (3, 450, 5) if full else (1, 120, 3)
-    motions = dict[str, Motion]()
+    motions = dict[str, SampledMotion]()
     plans = [("A", "cond", HARMONICS), ("B", "goals", HARMONICS), ("D", "log det", HARMONICS)]
     plans += [("A", "cond, n_f 12", 12), ("D", "log det, n_f 12", 12)] if full else []
     for which, words, harmonics in plans:
@@ -235,7 +237,7 @@ def study(full: bool, seed: int) -> tuple[dict[str, Any], dict[str, Motion]]:
     return found, motions | {"random path": random}
 
 
-def swept(seed: int, motions: dict[str, Motion]) -> dict[str, Any]:
+def swept(seed: int, motions: dict[str, SampledMotion]) -> dict[str, Any]:
     """Return condition numbers over T0, over the models, and of designs on the calibrated geometry."""
     periods, models, places = dict[str, Any](), dict[str, Any](), dict[str, Any]()
     for period in (10.0, 15.0, 20.0, 30.0):

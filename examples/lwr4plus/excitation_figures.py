@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from calib.procedure.report.style import AFTER, BEFORE, MARK, QUIET, WIDE, sheet, styled
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
-from trajectories.basis import Motion
+from trajectories.basis import SampledMotion
 
 ESSENTIAL = (
     "Ia1", "Fvm1", "Fcm1", "Ia2", "Fvm2", "Fcm2", "Ia3", "Fvm3", "Fcm3", "Fvm4", "Ia5", "Fvm5", "Fcm5", "Ia6", "Fvm6",
@@ -20,7 +20,7 @@ ESSENTIAL = (
 """The paper's Table 4 without its payload."""
 
 
-def paths(chain: Chain, motions: dict[str, Motion]) -> Figure:
+def paths(chain: Chain, motions: dict[str, SampledMotion]) -> Figure:
     """Draw the tool's path of every motion in space."""
     with styled():
         columns = min(len(motions), 3)

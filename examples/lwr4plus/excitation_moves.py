@@ -8,7 +8,7 @@ import numpy as np
 
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
-from trajectories.basis import Motion
+from trajectories.basis import SampledMotion
 
 SHARE = 0.9  # of the limits of position, velocity and torque
 INSIDE = np.linspace(0.0, 1.0, 60)
@@ -32,7 +32,7 @@ Torque = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 def moves(
     chain: Chain, torque: Torque, shape: str, seed: int, rate: float, period: float | None, count: int = 20
-) -> Motion:
+) -> SampledMotion:
     """Return moves through random waypoints of the workspace, straight in joint space, as fast as the limits allow.
 
     Args:
@@ -55,7 +55,7 @@ def moves(
     k = np.searchsorted(ends, t, side="right") - 1
     width, step = np.array(times)[k][:, None], np.diff(q, axis=0)[k]
     place, speed, bend = SHAPES[shape](((t - ends[k]) / width[:, 0])[:, None])
-    return Motion(t, q[k] + step * place, step * speed / width, step * bend / width**2, np.zeros(step.shape))
+    return SampledMotion(t, q[k] + step * place, step * speed / width, step * bend / width**2, np.zeros(step.shape))
 
 
 def _pose(chain: Chain, rng: np.random.Generator) -> np.ndarray:

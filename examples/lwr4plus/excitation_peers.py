@@ -47,11 +47,11 @@ from calib.robot.load import load
 from trajectories.constraints import TorqueLimit, box_limits
 from trajectories.design import search
 from trajectories.design.objectives import Excitation, condition_numbers
-from trajectories.design.problem import Evaluation, Problem, evaluate
-from trajectories.design.search import STAGES, Found, Run, one_start
+from trajectories.design.problem import Evaluation, ExcitationProblem, evaluate
+from trajectories.design.search import STAGES, SearchResult, StartSearch, one_start
 from trajectories.design.starts import random_start
 from trajectories.design.verify import dense_motion, ensured
-from trajectories.fourier import fourier
+from trajectories.fourier import fourier_family
 from trajectories.places import Workspace
 
 FC = (11.9, 11.5, 8.98, 8.35, 8.31, 4.72, 6.04)  # [N m], Jubien, Gautier & Janot 2014 as quoted in public code
@@ -62,7 +62,7 @@ Curve = list[tuple[float, float]]  # processor seconds, and the mean log cond of
 
 def problem(
     chain: Chain, period: float, friction: tuple | None = (FV, FC), radius: float | None = 0.3, lowest: float = -0.2
-) -> Problem:
+) -> ExcitationProblem:
     """Return the problem of a robot; torque is limited where its masses are known."""
     smooth, values = model(chain, 0.05, friction)
     velocity, effort = (np.array([getattr(j, key) for j in chain.joints]) for key in ("velocity", "effort"))
@@ -72,8 +72,8 @@ def problem(
         limits.append(TorqueLimit(smooth.regressor, smooth.regressor_gradient, values, effort))
     limits.append(Workspace(tool, tool.product, radius=radius, lowest=lowest))
     objectives = tuple((Excitation("cond", scaling), 0.5) for scaling in ("raw", "normalised"))
-    family = fourier(5, period, chain.n, rate=1000.0)
-    return Problem(family, smooth.regressor, smooth.regressor_gradient, objectives, tuple(limits))
+    family = fourier_family(5, period, chain.n, rate=1000.0)
+    return ExcitationProblem(family, smooth.regressor, smooth.regressor_gradient, objectives, tuple(limits))
 
 
 def model(chain: Chain, v0: float, friction: tuple | None) -> tuple[BaseModel, np.ndarray | None]:
@@ -87,7 +87,9 @@ def model(chain: Chain, v0: float, friction: tuple | None) -> tuple[BaseModel, n
     return BaseModel(full, found), found.transform @ np.concatenate([standard_parameters(chain), own.ravel()])
 
 
-def ours(spot: Problem, seconds: float, seed: int, evaluator: Any = evaluate) -> tuple[Curve, np.ndarray | None]:
+def ours(
+    spot: ExcitationProblem, seconds: float, seed: int, evaluator: Any = evaluate
+) -> tuple[Curve, np.ndarray | None]:
     """Search start after start until the time is up; the best motion of all."""
     began, curve, x, start = time.process_time(), Curve(), None, 0
 
@@ -101,13 +103,13 @@ def ours(spot: Problem, seconds: float, seed: int, evaluator: Any = evaluate) ->
             offset = time.process_time() - began
             found = one_start(spot, 600, "slsqp", seed, start)
             start += 1
-            if isinstance(found, Found):
+            if isinstance(found, SearchResult):
                 x = found.x if not curve or found.merit < min(m for _, m in curve) else x
                 curve += [(offset + t, m) for t, m in zip(found.times, found.history)]
     return falling(curve), x
 
 
-def differenced(spot: Problem, basis: Any, y: np.ndarray, sharpness: tuple[float, float]) -> Evaluation:
+def differenced(spot: ExcitationProblem, basis: Any, y: np.ndarray, sharpness: tuple[float, float]) -> Evaluation:
     """Return what `evaluate` returns, its gradients by forward differences over all variables."""
     bare = blind(spot)
     here = evaluate(bare, basis, y, sharpness)
@@ -120,7 +122,7 @@ def differenced(spot: Problem, basis: Any, y: np.ndarray, sharpness: tuple[float
     return replace(here, slopes=slopes, rows=rows)
 
 
-def blind(spot: Problem) -> Problem:
+def blind(spot: ExcitationProblem) -> ExcitationProblem:
     """Return the problem without derivative products: values cost what values cost."""
     limits = [replace(c, product=_none) if isinstance(c, TorqueLimit | Workspace) else c for c in spot.constraints]
     return replace(spot, product=_none, constraints=tuple(limits))
@@ -130,20 +132,20 @@ def _none(q: np.ndarray, *others: np.ndarray) -> Any:
     return np.zeros(q.shape) if len(others) == 1 else (np.zeros(q.shape),) * 3
 
 
-def by_scipy(spot: Problem, seconds: float, seed: int, exact: bool) -> tuple[Curve, np.ndarray | None]:
+def by_scipy(spot: ExcitationProblem, seconds: float, seed: int, exact: bool) -> tuple[Curve, np.ndarray | None]:
     """Run SciPy's SLSQP from random starts until the time is up."""
     given = spot if exact else blind(spot)
     basis, began, curve, x, start = given.basis(), time.process_time(), Curve(), None, 0
     while (offset := time.process_time() - began) < seconds:
-        run = Run(given, basis)
+        run = StartSearch(given, basis)
         run.sharpness = STAGES[-1]
 
-        def fun(z: np.ndarray, run: Run = run) -> float:
+        def fun(z: np.ndarray, run: StartSearch = run) -> float:
             if time.process_time() - began > seconds:
                 raise KeyboardInterrupt
             return sum(w * float(np.log(v)) for (_, w), v in zip(given.objectives, run.at(z).values))
 
-        def jac(z: np.ndarray, run: Run = run) -> np.ndarray:
+        def jac(z: np.ndarray, run: StartSearch = run) -> np.ndarray:
             found = run.at(z)
             return sum(w * s / v for (_, w), v, s in zip(given.objectives, found.values, found.slopes))
 
@@ -163,7 +165,7 @@ def by_scipy(spot: Problem, seconds: float, seed: int, exact: bool) -> tuple[Cur
     return falling(curve), x
 
 
-def at_random(spot: Problem, seconds: float, seed: int) -> tuple[Curve, np.ndarray | None]:
+def at_random(spot: ExcitationProblem, seconds: float, seed: int) -> tuple[Curve, np.ndarray | None]:
     began, curve, basis = time.process_time(), Curve(), spot.basis()
     rng, x, least, count, kept = np.random.default_rng(seed), None, np.inf, 0, 0
     while (now := time.process_time() - began) < seconds:
@@ -192,7 +194,9 @@ def falling(curve: Curve) -> Curve:
     return result
 
 
-def reached(chain: Chain, spot: Problem, x: np.ndarray, friction: tuple | None = (FV, FC)) -> dict[str, float]:
+def reached(
+    chain: Chain, spot: ExcitationProblem, x: np.ndarray, friction: tuple | None = (FV, FC)
+) -> dict[str, float]:
     """Return the condition numbers at 1000 samples with a Coulomb sign smoothed at 0.01 rad/s."""
     period = spot.family.period
     motion = dense_motion(spot.family, x, period / 1000 * np.arange(1000))
@@ -249,7 +253,7 @@ def compare(seconds: float, seed: int, out: Path, robots: Sequence[str]) -> dict
         if x is None:
             others[name] = None
             continue
-        found = Found(x, 1.0, curve[-1][1], np.zeros(0), (), 0, 0.0, seconds)
+        found = SearchResult(x, 1.0, curve[-1][1], np.zeros(0), (), 0, 0.0, seconds)
         found, proof = ensured(spot, found)
         others[name] = reached(chain, spot, found.x, None) | {
             "feasible": proof.feasible, "columns": len(model(chain, 0.01, None)[0].names),

@@ -28,13 +28,13 @@ from calib.robot import mdh
 from calib.robot.chain import Chain, element_index, random_joints
 from calib.robot.kinematics import jacobian
 from calib.simulation.cells import lwr4plus
-from calib.simulation.cells.cell import Instrument, measure, true_poses
+from calib.simulation.cells.cell import SimulatedInstrument, measure, true_poses
 from calib.simulation.cells.virtual_cells import lwr4plus_cell, rigid
 from calib.transforms import invert
 from poses.candidates import draw_candidates
 from poses.indices import observability
-from poses.select import Selection, random_baseline, select
-from poses.space import Constraint, SearchSpace, is_feasible
+from poses.select import Selection, random_baseline, select_poses
+from poses.space import PoseConstraint, SearchSpace, is_feasible
 
 LIMITS = np.deg2rad([170.0, 120.0, 170.0, 120.0, 170.0, 90.0, 170.0])
 DROPPED = ("alpha0", "d0", "theta7", "r7")  # the paper's four parameters that cannot be told
@@ -83,7 +83,7 @@ def search_space(nominal: np.ndarray, index: str) -> SearchSpace:
     """Return where poses may lie, and what they tell: metres and radians for cond, as the paper's; sigmas for O1."""
     scale = np.ones(6) if index == "cond" else SIGMAS
     jacobian_ = BaseJacobian(study_chain(nominal), scale)
-    return SearchSpace(jacobian_, -LIMITS, LIMITS, None, (Constraint("Table 1", TableOne(nominal)),))
+    return SearchSpace(jacobian_, -LIMITS, LIMITS, None, (PoseConstraint("Table 1", TableOne(nominal)),))
 
 
 def selections(nominal: np.ndarray, quick: bool, seed: int) -> tuple[list[dict[str, Any]], dict[str, Selection]]:
@@ -96,7 +96,7 @@ def selections(nominal: np.ndarray, quick: bool, seed: int) -> tuple[list[dict[s
         )
         array = space.jacobian(candidates)
         for method in METHODS[:1] if quick else METHODS:
-            found = select(
+            found = select_poses(
                 array, lwr4plus.POSES, q=candidates, space=space, index=index, method=method, seed=seed, starts=4
             )  # fmt: skip
             gain = found.random_baseline / found.value if index == "cond" else found.value / found.random_baseline
@@ -253,7 +253,7 @@ def base_leds(poses: np.ndarray, seed: int) -> dict[str, float]:
     """
     q, result = random_joints(lwr4plus.nominal_chain(), 500, 99), {}
     for name, frame in (("tool only", None), ("tool and base", np.eye(4))):
-        cell = lwr4plus_cell(Instrument(base_frame=frame), hidden=0.0)
+        cell = lwr4plus_cell(SimulatedInstrument(base_frame=frame), hidden=0.0)
         measured = measure(cell, poses, [seed, 3])
         found = fit(polish_frames(install(cell.nominal, [measured]), [measured]).cell, [measured])
         seen = see(found.cell, q).poses()[:, :3, 3]

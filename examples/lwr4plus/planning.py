@@ -29,7 +29,7 @@ from calib.robot import description, library
 from calib.robot.chain import Chain, random_joints
 from calib.simulation.cells.known_robots import truth
 from trajectories.errors import BadInput
-from trajectories.timing.limits import Limits
+from trajectories.timing.limits import TimingLimits
 from trajectories.timing.path import Path as JointPath
 from trajectories.timing.path import check_within, spline
 from trajectories.timing.profile import dense
@@ -82,7 +82,9 @@ def identified(model: IdentificationModel, values: np.ndarray, seed: int) -> tup
     return of_base(found, fitted), found, spread @ spread.T
 
 
-def guarded(path: JointPath, law: PathDynamics, model: BaseModel, covariance: np.ndarray, bounds: Limits) -> Timing:
+def guarded(
+    path: JointPath, law: PathDynamics, model: BaseModel, covariance: np.ndarray, bounds: TimingLimits
+) -> Timing:
     """Return the timing that keeps `SIGMAS` of each joint's predicted torque free, its largest along the first one."""
     sampled = time_optimal(path, bounds, law).sampled
     W = model.regressor(sampled.q, sampled.v, sampled.a)
@@ -90,9 +92,9 @@ def guarded(path: JointPath, law: PathDynamics, model: BaseModel, covariance: np
     return time_optimal(path, replace(bounds, torque=bounds.torque - SIGMAS * sigma), law)
 
 
-def limits(chain: Chain) -> Limits:
+def limits(chain: Chain) -> TimingLimits:
     speeds, efforts = (np.array([getattr(j, key) for j in chain.joints]) for key in ("velocity", "effort"))
-    return Limits(speeds, np.full(chain.n, np.inf), efforts)
+    return TimingLimits(speeds, np.full(chain.n, np.inf), efforts)
 
 
 def judged(timing: Timing, robot: PathDynamics, efforts: np.ndarray) -> dict[str, float]:

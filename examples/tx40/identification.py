@@ -44,7 +44,7 @@ from calib.identification.loop.controller import identify_controller
 from calib.identification.methods.instrumental import Instrumental, Loop, Round, identify_instrumental, simulated_case
 from calib.identification.rows import observe
 from calib.simulation.cells import known_robots
-from calib.simulation.loop.closed_loop import Plant, Run, Sensing, simulate
+from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, simulate
 from calib.simulation.loop.controllers import Controller, pd, slower
 from calib.simulation.loop.references import Reference, random_fourier, trapezoidal
 
@@ -73,7 +73,7 @@ class Log:
     """One recorded motion: what was asked, what is true, positions as logged, and the case that identification sees."""
 
     reference: Reference
-    run: Run
+    run: SimulatedRun
     seen: np.ndarray
     case: Case
 

@@ -25,10 +25,10 @@ from calib.robot.load import load
 from trajectories.constraints import TorqueLimit, box_limits
 from trajectories.design.objectives import Excitation, condition_numbers
 from trajectories.design.optimise import design
-from trajectories.design.problem import Goal, Problem, evaluate
+from trajectories.design.problem import AttainmentGoal, ExcitationProblem, evaluate
 from trajectories.design.starts import random_start
 from trajectories.design.verify import dense_motion, ensured
-from trajectories.fourier import fourier
+from trajectories.fourier import fourier_family
 from trajectories.places import Workspace
 
 CHAIN = load("lwr4plus")
@@ -44,7 +44,7 @@ def model() -> tuple[base.BaseModel, np.ndarray]:
     return base.BaseModel(full, found), found.transform @ values
 
 
-def problem(period: float, harmonics: int, samples: int = 200, goals=(), constrained: bool = True) -> Problem:
+def problem(period: float, harmonics: int, samples: int = 200, goals=(), constrained: bool = True) -> ExcitationProblem:
     columns, values = model()
     velocity, effort = (np.array([getattr(j, key) for j in CHAIN.joints]) for key in ("velocity", "effort"))
     points = Points(CHAIN, (0,), np.zeros((1, 3)))
@@ -53,14 +53,14 @@ def problem(period: float, harmonics: int, samples: int = 200, goals=(), constra
         TorqueLimit(columns.regressor, columns.regressor_gradient, values, effort),
         Workspace(points, points.product, radius=0.3, lowest=-0.2),
     )
-    chosen = tuple(Goal(Excitation("cond", name), goal) for name, goal in zip(("raw", "normalised"), goals))
-    return Problem(
-        fourier(harmonics, period, 7, rate=1000.0), columns.regressor, columns.regressor_gradient,
+    chosen = tuple(AttainmentGoal(Excitation("cond", name), goal) for name, goal in zip(("raw", "normalised"), goals))
+    return ExcitationProblem(
+        fourier_family(harmonics, period, 7, rate=1000.0), columns.regressor, columns.regressor_gradient,
         constraints=limits if constrained else (), goals=chosen, samples=samples,
     )  # fmt: skip
 
 
-def value(spot: Problem, basis, x: np.ndarray) -> float:
+def value(spot: ExcitationProblem, basis, x: np.ndarray) -> float:
     motion = basis.motion(x)
     Y = spot.regressor(motion.q, motion.v, motion.a)
     return Excitation().evaluate(motion, Y).value
@@ -108,7 +108,9 @@ def test_growth_with_joints_and_samples(benchmark, joints, samples):
     chain = first_joints(joints)
     full = IdentificationModel(tree(chain), drives.standard(["Fv Fc off"] * joints, 0.05))
     columns = base.BaseModel(full, base.find(full))
-    spot = Problem(fourier(5, 20.0, joints), columns.regressor, columns.regressor_gradient, samples=samples)
+    spot = ExcitationProblem(
+        fourier_family(5, 20.0, joints), columns.regressor, columns.regressor_gradient, samples=samples
+    )
     basis = spot.basis()
     x = random_start(spot, basis, np.random.default_rng(0))
     benchmark.pedantic(evaluate, (spot, basis, x, (np.inf, 1.0)), rounds=10, warmup_rounds=2)
@@ -140,7 +142,7 @@ def test_condition_number_under_all_constraints(benchmark, period, goals):
 def test_finite_differences_with_the_same_optimiser_and_the_same_time(benchmark):
     """The same SLSQP on the same problem, its gradients of cond by forward differences, stopped after 30 s."""
     spot = problem(20.0, 5, goals=(35.0, 6.0))
-    numeric = Problem(**(spot.__dict__ | {"product": partial(_differences, spot.regressor)}))
+    numeric = ExcitationProblem(**(spot.__dict__ | {"product": partial(_differences, spot.regressor)}))
     start = time.perf_counter()
     found = benchmark.pedantic(design, (numeric,), {"starts": 1, "evaluations": 150, "seed": 0}, rounds=1)
     print(f"\nregressor differentiated numerically: γ = {found.merit:.3f} in {time.perf_counter() - start:.0f} s")

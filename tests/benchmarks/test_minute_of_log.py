@@ -20,13 +20,13 @@ from calib.identification.cases import make_case
 from calib.identification.identify import identify
 from calib.identification.prediction import predict
 from calib.identification.scores import score
-from calib.identification.settings import Settings
+from calib.identification.settings import IdentificationSettings
 from calib.robot.load import load
 from calib.simulation.loop.references import random_fourier
 
 CHAIN = load("lwr4plus")
 N, RATE, SECONDS = 7, 1000.0, 60.0
-MODEL_2 = Settings(kind="both", sets=("Ia Fvm Fcm offm Fvl Fcl",), friction="standard", prior="none")
+MODEL_2 = IdentificationSettings(kind="both", sets=("Ia Fvm Fcm offm Fvl Fcl",), friction="standard", prior="none")
 
 
 def write(folder: Path, seed: int) -> tuple[Path, Path]:

@@ -7,7 +7,7 @@ import poses_arm
 import pytest
 
 from poses.convex import bound
-from poses.select import select
+from poses.select import select_poses
 
 CASES = {
     "17 of 2000, pose": (2000, 17, poses_arm.jacobian),
@@ -20,7 +20,7 @@ CASES = {
 def test_select(benchmark, case):
     count, m, function = CASES[case]
     jacobians = function(poses_arm.random_poses(count, 0))
-    chosen = benchmark.pedantic(select, (jacobians, m), rounds=3 if count < 5000 else 1, warmup_rounds=1)
+    chosen = benchmark.pedantic(select_poses, (jacobians, m), rounds=3 if count < 5000 else 1, warmup_rounds=1)
     random = chosen.efficiency * (chosen.random_baseline / chosen.value) ** 2
     figures = {"efficiency": chosen.efficiency, "random": random, "bound_gap": chosen.bound.gap}
     benchmark.extra_info.update(figures)

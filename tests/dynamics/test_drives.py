@@ -162,7 +162,7 @@ def test_stacking_copies_nothing():
         (lambda: drives.standard(["Ia Fx"]), "joint 1: drive term 'Fx' is none of Ia"),
         (lambda: drives.term("F", "sign", 0), r"needs \(v0\)"),
         (lambda: drives.term("F", "curly", 0), "shape 'curly' is none of"),
-        (lambda: drives.Term("F", "one", (), side="left"), "neither 'link' nor 'motor'"),
+        (lambda: drives.DriveTerm("F", "one", (), side="left"), "neither 'link' nor 'motor'"),
         (lambda: IdentificationModel(tree(TX40), drives.standard(["Ia"]) * 2), "'Ia1' occurs twice"),
         (lambda: IdentificationModel(tree(TX40), drives.standard(["Ia"] * 7)), "'Ia7' names a joint beyond"),
         (lambda: IdentificationModel(tree(TX40), (), "torque"), "kind 'torque' is none of"),

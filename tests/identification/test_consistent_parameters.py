@@ -10,9 +10,9 @@ from calib.dynamics import base as bases
 from calib.dynamics import pseudo_inertia
 from calib.dynamics.idim import IdentificationModel, from_chain
 from calib.identification.possible import solve
-from calib.identification.possible.information import Told, whitened
+from calib.identification.possible.information import Information, whitened
 from calib.identification.possible.nearest import nearest
-from calib.identification.possible.prior_bodies import find_references
+from calib.identification.possible.prior_bodies import find_prior_bodies
 from calib.identification.possible.problem import BodyCost, make_problem
 from calib.identification.prediction import Dynamics
 from calib.robot.chain import Chain, Element, Joint
@@ -39,7 +39,7 @@ def arm(inertias: np.ndarray | None) -> Chain:
     )
 
 
-def planted(seed: int, noise: float = 0.02) -> tuple[np.ndarray, IdentificationModel, bases.Base, Told]:
+def planted(seed: int, noise: float = 0.02) -> tuple[np.ndarray, IdentificationModel, bases.Base, Information]:
     """Return true standard parameters, off the CAD's by a third, and what noisy torques tell of them."""
     rng = np.random.default_rng(seed)
     pseudo = pseudo_inertia.from_standard(np.array(CAD))
@@ -59,9 +59,9 @@ def planted(seed: int, noise: float = 0.02) -> tuple[np.ndarray, IdentificationM
 
 def told(
     chain: Chain, model: IdentificationModel, base: bases.Base, values: np.ndarray, covariance: np.ndarray
-) -> Told:
+) -> Information:
     dynamics = Dynamics(model, bases.to_standard(base, values))
-    return Told(
+    return Information(
         chain, dynamics, base.names, base.units, values, covariance, base.transform, whitened(values, covariance), False
     )
 
@@ -131,8 +131,8 @@ def test_without_a_cad_rods_of_a_mass_the_data_choose_stand_in():
     assert 1.0 < found.dynamics.values[[9, 19, 29]].sum() < 100.0
 
 
-def problem_of(data: Told) -> BodyCost:
-    return make_problem(data, next(find_references(data.chain, data.dynamics.model)))
+def problem_of(data: Information) -> BodyCost:
+    return make_problem(data, next(find_prior_bodies(data.chain, data.dynamics.model)))
 
 
 def test_slope_and_curvature_are_those_of_the_cost():

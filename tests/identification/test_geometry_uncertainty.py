@@ -21,13 +21,13 @@ from calib.dynamics.bodies import tree
 from calib.errors import RobotError
 from calib.identification import geometry_uncertainty, reweighted
 from calib.identification.identify import identify
-from calib.identification.settings import Settings
+from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.kinematic_stage import robot_file
 from calib.robot import description
 from calib.robot.chain import Chain, Joint
 
-PLAIN = Settings(friction="standard", essential="none")
+PLAIN = IdentificationSettings(friction="standard", essential="none")
 MOVED = {"up": np.pi / 2 + 0.01, "upper": 0.51, "shoulder": 0.02}
 
 

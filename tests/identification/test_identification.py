@@ -9,16 +9,16 @@ import pytest
 from calib.dynamics import friction
 from calib.dynamics.drives import term
 from calib.errors import CalibError, MeasurementError, UsageError
-from calib.identification.friction.friction_ladder import Ground, climb
+from calib.identification.friction.friction_ladder import FrictionCandidates, select_friction
 from calib.identification.gains import identify_gains
 from calib.identification.identify import common_decimator, find_base, first_fit, identify
 from calib.identification.prediction import Dynamics, predict
 from calib.identification.reweighted import standstill_shift
 from calib.identification.rows import observe, pool, triangulate, with_blocks
 from calib.identification.scores import score
-from calib.identification.settings import Payload, Settings, make_model
+from calib.identification.settings import IdentificationSettings, Payload, make_model
 
-PLAIN = Settings(friction="standard")
+PLAIN = IdentificationSettings(friction="standard")
 
 
 def errors(found) -> np.ndarray:
@@ -30,7 +30,7 @@ def errors(found) -> np.ndarray:
 
 @pytest.mark.parametrize("method", ["ols", "wls", "irls"])
 def test_base_parameters_come_back_within_their_covariance(method):
-    settings = Settings(friction="standard", method=method, essential="none")
+    settings = IdentificationSettings(friction="standard", method=method, essential="none")
     size = [errors(identify(planted.arm(), [planted.case("a", seed)], settings)) for seed in range(5)]
     assert 0.5 < np.mean(size) < 2.0
 
@@ -45,8 +45,8 @@ def test_prediction_of_other_motion_is_as_good_as_the_noise():
 
 def test_nothing_is_added_to_a_plain_robot():
     found = identify(planted.arm(), [planted.case("a", 0)])
-    assert found.climb.terms == () and found.climb.chosen == "standard"
-    assert len(found.rungs) > 5 and all(rung.note for rung in found.rungs[1:])
+    assert found.friction.terms == () and found.friction.chosen == "standard"
+    assert len(found.friction.steps) > 5 and all(rung.note for rung in found.friction.steps[1:])
 
 
 @pytest.mark.parametrize(
@@ -60,7 +60,7 @@ def test_nothing_is_added_to_a_plain_robot():
 def test_the_ladder_takes_what_is_planted_and_only_there(name, terms, size):
     values = {one.name: size for one in terms}
     found = identify(planted.arm(), [planted.case("a", 0, terms=terms, values=values)])
-    rungs = {rung.model: rung for rung in found.rungs if rung.kept}
+    rungs = {rung.model: rung for rung in found.friction.steps if rung.kept}
     assert f"+ {name}" in rungs and rungs[f"+ {name}"].kept_at == (1,)
     other = planted.case("b", 1, terms=terms, values=values)
     plain = identify(planted.arm(), [planted.case("a", 0, terms=terms, values=values)], PLAIN)
@@ -80,15 +80,15 @@ def test_friction_that_fades_near_standstill_shows_where_slow_rows_are_left_out(
 
 
 def test_a_named_rung_is_taken_at_all_joints_whatever_it_brings():
-    found = identify(planted.arm(), [planted.case("a", 0)], Settings(friction="asymmetric"))
-    assert [one.name for one in found.climb.terms] == ["Fva1", "Fva2", "Fva3"]
+    found = identify(planted.arm(), [planted.case("a", 0)], IdentificationSettings(friction="asymmetric"))
+    assert [one.name for one in found.friction.terms] == ["Fva1", "Fva2", "Fva3"]
     with pytest.raises(UsageError, match="friction 'stribek' is none of"):
-        climb(Ground([], [], [], None, *[np.zeros(0)] * 4), "stribek")  # type: ignore[arg-type]
+        select_friction(FrictionCandidates([], [], [], None, *[np.zeros(0)] * 4), "stribek")  # type: ignore[arg-type]
 
 
 def test_gains_come_from_a_payload_of_known_mass():
     gains, arm = np.array([8.0, 12.0, 5.0]), planted.arm()
-    settings = Settings(payloads={"load": Payload(2.0)})
+    settings = IdentificationSettings(payloads={"load": Payload(2.0)})
     cases = [planted.case("u", 0, gains=gains, noise=0.1), planted.case("l", 0, ("load",), gains=gains, noise=0.1)]
     model = make_model(arm, settings)
     base = find_base(arm, model, settings, None, cases)
@@ -122,12 +122,14 @@ def one_sine(name: str = "s"):
 
 def test_one_sine_is_drawn_to_cad_and_says_so():
     found = identify(planted.arm(), [one_sine()])
-    assert found.prior is not None and found.prior.source == "cad" and found.climb.terms == ()
+    assert found.prior is not None and found.prior.source == "cad" and found.friction.terms == ()
     values = dict(zip(found.names, found.fitted.estimate.values))
     assert all(values[name] >= 0.0 for name in values if name[:2] in ("Ia", "Fv", "Fc"))
     other = planted.case("b", 1)
     with_cad = score(other, predict(found.dynamics, other)).raw.total
-    without = identify(planted.arm(), [one_sine()], Settings(friction="standard", prior="none", essential="none"))
+    without = identify(
+        planted.arm(), [one_sine()], IdentificationSettings(friction="standard", prior="none", essential="none")
+    )
     assert with_cad < 0.5 * score(other, predict(without.dynamics, other)).raw.total
 
 
@@ -140,7 +142,7 @@ def test_a_term_from_the_options_is_found():
     spring = term("Ks2", "position", 1)
     values = {"Ks2": 15.0}
     data = planted.case("a", 0, terms=(spring,), values=values)
-    found = identify(planted.arm(), [data], Settings(friction="standard", terms=(spring,)))
+    found = identify(planted.arm(), [data], IdentificationSettings(friction="standard", terms=(spring,)))
     k = found.names.index("Ks2")
     estimate = found.fitted.estimate
     assert estimate.values[k] == pytest.approx(15.0, abs=4 * estimate.sigma[k])
@@ -148,11 +150,11 @@ def test_a_term_from_the_options_is_found():
 
 def test_a_long_recording_keeps_its_band_and_loses_rows():
     cases = [planted.case("train", 0)]
-    all_of_them = common_decimator(cases, Settings())
-    few = common_decimator(cases, Settings(samples=100))
+    all_of_them = common_decimator(cases, IdentificationSettings())
+    few = common_decimator(cases, IdentificationSettings(samples=100))
     assert few.band == all_of_them.band and few.factor % all_of_them.factor == 0
     model = planted.model()
-    base = find_base(planted.arm(), model, Settings(), None, cases)
+    base = find_base(planted.arm(), model, IdentificationSettings(), None, cases)
     full, part = (observe(model, base.kept, cases[0], one) for one in (all_of_them, few))
     assert len(part.target) <= 101 < len(full.target)
     step = few.factor // all_of_them.factor

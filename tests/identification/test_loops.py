@@ -16,7 +16,7 @@ from calib.errors import CalibError, UsageError
 from calib.identification import identify_options
 from calib.identification.loop import loop_settings
 from calib.simulation.loop import controllers, references
-from calib.simulation.loop.closed_loop import Plant, Run, Sensing, simulate
+from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, simulate
 
 RATE, EVERY = 1000.0, 4
 KP, KD = np.array([4000.0, 3000.0, 500.0]), np.array([200.0, 150.0, 25.0])
@@ -40,7 +40,7 @@ def motion(seed: int) -> references.Reference:
 
 
 @cache
-def moved(seed: int) -> Run:
+def moved(seed: int) -> SimulatedRun:
     return simulate(plant(), controllers.pd(KP, KD), motion(seed), Sensing(sigma_tau=0.1, every=EVERY), seed)
 
 

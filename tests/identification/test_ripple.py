@@ -7,12 +7,12 @@ import pytest
 
 from calib.dynamics.shapes import Joined
 from calib.identification.friction import ripple
-from calib.identification.friction.ripple import Track
+from calib.identification.friction.ripple import GearTravel
 
 RATE, TURNS = 500.0, 100
 
 
-def track(seed: int, seconds: float = 12.0) -> Track:
+def track(seed: int, seconds: float = 12.0) -> GearTravel:
     """Return two joints on sums of sines."""
     random = np.random.default_rng(seed)
     t = np.arange(0.0, seconds, 1.0 / RATE)
@@ -20,17 +20,17 @@ def track(seed: int, seconds: float = 12.0) -> Track:
     w = 2.0 * np.pi * f
     q = np.array([np.sum(0.25 * np.sin(w * t + own), axis=0) for own in phase]).T
     v = np.array([np.sum(0.25 * w * np.cos(w * t + own), axis=0) for own in phase]).T
-    return Track(q, v, np.arange(len(t)) * 8 // len(t), (0, 1))
+    return GearTravel(q, v, np.arange(len(t)) * 8 // len(t), (0, 1))
 
 
-def planted(where: Track) -> np.ndarray:
+def planted(where: GearTravel) -> np.ndarray:
     """Return torques (N, 2): gear 1's ripple in both joints, growing with speed."""
     q, v = where.q[:, 0], np.abs(where.v[:, 0])
     wave = v * (np.sin(2 * TURNS * q + 0.3) + 0.7 * np.cos((2 * TURNS + 2) * q) + 0.5 * np.sin(TURNS * q))
     return np.stack([wave, -0.6 * wave], axis=1)
 
 
-def explained(one: ripple.Ripple, where: Track, torque: np.ndarray) -> float:
+def explained(one: ripple.Ripple, where: GearTravel, torque: np.ndarray) -> float:
     predicted = np.zeros(len(torque))
     for own, value in zip(one.terms, one.values):
         source = own.acts[0][1][0][0]

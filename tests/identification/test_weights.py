@@ -15,7 +15,7 @@ from calib.estimation.linear import wls
 from calib.identification.cases import make_case
 from calib.identification.identify import identify
 from calib.identification.identify_options import parse_options
-from calib.identification.settings import Settings
+from calib.identification.settings import IdentificationSettings
 
 SINGLE = np.array([0.2, 4.0, 0.1])  # standard deviations of one sample over the periods [N m]
 PERIODS = 4
@@ -41,7 +41,7 @@ def test_weights_come_from_the_repeats_and_not_from_a_model_error():
     wrong = np.array(case.target)
     wrong[:, 2] += 3.0 * np.sin(5.0 * case.motion.q[:, 2])
     case = replace(case, target=wrong, noise=SINGLE)
-    settings = Settings(friction="standard", essential="none", prior="none")
+    settings = IdentificationSettings(friction="standard", essential="none", prior="none")
     plain, repeats = (identify(planted.arm(), [case], replace(settings, weights=w)) for w in ("residuals", "repeats"))
     assert plain.fitted.std[2] > 5 * plain.fitted.std[1]
     np.testing.assert_allclose(repeats.fitted.std / repeats.fitted.std[0], SINGLE / SINGLE[0])

@@ -13,7 +13,7 @@ from poses.errors import BadInput, NothingFeasible, NotIdentifiable, TooFewCandi
 from poses.exchange import detmax, exchanged, greedy
 from poses.indices import observability
 from poses.information import prepared
-from poses.select import random_baseline, select
+from poses.select import random_baseline, select_poses
 
 ARM = poses_arm.jacobian(poses_arm.random_poses(400, 0))
 
@@ -27,7 +27,7 @@ def log_det_of(jacobians):
 @pytest.mark.parametrize("m", [17, 30])
 def test_sandwich(function, m):
     jacobians = function(poses_arm.random_poses(600, 2))
-    chosen = select(jacobians, m, seed=1)
+    chosen = select_poses(jacobians, m, seed=1)
     assert chosen.random_baseline < chosen.value
     p = jacobians.shape[2]
     assert log_det_of(jacobians[chosen.indices]) <= chosen.bound.log_upper
@@ -80,7 +80,7 @@ def test_detmax_finds_the_best_of_all_sets():
     for seed in range(6):
         jacobians = np.random.default_rng(seed).normal(size=(11, 2, 4))
         best = max(combinations(range(11), 4), key=lambda s: log_det_of(jacobians[list(s)]))
-        assert tuple(select(jacobians, 4, seed=seed).indices) == best
+        assert tuple(select_poses(jacobians, 4, seed=seed).indices) == best
 
 
 def test_exchange_ends_where_no_single_exchange_helps():
@@ -98,8 +98,8 @@ def test_exchange_ends_where_no_single_exchange_helps():
 
 @pytest.mark.parametrize("index", ["O2", "O3", "O4", "O5", "cond"])
 def test_other_indices_improve_on_the_d_optimal_and_on_random_sets(index):
-    start = observability(ARM[select(ARM, 17).indices], index)
-    chosen = select(ARM, 17, index=index)
+    start = observability(ARM[select_poses(ARM, 17).indices], index)
+    chosen = select_poses(ARM, 17, index=index)
     assert chosen.value == pytest.approx(observability(ARM[chosen.indices], index))
     if index == "cond":
         assert chosen.value <= start and chosen.value < chosen.random_baseline
@@ -110,30 +110,30 @@ def test_other_indices_improve_on_the_d_optimal_and_on_random_sets(index):
 
 def test_o1_selection_does_not_see_units():
     scale = 10.0 ** np.random.default_rng(1).uniform(-3, 3, ARM.shape[2])
-    one, other = select(ARM, 17), select(ARM * scale, 17)
+    one, other = select_poses(ARM, 17), select_poses(ARM * scale, 17)
     assert (one.indices == other.indices).all()
     assert other.efficiency == pytest.approx(one.efficiency, rel=1e-5)
 
 
 def test_what_is_known_already_is_taken_into_account():
     before = ARM[:30]
-    chosen = select(ARM[30:], 6, existing=before)
+    chosen = select_poses(ARM[30:], 6, existing=before)
     together = np.concatenate([ARM[30:][chosen.indices], before])
     assert chosen.value == pytest.approx(observability(together, "O1"))
-    alone = select(ARM[30:], 6).indices
+    alone = select_poses(ARM[30:], 6).indices
     assert log_det_of(together) > log_det_of(np.concatenate([ARM[30:][alone], before]))
     assert chosen.random_baseline < chosen.value and chosen.efficiency <= 1
-    assert select(ARM, 1, existing=before).indices.shape == (1,)
+    assert select_poses(ARM, 1, existing=before).indices.shape == (1,)
 
 
 def test_choosing_all_candidates_is_allowed():
-    chosen = select(ARM[:17], 17)
+    chosen = select_poses(ARM[:17], 17)
     assert (chosen.indices == np.arange(17)).all()
     assert chosen.efficiency == pytest.approx(1.0, abs=2e-3)
 
 
 def test_the_seed_repeats_every_bit():
-    one, two = select(ARM, 17, seed=5), select(ARM, 17, seed=5)
+    one, two = select_poses(ARM, 17, seed=5), select_poses(ARM, 17, seed=5)
     assert (one.indices == two.indices).all() and one.value == two.value
     assert (one.history == two.history).all() and one.random_baseline == two.random_baseline
     assert random_baseline(ARM, 17, seed=6) != one.random_baseline
@@ -144,27 +144,27 @@ def test_interrupted_exchange_returns_the_best_so_far():
         if done == 3:
             raise KeyboardInterrupt
 
-    chosen = select(ARM, 17, progress=stop)
+    chosen = select_poses(ARM, 17, progress=stop)
     assert chosen.interrupted and chosen.value > chosen.random_baseline
-    assert not select(ARM, 17).interrupted
+    assert not select_poses(ARM, 17).interrupted
 
 
 def test_errors_say_what_and_why():
     with pytest.raises(TooFewCandidates, match="5 candidates for 17 poses") as caught:
-        select(ARM[:5], 17)
+        select_poses(ARM[:5], 17)
     assert caught.value.found == 5 and caught.value.wanted == 17
     with pytest.raises(NotIdentifiable, match="at least 6 poses"):
-        select(ARM, 5)
+        select_poses(ARM, 5)
     with pytest.raises(NotIdentifiable, match="rank 34 for 35") as deficient:
-        select(np.concatenate([ARM, ARM[:, :, :1] + ARM[:, :, 1:2]], axis=2), 17)
+        select_poses(np.concatenate([ARM, ARM[:, :, :1] + ARM[:, :, 1:2]], axis=2), 17)
     assert deficient.value.singular_values is not None and len(deficient.value.singular_values) == 35
     noise = 1e-17 * np.random.default_rng(0).normal(size=(*ARM.shape[:2], 1))
     with pytest.raises(NotIdentifiable, match=r"columns \[34\]"):
-        select(np.concatenate([ARM, noise], axis=2), 17)
+        select_poses(np.concatenate([ARM, noise], axis=2), 17)
     with pytest.raises(BadInput, match="pose 7"):
-        select(np.where(np.arange(400)[:, None, None] == 7, np.nan, ARM), 17)
+        select_poses(np.where(np.arange(400)[:, None, None] == 7, np.nan, ARM), 17)
     with pytest.raises(BadInput, match="give space"):
-        select(ARM, 17, method="tabu")
+        select_poses(ARM, 17, method="tabu")
 
 
 def test_candidates_keep_limits_and_predicate():
@@ -190,7 +190,7 @@ def test_nothing_feasible_gives_the_share():
 @pytest.mark.parametrize("spare", [1, 2, 5, 40])
 def test_bound_is_tight_with_few_candidates_to_spare(spare):
     few = ARM[: 17 + spare]
-    chosen = select(few, 17)
+    chosen = select_poses(few, 17)
     assert chosen.bound.gap < 1e-3 and chosen.efficiency <= 1 + 1e-12
     if spare <= 2:
         best = max(combinations(range(17 + spare), 17), key=lambda s: log_det_of(few[list(s)]))

@@ -14,7 +14,7 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.path_dynamics import PathDynamics, of_standard
 from calib.robot.load import load
 from calib.simulation.cells.known_robots import truth
-from trajectories.timing.limits import Limits
+from trajectories.timing.limits import TimingLimits
 
 CHAIN = load("lwr4plus")
 WAYPOINTS = np.array(
@@ -31,13 +31,13 @@ def lwr(viscous: float = 1.0) -> PathDynamics:
     return of_standard(model, np.concatenate([standard_parameters(CHAIN), amounts]))
 
 
-def limits(**changed) -> Limits:
+def limits(**changed) -> TimingLimits:
     kept = {
         "velocity": np.array([joint.velocity for joint in CHAIN.joints]),
         "acceleration": np.full(7, np.inf),
         "torque": np.array([joint.effort for joint in CHAIN.joints]),
     }
-    return Limits(**kept | changed)
+    return TimingLimits(**kept | changed)
 
 
 @dataclass(frozen=True)
@@ -74,5 +74,5 @@ class Cart:
         return phases(brentq(lambda t: phases(t)[1] - way, 1e-9, 1e3, xtol=1e-14))[0]
 
 
-def cart_limits(force: float = np.inf, velocity: float = np.inf, acceleration: float = np.inf) -> Limits:
-    return Limits(np.array([velocity]), np.array([acceleration]), np.array([force]))
+def cart_limits(force: float = np.inf, velocity: float = np.inf, acceleration: float = np.inf) -> TimingLimits:
+    return TimingLimits(np.array([velocity]), np.array([acceleration]), np.array([force]))

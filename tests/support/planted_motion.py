@@ -10,7 +10,7 @@ from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics import drives
 from calib.dynamics.bodies import tree, with_payload
-from calib.dynamics.drives import Term
+from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.identification.cases import Case, make_case
 from calib.robot.chain import Chain, Element, Joint
@@ -42,7 +42,7 @@ def arm() -> Chain:
     return Chain("planted", joints, elements, inertias=INERTIAS)
 
 
-def model(terms: tuple[Term, ...] = (), payload: bool = False) -> IdentificationModel:
+def model(terms: tuple[DriveTerm, ...] = (), payload: bool = False) -> IdentificationModel:
     """Return the truth's model; v0 of the sign is the default."""
     bodies = tree(arm())
     if payload:
@@ -71,8 +71,8 @@ def motion(seed: int, duration: float = 20.0, harmonics: int = 6) -> tuple[np.nd
 
 
 def torques(
-    q: np.ndarray, v: np.ndarray, a: np.ndarray, terms: tuple[Term, ...] = (), values: dict[str, float] | None = None,
-    payload: bool = False,
+    q: np.ndarray, v: np.ndarray, a: np.ndarray, terms: tuple[DriveTerm, ...] = (),
+    values: dict[str, float] | None = None, payload: bool = False,
 ) -> np.ndarray:  # fmt: skip
     """Return the true torques (N, 3); load-dependent friction feels the bodies' torque."""
     plain = model(payload=payload)
@@ -83,7 +83,7 @@ def torques(
 
 
 def series(
-    seed: int, noise: float = 0.2, terms: tuple[Term, ...] = (), values: dict[str, float] | None = None,
+    seed: int, noise: float = 0.2, terms: tuple[DriveTerm, ...] = (), values: dict[str, float] | None = None,
     payload: bool = False, **how,
 ) -> dict[str, np.ndarray]:  # fmt: skip
     """Return t, q and tau as a controller would log them, torque noise white."""

@@ -12,17 +12,17 @@ import pytest
 
 from calib.dynamics import model
 from calib.dynamics.bodies import standard_parameters
-from trajectories.bspline import bspline
+from trajectories.bspline import bspline_family
 from trajectories.constraints import BoxLimit, TorqueLimit, box_limits
 from trajectories.design.objectives import Duration, Excitation, FrictionCoverage, TorqueSlack, condition_numbers
 from trajectories.design.optimise import design
 from trajectories.design.pareto import non_dominated, proposed_goals, sweep
-from trajectories.design.problem import Goal, Problem
-from trajectories.design.search import Found, Stuck, one_start
+from trajectories.design.problem import AttainmentGoal, ExcitationProblem
+from trajectories.design.search import SearchResult, Stuck, one_start
 from trajectories.design.starts import random_start
-from trajectories.design.verify import dense_motion, ensured, verify
+from trajectories.design.verify import dense_motion, ensured, verify_motion
 from trajectories.errors import BadInput, NotExciting, NothingFeasible
-from trajectories.fourier import fourier
+from trajectories.fourier import fourier_family
 from trajectories.places import Workspace
 
 BASE, CHI, CHAIN = arm.lwr()
@@ -40,13 +40,13 @@ def limits(radius: float = 0.3, lowest: float = -0.2) -> tuple:
     )
 
 
-def problem(**options) -> Problem:
-    given = {"family": fourier(4, 15.0, 7), "constraints": limits(), "samples": 90} | options
-    return Problem(regressor=BASE.regressor, product=BASE.regressor_gradient, **given)
+def problem(**options) -> ExcitationProblem:
+    given = {"family": fourier_family(4, 15.0, 7), "constraints": limits(), "samples": 90} | options
+    return ExcitationProblem(regressor=BASE.regressor, product=BASE.regressor_gradient, **given)
 
 
 @cache
-def designed() -> tuple[Problem, Found]:
+def designed() -> tuple[ExcitationProblem, SearchResult]:
     spot = problem()
     return spot, design(spot, starts=1, evaluations=150, seed=1)
 
@@ -97,20 +97,20 @@ def test_the_search_beats_random_motions():
 def test_the_other_methods_improve_their_start_too(method):
     spot = problem()
     run = one_start(spot, 240, method, 1, 0)
-    assert isinstance(run, Found) and run.merit < run.history[0] - 1.0
+    assert isinstance(run, SearchResult) and run.merit < run.history[0] - 1.0
     assert ensured(spot, run)[1].feasible
 
 
 def test_splines_are_a_family_like_any_other():
-    spot = problem(family=bspline(12, 15.0, 7))
+    spot = problem(family=bspline_family(12, 15.0, 7))
     run = one_start(spot, 120, "slsqp", 1, 0)
-    assert isinstance(run, Found) and run.merit < run.history[0] - 1.0
+    assert isinstance(run, SearchResult) and run.merit < run.history[0] - 1.0
     _, proof = ensured(spot, run)
     assert proof.feasible and max(proof.rest) < 1e-6
 
 
 def test_goals_are_attained_within_gamma():
-    spot = problem(goals=(Goal(Excitation("cond", "normalised"), 20.0), Goal(SLACK, 0.85, 0.0)))
+    spot = problem(goals=(AttainmentGoal(Excitation("cond", "normalised"), 20.0), AttainmentGoal(SLACK, 0.85, 0.0)))
     run = design(spot, starts=1, evaluations=150, seed=1, guesses=(designed()[1].x,))
     assert run.values[1] <= 0.85 + 1e-6
     assert run.merit == pytest.approx(run.values[0] / 20.0 - 1.0)
@@ -118,19 +118,20 @@ def test_goals_are_attained_within_gamma():
 
 
 def test_a_hard_goal_out_of_reach_is_named():
-    spot = problem(goals=(Goal(Excitation(), 30.0), Goal(SLACK, 0.1, 0.0)))
+    spot = problem(goals=(AttainmentGoal(Excitation(), 30.0), AttainmentGoal(SLACK, 0.1, 0.0)))
     with pytest.raises(NothingFeasible, match=r"torque slack of joints 6, 7.*0\.1"):
         design(spot, starts=1, evaluations=60)
 
 
 def test_a_free_period_is_shortened_down_to_a_limit():
     spot = problem(
-        goals=(Goal(Duration(), 10.0), Goal(Excitation("cond", "normalised"), 15.0, 0.0)), stretch=(0.4, 2.0)
+        goals=(AttainmentGoal(Duration(), 10.0), AttainmentGoal(Excitation("cond", "normalised"), 15.0, 0.0)),
+        stretch=(0.4, 2.0),
     )
     run = design(spot, starts=1, evaluations=150, seed=1, guesses=(designed()[1].x,))
     assert run.factor < 0.95 and run.values[0] == pytest.approx(15.0 * run.factor)
     assert run.values[1] <= 15.0 * (1 + 1e-5)
-    proof = verify(spot.family, run.x, spot.constraints, factor=run.factor)
+    proof = verify_motion(spot.family, run.x, spot.constraints, factor=run.factor)
     assert proof.feasible
     assert min(one.share for one in proof.margins) < 0.1
 
@@ -181,14 +182,14 @@ def test_nothing_feasible_names_the_constraint_and_the_excess():
 
 def test_a_start_outside_the_limits_is_infeasible_by_what_it_lacks():
     start = np.array([0.0, 0.8, 0.0, -1.0, 0.0, 2.3, 0.0])  # joint 6 may go to 2.094
-    spot = problem(family=fourier(4, 15.0, 7, start=start))
+    spot = problem(family=fourier_family(4, 15.0, 7, start=start))
     with pytest.raises(NothingFeasible, match=r"position limit \(joint 6 upper\) by 0\.2\d* rad at t = 0 s"):
         design(spot, starts=1, evaluations=30)
 
 
 def test_a_locked_joint_leaves_columns_without_information():
     with pytest.raises(NotExciting, match="zero along the whole motion"):
-        design(problem(family=fourier((4, 4, 0, 4, 4, 4, 4), 15.0)), starts=1, evaluations=30)
+        design(problem(family=fourier_family((4, 4, 0, 4, 4, 4, 4), 15.0)), starts=1, evaluations=30)
 
 
 def test_interrupting_keeps_the_best_so_far():
@@ -200,18 +201,20 @@ def test_interrupting_keeps_the_best_so_far():
             raise KeyboardInterrupt
         return BASE.regressor(q, v, a)
 
-    spot = Problem(fourier(4, 15.0, 7), regressor, BASE.regressor_gradient, constraints=limits(), samples=60)
+    spot = ExcitationProblem(
+        fourier_family(4, 15.0, 7), regressor, BASE.regressor_gradient, constraints=limits(), samples=60
+    )
     found = design(spot, starts=5, evaluations=600, seed=1)
     assert found.interrupted and len(calls) == 150 and found.merit < found.history[0]
 
 
 def test_verification_finds_what_happens_between_samples():
-    family = fourier(8, 8.0, 1)
+    family = fourier_family(8, 8.0, 1)
     x = family.random(np.random.default_rng(0), np.zeros(1), np.ones(1))
     peak = np.abs(family.evaluate(x, np.linspace(0, 8, 100_001), 1)).max()
     box = BoxLimit(1, np.array([-peak]), np.array([peak]))
     for instants in (50, 500):
-        report = verify(family, x, [box], instants=instants)
+        report = verify_motion(family, x, [box], instants=instants)
         assert not report.feasible or min(one.margin for one in report.margins) < 1e-9
         assert min(one.margin for one in report.margins) > -0.2 * peak * (50 / instants) ** 2
     coarse = np.abs(family.evaluate(x, np.linspace(0, 8, 51), 1)).max()
@@ -221,8 +224,8 @@ def test_verification_finds_what_happens_between_samples():
 def test_a_motion_infeasible_between_coarse_samples_is_searched_again():
     spot = problem(samples=14, tightening=0.0)
     run = one_start(spot, 120, "slsqp", 1, 0)
-    assert isinstance(run, Found)
-    assert not verify(spot.family, run.x, spot.constraints).feasible
+    assert isinstance(run, SearchResult)
+    assert not verify_motion(spot.family, run.x, spot.constraints).feasible
     again, proof = ensured(spot, run)
     assert proof.feasible and again.evaluations > run.evaluations
 
@@ -236,7 +239,7 @@ def test_a_motion_infeasible_between_coarse_samples_is_searched_again():
         (lambda: problem(samples=3), "8 or more"),
         (lambda: problem(objectives=()), "nothing to design"),
         (lambda: problem(stretch=(2.0, 1.0)), "smaller first"),
-        (lambda: Goal(SLACK, np.nan), "expected a number"),
+        (lambda: AttainmentGoal(SLACK, np.nan), "expected a number"),
     ],
 )
 def test_refusals(make, words):

@@ -7,16 +7,16 @@ import pytest
 from differences import check
 
 from trajectories.basis import aligned_period, sample_times
-from trajectories.bspline import bspline
+from trajectories.bspline import bspline_family
 from trajectories.errors import BadInput
-from trajectories.fourier import evaluate, fourier
+from trajectories.fourier import evaluate, fourier_family
 
 FAMILIES = [
-    fourier((3, 5, 2), 4.0),
-    fourier(3, 4.0, 3, rest=False),
-    fourier(4, 4.0, 3, start=np.array([0.3, -1.0, 2.0])),
-    bspline(9, 4.0, 3),
-    bspline((12, 9, 1), 4.0, start=np.array([0.3, -1.0, 2.0])),
+    fourier_family((3, 5, 2), 4.0),
+    fourier_family(3, 4.0, 3, rest=False),
+    fourier_family(4, 4.0, 3, start=np.array([0.3, -1.0, 2.0])),
+    bspline_family(9, 4.0, 3),
+    bspline_family((12, 9, 1), 4.0, start=np.array([0.3, -1.0, 2.0])),
 ]
 IDS = ["fourier", "not at rest", "given start", "spline", "spline, one joint locked"]
 
@@ -56,7 +56,7 @@ def test_any_variables_start_and_end_at_rest(family):
 
 
 def test_a_given_start_is_kept():
-    family = fourier(4, 4.0, 3, start=np.array([0.3, -1.0, 2.0]))
+    family = fourier_family(4, 4.0, 3, start=np.array([0.3, -1.0, 2.0]))
     assert np.allclose(family.basis(np.zeros(1)).motion(drawn(family)).q, [[0.3, -1.0, 2.0]])
 
 
@@ -91,14 +91,14 @@ def test_variables_are_read_back_from_coefficients(family):
     assert np.allclose(family.variables(family.coefficients(x)), x, atol=1e-12)
 
 
-@pytest.mark.parametrize("family", [fourier(3, 4.0, 3, held={1: 0.7}), bspline(9, 4.0, 3, held={1: 0.7})])
+@pytest.mark.parametrize("family", [fourier_family(3, 4.0, 3, held={1: 0.7}), bspline_family(9, 4.0, 3, held={1: 0.7})])
 def test_a_joint_is_held_at_its_value(family):
     motion = family.basis(sample_times(4.0, 20)).motion(drawn(family))
     assert np.allclose(motion.q[:, 1], 0.7) and not motion.v[:, 1].any() and np.ptp(motion.q[:, 0]) > 0
 
 
 def test_a_locked_joint_stands_still():
-    family = fourier((3, 0, 2), 4.0)
+    family = fourier_family((3, 0, 2), 4.0)
     motion = family.basis(sample_times(4.0, 20)).motion(drawn(family))
     assert np.ptp(motion.q[:, 1]) == 0 and np.ptp(motion.q[:, 0]) > 0
 
@@ -106,16 +106,16 @@ def test_a_locked_joint_stands_still():
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: fourier(5, 2.0, 7, resonance=15.0), "not below the resonance"),
-        (lambda: fourier(5, 1.00037, 7, rate=1000.0), "take 1 s"),
-        (lambda: fourier(1, 2.0, 7), "cannot start at rest"),
-        (lambda: fourier(5, 0.0, 7), "period 0"),
-        (lambda: fourier(5, float("nan"), 7), "period nan"),
-        (lambda: fourier(2, 4.0, 2, start=np.array([0.0, np.nan])), "2 finite joint values"),
-        (lambda: fourier(4, 4.0, 2, held={2: 0.0}), "joint 3 of 2 cannot be held"),
-        (lambda: fourier(4, 4.0, 2, held={0: 0.5}, start=np.zeros(2)), "held at 0.5, but"),
-        (lambda: bspline(5, 4.0, 3), "more than the degree"),
-        (lambda: bspline(9, 4.0, 3, degree=4), "jerk"),
+        (lambda: fourier_family(5, 2.0, 7, resonance=15.0), "not below the resonance"),
+        (lambda: fourier_family(5, 1.00037, 7, rate=1000.0), "take 1 s"),
+        (lambda: fourier_family(1, 2.0, 7), "cannot start at rest"),
+        (lambda: fourier_family(5, 0.0, 7), "period 0"),
+        (lambda: fourier_family(5, float("nan"), 7), "period nan"),
+        (lambda: fourier_family(2, 4.0, 2, start=np.array([0.0, np.nan])), "2 finite joint values"),
+        (lambda: fourier_family(4, 4.0, 2, held={2: 0.0}), "joint 3 of 2 cannot be held"),
+        (lambda: fourier_family(4, 4.0, 2, held={0: 0.5}, start=np.zeros(2)), "held at 0.5, but"),
+        (lambda: bspline_family(5, 4.0, 3), "more than the degree"),
+        (lambda: bspline_family(9, 4.0, 3, degree=4), "jerk"),
     ],
 )
 def test_refusals_say_what_to_do(make, words):

@@ -16,14 +16,14 @@ from trajectories.design.objectives import (  # fmt: skip
     condition_numbers,
     information,
 )
-from trajectories.design.problem import Problem, evaluate
+from trajectories.design.problem import ExcitationProblem, evaluate
 from trajectories.errors import BadInput, NotExciting
-from trajectories.fourier import fourier
+from trajectories.fourier import fourier_family
 from trajectories.places import Clearance, Workspace
 
 BASE, CHI, CHAIN = arm.lwr(0.3)
 LIMITS = np.array([joint.effort for joint in CHAIN.joints])
-FAMILY = fourier(4, 6.0, 7)
+FAMILY = fourier_family(4, 6.0, 7)
 PAST = np.random.default_rng(5).normal(size=(80, 64))
 OBJECTIVES = [
     Excitation("cond", "raw"),
@@ -41,8 +41,8 @@ OBJECTIVES = [
 ]
 
 
-def problem(objective, constraints=(), stretch=(1.0, 1.0)) -> Problem:
-    return Problem(
+def problem(objective, constraints=(), stretch=(1.0, 1.0)) -> ExcitationProblem:
+    return ExcitationProblem(
         FAMILY, BASE.regressor, BASE.regressor_gradient, ((objective, 1.0),), constraints, samples=60, stretch=stretch
     )
 
@@ -132,7 +132,7 @@ def test_the_slack_is_what_the_paper_minimises_up_to_the_stated_smoothing():
 
 def test_coverage_is_zero_where_every_range_is_visited_enough():
     coverage = FrictionCoverage(np.array([0.4]), np.array([0.8]), wanted=0.1)
-    motion = fourier(1, 6.0, 1, rest=False).basis(np.linspace(0, 6, 600, endpoint=False))
+    motion = fourier_family(1, 6.0, 1, rest=False).basis(np.linspace(0, 6, 600, endpoint=False))
     fast = motion.motion(np.array([0.0, 1.0, 0.0]) * 6 / 2 / np.pi)
     slow = motion.motion(np.array([0.0, 0.3, 0.0]) * 6 / 2 / np.pi)
     assert coverage.evaluate(fast, np.zeros(0)).value == 0.0

@@ -23,7 +23,7 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from trajectories.basis import Motion
+from trajectories.basis import SampledMotion
 from trajectories.errors import BadInput, NotExciting
 
 Index = Literal["cond", "logdet", "smallest"]
@@ -71,7 +71,7 @@ class Excitation:
     def name(self) -> str:
         return self.index + (f" {self.scaling}" if isinstance(self.scaling, str) else " scaled")
 
-    def evaluate(self, motion: Motion, regressor: np.ndarray) -> Value:
+    def evaluate(self, motion: SampledMotion, regressor: np.ndarray) -> Value:
         """Return the index and ∂F/∂regressor."""
         weighted = regressor if self.sigmas is None else regressor / self.sigmas[:, None]
         stacked = _stacked(weighted)
@@ -139,7 +139,7 @@ class TorqueSlack:
     def name(self) -> str:
         return "torque slack of joints " + ", ".join(str(j + 1) for j in self.joints)
 
-    def evaluate(self, motion: Motion, regressor: np.ndarray) -> Value:
+    def evaluate(self, motion: SampledMotion, regressor: np.ndarray) -> Value:
         chosen = list(self.joints)
         ratio = regressor[:, chosen] @ self.parameters / self.limits[chosen]
         size = np.sqrt(ratio**2 + self.smoothing**2)
@@ -168,7 +168,7 @@ class FrictionCoverage:
     width: float = 0.2
     name: str = "friction coverage"
 
-    def evaluate(self, motion: Motion, regressor: np.ndarray) -> Value:
+    def evaluate(self, motion: SampledMotion, regressor: np.ndarray) -> Value:
         count, n = motion.v.shape
         value, slope = 0.0, np.zeros((4, count, n))
         slow, fast = self.width * self.low, self.width * self.high
@@ -182,7 +182,7 @@ class FrictionCoverage:
                 slope[1] -= sign * 2 * missing / self.wanted / count / (4 * n) * by_v
         return Value(value, None, slope)
 
-    def shares(self, motion: Motion) -> np.ndarray:
+    def shares(self, motion: SampledMotion) -> np.ndarray:
         """Return the exact shares of time (4, n): fast forward, slow forward, fast backward, slow backward."""
         rows = []
         for v in (motion.v, -motion.v):
@@ -196,7 +196,7 @@ class Duration:
 
     name: str = "duration"
 
-    def evaluate(self, motion: Motion, regressor: np.ndarray) -> Value:
+    def evaluate(self, motion: SampledMotion, regressor: np.ndarray) -> Value:
         return Value(float(len(motion) * (motion.times[1] - motion.times[0])), by_duration=1.0)
 
 

@@ -15,13 +15,13 @@ from typing import get_args
 
 import numpy as np
 
-from trajectories.design.problem import Problem, exact_values, stretched, unmet
-from trajectories.design.search import Found, Method, Stuck, one_start
+from trajectories.design.problem import ExcitationProblem, exact_values, stretched, unmet
+from trajectories.design.search import Method, SearchResult, Stuck, one_start
 from trajectories.errors import BadInput, NotExciting, NothingFeasible
 
 
 def design(
-    problem: Problem,
+    problem: ExcitationProblem,
     *,
     starts: int = 6,
     evaluations: int = 600,
@@ -30,7 +30,7 @@ def design(
     guesses: tuple[np.ndarray, ...] = (),
     map: Callable = map,
     report: Callable[[int, int, str], None] | None = None,
-) -> Found:
+) -> SearchResult:
     """Return the best motion over several starts.
 
     Args:
@@ -52,12 +52,12 @@ def design(
     tasks: list[int | np.ndarray] = [*guesses, *range(starts)]
     if not tasks:
         raise BadInput("no starts: ask for one at least, or give a guess")
-    found, stuck, spent = list[Found](), list[Stuck](), 0
+    found, stuck, spent = list[SearchResult](), list[Stuck](), 0
     interrupted = False
     try:
         wanted = takewhile(lambda _: not interrupted, tasks)  # a map in other processes may still hand back what it has
         for number, run in enumerate(map(partial(one_start, problem, evaluations, method, seed), wanted), 1):
-            if isinstance(run, Found):
+            if isinstance(run, SearchResult):
                 found.append(run)
             else:
                 stuck.append(run)
@@ -65,7 +65,7 @@ def design(
             if report:
                 best = min((one.merit for one in found), default=np.inf)
                 report(number, len(tasks), f"best so far {best:.4g}" if found else "nothing feasible yet")
-            interrupted |= isinstance(run, Found) and run.interrupted
+            interrupted |= isinstance(run, SearchResult) and run.interrupted
     except KeyboardInterrupt:
         if not found:
             raise
@@ -79,7 +79,7 @@ def design(
     )
 
 
-def _nothing(problem: Problem, stuck: list[Stuck]) -> NothingFeasible:
+def _nothing(problem: ExcitationProblem, stuck: list[Stuck]) -> NothingFeasible:
     """Return the error that names the constraint which was in the way."""
     best = min(stuck, key=lambda one: one.excess)
     motion = stretched(problem.basis().motion(best.x), best.factor)

@@ -9,8 +9,8 @@ import numpy as np
 
 from trajectories.design.objectives import Objective
 from trajectories.design.optimise import design
-from trajectories.design.problem import Goal, Problem
-from trajectories.design.search import Found, Stuck, one_start
+from trajectories.design.problem import AttainmentGoal, ExcitationProblem
+from trajectories.design.search import SearchResult, Stuck, one_start
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,12 +25,12 @@ class Front:
 
     names: tuple[str, ...]
     values: np.ndarray
-    found: tuple[Found, ...]
+    found: tuple[SearchResult, ...]
     best: np.ndarray
 
 
 def proposed_goals(
-    problem: Problem,
+    problem: ExcitationProblem,
     objectives: Sequence[Objective],
     *,
     starts: int = 2,
@@ -38,7 +38,7 @@ def proposed_goals(
     seed: int = 0,
     guesses: tuple[np.ndarray, ...] = (),
     map: Callable = map,
-) -> list[tuple[float, Found]]:
+) -> list[tuple[float, SearchResult]]:
     """Return what each objective reaches alone, with its motion: where goals start from (the study's advice)."""
     result = []
     for objective in objectives:
@@ -49,7 +49,7 @@ def proposed_goals(
 
 
 def sweep(
-    problem: Problem,
+    problem: ExcitationProblem,
     first: Objective,
     second: Objective,
     levels: Sequence[float],
@@ -66,9 +66,9 @@ def sweep(
         guess: variables to start from (p,).
         other: to try where the last motion does not lead to a level, best what the second objective alone reached.
     """
-    runs, values = list[Found](), list[np.ndarray]()
+    runs, values = list[SearchResult](), list[np.ndarray]()
     for number, level in enumerate(levels, 1):
-        goals = (Goal(first, _level(problem, first, guess)), Goal(second, float(level), 0.0))
+        goals = (AttainmentGoal(first, _level(problem, first, guess)), AttainmentGoal(second, float(level), 0.0))
         run = one_start(replace(problem, goals=goals), evaluations, "slsqp", 0, guess)
         if isinstance(run, Stuck) and other is not None:
             run = one_start(replace(problem, goals=goals), evaluations, "slsqp", 0, other)
@@ -88,7 +88,7 @@ def non_dominated(values: np.ndarray) -> np.ndarray:
     return np.logical_not(better.any(axis=0))
 
 
-def _level(problem: Problem, objective: Objective, y: np.ndarray) -> float:
+def _level(problem: ExcitationProblem, objective: Objective, y: np.ndarray) -> float:
     """Return the objective at a guess: a goal that can be bettered."""
     x = y[: problem.basis().p]
     motion = problem.basis().motion(x)

@@ -11,14 +11,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trajectories.basis import Basis, Family, Motion, sample_times
-from trajectories.constraints import Constraint, Product, Regressor, gathered
+from trajectories.basis import Basis, Family, SampledMotion, sample_times
+from trajectories.constraints import MotionConstraint, Product, Regressor, gathered
 from trajectories.design.objectives import Excitation, Objective
 from trajectories.errors import BadInput
 
 
 @dataclass(frozen=True, eq=False)
-class Goal:
+class AttainmentGoal:
     """F ≤ goal + weight · γ; weight None: |goal|, 0: hard."""
 
     objective: Objective
@@ -41,7 +41,7 @@ class Goal:
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class ExcitationProblem:
     """What is to be designed.
 
     Attributes:
@@ -61,8 +61,8 @@ class Problem:
     regressor: Regressor
     product: Product
     objectives: tuple[tuple[Objective, float], ...] = ((Excitation(), 1.0),)
-    constraints: tuple[Constraint, ...] = ()
-    goals: tuple[Goal, ...] = ()
+    constraints: tuple[MotionConstraint, ...] = ()
+    goals: tuple[AttainmentGoal, ...] = ()
     samples: int = 200
     stretch: tuple[float, float] = (1.0, 1.0)
     tightening: float = 0.003
@@ -93,7 +93,7 @@ class Evaluation:
         excess: largest constraint value at the samples, over its scale.
     """
 
-    motion: Motion
+    motion: SampledMotion
     regressor: np.ndarray
     values: np.ndarray
     slopes: np.ndarray
@@ -102,11 +102,11 @@ class Evaluation:
     excess: float
 
 
-def evaluate(problem: Problem, basis: Basis, y: np.ndarray, sharpness: tuple[float, float]) -> Evaluation:
+def evaluate(problem: ExcitationProblem, basis: Basis, y: np.ndarray, sharpness: tuple[float, float]) -> Evaluation:
     """Evaluate everything at y = (x, factor on the period if that is free).
 
     Args:
-        basis: `Problem.basis`.
+        basis: `ExcitationProblem.basis`.
         sharpness: p of the spectra and ρ of the constraints.
     """
     x, factor = (y[:-1], float(y[-1])) if problem.free_period else (y, problem.stretch[0])
@@ -131,7 +131,7 @@ def evaluate(problem: Problem, basis: Basis, y: np.ndarray, sharpness: tuple[flo
     )  # fmt: skip
 
 
-def terms(problem: Problem) -> list[Objective]:
+def terms(problem: ExcitationProblem) -> list[Objective]:
     """Return the objectives that are evaluated: those of the goals, or those of the sum."""
     return [goal.objective for goal in problem.goals] or [one for one, _ in problem.objectives]
 
@@ -144,12 +144,12 @@ def is_condition(objective: Objective) -> bool:
     return isinstance(objective, Excitation) and objective.index == "cond"
 
 
-def exact_values(problem: Problem, motion: Motion, regressor: np.ndarray) -> np.ndarray:
+def exact_values(problem: ExcitationProblem, motion: SampledMotion, regressor: np.ndarray) -> np.ndarray:
     """Return the unsmoothed objectives of a motion (k,)."""
     return np.array([sharpened(one, np.inf).evaluate(motion, regressor).value for one in terms(problem)])
 
 
-def merit(problem: Problem, values: np.ndarray) -> float:
+def merit(problem: ExcitationProblem, values: np.ndarray) -> float:
     """Return what is minimised: γ, or the weighted sum with condition numbers by their logarithm."""
     if problem.goals:
         return max(goal.attainment(value) for goal, value in zip(problem.goals, values))
@@ -159,9 +159,9 @@ def merit(problem: Problem, values: np.ndarray) -> float:
     return float(total)
 
 
-def unmet(problem: Problem, values: np.ndarray) -> tuple[float, Goal | None, float]:
+def unmet(problem: ExcitationProblem, values: np.ndarray) -> tuple[float, AttainmentGoal | None, float]:
     """Return by how much the worst hard goal is missed, as a share of it, that goal, and its value; or zeros."""
-    worst: tuple[float, Goal | None, float] = (0.0, None, 0.0)
+    worst: tuple[float, AttainmentGoal | None, float] = (0.0, None, 0.0)
     for goal, value in zip(problem.goals, values):
         lacking = (value - goal.goal) / max(abs(goal.goal), 1e-3)
         if goal.share == 0 and lacking > worst[0]:
@@ -169,15 +169,22 @@ def unmet(problem: Problem, values: np.ndarray) -> tuple[float, Goal | None, flo
     return worst
 
 
-def stretched(motion: Motion, factor: float) -> Motion:
+def stretched(motion: SampledMotion, factor: float) -> SampledMotion:
     """Return the motion along the same path, `factor` times slower."""
     if factor == 1.0:
         return motion
-    return Motion(factor * motion.times, motion.q, motion.v / factor, motion.a / factor**2, motion.jerk / factor**3)
+    return SampledMotion(
+        factor * motion.times, motion.q, motion.v / factor, motion.a / factor**2, motion.jerk / factor**3
+    )
 
 
 def _by_variables(
-    problem: Problem, basis: Basis, motion: Motion, slopes: np.ndarray, factor: float, by_duration: np.ndarray
+    problem: ExcitationProblem,
+    basis: Basis,
+    motion: SampledMotion,
+    slopes: np.ndarray,
+    factor: float,
+    by_duration: np.ndarray,
 ) -> np.ndarray:
     """Return gradients (m, p) by (x, factor): d v/d factor = -v / factor, and so on."""
     powers = factor ** np.arange(4)

@@ -13,7 +13,15 @@ import nlopt
 import numpy as np
 
 from trajectories.basis import Basis
-from trajectories.design.problem import Evaluation, Problem, evaluate, exact_values, is_condition, merit, unmet
+from trajectories.design.problem import (
+    Evaluation,
+    ExcitationProblem,
+    evaluate,
+    exact_values,
+    is_condition,
+    merit,
+    unmet,
+)
 from trajectories.design.starts import random_start
 from trajectories.errors import NotExciting
 
@@ -24,7 +32,7 @@ S_RANGE = (-4.0, 12.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class SearchResult:
     """What a search ends with.
 
     Attributes:
@@ -69,10 +77,12 @@ class Stuck:
     reason: str = ""
 
 
-def one_start(problem: Problem, evaluations: int, method: Method, seed: int, start: int | np.ndarray) -> Found | Stuck:
+def one_start(
+    problem: ExcitationProblem, evaluations: int, method: Method, seed: int, start: int | np.ndarray
+) -> SearchResult | Stuck:
     """Search from one random start (its number) or from given variables."""
     began = time.perf_counter()
-    run = Run(problem, problem.basis())
+    run = StartSearch(problem, problem.basis())
     if isinstance(start, int | np.integer):
         rng = np.random.default_rng([seed, int(start)])
         y = random_start(problem, run.basis, rng)
@@ -98,16 +108,16 @@ def one_start(problem: Problem, evaluations: int, method: Method, seed: int, sta
         return Stuck(nearest[:p], factor, run.least, run.count, run.reason)
     seconds, share = time.perf_counter() - began, run.kept / run.count
     label = int(start) if isinstance(start, int | np.integer) else -1
-    return Found(
+    return SearchResult(
         run.best[:p], factor, run.merit, run.values, tuple(run.history), run.count, share, seconds, label,
         run.interrupted, tuple(run.times),
     )  # fmt: skip
 
 
-class Run:
+class StartSearch:
     """One start's search: the state that NLopt's callbacks share."""
 
-    def __init__(self, problem: Problem, basis: Basis):
+    def __init__(self, problem: ExcitationProblem, basis: Basis):
         self.problem, self.basis = problem, basis
         self.sharpness = STAGES[0]
         self.best: np.ndarray | None = None

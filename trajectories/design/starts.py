@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from trajectories.basis import Basis, Motion
+from trajectories.basis import Basis, SampledMotion
 from trajectories.constraints import BoxLimit
-from trajectories.design.problem import Problem, stretched
+from trajectories.design.problem import ExcitationProblem, stretched
 
 
-def random_start(problem: Problem, basis: Basis, rng: np.random.Generator) -> np.ndarray:
+def random_start(problem: ExcitationProblem, basis: Basis, rng: np.random.Generator) -> np.ndarray:
     """Draw variables of a motion about a random pose that fills a random part of the joint limits.
 
     The centre is the best of 200 poses by the constraints that a constant pose can break; the amplitude is scaled down
@@ -25,7 +25,7 @@ def random_start(problem: Problem, basis: Basis, rng: np.random.Generator) -> np
     fixed = ~basis.used.any(axis=1)
     poses[:, fixed] = basis.offsets[0, 0, fixed]
     still = np.zeros((200, n))
-    resting = Motion(np.arange(200.0), poses, still, still, still)
+    resting = SampledMotion(np.arange(200.0), poses, still, still, still)
     excess = np.zeros(200)
     for constraint in (c for c in problem.constraints if not isinstance(c, BoxLimit)):
         excess = np.maximum(excess, (constraint.values(resting) / constraint.scale).max(axis=1))
@@ -38,7 +38,7 @@ def random_start(problem: Problem, basis: Basis, rng: np.random.Generator) -> np
     return np.append(x, factor) if problem.free_period else x
 
 
-def _fitting(boxes: list[BoxLimit], still: Motion, moving: Motion) -> float:
+def _fitting(boxes: list[BoxLimit], still: SampledMotion, moving: SampledMotion) -> float:
     """Return the largest share (at most 1) of a motion about a pose inside the box limits."""
     share = 1.0
     for box in boxes:

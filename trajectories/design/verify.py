@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trajectories.basis import Family, Motion
-from trajectories.constraints import BoxLimit, Constraint
-from trajectories.design.problem import Problem
-from trajectories.design.search import Found, one_start
+from trajectories.basis import Family, SampledMotion
+from trajectories.constraints import BoxLimit, MotionConstraint
+from trajectories.design.problem import ExcitationProblem
+from trajectories.design.search import SearchResult, one_start
 from trajectories.errors import NothingFeasible
 
 BLOCK = 2000
@@ -72,14 +72,14 @@ class Verification:
         return result
 
 
-def dense_motion(family: Family, x: np.ndarray, times: np.ndarray, factor: float = 1.0) -> Motion:
+def dense_motion(family: Family, x: np.ndarray, times: np.ndarray, factor: float = 1.0) -> SampledMotion:
     """Return the motion at times [s] of the stretched motion, from the family's own formula."""
     orders = [family.evaluate(x, times / factor, order) / factor**order for order in range(4)]
-    return Motion(times, *orders)
+    return SampledMotion(times, *orders)
 
 
-def verify(
-    family: Family, x: np.ndarray, constraints: Sequence[Constraint], *, factor: float = 1.0, instants: int = 5000
+def verify_motion(
+    family: Family, x: np.ndarray, constraints: Sequence[MotionConstraint], *, factor: float = 1.0, instants: int = 5000
 ) -> Verification:
     """Check a motion against constraints at `instants` over one period, and between them.
 
@@ -95,13 +95,13 @@ def verify(
 
 
 def ensured(
-    problem: Problem,
-    found: Found,
-    constraints: Sequence[Constraint] | None = None,
+    problem: ExcitationProblem,
+    found: SearchResult,
+    constraints: Sequence[MotionConstraint] | None = None,
     instants: int = 5000,
     rounds: int = 3,
-) -> tuple[Found, Verification]:
-    """Return a motion that passes `verify`: where `found` does not, it is searched again from there, further inside.
+) -> tuple[SearchResult, Verification]:
+    """Return a motion that passes `verify_motion`; one that does not is searched again from there, further inside.
 
     Args:
         constraints: to verify against; default the problem's.
@@ -110,7 +110,10 @@ def ensured(
         NothingFeasible: where that does not help.
     """
     checked = problem.constraints if constraints is None else constraints
-    spent, report = found.evaluations, verify(problem.family, found.x, checked, factor=found.factor, instants=instants)
+    spent, report = (
+        found.evaluations,
+        verify_motion(problem.family, found.x, checked, factor=found.factor, instants=instants),
+    )
     tighter = problem
     for _ in range(rounds):
         if report.feasible:
@@ -122,12 +125,12 @@ def ensured(
         y = np.append(found.x, found.factor) if problem.free_period else found.x
         again = one_start(tighter, 240, "slsqp", found.seed, y)
         spent += again.evaluations
-        if isinstance(again, Found):
+        if isinstance(again, SearchResult):
             found = replace(
                 again, history=found.history, seconds=found.seconds + again.seconds,
                 interrupted=found.interrupted or again.interrupted,
             )  # fmt: skip
-            report = verify(problem.family, found.x, checked, factor=found.factor, instants=instants)
+            report = verify_motion(problem.family, found.x, checked, factor=found.factor, instants=instants)
     if not report.feasible:
         worst = min(report.margins, key=lambda one: one.share)
         raise NothingFeasible(
@@ -139,7 +142,7 @@ def ensured(
 
 
 def _margins(
-    family: Family, x: np.ndarray, constraint: Constraint, motion: Motion, step: float, factor: float
+    family: Family, x: np.ndarray, constraint: MotionConstraint, motion: SampledMotion, step: float, factor: float
 ) -> list[Margin]:
     starts = range(0, len(motion), BLOCK)
     values = np.concatenate([constraint.values(motion.part(np.arange(len(motion))[s : s + BLOCK])) for s in starts])

@@ -21,7 +21,7 @@ class Law(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Limits:
+class TimingLimits:
     """Largest moduli (n,), each above zero, infinite where there is no limit.
 
     Attributes:

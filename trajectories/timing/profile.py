@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from trajectories.setpoints import Setpoints
 from trajectories.timing.path import Path
-from trajectories.track import Track
 
 SMALLEST = 1e-9  # share of a speed that stands for "just after rest", where friction has its direction already
 TorqueLaw = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -95,7 +95,7 @@ def moved(path: Path, s: np.ndarray, speed: np.ndarray, u: np.ndarray) -> tuple[
     return path(s), slope * speed[:, None], slope * u[:, None] + path(s, 2) * (speed**2)[:, None]
 
 
-def track(path: Path, profile: Profile, rate: float, torque: TorqueLaw | None = None) -> Track:
+def track(path: Path, profile: Profile, rate: float, torque: TorqueLaw | None = None) -> Setpoints:
     """Return the motion at a controller's rate [Hz]; its duration has to be a whole number of samples.
 
     Torques at rest are those just after the start and just before the end.
@@ -106,6 +106,6 @@ def track(path: Path, profile: Profile, rate: float, torque: TorqueLaw | None = 
     speed[[0, -1]] = np.sqrt(profile.x[[0, -1]])
     q, v, a = moved(path, s, speed, u)
     if torque is None:
-        return Track(rate, q, v, a)
+        return Setpoints(rate, q, v, a)
     barely = np.maximum(speed, SMALLEST * speed.max())
-    return Track(rate, q, v, a, torque(q, path(s, 1) * barely[:, None], a))
+    return Setpoints(rate, q, v, a, torque(q, path(s, 1) * barely[:, None], a))

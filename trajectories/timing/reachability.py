@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from trajectories.errors import BadInput, NothingFeasible
-from trajectories.timing.limits import Law, Limits
+from trajectories.timing.limits import Law, TimingLimits
 from trajectories.timing.path import Path
 from trajectories.timing.profile import Profile
 
@@ -41,7 +41,7 @@ class Bounded:
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class ConstraintRows:
     """What does not change from round to round.
 
     Attributes:
@@ -58,10 +58,10 @@ class Rows:
     A: np.ndarray
     B: np.ndarray
     G: np.ndarray
-    limits: Limits
+    limits: TimingLimits
 
     @classmethod
-    def of(cls, path: Path, s: np.ndarray, limits: Limits, law: Law | None) -> Rows:
+    def of(cls, path: Path, s: np.ndarray, limits: TimingLimits, law: Law | None) -> ConstraintRows:
         steps = np.diff(s)
         ends = np.concatenate([s[:-1] + INSIDE * steps, s[1:] - INSIDE * steps])
         shape = (2, len(steps), path.n)

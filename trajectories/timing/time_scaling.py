@@ -20,10 +20,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from trajectories.errors import BadInput, NothingFeasible
-from trajectories.timing.limits import Law, Limits
+from trajectories.timing.limits import Law, TimingLimits
 from trajectories.timing.path import Path, reversals
 from trajectories.timing.profile import Profile, Sampled, dense, moved
-from trajectories.timing.reachability import Rows, fastest
+from trajectories.timing.reachability import ConstraintRows, fastest
 
 GRID, PER_SPAN, MOST = 400, 200, 2400  # intervals, in all and between two knots
 ROUNDS = 25
@@ -45,7 +45,7 @@ class Timing:
 
     path: Path
     profile: Profile
-    limits: Limits
+    limits: TimingLimits
     sampled: Sampled
     iterations: int
     tightened: float
@@ -73,7 +73,7 @@ class Timing:
 
 
 def time_optimal(
-    path: Path, limits: Limits, law: Law | None = None, *, rate: float | None = None, grid: int | None = None
+    path: Path, limits: TimingLimits, law: Law | None = None, *, rate: float | None = None, grid: int | None = None
 ) -> Timing:
     """Return the fastest motion from rest to rest along a path.
 
@@ -90,7 +90,7 @@ def time_optimal(
     s = grid_points(path, grid)
     if law is not None:
         check_holding(path, limits, law, s)
-    rows = Rows.of(path, s, limits, law)
+    rows = ConstraintRows.of(path, s, limits, law)
     tight = {name: np.ones((len(s) - 1, path.n)) for name in ("velocity", "acceleration", "torque")}
     history: list[float] = []
     best = last = x = before = None
@@ -138,7 +138,9 @@ def _per_interval(values: np.ndarray, count: int) -> np.ndarray:
     return values.reshape(count, -1, values.shape[1]).max(axis=1)
 
 
-def _round(rows: Rows, law: Law | None, x: np.ndarray | None, before: np.ndarray | None, tight: dict) -> Profile:
+def _round(
+    rows: ConstraintRows, law: Law | None, x: np.ndarray | None, before: np.ndarray | None, tight: dict
+) -> Profile:
     """Return the fastest profile with friction as a line; by secants alone where tangents leave nothing feasible."""
     try:
         return fastest(rows.bounded(rows.friction(law, x, before), tight), rows.s)
@@ -146,7 +148,7 @@ def _round(rows: Rows, law: Law | None, x: np.ndarray | None, before: np.ndarray
         return fastest(rows.bounded(rows.friction(law, x, None), tight), rows.s)
 
 
-def shares(sampled: Sampled, limits: Limits) -> dict[str, np.ndarray]:
+def shares(sampled: Sampled, limits: TimingLimits) -> dict[str, np.ndarray]:
     """Return the shares of the limits in use, (N, n) each; kinds of limit that no joint has are left out."""
     found = {"velocity": sampled.v, "acceleration": sampled.a, "torque": sampled.tau}
     sizes = {"velocity": limits.velocity, "acceleration": limits.acceleration, "torque": limits.torque}
@@ -157,7 +159,7 @@ def shares(sampled: Sampled, limits: Limits) -> dict[str, np.ndarray]:
     }
 
 
-def check_holding(path: Path, limits: Limits, law: Law, s: np.ndarray) -> None:
+def check_holding(path: Path, limits: TimingLimits, law: Law, s: np.ndarray) -> None:
     """Refuse a path on which the torque limits do not hold the robot still, or do not move it slowly.
 
     A motion that swings through such a place can exist; it could not be stopped there, nor rehearsed (our choice).

@@ -143,7 +143,7 @@ class _Climber:
         self.measured, self.settings, self.torques, self.folds, self.tell = measured, settings, torques, folds, tell
         self.fixed, self.prior = np.array([], dtype=int) if fixed is None else fixed, prior
         tell(0, len(MODELS), "frames")
-        self.nominal = polish_frames(cell, measured, settings)
+        self.nominal = polish_frames(cell, measured, settings, torques)
         self.best, self.rungs, self.chosen = self.nominal, [], "frames"
         self.stiff = self.nominal
         self.steps = 0
@@ -165,7 +165,8 @@ class _Climber:
             self._tick(name)
             candidates = np.setdiff1d(candidates, self.fixed)
             found = self.nominal if name == "frames" else fit(
-                self.nominal.cell, self.measured, candidates, settings=self.settings, drawn=self.drawn, prior=self.prior
+                self.nominal.cell, self.measured, candidates, settings=self.settings, torques=self.torques,
+                drawn=self.drawn, prior=self.prior,
             )  # fmt: skip
             unseen = self._judge(found, ()).error_rigid()
             better = unseen < error * (1.0 - GAIN)

@@ -16,11 +16,11 @@ import numpy as np
 
 from calib.data.signals.decimation import Decimator
 from calib.dynamics import friction
-from calib.dynamics.drives import Term
+from calib.dynamics.drives import DriveTerm
 from calib.errors import UsageError
 from calib.identification.cases import Case
-from calib.identification.friction.time_folds import Bench
-from calib.identification.rows import Rows, extend, observe_terms, triangulate
+from calib.identification.friction.time_folds import CrossValidation
+from calib.identification.rows import ObservationRows, extend, observe_terms, triangulate
 
 GAIN = 0.02  # a rung has to lower a joint's rms error on unseen time by this share (our choice)
 WIDTHS = (0.0005, 0.002, 0.008, 0.03)  # of presliding, shares of a joint's travel (our choice)
@@ -32,7 +32,7 @@ Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Rung:
+class FrictionStep:
     """One rung tried.
 
     Attributes:
@@ -57,20 +57,20 @@ class Rung:
 
 
 @dataclass(frozen=True, eq=False)
-class Climb:
+class FrictionSelection:
     """Where the ladder ended: the terms taken, their ridge groups, and the rungs."""
 
-    terms: tuple[Term, ...]
+    terms: tuple[DriveTerm, ...]
     groups: tuple[int, ...]
-    rungs: tuple[Rung, ...]
+    steps: tuple[FrictionStep, ...]
 
     @property
     def chosen(self) -> str:
-        return " + ".join(["standard", *(rung.model[2:] for rung in self.rungs if rung.kept and rung.model[0] == "+")])
+        return " + ".join(["standard", *(rung.model[2:] for rung in self.steps if rung.kept and rung.model[0] == "+")])
 
 
 @dataclass(frozen=True, eq=False)
-class Ground:
+class FrictionCandidates:
     """What a climb stands on.
 
     Attributes:
@@ -85,7 +85,7 @@ class Ground:
     """
 
     cases: Sequence[Case]
-    rows: Sequence[Rows]
+    rows: Sequence[ObservationRows]
     loads: Sequence[np.ndarray | None]
     decimator: Decimator
     std: np.ndarray
@@ -99,7 +99,9 @@ class Ground:
         return self.cases[0].motion.n
 
 
-def climb(ground: Ground, wanted: str = "auto", progress: Progress | None = None) -> Climb:
+def select_friction(
+    ground: FrictionCandidates, wanted: str = "auto", progress: Progress | None = None
+) -> FrictionSelection:
     """Return the friction terms that unseen time rewards, or those of a rung by name.
 
     Args:
@@ -117,7 +119,7 @@ def climb(ground: Ground, wanted: str = "auto", progress: Progress | None = None
     say("friction: standard")
     size = _sizes(ground, bench)
     error = bench.errors(base)
-    rungs = [_rung("standard", len(base), error, size, tuple(range(ground.n)))]
+    steps = [_step("standard", len(base), error, size, tuple(range(ground.n)))]
     taken: list[int] = []
     waiting = list(offered)
     for second in (False, True):
@@ -128,7 +130,7 @@ def climb(ground: Ground, wanted: str = "auto", progress: Progress | None = None
             found, new, at = _try(bench, base, taken, columns, every, error, wanted != "auto")
             note = "" if at else "no better on unseen time: left out"
             shown = new if found else bench.errors(np.array([*base, *taken, *columns]))
-            rungs.append(_rung(f"+ {name}", len(base) + len(taken) + len(found or columns), shown, size, at, note))
+            steps.append(_step(f"+ {name}", len(base) + len(taken) + len(found or columns), shown, size, at, note))
             if found:
                 taken, error = [*taken, *found], new
             else:
@@ -137,15 +139,15 @@ def climb(ground: Ground, wanted: str = "auto", progress: Progress | None = None
             break
         waiting = [name for name in refused if any(at > place[name][0] for at in taken)]
     groups = bench.group[taken]
-    return Climb(tuple(every[k - len(base)] for k in taken), tuple(int(g) for g in groups), tuple(rungs))
+    return FrictionSelection(tuple(every[k - len(base)] for k in taken), tuple(int(g) for g in groups), tuple(steps))
 
 
 def _try(
-    bench: Bench,
+    bench: CrossValidation,
     base: np.ndarray,
     taken: list[int],
     columns: list[int],
-    every: list[Term],
+    every: list[DriveTerm],
     error: np.ndarray,
     forced: bool,
 ) -> tuple[list[int], np.ndarray, tuple[int, ...]]:
@@ -176,9 +178,9 @@ def _pays(before: np.ndarray, after: np.ndarray) -> bool:
     return bool(after.sum() < (1.0 - GAIN) ** 2 * before.sum() and lower >= WINS)
 
 
-def _terms(ground: Ground, name: str) -> list[Term]:
+def _terms(ground: FrictionCandidates, name: str) -> list[DriveTerm]:
     """Return a rung's terms of all joints."""
-    found: list[Term] = []
+    found: list[DriveTerm] = []
     for j in range(ground.n):
         v = np.concatenate([np.abs(case.motion.v[:, j]) for case in ground.cases])
         peak = float(np.quantile(v, 0.98))
@@ -201,7 +203,9 @@ def _terms(ground: Ground, name: str) -> list[Term]:
     return found
 
 
-def _bench(ground: Ground, offered: dict[str, list[Term]], every: list[Term]) -> tuple[Bench, dict[str, list[int]]]:
+def _bench(
+    ground: FrictionCandidates, offered: dict[str, list[DriveTerm]], every: list[DriveTerm]
+) -> tuple[CrossValidation, dict[str, list[int]]]:
     """Return the bench with all offered columns behind the base's, and where each rung's stand."""
     rows = [
         extend(part, every, observe_terms(every, case, ground.decimator, load))
@@ -219,7 +223,7 @@ def _bench(ground: Ground, offered: dict[str, list[Term]], every: list[Term]) ->
         start += len(terms)
         number += 1
     blocks = 1 + max(int(part.block.max(initial=-1)) for part in rows)
-    return Bench(
+    return CrossValidation(
         data, rows[0].target.shape[1], blocks, ground.std, ground.inflation, group, _padded(ground.prior, len(every))
     ), place
 
@@ -231,14 +235,16 @@ def _padded(prior: np.ndarray | None, more: int) -> np.ndarray | None:
     return np.hstack([prior[:, :-1], np.zeros((len(prior), more)), prior[:, -1:]])
 
 
-def _sizes(ground: Ground, bench: Bench) -> np.ndarray:
+def _sizes(ground: FrictionCandidates, bench: CrossValidation) -> np.ndarray:
     """Return Σ τ² per row over the judged blocks (rows,)."""
     squares = bench.data.factors[:, :, -1] ** 2
     return squares.sum(axis=1).reshape(-1, bench.rows)[: bench.blocks].sum(axis=0)
 
 
-def _rung(name: str, parameters: int, error: np.ndarray, size: np.ndarray, at: tuple[int, ...], note: str = "") -> Rung:
+def _step(
+    name: str, parameters: int, error: np.ndarray, size: np.ndarray, at: tuple[int, ...], note: str = ""
+) -> FrictionStep:
     with np.errstate(divide="ignore", invalid="ignore"):
         joints = 100.0 * np.sqrt(error.sum(axis=0) / size)
     total = float(100.0 * np.sqrt(error.sum() / size.sum()))
-    return Rung(name, parameters, total, tuple(float(x) for x in np.nan_to_num(joints)), at, note)
+    return FrictionStep(name, parameters, total, tuple(float(x) for x in np.nan_to_num(joints)), at, note)

@@ -30,7 +30,7 @@ import scipy.linalg
 
 from calib.arrays import frozen
 from calib.data.signals.filtering import low_pass
-from calib.dynamics.drives import Term
+from calib.dynamics.drives import DriveTerm
 from calib.dynamics.shapes import Joined
 from calib.identification.cases import Case
 from calib.identification.rows import segments
@@ -67,13 +67,13 @@ class Ripple:
 
     joint: int
     waves: tuple[Wave, ...]
-    terms: tuple[Term, ...]
+    terms: tuple[DriveTerm, ...]
     values: np.ndarray
     share: float
 
 
 @dataclass(frozen=True, eq=False)
-class Track:
+class GearTravel:
     """Where the gears have been: q, v (N, n), the number of the time block (N,), and the joints that travel."""
 
     q: np.ndarray
@@ -96,7 +96,7 @@ def find_all(cases: Sequence[Case], residuals: Sequence[np.ndarray]) -> list[Rip
         return []
     q, v = (np.concatenate([getattr(case.motion, name)[::step] for case in cases])[kept] for name in ("q", "v"))
     moving = tuple(int(j) for j in np.flatnonzero(np.ptp(q, axis=0) >= LEAST))
-    track = Track(q, v, block[kept], moving)
+    track = GearTravel(q, v, block[kept], moving)
     fast = np.zeros(q.shape)
     for j in moving:
         parts = [_fast(case, residual[:, j])[::step] for case, residual in zip(cases, residuals)]
@@ -106,7 +106,7 @@ def find_all(cases: Sequence[Case], residuals: Sequence[np.ndarray]) -> list[Rip
     return [one for one in found if one is not None]
 
 
-def find_turns(track: Track, residuals: np.ndarray) -> dict[int, int]:
+def find_turns(track: GearTravel, residuals: np.ndarray) -> dict[int, int]:
     """Return joint → motor turns per turn of its gear, of the joints that travel: the most coherent family.
 
     Args:
@@ -122,7 +122,7 @@ def find_turns(track: Track, residuals: np.ndarray) -> dict[int, int]:
     }
 
 
-def find(joint: int, track: Track, residual: np.ndarray, turns: Mapping[int, int]) -> Ripple | None:
+def find(joint: int, track: GearTravel, residual: np.ndarray, turns: Mapping[int, int]) -> Ripple | None:
     """Return the ripple in a joint's torque that left-out blocks confirm, or None.
 
     Args:
@@ -131,7 +131,7 @@ def find(joint: int, track: Track, residual: np.ndarray, turns: Mapping[int, int
     """
     if not residual.any():
         return None
-    bench = Bench(track, residual)
+    bench = WaveCrossValidation(track, residual)
     others = {j: _lobes(coherence(track, j, residual))[turns[j] - TURNS[0]] for j in turns if j != joint}
     sources = [joint, *sorted(others, key=lambda j: -others[j])[:1]]
     offers = [tuple((j, order) for order in one) for j in sources for one in family(turns[j])]
@@ -156,7 +156,7 @@ def family(turns: int) -> tuple[tuple[int, ...], ...]:
     )  # fmt: skip
 
 
-def terms(joint: int, waves: Sequence[Wave], nodes: Sequence[float], track: Track | None) -> tuple[Term, ...]:
+def terms(joint: int, waves: Sequence[Wave], nodes: Sequence[float], track: GearTravel | None) -> tuple[DriveTerm, ...]:
     """Return the terms of the ripple in a joint's torque, wave after wave; without a track they reach everywhere."""
     edges = (0.0, *nodes, np.inf)
     found = []
@@ -169,17 +169,17 @@ def terms(joint: int, waves: Sequence[Wave], nodes: Sequence[float], track: Trac
                     settings = (order, *edges[m : m + 3], way, *reach)
                     acts = ((joint, ((source, 1.0),)),)
                     title = f"{name}{label}.{order}{sign}{node:g}Hz"
-                    found.append(Term(title, shape, acts, tuple(float(x) for x in settings)))
+                    found.append(DriveTerm(title, shape, acts, tuple(float(x) for x in settings)))
     return tuple(found)
 
 
-class Bench:
+class WaveCrossValidation:
     """A joint's residual and the columns offered for it: how much of it they explain on blocks left out.
 
     Columns of a wave are made once.
     """
 
-    def __init__(self, track: Track, residual: np.ndarray) -> None:
+    def __init__(self, track: GearTravel, residual: np.ndarray) -> None:
         self._track, self.residual = track, residual
         self._parts = [slice(a, b) for a, b in segments(track.block)]
         self._made: dict[tuple[Wave, tuple[float, ...]], np.ndarray] = {}
@@ -221,14 +221,14 @@ class Bench:
         return self.residual - matrix @ x, x
 
 
-def columns(track: Track, wave: Wave, nodes: Sequence[float]) -> np.ndarray:
+def columns(track: GearTravel, wave: Wave, nodes: Sequence[float]) -> np.ndarray:
     """Return the columns (N, k) of a wave at the samples of a track, in the order of `terms`."""
     q, v = track.q[:, wave[0]], track.v[:, wave[0]]
     seen = Joined(q, v, np.zeros_like(q))
     return np.stack([one.form.values(seen, one.settings) for one in terms(wave[0], (wave,), nodes, None)], axis=1)
 
 
-def coherence(track: Track, source: int, residual: np.ndarray) -> np.ndarray:
+def coherence(track: GearTravel, source: int, residual: np.ndarray) -> np.ndarray:
     """Return S(k) of all whole orders k of a gear from 0 on, (CELLS / 2 + 1,); see the module."""
     q, v = track.q[:, source], track.v[:, source]
     speed = np.abs(v)
@@ -254,7 +254,7 @@ def _lobes(power: np.ndarray) -> np.ndarray:
 
 
 def _climb(
-    bench: Bench, offer: Callable[[np.ndarray], Sequence[tuple[Wave, ...]]], pays: float, most: int = 12
+    bench: WaveCrossValidation, offer: Callable[[np.ndarray], Sequence[tuple[Wave, ...]]], pays: float, most: int = 12
 ) -> tuple[tuple[Wave, ...], float, float]:
     """Return the waves taken one set after the other as long as left-out blocks gain, their share, and the ridge."""
     taken: tuple[Wave, ...] = ()
@@ -271,7 +271,7 @@ def _climb(
     return (taken, best, ridge) if best >= WORTH else ((), 0.0, ridge)
 
 
-def _free(track: Track, joint: int, rest: np.ndarray) -> list[tuple[Wave, ...]]:
+def _free(track: GearTravel, joint: int, rest: np.ndarray) -> list[tuple[Wave, ...]]:
     """Return the most coherent order of the joint's own gear, and the most coherent two that are two apart."""
     power = coherence(track, joint, rest)
     order = LOWEST + int(np.argmax(power[LOWEST : HIGHEST + 1]))

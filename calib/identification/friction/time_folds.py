@@ -14,7 +14,7 @@ ITERATIONS = 12
 
 
 @dataclass(frozen=True, eq=False)
-class Bench:
+class CrossValidation:
     """Triangles of all candidate columns by (block, row), and how they are weighed.
 
     Attributes:

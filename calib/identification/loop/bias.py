@@ -16,7 +16,7 @@ from calib.identification.cases import Case
 from calib.identification.loop.loop_recordings import ClosedLoops, close_loops
 from calib.identification.loop.loop_settings import per_joint
 from calib.identification.methods.instrumental import Instrumental, identify_instrumental
-from calib.identification.settings import Settings
+from calib.identification.settings import IdentificationSettings
 from calib.robot.chain import Chain
 
 FOLLOWS = 10.0  # [%] of a joint's motion by which the simulated robot may miss the recorded one (our choice)
@@ -50,7 +50,7 @@ class LoopTest:
         return told + (_blurred(self) if method == "iv" else _words(self.found))
 
 
-def require_loop(settings: Settings) -> Settings:
+def require_loop(settings: IdentificationSettings) -> IdentificationSettings:
     """Return the settings of method ``iv``, whose model is one that can be simulated.
 
     Raises:
@@ -73,7 +73,7 @@ def require_loop(settings: Settings) -> Settings:
 
 def try_loop(
     chain: Chain, model: IdentificationModel, base: Base, cases: Sequence[Case], decimator: Decimator,
-    settings: Settings,
+    settings: IdentificationSettings,
 ) -> LoopTest:  # fmt: skip
     """Return the IV estimate of the standard model; nothing without a loop.
 

@@ -30,7 +30,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from calib.dynamics.bodies import standard_parameters
-from calib.dynamics.drives import Term, added_inertia, standard
+from calib.dynamics.drives import DriveTerm, added_inertia, standard
 from calib.dynamics.rigid_body import mass_matrix
 from calib.errors import CalibError
 from calib.identification.cases import Case
@@ -174,7 +174,7 @@ def _possible(robot: Plant, reference: Reference) -> tuple[Plant, np.ndarray]:
     return Plant(tree, (*robot.terms, *extra), np.concatenate([robot.parameters, added])), added
 
 
-def _softer(one: Term, value: float, size: np.ndarray, reference: Reference) -> Term:
+def _softer(one: DriveTerm, value: float, size: np.ndarray, reference: Reference) -> DriveTerm:
     """Return a term whose sign the simulator can integrate at this control period."""
     if one.shape not in ("sign", "stribeck"):
         return one

@@ -27,14 +27,14 @@ from calib.dynamics.idim import IdentificationModel
 from calib.errors import CalibError, NotConverged, UsageError
 from calib.estimation import instrumental_variables
 from calib.estimation.constrained import Constrained, within
-from calib.estimation.instrumental_variables import Instruments, Strength, Verdict
+from calib.estimation.instrumental_variables import ExogeneityTest, Instruments, InstrumentStrength
 from calib.estimation.linear import LinearFit, settled_std, wls
 from calib.estimation.triangles import absorb, empty, residual_squares, select
 from calib.estimation.whiteness import inflation
 from calib.identification.cases import Case
 from calib.identification.prediction import carried_columns
-from calib.identification.rows import Rows, observe
-from calib.simulation.loop.closed_loop import Plant, Run, Sensing, inertia_diagonal, simulate, with_parameters
+from calib.identification.rows import ObservationRows, observe
+from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, inertia_diagonal, simulate, with_parameters
 from calib.simulation.loop.controllers import Controller, scaled
 from calib.simulation.loop.references import Reference
 
@@ -62,7 +62,7 @@ class Loop:
     design: np.ndarray | None = None
 
 
-Runs = list[tuple[tuple[Case, Loop], Run]]
+Runs = list[tuple[tuple[Case, Loop], SimulatedRun]]
 
 
 @dataclass(frozen=True)
@@ -105,8 +105,8 @@ class Instrumental:
     columns: np.ndarray
     plant: Plant
     rounds: tuple[Round, ...]
-    strength: Strength
-    verdict: Verdict
+    strength: InstrumentStrength
+    verdict: ExogeneityTest
     std: np.ndarray
     inflation: float
     distance: np.ndarray
@@ -211,7 +211,7 @@ class _Task:
     kept: np.ndarray
     cases: Sequence[tuple[Case, Loop]]
     decimator: Decimator
-    observed: Sequence[Rows]
+    observed: Sequence[ObservationRows]
     method: str
     positive: Sequence[str]
 
@@ -268,7 +268,7 @@ def _result(
     )  # fmt: skip
 
 
-def simulated_case(case: Case, run: Run, loop: Loop) -> Case:
+def simulated_case(case: Case, run: SimulatedRun, loop: Loop) -> Case:
     """Return the case with the simulated motion at the instants of the recorded one, filtered like that one.
 
     The same low-pass and differences: what they do to a motion (they round off reversals) is in W and in Z alike, and
@@ -343,7 +343,7 @@ def _simulate_new(old: Plant, new: Plant, cases: Sequence[tuple[Case, Loop]]) ->
     raise NotConverged(f"the estimate cannot be simulated, nor anything near: {problem}", new)
 
 
-def _stack(observed: Sequence[Rows], simulated: Sequence[np.ndarray]) -> Instruments:
+def _stack(observed: Sequence[ObservationRows], simulated: Sequence[np.ndarray]) -> Instruments:
     """Return the triangles of [Z W y], one group per torque row."""
     problem: Instruments | None = None
     for rows, z in zip(observed, simulated, strict=True):
@@ -357,7 +357,7 @@ def _stack(observed: Sequence[Rows], simulated: Sequence[np.ndarray]) -> Instrum
     return problem
 
 
-def _ordinary(observed: Sequence[Rows]) -> LinearFit:
+def _ordinary(observed: Sequence[ObservationRows]) -> LinearFit:
     """Return weighted least squares of the rows as they are."""
     count, first = observed[0].target.shape[1], observed[0]
     data = empty(first.names, first.units, count)
@@ -377,7 +377,7 @@ def _estimate(problem: Instruments, method: str, std: np.ndarray, tau: float = 1
     return wls(simulated, std, np.full(problem.data.groups, tau))
 
 
-def _inflation(observed: Sequence[Rows], fit: LinearFit) -> float:
+def _inflation(observed: Sequence[ObservationRows], fit: LinearFit) -> float:
     """Return how many rows count as one, the mean over torque rows of the residuals' integrated autocorrelation."""
     series = [rows.target - rows.matrix @ fit.estimate.values for rows in observed]
     longest = max(series, key=len)

@@ -15,7 +15,7 @@ from calib.estimation.total import tls
 from calib.estimation.triangles import Triangles, residual_squares
 from calib.estimation.whiteness import inflation
 from calib.identification.friction.time_folds import estimate
-from calib.identification.rows import Rows, pool
+from calib.identification.rows import ObservationRows, pool
 
 METHODS = ("ols", "wls", "irls", "tls", "iv")
 COLUMN_NOISE = 0.01  # of a column's rms: what filtered derivatives miss (our choice)
@@ -33,7 +33,7 @@ ASSUMES = {
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class MethodEstimate:
     """A fit of base parameters.
 
     Attributes:
@@ -56,12 +56,12 @@ class Fitted:
 
 
 def fit_rows(
-    all_rows: Sequence[Rows],
+    all_rows: Sequence[ObservationRows],
     data: Triangles,
     method: str = "wls",
     exact: bool = True,
     noise: np.ndarray | None = None,
-) -> Fitted:
+) -> MethodEstimate:
     """Estimate the columns' parameters, with a covariance that knows that residuals are correlated in time.
 
     Args:
@@ -89,7 +89,7 @@ def fit_rows(
         fit = _tls(pooled, std)
     else:
         fit = wls(pooled, std, tau)
-    return Fitted(fit, pooled, std, tau, method)
+    return MethodEstimate(fit, pooled, std, tau, method)
 
 
 def scaled(noise: np.ndarray | None, std: np.ndarray, counts: np.ndarray) -> np.ndarray:
@@ -102,7 +102,9 @@ def scaled(noise: np.ndarray | None, std: np.ndarray, counts: np.ndarray) -> np.
     return std if noise is None else noise * np.sqrt(np.average((std / noise) ** 2, weights=np.maximum(counts, 1)))
 
 
-def _least_norm(all_rows: Sequence[Rows], pooled: Triangles, method: str, noise: np.ndarray | None) -> Fitted:
+def _least_norm(
+    all_rows: Sequence[ObservationRows], pooled: Triangles, method: str, noise: np.ndarray | None
+) -> MethodEstimate:
     """Return a fit whose values serve for its residuals alone: a prior will decide what the data leave open."""
     std, tau = np.ones(pooled.groups), np.ones(pooled.groups)
     values = np.zeros(pooled.parameters)
@@ -113,10 +115,10 @@ def _least_norm(all_rows: Sequence[Rows], pooled: Triangles, method: str, noise:
     covariance = np.zeros((pooled.parameters, pooled.parameters))
     holder = Estimate(pooled.names, pooled.units, values, covariance, 1.0, int(pooled.rows.sum()))
     tau = residual_inflation(all_rows, values)
-    return Fitted(LinearFit(holder, std, np.inf, np.inf), pooled, std, tau, method)
+    return MethodEstimate(LinearFit(holder, std, np.inf, np.inf), pooled, std, tau, method)
 
 
-def residual_inflation(all_rows: Sequence[Rows], values: np.ndarray) -> np.ndarray:
+def residual_inflation(all_rows: Sequence[ObservationRows], values: np.ndarray) -> np.ndarray:
     """Return the integrated autocorrelation of each row's residuals (rows,), averaged over cases by length."""
     rows = all_rows[0].target.shape[1]
     total, weight = np.zeros(rows), 0.0
@@ -127,7 +129,7 @@ def residual_inflation(all_rows: Sequence[Rows], values: np.ndarray) -> np.ndarr
     return np.maximum(total / max(weight, 1.0), 1.0)
 
 
-def _irls(all_rows: Sequence[Rows], inflated: float) -> LinearFit:
+def _irls(all_rows: Sequence[ObservationRows], inflated: float) -> LinearFit:
     matrix = np.concatenate([part.matrix for part in all_rows])
     target = np.concatenate([part.target for part in all_rows])
     present = np.concatenate([part.present for part in all_rows])

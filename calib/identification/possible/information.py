@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
+class Information:
     """An identified model with what its data say.
 
     Attributes:
@@ -82,7 +82,7 @@ def information(found: Identification) -> np.ndarray:
     rows = [combine(fitted.pooled, fitted.std * np.sqrt(fitted.inflation))]
     count = len(found.names) - own
     if count:
-        group = np.concatenate([np.full(own, -1), found.climb.groups]).astype(int)
+        group = np.concatenate([np.full(own, -1), found.friction.groups]).astype(int)
         from calib.identification.friction.time_folds import estimate
 
         known = None if found.prior is None else _widened(found.prior.rows, count)
@@ -97,7 +97,7 @@ def _widened(rows: np.ndarray, more: int) -> np.ndarray:
     return np.hstack([rows[:, :-1], np.zeros((len(rows), more)), rows[:, -1:]])
 
 
-def read(folder: str | Path) -> Told:
+def read(folder: str | Path) -> Information:
     """Read what an identification left in `folder`.
 
     Raises:
@@ -118,7 +118,7 @@ def read(folder: str | Path) -> Told:
             raise ValueError("files of different sizes")
     except (OSError, KeyError, ValueError) as error:
         raise RobotError(f"{folder}: estimate.csv, covariance.csv and dynamics.json do not agree: {error}") from error
-    return Told(chain, dynamics, names, units, values, covariance, transform, factor, rested)
+    return Information(chain, dynamics, names, units, values, covariance, transform, factor, rested)
 
 
 def whitened(values: np.ndarray, covariance: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ import scipy.linalg
 from calib.dynamics import pseudo_inertia
 from calib.errors import NotConverged
 from calib.estimation.triangles import retriangulate
-from calib.identification.possible.information import Told
+from calib.identification.possible.information import Information
 from calib.identification.possible.problem import BodyCost
 
 LARGEST = 1e3  # of tr(P⁰⁻¹ P) / 4: keeps what the data do not see finite
@@ -65,7 +65,7 @@ def nearest(problem: BodyCost, spared: int | None = None) -> np.ndarray:
     return result
 
 
-def blame(problem: BodyCost, told: Told, most: int = 3) -> tuple[tuple[str, float], ...]:
+def blame(problem: BodyCost, told: Information, most: int = 3) -> tuple[tuple[str, float], ...]:
     """Return whose possibility costs most: label or name, and the distance left without the demand on it."""
     model = told.dynamics.model
     found = [(f"body {label}", i) for i, label in enumerate(model.tree.labels)]

@@ -21,7 +21,7 @@ TOTALS = tuple(float(10.0 ** (k / 2)) for k in range(0, 7))  # [kg] of an arm wi
 
 
 @dataclass(frozen=True, eq=False)
-class References:
+class PriorBodies:
     """One body per body of a model.
 
     Attributes:
@@ -43,7 +43,7 @@ class References:
         object.__setattr__(self, "drawn", frozen(self.drawn, bool))
 
 
-def find_references(chain: Chain, model: IdentificationModel) -> Iterator[References]:
+def find_prior_bodies(chain: Chain, model: IdentificationModel) -> Iterator[PriorBodies]:
     """Yield the references between which the evidence decides: one of the CAD, or rods of several total masses."""
     carried = model.tree.coordinates < 0
     if chain.inertias is not None and chain.inertias[:, 9].max() > 0.0:
@@ -52,10 +52,10 @@ def find_references(chain: Chain, model: IdentificationModel) -> Iterator[Refere
     for total in TOTALS:
         rods = _rods(chain, model, total)
         words = f"no masses in the robot's description: rods between the joints, {total:.3g} kg in all, by the evidence"
-        yield References(rods, ~carried, False, words)
+        yield PriorBodies(rods, ~carried, False, words)
 
 
-def _cad(chain: Chain, model: IdentificationModel, carried: np.ndarray) -> References:
+def _cad(chain: Chain, model: IdentificationModel, carried: np.ndarray) -> PriorBodies:
     bodies = np.zeros((model.tree.bodies, 10))
     own = standard_parameters(chain).reshape(-1, 10)
     bodies[: len(own)] = own
@@ -70,7 +70,7 @@ def _cad(chain: Chain, model: IdentificationModel, carried: np.ndarray) -> Refer
             bodies[i] = _thickened(own[i])
             if pseudo_inertia.margin(own[i]) < 0.0:
                 notes.append(f"the CAD's inertia of body {label} belongs to no possible body: drawn to the nearest one")
-    return References(bodies, drawn, True, "the inertias of the robot's description", tuple(notes))
+    return PriorBodies(bodies, drawn, True, "the inertias of the robot's description", tuple(notes))
 
 
 def _thickened(body: np.ndarray) -> np.ndarray:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.dynamics import pseudo_inertia
-from calib.identification.possible.information import Told
-from calib.identification.possible.prior_bodies import References
+from calib.identification.possible.information import Information
+from calib.identification.possible.prior_bodies import PriorBodies
 from calib.identification.prior import DRIVES, POSITIVE, ROTOR
 
 WEAK = 2.0  # γ of payloads: nothing is known of them but the order of size
@@ -48,7 +48,7 @@ class BodyCost:
         return self.lift * np.where(self.drawn, gamma, WEAK)
 
 
-def make_problem(told: Told, references: References) -> BodyCost:
+def make_problem(told: Information, references: PriorBodies) -> BodyCost:
     """Return the cost of an identified model; sizes of drive terms come from the torque they could explain."""
     model = told.dynamics.model
     bodies = model.tree.bodies

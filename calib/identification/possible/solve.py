@@ -44,8 +44,8 @@ from calib.dynamics import pseudo_inertia
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import NotConverged, UsageError
 from calib.identification.possible import nearest as border
-from calib.identification.possible.information import Told
-from calib.identification.possible.prior_bodies import References, find_references
+from calib.identification.possible.information import Information
+from calib.identification.possible.prior_bodies import PriorBodies, find_prior_bodies
 from calib.identification.possible.problem import BodyCost, make_problem
 from calib.identification.prediction import Dynamics
 
@@ -98,7 +98,7 @@ class Consistent:
         return self.nearest <= self.allowed
 
 
-def find_consistent(told: Told, weight: float | None = None) -> Consistent:
+def find_consistent(told: Information, weight: float | None = None) -> Consistent:
     """Return the full standard parameters of an identified model.
 
     Args:
@@ -114,7 +114,7 @@ def find_consistent(told: Told, weight: float | None = None) -> Consistent:
     if model.kind == "drive":
         raise UsageError("the model holds drives alone (kind 'drive'): there are no bodies to make consistent")
     allowed = float(np.sqrt(chi2.ppf(0.95, told.b)))
-    choices = [(references, make_problem(told, references)) for references in find_references(told.chain, model)]
+    choices = [(references, make_problem(told, references)) for references in find_prior_bodies(told.chain, model)]
     away, problem = min(
         ((told.distance(border.nearest(problem)), problem) for _, problem in choices[:: max(len(choices) - 1, 1)]),
         key=lambda pair: pair[0],
@@ -136,8 +136,8 @@ def find_consistent(told: Told, weight: float | None = None) -> Consistent:
 
 
 def _candidates(
-    references: References, problem: BodyCost, weight: float | None, doubt: float
-) -> Iterator[tuple[float, float, BodyCost, np.ndarray, References]]:
+    references: PriorBodies, problem: BodyCost, weight: float | None, doubt: float
+) -> Iterator[tuple[float, float, BodyCost, np.ndarray, PriorBodies]]:
     """Yield the optimum of each weight with its evidence, the data's sigmas widened by `doubt`."""
     doubted = replace(problem, factor=problem.factor / doubt)
     usual = [g for g in WEIGHTS if g >= LEAST] if references.cad else WEIGHTS[4::3]
@@ -259,7 +259,7 @@ def _scaled(problem: BodyCost, pseudo: np.ndarray) -> np.ndarray:
 
 
 def _notes(
-    model: IdentificationModel, told: Told, problem: BodyCost, values: np.ndarray, allowed: float
+    model: IdentificationModel, told: Information, problem: BodyCost, values: np.ndarray, allowed: float
 ) -> Sequence[str]:
     """Return what stands out: a distance beyond the covariance, bodies thinner than a millimetre."""
     found = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,12 @@ from calib.identification.gains import DriveGains
 from calib.identification.methods.least_squares import ASSUMES
 from calib.identification.model_file import in_unit, to_table
 from calib.identification.possible.information import information
-from calib.identification.scores import Part, Score
+from calib.identification.scores import Score, TorqueErrors
 from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.loop_tables import loop_table, write_instrumental
 from calib.procedure.dynamic_stage.tracking import tracking_table
+from calib.procedure.dynamic_stage.verdict import resting_parameters
 from calib.procedure.kinematic_stage import robot_file
 from calib.robot import description
 
@@ -106,7 +108,9 @@ def estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:
     estimate = found.fitted.estimate
     words = [line.split(" = ", 1)[1] for line in expressions(found.base)]
     off = switched_off(found.names, found.base.b, estimate.sigma)
-    words += [f"{one.shape}, switched off: not measured" if one.name in off else one.shape for one in found.climb.terms]
+    words += [
+        f"{one.shape}, switched off: not measured" if one.name in off else one.shape for one in found.friction.terms
+    ]
     carried = outcome.carried
     sigmas = estimate.sigma if carried is None else carried.sigma
     parts = [None] * len(sigmas) if carried is None or carried.geometry is None else carried.sigma_geometry.tolist()
@@ -145,7 +149,7 @@ def switched_off(names: Sequence[str], base: int, sigma: np.ndarray) -> tuple[st
 def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
     """Return the content of ``metrics.json``."""
     found = outcome.found
-    essential = found.base.b + len(found.climb.terms)
+    essential = found.base.b + len(found.friction.terms)
     if found.elimination is not None:
         essential = len(found.elimination.kept)
     return {
@@ -156,7 +160,7 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
         },
         "parameters": {
             "standard": found.dynamics.model.p,
-            "base": found.base.b + len(found.climb.terms),
+            "base": found.base.b + len(found.friction.terms),
             "essential": essential,
         },
         "counts": {"without_effect": len(found.base.without_effect), "regrouped": len(found.base.regrouped)},
@@ -164,7 +168,7 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
         "drive_gains": gain_table(outcome.inputs.gains, outcome.inputs.unit),
         "rows": list(row_labels(found.settings.kind, outcome.inputs.chain.n)),
         "condition_number": {"raw": _finite(found.condition[0]), "normalised": _finite(found.condition[1])},
-        "friction": found.climb.chosen,
+        "friction": found.friction.chosen,
         "switched_off": list(switched_off(found.names, found.base.b, found.fitted.estimate.sigma)),
         "method": found.fitted.method,
         "method_assumes": ASSUMES[found.fitted.method],
@@ -178,7 +182,7 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
                 "kept": rung.kept,
                 "note": rung.note,
             }
-            for rung in found.rungs
+            for rung in found.friction.steps
         ],
         "ripple": [
             {
@@ -194,6 +198,7 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
         "filters": {case.name: filter_table(case.motion) for case in (*outcome.inputs.cases, *outcome.inputs.unseen)},
         "geometry": geometry_tables.metrics(outcome.carried, outcome.geometries),
         "repeated": dict(outcome.repeated),
+        "resting": asdict(resting_parameters(found)),
         "warnings": list(outcome.warnings),
         "verdict": outcome.verdict.level,
         "reason": outcome.verdict.reason,
@@ -233,7 +238,7 @@ def score_table(found: Score) -> dict[str, Any]:
     }
 
 
-def part_table(part: Part) -> dict[str, Any]:
+def part_table(part: TorqueErrors) -> dict[str, Any]:
     relative = {"total": _finite(part.total), "joints": [_finite(x) for x in part.joints]}
     return {"relative_error_percent": relative, "rms": [_finite(x) for x in part.rms], "samples": part.samples}
 

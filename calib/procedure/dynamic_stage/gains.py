@@ -18,7 +18,7 @@ from calib.identification.identify import common_decimator, find_base, first_fit
 from calib.identification.identify_options import FileSettings, IdentifyOptions, file_settings
 from calib.identification.model_file import TORQUE
 from calib.identification.rows import observe, pool, triangulate, with_blocks
-from calib.identification.settings import Settings, make_model
+from calib.identification.settings import IdentificationSettings, make_model
 from calib.robot.chain import Chain
 
 
@@ -137,7 +137,11 @@ def relative_warnings(unit: str) -> tuple[str, ...]:
 
 
 def _identify(
-    chain: Chain, cases: Sequence[Case], settings: Settings, known: Mapping[str, float], reference: int | None
+    chain: Chain,
+    cases: Sequence[Case],
+    settings: IdentificationSettings,
+    known: Mapping[str, float],
+    reference: int | None,
 ) -> DriveGains:
     model = make_model(chain, settings)
     base = find_base(chain, model, settings, None, cases)

@@ -26,8 +26,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from calib import files
-from calib.identification.geometry_uncertainty import NOTHING, TILTS, Propagation
-from calib.identification.two_geometries import Comparison
+from calib.identification.geometry_uncertainty import NOTHING, TILTS, GeometryUncertainty
+from calib.identification.two_geometries import GeometryComparison
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.kinematic_stage import robot_file
 
@@ -63,7 +63,7 @@ def write(outcome: IdentificationOutcome, folder: Path) -> None:
         robot_file.write_chain_covariance(names, covariance[np.ix_(own, own)], folder)
 
 
-def ranking(carried: Propagation) -> np.ndarray:
+def ranking(carried: GeometryUncertainty) -> np.ndarray:
     """Return the elements' indices: by the largest shift that one σ of theirs causes, then the ones without any σ."""
     known = np.isfinite(carried.deviations)
     unit = _per_sigma(carried).max(axis=0, initial=0.0)
@@ -71,7 +71,7 @@ def ranking(carried: Propagation) -> np.ndarray:
     return np.lexsort((-size, ~known))
 
 
-def effects(carried: Propagation) -> list[tuple[Any, ...]]:
+def effects(carried: GeometryUncertainty) -> list[tuple[Any, ...]]:
     """Return the rows of ``geometry_effects.csv`` (`HEADER`), the most harmful element first.
 
     shift_sigma: of the parameter that moves most, by one σ of the element, in that parameter's σ from torque noise;
@@ -98,7 +98,7 @@ def effects(carried: Propagation) -> list[tuple[Any, ...]]:
     return found
 
 
-def geometries(found: Comparison, essential: Sequence[str]) -> list[tuple[Any, ...]]:
+def geometries(found: GeometryComparison, essential: Sequence[str]) -> list[tuple[Any, ...]]:
     """Return the rows of ``geometries.csv``: each parameter on the nominal and on the calibrated geometry."""
     return [
         (
@@ -120,7 +120,7 @@ def essential_names(outcome: IdentificationOutcome) -> tuple[str, ...]:
     return tuple(own[name] for name in found.elimination.essential.estimate.names)
 
 
-def metrics(carried: Propagation | None, compared: Comparison | None) -> dict[str, Any] | None:
+def metrics(carried: GeometryUncertainty | None, compared: GeometryComparison | None) -> dict[str, Any] | None:
     """Return the entry ``geometry`` of ``metrics.json``."""
     if carried is None:
         return None
@@ -137,7 +137,7 @@ def metrics(carried: Propagation | None, compared: Comparison | None) -> dict[st
     }
 
 
-def summary(carried: Propagation) -> str:
+def summary(carried: GeometryUncertainty) -> str:
     """Say in a sentence what the geometry's uncertainty changes."""
     if carried.geometry is None:
         return (
@@ -178,20 +178,20 @@ def lines(outcome: IdentificationOutcome) -> Iterator[RenderableType]:
     yield table
 
 
-def tilt(carried: Propagation) -> tuple[str, float]:
+def tilt(carried: GeometryUncertainty) -> tuple[str, float]:
     """Return which parameter 1 mrad of tilt of the base against gravity moves most, and by how many σ of torque."""
     size = 1e-3 * _per_sigma(carried)[:, -len(TILTS) :].max(axis=1, initial=0.0)
     worst = int(np.argmax(size))
     return carried.names[worst], float(size[worst])
 
 
-def _per_sigma(carried: Propagation) -> np.ndarray:
+def _per_sigma(carried: GeometryUncertainty) -> np.ndarray:
     """Return |dφ/dg| in σ of torque noise (p, K + 2); zero where a parameter has no σ."""
     sigma = carried.sigma_torque[:, None]
     return np.divide(np.abs(carried.sensitivity), sigma, out=np.zeros(carried.sensitivity.shape), where=sigma > 0.0)
 
 
-def _largest(compared: Comparison) -> list[dict[str, Any]]:
+def _largest(compared: GeometryComparison) -> list[dict[str, Any]]:
     """Return the five parameters that differ most between the geometries, in their total σ, and by how much [%]."""
     size = (compared.values[0] - compared.values[1]) / np.where(compared.sigma[1] > 0.0, compared.sigma[1], np.inf)
     return [

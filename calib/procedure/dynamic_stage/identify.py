@@ -19,16 +19,23 @@ from calib.errors import UsageError
 from calib.identification.cases import Case, case_names, make_case, row_labels
 from calib.identification.friction.passivity import driven
 from calib.identification.gains import DriveGains
-from calib.identification.geometry_uncertainty import Propagation, propagate
+from calib.identification.geometry_uncertainty import GeometryUncertainty, propagate
 from calib.identification.identify import Identification, identify
 from calib.identification.identify_options import FileSettings, IdentifyOptions, file_settings
-from calib.identification.prediction import predict
+from calib.identification.prediction import Dynamics, predict
 from calib.identification.scores import Score, score
-from calib.identification.settings import Settings
-from calib.identification.two_geometries import Comparison, compare
+from calib.identification.settings import IdentificationSettings
+from calib.identification.two_geometries import GeometryComparison, compare
 from calib.procedure.dynamic_stage.gains import FoundGains, find_gains, relative_warnings
 from calib.procedure.dynamic_stage.tracking import Tracking, track
-from calib.procedure.dynamic_stage.verdict import judge, warnings, with_prior
+from calib.procedure.dynamic_stage.verdict import (
+    Resting,
+    judge,
+    model_warnings,
+    resting_parameters,
+    warnings,
+    with_prior,
+)
 from calib.procedure.kinematic_stage import robot_file
 from calib.procedure.kinematic_stage.inputs import joint_kinds
 from calib.procedure.kinematic_stage.verdict import Verdict
@@ -101,8 +108,8 @@ class IdentificationOutcome:
     verdict: Verdict
     seed: int = 0
     extra: Mapping[str, object] = field(default_factory=dict)
-    carried: Propagation | None = None
-    geometries: Comparison | None = None
+    carried: GeometryUncertainty | None = None
+    geometries: GeometryComparison | None = None
     tracking: Tracking = field(default_factory=Tracking)
 
 
@@ -154,44 +161,102 @@ def gather(
     )  # fmt: skip
 
 
+@dataclass(frozen=True, eq=False)
+class Assessment:
+    """A model beside the recordings, and what that comes to.
+
+    Attributes:
+        fit, validation: case name → its score.
+        predictions: case name → predicted torques (N, rows) at the full rate.
+        repeated: validation case → share of its states that the training motion has been in, where it is no proof.
+        excitation: case name → what the motion can tell.
+        verdict: as of `calib.procedure.dynamic_stage.verdict`.
+        warnings: what a user should know of the recordings, and of the model.
+    """
+
+    fit: Mapping[str, Score]
+    validation: Mapping[str, Score]
+    predictions: Mapping[str, np.ndarray]
+    repeated: Mapping[str, float]
+    excitation: Mapping[str, ExcitationReport]
+    verdict: Verdict
+    warnings: tuple[str, ...]
+
+
 def run(inputs: IdentificationInputs, progress: Progress | None = None) -> IdentificationOutcome:
     """Identify, predict every recording, and judge."""
     say, settings = progress or (lambda words: None), inputs.options.settings
     found = identify(inputs.chain, inputs.cases, settings, inputs.nominal, progress)
-    wrong = driven(found.dynamics, inputs.cases)
+    wrong = driven(found.dynamics, inputs.cases)  # refused before hours go into the geometry's share
     carried, geometries = carry(inputs, found, say)
+    excitation = {case.name: report_excitation(case.motion) for case in inputs.cases}
+    amperes = relative_warnings(inputs.unit)
+    said = *amperes, *model_warnings(inputs.cases, found, excitation)
+    result = assess(inputs, found.dynamics, resting_parameters(found), said, wrong, progress=say)
+    say("tracking with the model fed forward")
+    tracking = (
+        Tracking(unseen=bool(inputs.unseen), failure=amperes[0]) if amperes
+        else track(inputs.chain, found, inputs.cases, inputs.unseen, result.predictions, inputs.unit)
+    )  # fmt: skip
+    return IdentificationOutcome(
+        inputs, found, result.fit, result.validation, result.predictions, result.repeated, result.excitation,
+        result.warnings, result.verdict, settings.seed, carried=carried, geometries=geometries, tracking=tracking,
+    )  # fmt: skip
+
+
+def assess(
+    inputs: IdentificationInputs,
+    dynamics: Dynamics,
+    rests: Resting,
+    said: Sequence[str],
+    wrong: Sequence[int] | None = None,
+    tolerance: float = 0.0,
+    progress: Progress | None = None,
+) -> Assessment:
+    """Predict every recording and judge: in the command, and of a model read from its folder.
+
+    Args:
+        inputs: recordings to learn from (for the model's own error) and unseen ones.
+        dynamics: the model.
+        rests: its parameters that rest on a prior.
+        said: warnings of the model itself.
+        wrong: joints that friction drives, where that is known already (`friction.passivity.driven`).
+        tolerance: largest error of the torque on unseen motion that is good enough [%]; 0: none.
+    """
+    say = progress or (lambda words: None)
+    wrong = driven(dynamics, inputs.cases) if wrong is None else wrong
     predictions, scores = {}, {}
     for case in (*inputs.cases, *inputs.unseen):
         say(f"predicting {case.name}")
-        predictions[case.name] = predict(found.dynamics, case)
+        predictions[case.name] = predict(dynamics, case)
         scores[case.name] = score(case, predictions[case.name], inputs.options.slow)
-    say("tracking with the model fed forward")
-    amperes = relative_warnings(inputs.unit)
-    tracking = (
-        Tracking(unseen=bool(inputs.unseen), failure=amperes[0]) if amperes
-        else track(inputs.chain, found, inputs.cases, inputs.unseen, predictions, inputs.unit)
-    )  # fmt: skip
     say("judging")
-    shares = {
-        case.name: max(repeats(own.motion, case.motion) for own in inputs.cases) for case in inputs.unseen
-    }  # fmt: skip
+    shares = {case.name: max(repeats(own.motion, case.motion) for own in inputs.cases) for case in inputs.unseen}
     repeated = {name: share for name, share in shares.items() if share >= REPEAT}
     excitation = {case.name: report_excitation(case.motion) for case in inputs.cases}
     fit = {case.name: scores[case.name] for case in inputs.cases}
     validation = {case.name: scores[case.name] for case in inputs.unseen}
-    told = (
-        *amperes, *warnings(inputs.cases, inputs.unseen, found, validation, repeated, excitation, inputs.chain)
-    )  # fmt: skip
-    proofs = {name: found_score for name, found_score in validation.items() if name not in repeated}
-    labels = row_labels(settings.kind, inputs.chain.n)
-    verdict = with_prior(judge(fit, proofs, repeated, excitation, wrong, labels), found)
-    return IdentificationOutcome(
-        inputs, found, fit, validation, predictions, repeated, excitation, told, verdict, settings.seed,
-        carried=carried, geometries=geometries, tracking=tracking,
+    proofs = {name: one for name, one in validation.items() if name not in repeated}
+    labels = row_labels(inputs.options.settings.kind, inputs.chain.n)
+    verdict = with_prior(judge(fit, proofs, repeated, excitation, wrong, labels), rests)
+    told = *warnings(inputs.cases, inputs.unseen, validation, repeated, excitation, inputs.chain), *said
+    return Assessment(
+        fit, validation, predictions, repeated, excitation, tolerated(verdict, proofs, tolerance),
+        tuple(dict.fromkeys(told)),
     )  # fmt: skip
 
 
-def carry(inputs: IdentificationInputs, found: Identification, say: Progress) -> tuple[Propagation, Comparison | None]:
+def tolerated(verdict: Verdict, proofs: Mapping[str, Score], tolerance: float) -> Verdict:
+    """Return the verdict, made to fail where the tolerance [%] is not kept."""
+    worst = max((one.raw.total for one in proofs.values()), default=0.0)
+    if not tolerance or worst <= tolerance:
+        return verdict
+    return replace(verdict, level="fail", reason=f"{verdict.reason}; above the tolerance of {tolerance:g} %")
+
+
+def carry(
+    inputs: IdentificationInputs, found: Identification, say: Progress
+) -> tuple[GeometryUncertainty, GeometryComparison | None]:
     """Return what the geometry's uncertainty adds to the estimate, and the estimate on the nominal geometry beside."""
     carried = propagate(found, inputs.chain, inputs.cases, inputs.geometry, say)
     if inputs.nominal is None:
@@ -205,7 +270,7 @@ def with_choices(options: IdentifyOptions, method: str | None, friction: str | N
     from calib.identification.friction.friction_ladder import NAMES
     from calib.identification.methods.least_squares import METHODS
 
-    settings: Settings = replace(options.settings, seed=seed)
+    settings: IdentificationSettings = replace(options.settings, seed=seed)
     for value, allowed, key in ((method, METHODS, "method"), (friction, NAMES, "friction")):
         if value is None:
             continue

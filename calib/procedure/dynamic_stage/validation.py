@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from calib import files
-from calib.data.signals.persistency import repeats, report_excitation
-from calib.identification.cases import Case, row_labels
+from calib.errors import UsageError
+from calib.identification.cases import Case
 from calib.identification.model_file import read_dynamics
-from calib.identification.prediction import predict
-from calib.identification.scores import Score, score
 from calib.procedure.dynamic_stage.folder import score_table, write_torques
-from calib.procedure.dynamic_stage.identify import REPEAT, IdentificationInputs
-from calib.procedure.dynamic_stage.verdict import judge
-from calib.procedure.kinematic_stage.verdict import Verdict
+from calib.procedure.dynamic_stage.identify import Assessment, IdentificationInputs, assess
+from calib.procedure.dynamic_stage.verdict import Resting
 
 SCHEMA = 1
 POINTS = 400  # samples per curve of the certificate (our choice)
@@ -26,24 +23,10 @@ POINTS = 400  # samples per curve of the certificate (our choice)
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """A model on unseen motion.
-
-    Attributes:
-        inputs: the recordings.
-        fit, validation: case name → its score.
-        predictions: case name → torques (N, rows) by the model.
-        repeated: validation case → share of its states that training has been in, where that makes it no proof.
-        verdict: of the dynamics.
-        warnings: what a user should know.
-    """
+    """A model on unseen motion: the recordings, and what it comes to on them."""
 
     inputs: IdentificationInputs
-    fit: Mapping[str, Score]
-    validation: Mapping[str, Score]
-    predictions: Mapping[str, np.ndarray]
-    repeated: Mapping[str, float]
-    verdict: Verdict
-    warnings: tuple[str, ...]
+    result: Assessment
 
 
 def hold(inputs: IdentificationInputs, folder: Path, tolerance: float = 0.0) -> Held:
@@ -52,63 +35,50 @@ def hold(inputs: IdentificationInputs, folder: Path, tolerance: float = 0.0) -> 
     Args:
         inputs: recordings to learn from (for the model's own error) and unseen ones.
         tolerance: largest error of the torque on unseen motion that is good enough [%]; 0: none.
+
+    Raises:
+        RobotError: where the folder holds no model.
+        UsageError: where its ``metrics.json`` is missing or damaged.
     """
     _, dynamics = read_dynamics(folder)
-    predictions, scores = {}, {}
-    for case in (*inputs.cases, *inputs.unseen):
-        predictions[case.name] = predict(dynamics, case)
-        scores[case.name] = score(case, predictions[case.name], inputs.options.slow)
-    shares = {case.name: max(repeats(own.motion, case.motion) for own in inputs.cases) for case in inputs.unseen}
-    repeated = {name: share for name, share in shares.items() if share >= REPEAT}
-    fit = {case.name: scores[case.name] for case in inputs.cases}
-    validation = {case.name: scores[case.name] for case in inputs.unseen}
-    proofs = {name: one for name, one in validation.items() if name not in repeated}
-    excitation = {case.name: report_excitation(case.motion) for case in inputs.cases}
-    labels = row_labels(inputs.options.settings.kind, inputs.chain.n)
-    verdict = tolerated(judge(fit, proofs, repeated, excitation, rows=labels), proofs, tolerance)
-    told = tuple(
-        f"{name}: {100 * share:.0f} % of its states were met in training: a repeat proves nothing, it is no evidence"
-        for name, share in repeated.items()
-    )
-    return Held(inputs, fit, validation, predictions, repeated, verdict, told)
-
-
-def tolerated(verdict: Verdict, proofs: Mapping[str, Score], tolerance: float) -> Verdict:
-    """Return the verdict, made to fail where the tolerance [%] is not kept."""
-    worst = max((one.raw.total for one in proofs.values()), default=0.0)
-    if not tolerance or worst <= tolerance:
-        return verdict
-    return replace(verdict, level="fail", reason=f"{verdict.reason}; above the tolerance of {tolerance:g} %")
+    try:
+        metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+        known = metrics.get("resting", {})  # an older version does not say it: its warnings do
+        rests = Resting(tuple(known.get("names", ())), known.get("of", 0), known.get("source", ""))
+        said = metrics["warnings"]
+    except (OSError, ValueError, KeyError) as error:
+        raise UsageError(f"{folder}/metrics.json: {error!r}; identify again") from error
+    return Held(inputs, assess(inputs, dynamics, rests, said, tolerance=tolerance))
 
 
 def write(held: Held, folder: Path) -> None:
     """Write ``report.json`` (scores, verdict, curves for the certificate) and a table of unseen torques per file."""
     for number, case in enumerate(held.inputs.unseen, 1):
-        write_torques(case, held.predictions[case.name], folder / f"torques_{number}.csv")
+        write_torques(case, held.result.predictions[case.name], folder / f"torques_{number}.csv")
     files.write_json(folder / "report.json", report(held))
 
 
 def report(held: Held) -> dict[str, Any]:
     """Return scores, verdict and curves as JSON holds them."""
-    chain, kind = held.inputs.chain, held.inputs.options.settings.kind
+    chain, kind, found = held.inputs.chain, held.inputs.options.settings.kind, held.result
     return {
         "schema": SCHEMA,
-        "verdict": held.verdict.level,
-        "reason": held.verdict.reason,
-        "warnings": list(held.warnings),
+        "verdict": found.verdict.level,
+        "reason": found.verdict.reason,
+        "warnings": list(found.warnings),
         "rows": row_names(chain.joint_names, kind),
         "units": ["N" if joint.kind == "prismatic" else "N m" for joint in chain.joints] * (2 if kind == "both" else 1),
-        "fit": {name: score_table(one) for name, one in held.fit.items()},
+        "fit": {name: score_table(one) for name, one in found.fit.items()},
         "validation": {
-            name: score_table(one) | {"evidence": name not in held.repeated} for name, one in held.validation.items()
+            name: score_table(one) | {"evidence": name not in found.repeated} for name, one in found.validation.items()
         },
-        "curves": [_curves(case, held.predictions[case.name]) for case in (held.inputs.unseen or held.inputs.cases)],
+        "curves": [_curves(case, found.predictions[case.name]) for case in (held.inputs.unseen or held.inputs.cases)],
         "autocorrelation": {
             name: {
                 "bound": [None if w is None else w.bound for w in one.whiteness],
                 "values": [None if w is None else [round(float(x), 4) for x in w.acf] for w in one.whiteness],
             }
-            for name, one in (held.validation or held.fit).items()
+            for name, one in (found.validation or found.fit).items()
         },
     }
 

@@ -12,7 +12,7 @@ which of these held.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,6 +37,21 @@ CONDITION = 200.0  # of the observation matrix with columns of unit norm
 MOVES = 0.1  # share of moving rows below which a recording is no motion
 BEND = 1e-4  # rms of link minus motor position that shows elasticity [rad or m]
 SLOW_SHARE = 0.1  # share of samples near standstill from which on Coulomb friction is drawn down
+
+
+@dataclass(frozen=True)
+class Resting:
+    """Base parameters that rest on a prior, not on the motion.
+
+    Attributes:
+        names: theirs.
+        of: how many base parameters there are.
+        source: of the prior: ``cad`` or ``sizes``; empty where there was none.
+    """
+
+    names: tuple[str, ...] = ()
+    of: int = 0
+    source: str = ""
 
 
 def judge(
@@ -128,26 +143,24 @@ def _held_by_joint(verdict: Verdict, scores: Mapping[str, Score], rows: Sequence
     )
 
 
-def with_prior(verdict: Verdict, found: Identification) -> Verdict:
+def with_prior(verdict: Verdict, rests: Resting) -> Verdict:
     """Return the verdict with it said where most parameters are not the motion's: what they are worth, CAD knows."""
-    drawn = resting_names(found)
-    if 2 * len(drawn) <= found.base.b:
+    if 2 * len(rests.names) <= rests.of:
         return verdict
-    source = "the CAD's" if found.prior is not None and found.prior.source == "cad" else "a guess of their sizes"
-    told = f"{len(drawn)} of {found.base.b} parameters are {source}: this motion does not tell them"
+    source = "the CAD's" if rests.source == "cad" else "a guess of their sizes"
+    told = f"{len(rests.names)} of {rests.of} parameters are {source}: this motion does not tell them"
     return replace(verdict, reason=f"{verdict.reason}; {told}")
 
 
 def warnings(
     cases: Sequence[Case],
     unseen: Sequence[Case],
-    found: Identification,
     validation: Mapping[str, Score],
     repeated: Mapping[str, float],
     excitation: Mapping[str, ExcitationReport],
     chain: Chain,
-) -> tuple[str, ...]:
-    """Return what a user should know, worst first."""
+) -> list[str]:
+    """Return what a user should know of the recordings, whatever model was identified, worst first."""
     told = [line for case in (*cases, *unseen) for line in beyond(case, chain)]
     told += [
         f"{name}: {100 * share:.0f} % of its states were met in training: a repeat proves nothing, it is no evidence"
@@ -155,12 +168,18 @@ def warnings(
     ]
     for name, report in excitation.items():
         told += [f"{name}: {note}" for note in report.notes]
-    told += [
+    return told + [
         f"{name}: the robot stands there; its errors are of friction at rest, which no function of q, v, a predicts"
         for name, scored in validation.items()
         if scored.motion_share < MOVES
     ]
-    normalised = found.condition[1]
+
+
+def model_warnings(
+    cases: Sequence[Case], found: Identification, excitation: Mapping[str, ExcitationReport]
+) -> tuple[str, ...]:
+    """Return what a user should know of the model and the motion it was identified from, whatever is unseen."""
+    told, normalised = [], found.condition[1]
     if normalised > CONDITION:
         told.append(
             f"condition number {normalised:.0f} (columns of unit norm): the motion tells some parameters apart badly; "
@@ -172,7 +191,7 @@ def warnings(
     told += _rests(found)
     told += _elastic(cases)
     told += _slow_bias(cases, found)
-    return tuple(dict.fromkeys(told))
+    return tuple(told)
 
 
 def beyond(case: Case, chain: Chain) -> list[str]:
@@ -188,17 +207,18 @@ def beyond(case: Case, chain: Chain) -> list[str]:
     return [f"{case.name}: far beyond the robot's limits ({named}): is this the robot, are the columns in its order?"]
 
 
-def resting_names(found: Identification) -> list[str]:
+def resting_parameters(found: Identification) -> Resting:
     """Return the base parameters that the motion does not tell."""
     if found.prior is None:
-        return []
+        return Resting(of=found.base.b)
     on = resting(found.prior, found.fitted.estimate.covariance)
-    return [name for name, rests in zip(found.base.names, on) if rests]
+    names = tuple(name for name, rests in zip(found.base.names, on) if rests)
+    return Resting(names, found.base.b, found.prior.source)
 
 
 def _rests(found: Identification) -> list[str]:
     """Say which parameters the motion does not tell."""
-    names = resting_names(found)
+    names = resting_parameters(found).names
     if found.prior is None or not names:
         return []
     source = "the robot's own inertias" if found.prior.source == "cad" else "nothing but the order of their sizes"
@@ -248,7 +268,7 @@ def _coulomb_shift(cases: Sequence[Case], found: Identification) -> list[str]:
     """
     if found.settings.kind != "motor":
         return []
-    richer = {joint for one in found.climb.terms for joint, _ in one.acts}
+    richer = {joint for one in found.friction.terms for joint, _ in one.acts}
     index = {j: found.names.index(f"Fc{j + 1}") for j in range(cases[0].motion.n) if f"Fc{j + 1}" in found.names}
     estimate = found.fitted.estimate
     shift, sigma, percent = standstill_shift(found, cases), estimate.sigma, 0.01 * np.abs(estimate.values)

@@ -9,11 +9,11 @@ import numpy as np
 from calib.errors import UsageError
 from calib.procedure.excitation.limits import MotionLimits
 from calib.robot.chain import Chain
-from trajectories.approach import approach
-from trajectories.basis import Motion
-from trajectories.constraints import BoxLimit, Constraint
+from trajectories.approach import straight_approach
+from trajectories.basis import SampledMotion
+from trajectories.constraints import BoxLimit, MotionConstraint
 from trajectories.places import Clearance
-from trajectories.track import Track
+from trajectories.setpoints import Setpoints
 
 ACCELERATION, JERK = 2.0, 20.0  # of an approach, per s and s² times the velocity limit, where nothing else is said
 LEISURE = 1.0  # [rad/s or m/s] an approach is no faster than this (our choice)
@@ -21,7 +21,7 @@ LEISURE = 1.0  # [rad/s or m/s] an approach is no faster than this (our choice)
 
 def approach_to(
     start: Sequence[float], goal: np.ndarray, rate: float, known: MotionLimits, chain: Chain
-) -> tuple[Track, tuple[str, ...]]:
+) -> tuple[Setpoints, tuple[str, ...]]:
     """Return the way from a pose to the start of a motion, a straight line in joint space, and what a user should know.
 
     Velocity, acceleration and jerk come from the limits file, else from the robot and our own choice.
@@ -42,7 +42,7 @@ def approach_to(
         np.where(np.isfinite(sizes.get(order, free)), sizes.get(order, free), factor * velocity)
         for order, factor in ((2, ACCELERATION), (3, JERK))
     )
-    found = approach(here, goal, velocity, acceleration, jerk, rate)
+    found = straight_approach(here, goal, velocity, acceleration, jerk, rate)
     notes = [_place(one, found) for one in known.constraints if not isinstance(one, BoxLimit)]
     return found, tuple(note for note in notes if note)
 
@@ -57,11 +57,11 @@ def check_start(start: np.ndarray, chain: Chain, known: MotionLimits) -> None:
             raise UsageError(f"--start: {name} at {value:g} is beyond its limits {lower:.4g} to {upper:.4g}")
 
 
-def _place(limit: Constraint, track: Track) -> str:
+def _place(limit: MotionConstraint, track: Setpoints) -> str:
     """Return a note where an approach leaves the workspace, which a robot may; refuse one that comes too near."""
     rows = np.unique(np.linspace(0, len(track) - 1, 500).astype(int))
     parts = (track.times, track.q, track.v, track.a, np.zeros(track.q.shape))
-    values = limit.values(Motion(*(x[rows] for x in parts)))
+    values = limit.values(SampledMotion(*(x[rows] for x in parts)))
     if values.max() <= 0:
         return ""
     k, column = (int(i) for i in np.unravel_index(np.argmax(values), values.shape))

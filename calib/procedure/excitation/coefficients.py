@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.errors import UsageError
-from trajectories.bspline import bspline
+from trajectories.bspline import bspline_family
 from trajectories.errors import BadInput
 from trajectories.fourier import evaluate
 
@@ -55,7 +55,7 @@ class Periodic:
         if self.kind == "fourier":
             q, v, a = (evaluate(self.coefficients, self.period, times, order) for order in range(3))
             return q, v, a
-        family = bspline([len(c) for c in self.coefficients], self.period, degree=self.degree, rest=False)
+        family = bspline_family([len(c) for c in self.coefficients], self.period, degree=self.degree, rest=False)
         x = family.variables(self.coefficients)
         q, v, a = (family.evaluate(x, times, order) for order in range(3))
         return q, v, a

@@ -15,22 +15,22 @@ from calib.data.poses.fit_options import FitOptions
 from calib.errors import UsageError
 from calib.procedure.excitation.goals import SCALINGS, objective_of, read_goals, scaled, with_conditions
 from calib.procedure.excitation.limits import MotionLimits, read_motion_limits
-from calib.procedure.excitation.locked_joints import Told, read_held, told
-from calib.procedure.excitation.model import Dynamics, read_dynamics
+from calib.procedure.excitation.locked_joints import IdentifiableColumns, read_held, told
+from calib.procedure.excitation.model import ExcitedModel, read_dynamics
 from calib.procedure.excitation.playback import Playback, check_playback, play
 from calib.procedure.excitation.prior_motions import Existing, read_existing
 from calib.procedure.kinematic_stage.inputs import load_robot
 from calib.robot.chain import Chain
 from trajectories.basis import Family, aligned_period
-from trajectories.bspline import bspline
-from trajectories.constraints import Constraint, TorqueLimit
+from trajectories.bspline import bspline_family
+from trajectories.constraints import MotionConstraint, TorqueLimit
 from trajectories.design.objectives import Excitation, TorqueSlack, condition_numbers
 from trajectories.design.optimise import design
 from trajectories.design.pareto import Front, proposed_goals, sweep
-from trajectories.design.problem import Goal, Problem
-from trajectories.design.search import Found
+from trajectories.design.problem import AttainmentGoal, ExcitationProblem
+from trajectories.design.search import SearchResult
 from trajectories.design.verify import Verification, dense_motion, ensured
-from trajectories.fourier import fourier
+from trajectories.fourier import fourier_family
 
 GUARD = 0.2  # share of the torque limits kept free where no friction is known (our choice)
 INSTANTS = 1000  # over the period, at which condition numbers are reported
@@ -56,18 +56,18 @@ class Designed:
     """
 
     chain: Chain
-    dynamics: Dynamics
+    dynamics: ExcitedModel
     limits: MotionLimits
     family: Family
-    problem: Problem
-    found: Found
+    problem: ExcitationProblem
+    found: SearchResult
     proof: Verification
     condition: dict[str, float]
     goals: tuple[tuple[str, float, float, float], ...]
     front: Front | None
     playback: Playback
     held: Mapping[int, float]
-    told: Told
+    told: IdentifiableColumns
     existing: Existing | None
     rate: float
     kind: str
@@ -143,7 +143,7 @@ def excite(
     columns = told(dynamics, chain, held, None if before is None else before.information)
     known = None if before is None else before.per_sample(samples, repeat * period)
     condition = Excitation("cond", sigmas=columns.sigmas, existing=known, columns=columns.columns)
-    problem = Problem(
+    problem = ExcitationProblem(
         motions, dynamics.smooth.regressor, dynamics.smooth.regressor_gradient,
         tuple((scaled(condition, scaling), 0.5) for scaling in SCALINGS), search, samples=samples,
     )  # fmt: skip
@@ -168,13 +168,13 @@ def excite(
 
 
 def _searched(
-    problem: Problem,
-    wanted: list[tuple[str, Goal]],
+    problem: ExcitationProblem,
+    wanted: list[tuple[str, AttainmentGoal]],
     starts: int,
-    search: Callable[..., Found],
+    search: Callable[..., SearchResult],
     say: Progress,
     condition: Excitation,
-) -> tuple[Found, Problem]:
+) -> tuple[SearchResult, ExcitationProblem]:
     """Search without goals, or for the goals: with a first run that proposes some for the condition numbers."""
     if not wanted:
         return search(problem, starts=starts), problem
@@ -199,7 +199,12 @@ def _reporter(say: Progress) -> Callable[[int, int, str], None]:
 
 
 def condition_of(
-    dynamics: Dynamics, family: Family, found: Found, told: Told, existing: Existing | None = None, repeat: int = 1
+    dynamics: ExcitedModel,
+    family: Family,
+    found: SearchResult,
+    told: IdentifiableColumns,
+    existing: Existing | None = None,
+    repeat: int = 1,
 ) -> dict[str, float]:
     """Return the condition numbers of `INSTANTS` samples over the period, with the model's own Coulomb sign.
 
@@ -267,16 +272,16 @@ def _family(
     values = {j: value for j, value in held.items() if value is not None}
     if kind == "fourier":
         counts = [0 if j in held else harmonics for j in range(chain.n)]
-        return fourier(counts, period, held=values, resonance=limits.resonance, rate=rate)
+        return fourier_family(counts, period, held=values, resonance=limits.resonance, rate=rate)
     if kind == "bspline":
         counts = [1 if j in held else harmonics for j in range(chain.n)]
-        return bspline(counts, period, held=values, rate=rate)
+        return bspline_family(counts, period, held=values, rate=rate)
     raise UsageError(f"family '{kind}' is none of fourier, bspline")
 
 
 def _constraints(
-    dynamics: Dynamics, limits: MotionLimits
-) -> tuple[tuple[Constraint, ...], tuple[Constraint, ...], tuple[str, ...]]:
+    dynamics: ExcitedModel, limits: MotionLimits
+) -> tuple[tuple[MotionConstraint, ...], tuple[MotionConstraint, ...], tuple[str, ...]]:
     """Return what the search keeps, and what is verified: the torque with the model's own Coulomb sign."""
     if dynamics.values is None or not np.isfinite(limits.torque).any():
         return limits.constraints, limits.constraints, ("no torque limit is checked",)
@@ -294,19 +299,19 @@ def _constraints(
     return (*limits.constraints, torque[0]), (*limits.constraints, torque[1]), notes
 
 
-def _reached(problem: Problem, found: Found) -> tuple[tuple[str, float, float, float], ...]:
+def _reached(problem: ExcitationProblem, found: SearchResult) -> tuple[tuple[str, float, float, float], ...]:
     return tuple(
         (goal.objective.name, goal.goal, goal.share, float(value)) for goal, value in zip(problem.goals, found.values)
     )
 
 
 def _front(
-    problem: Problem,
-    dynamics: Dynamics,
+    problem: ExcitationProblem,
+    dynamics: ExcitedModel,
     chain: Chain,
     limits: MotionLimits,
-    found: Found,
-    wanted: list[tuple[str, Goal]],
+    found: SearchResult,
+    wanted: list[tuple[str, AttainmentGoal]],
     count: int,
     condition: Excitation,
     report: Callable[[int, int, str], None],

@@ -12,7 +12,7 @@ from calib import files
 from calib.procedure.excitation import design, motion_files
 from calib.procedure.excitation.design import Designed
 from calib.robot.tables import dumps
-from trajectories.basis import Motion
+from trajectories.basis import SampledMotion
 from trajectories.design.verify import dense_motion
 
 OURS = ("metrics.json", "trajectory.csv", "trajectory.toml")
@@ -47,7 +47,7 @@ def write_folder(designed: Designed, out: Path, draw: Callable[[Designed, Path],
     return out
 
 
-def sampled(designed: Designed) -> Motion:
+def sampled(designed: Designed) -> SampledMotion:
     """Return one period at the controller's rate, both ends included."""
     count = round(designed.period * designed.rate)
     times = np.arange(count + 1) * (designed.period / count)

@@ -12,18 +12,18 @@ import numpy as np
 
 from calib.errors import UsageError
 from calib.procedure.excitation.limits import MotionLimits
-from calib.procedure.excitation.model import Dynamics
+from calib.procedure.excitation.model import ExcitedModel
 from calib.robot.chain import Chain
 from trajectories.design.objectives import Excitation, FrictionCoverage, Objective, Scaling, TorqueSlack
-from trajectories.design.problem import Goal
-from trajectories.design.search import Found
+from trajectories.design.problem import AttainmentGoal
+from trajectories.design.search import SearchResult
 
 SCALINGS: tuple[Scaling, ...] = ("raw", "normalised")
 
 
 def read_goals(
-    texts: Sequence[str], dynamics: Dynamics, chain: Chain, limits: MotionLimits, soft: int, condition: Excitation
-) -> list[tuple[str, Goal]]:
+    texts: Sequence[str], dynamics: ExcitedModel, chain: Chain, limits: MotionLimits, soft: int, condition: Excitation
+) -> list[tuple[str, AttainmentGoal]]:
     """Return the goals said on the command line, by name.
 
     Args:
@@ -38,12 +38,18 @@ def read_goals(
         except ValueError:
             raise UsageError(f"goal '{text}': expected NAME=NUMBER, e.g. wrist=0.1") from None
         objective, goal = objective_of(name, value, dynamics, chain, limits, text, condition)
-        result.append((name, Goal(objective, goal, None if number < soft else 0.0)))
+        result.append((name, AttainmentGoal(objective, goal, None if number < soft else 0.0)))
     return result
 
 
 def objective_of(
-    name: str, value: float, dynamics: Dynamics, chain: Chain, limits: MotionLimits, text: str, condition: Excitation
+    name: str,
+    value: float,
+    dynamics: ExcitedModel,
+    chain: Chain,
+    limits: MotionLimits,
+    text: str,
+    condition: Excitation,
 ) -> tuple[Objective, float]:
     if name in SCALINGS:
         if not value > 1:
@@ -68,8 +74,10 @@ def scaled(condition: Excitation, scaling: Scaling) -> Excitation:
     return replace(condition, scaling=scaling)
 
 
-def with_conditions(wanted: list[tuple[str, Goal]], found: Found, condition: Excitation) -> tuple[Goal, ...]:
+def with_conditions(
+    wanted: list[tuple[str, AttainmentGoal]], found: SearchResult, condition: Excitation
+) -> tuple[AttainmentGoal, ...]:
     """Add the condition numbers with what the first run reached as their goals."""
     both = zip(SCALINGS, found.values)
-    conditions = (Goal(scaled(condition, scaling), float(value)) for scaling, value in both)
+    conditions = (AttainmentGoal(scaled(condition, scaling), float(value)) for scaling, value in both)
     return (*(goal for _, goal in wanted), *conditions)

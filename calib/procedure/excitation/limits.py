@@ -41,9 +41,9 @@ from calib.procedure.kinematic_stage.pose_limits import Limits, read_limits
 from calib.robot.chain import Chain
 from calib.robot.kinematics import element_jacobian, joint_frames, joint_jacobian, sweep
 from calib.robot.tables import check_keys, load, number, vector
-from poses.space import Constraint as PoseConstraint
-from trajectories.basis import Motion
-from trajectories.constraints import BoxLimit, Constraint, box_limits
+from poses.space import PoseConstraint
+from trajectories.basis import SampledMotion
+from trajectories.constraints import BoxLimit, MotionConstraint, box_limits
 from trajectories.places import Clearance, Workspace
 
 STEP = 1e-6  # [rad or m] of the central differences of collision distances (our choice)
@@ -62,7 +62,7 @@ class MotionLimits:
         notes: what a user should know.
     """
 
-    constraints: tuple[Constraint, ...]
+    constraints: tuple[MotionConstraint, ...]
     torque: np.ndarray
     margin: float | None
     deviations: float
@@ -104,7 +104,7 @@ def read_motion_limits(path: Path | None, chain: Chain, source: Path | None = No
     except RobotError as error:
         raise UsageError(str(error)) from error
     linear = [joint.kind == "prismatic" for joint in chain.joints]
-    constraints: list[Constraint] = [*box_limits(found.lower, found.upper, velocity, *bounds, linear=linear)]
+    constraints: list[MotionConstraint] = [*box_limits(found.lower, found.upper, velocity, *bounds, linear=linear)]
     constraints += _places(table, found, points, where)
     if found.collision is not None:
         constraints.append(_clearance(found))
@@ -169,10 +169,10 @@ class PoseLimit:
     def groups(self) -> np.ndarray:
         return np.arange(self.count)
 
-    def values(self, motion: Motion) -> np.ndarray:
+    def values(self, motion: SampledMotion) -> np.ndarray:
         return np.asarray(self.of.function(motion.q), dtype=float)
 
-    def slopes(self, motion: Motion, weights: np.ndarray) -> np.ndarray:
+    def slopes(self, motion: SampledMotion, weights: np.ndarray) -> np.ndarray:
         from poses.space import constraint_gradient
 
         result = np.zeros((4, *motion.q.shape))
@@ -180,7 +180,7 @@ class PoseLimit:
         return result
 
 
-def _places(table: Mapping[str, Any], found: Limits, points: Points, where: str) -> list[Constraint]:
+def _places(table: Mapping[str, Any], found: Limits, points: Points, where: str) -> list[MotionConstraint]:
     """Return the workspace of tip and named points, and what else a pose must keep."""
     target = table.get("target", {})
     radius = number(target["axis_distance"], where, "length") if "axis_distance" in target else None
@@ -190,7 +190,7 @@ def _places(table: Mapping[str, Any], found: Limits, points: Points, where: str)
         lowest, highest = map(float, vector(span, 2, where, "length")) if isinstance(span, list) else (
             number(span, where, "length"), None
         )  # fmt: skip
-    result: list[Constraint] = []
+    result: list[MotionConstraint] = []
     if target.keys() & {"axis_distance", "height"}:
         names = ("tool", *(entry["name"] for entry in table.get("point", [])))
         result.append(Workspace(points, points.product, names, radius, lowest, highest))

@@ -15,7 +15,7 @@ import numpy as np
 from calib.dynamics import base
 from calib.errors import UsageError
 from calib.estimation.base_columns import split_columns
-from calib.procedure.excitation.model import Dynamics
+from calib.procedure.excitation.model import ExcitedModel
 from calib.robot.chain import Chain
 from trajectories.constraints import BoxLimit
 
@@ -23,7 +23,7 @@ INDEPENDENT = 1e-4  # of a column at unit norm that no other one explains (our c
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
+class IdentifiableColumns:
     """What the motion can tell.
 
     Attributes:
@@ -68,8 +68,8 @@ def read_held(texts: Sequence[str], chain: Chain, limits: BoxLimit) -> dict[int,
 
 
 def told(
-    dynamics: Dynamics, chain: Chain, held: Mapping[int, float | None], existing: np.ndarray | None = None
-) -> Told:
+    dynamics: ExcitedModel, chain: Chain, held: Mapping[int, float | None], existing: np.ndarray | None = None
+) -> IdentifiableColumns:
     """Return which columns a motion with these joints held can tell apart.
 
     Args:
@@ -77,7 +77,7 @@ def told(
     """
     names = dynamics.exact.names
     if not held:
-        return Told(None, None, names)
+        return IdentifiableColumns(None, None, names)
     n = chain.n
     sigmas = np.where(np.isin(np.arange(n), list(held)), np.inf, 1.0)
     lower, upper = (np.where(np.isfinite(x), x, s * np.pi) for x, s in ((chain.lower, -1.0), (chain.upper, 1.0)))
@@ -98,4 +98,4 @@ def told(
         f"columns can be told ({len(gone)} fold into others or vanish: {', '.join(gone[:12])}"
         f"{', ...' if len(gone) > 12 else ''})"
     )
-    return Told(np.asarray(kept), sigmas, tuple(names[k] for k in kept), (note,) if gone else ())
+    return IdentifiableColumns(np.asarray(kept), sigmas, tuple(names[k] for k in kept), (note,) if gone else ())

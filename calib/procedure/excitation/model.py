@@ -12,7 +12,7 @@ from calib.dynamics import base as base_parameters
 from calib.dynamics import drives
 from calib.dynamics.base import BaseModel
 from calib.dynamics.bodies import standard_parameters, tree, with_gravity
-from calib.dynamics.drives import Term
+from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.shapes import V0
 from calib.errors import UsageError
@@ -25,7 +25,7 @@ SMOOTH = 0.05  # [rad/s or m/s] of the Coulomb sign while searching; the figures
 
 
 @dataclass(frozen=True, eq=False)
-class Dynamics:
+class ExcitedModel:
     """A model to excite, and the best there is to predict torques with.
 
     Attributes:
@@ -44,7 +44,7 @@ class Dynamics:
     notes: tuple[str, ...] = ()
 
 
-def read_dynamics(chain: Chain, folder: Path | None, sets: str, limits: MotionLimits) -> Dynamics:
+def read_dynamics(chain: Chain, folder: Path | None, sets: str, limits: MotionLimits) -> ExcitedModel:
     """Return the model to excite: of an identification's folder, or the robot's own inertias and stated friction."""
     if folder is not None:
         return _identified(chain, folder)
@@ -68,7 +68,7 @@ def read_dynamics(chain: Chain, folder: Path | None, sets: str, limits: MotionLi
     return _dynamics(model, values, None, friction, tuple(notes))
 
 
-def _identified(chain: Chain, folder: Path) -> Dynamics:
+def _identified(chain: Chain, folder: Path) -> ExcitedModel:
     """Read an identification; payloads are left ashore."""
     refuse_currents(folder, "an excitation within torque limits")
     table = read_table(folder)
@@ -102,14 +102,14 @@ def _identified(chain: Chain, folder: Path) -> Dynamics:
 
 def _dynamics(
     model: IdentificationModel, values: np.ndarray | None, covariance: np.ndarray | None, friction: bool, notes: tuple
-) -> Dynamics:
+) -> ExcitedModel:
     smooth = replace(model, terms=tuple(_smoothed(one) for one in model.terms))
     found = base_parameters.find(model)
     chosen = None if values is None else found.transform @ values
-    return Dynamics(BaseModel(smooth, found), BaseModel(model, found), chosen, covariance, friction, notes)
+    return ExcitedModel(BaseModel(smooth, found), BaseModel(model, found), chosen, covariance, friction, notes)
 
 
-def _smoothed(one: Term) -> Term:
+def _smoothed(one: DriveTerm) -> DriveTerm:
     return replace(one, settings=(max(SMOOTH, one.settings[0]),)) if one.shape == "sign" else one
 
 

@@ -25,16 +25,16 @@ from calib.procedure.kinematic_stage.inputs import load_robot
 from calib.robot.chain import Chain
 from calib.robot.kinematics import element_jacobian, forward, joint_jacobian, sweep
 from calib.robot.tables import check_keys, load, vector
-from trajectories.basis import Motion
+from trajectories.basis import SampledMotion
 from trajectories.constraints import BoxLimit
-from trajectories.timing.limits import Limits
+from trajectories.setpoints import Setpoints, joined, slowed
+from trajectories.timing.limits import TimingLimits
 from trajectories.timing.lines import line
 from trajectories.timing.path import Path as JointPath
 from trajectories.timing.path import check_within, checked, spline
 from trajectories.timing.profile import track
 from trajectories.timing.shape import Shaped, shorten
 from trajectories.timing.time_scaling import Timing, time_optimal
-from trajectories.track import Track, joined, slowed
 
 DRIVES = ("Ia", "Fv", "Fc", "off")
 COARSE = 150  # grid of the outer loop
@@ -61,16 +61,16 @@ class Planned:
 
     chain: Chain
     law: PathDynamics | None
-    limits: Limits
+    limits: TimingLimits
     lower: np.ndarray
     upper: np.ndarray
     timings: tuple[Timing, ...]
-    track: Track
+    track: Setpoints
     margins: np.ndarray
     deviation: np.ndarray | None
     shaped: Shaped | None
-    approach: Track | None
-    rehearsal: Track | None
+    approach: Setpoints | None
+    rehearsal: Setpoints | None
     sigma: np.ndarray | None
     notes: tuple[str, ...]
 
@@ -163,7 +163,7 @@ def check_places(path: JointPath, known: MotionLimits) -> None:
     for one in known.constraints:
         if isinstance(one, BoxLimit):
             continue
-        values = one.values(Motion(s, path(s), still, still, still))
+        values = one.values(SampledMotion(s, path(s), still, still, still))
         if values.max() > 0:
             k, column = (int(i) for i in np.unravel_index(np.argmax(values), values.shape))
             raise UsageError(
@@ -228,7 +228,7 @@ def _identified(chain: Chain, folder: Path, payloads: Sequence[str]) -> tuple[Pa
     return of_standard(model, values), read_uncertainty(folder, Dynamics(model, values), payloads)
 
 
-def _guarded(bounds: Limits, margin: np.ndarray, chain: Chain) -> Limits:
+def _guarded(bounds: TimingLimits, margin: np.ndarray, chain: Chain) -> TimingLimits:
     """Return the limits with a margin (n,) of torque left free."""
     if (margin >= bounds.torque).any():
         j = int(np.argmax(margin / bounds.torque))
@@ -239,7 +239,7 @@ def _guarded(bounds: Limits, margin: np.ndarray, chain: Chain) -> Limits:
     return replace(bounds, torque=bounds.torque - margin)
 
 
-def _bounds(chain: Chain, known: MotionLimits, law: PathDynamics | None) -> tuple[np.ndarray, np.ndarray, Limits]:
+def _bounds(chain: Chain, known: MotionLimits, law: PathDynamics | None) -> tuple[np.ndarray, np.ndarray, TimingLimits]:
     """Return joint limits and the limits of timing."""
     boxes = {one.order: one for one in known.constraints if isinstance(one, BoxLimit)}
     free = np.full(chain.n, np.inf)
@@ -250,7 +250,7 @@ def _bounds(chain: Chain, known: MotionLimits, law: PathDynamics | None) -> tupl
     torque = known.torque * (1 - margin) if law is not None else free
     if not any(np.isfinite(x).any() for x in (*sizes, torque)):
         raise UsageError(f"robot '{chain.name}' has no limits of speed, acceleration or torque; give --limits")
-    return known.positions.lower, known.positions.upper, Limits(sizes[0], sizes[1], torque)
+    return known.positions.lower, known.positions.upper, TimingLimits(sizes[0], sizes[1], torque)
 
 
 def _paths(chain: Chain, points: np.ndarray, lines: bool) -> tuple[list[JointPath], np.ndarray | None]:
@@ -269,7 +269,9 @@ def tool_jacobian(chain: Chain, q: np.ndarray) -> np.ndarray:
     return joint_jacobian(chain, element_jacobian(chain, walked, walked.position)).transpose(2, 1, 0)
 
 
-def _duration(path: JointPath, limits: Limits, law: PathDynamics | None, lower, upper, known: MotionLimits) -> float:
+def _duration(
+    path: JointPath, limits: TimingLimits, law: PathDynamics | None, lower, upper, known: MotionLimits
+) -> float:
     check_within(path, lower, upper)
     check_places(path, known)
     return time_optimal(path, limits, law, grid=COARSE).duration

@@ -11,12 +11,12 @@ from calib.dynamics.base import BaseModel
 from calib.errors import UsageError
 from calib.procedure.excitation.approach import approach_to, check_start
 from calib.procedure.excitation.limits import MotionLimits
-from calib.procedure.excitation.model import Dynamics
+from calib.procedure.excitation.model import ExcitedModel
 from calib.robot.chain import Chain
 from trajectories.basis import Family
-from trajectories.design.search import Found
+from trajectories.design.search import SearchResult
 from trajectories.design.verify import dense_motion
-from trajectories.track import Track, joined, repeated, slowed
+from trajectories.setpoints import Setpoints, joined, repeated, slowed
 
 BLOCK = 4000
 
@@ -32,9 +32,9 @@ class Playback:
         notes: what a user should know.
     """
 
-    run: Track
-    approach: Track | None
-    rehearsal: Track | None
+    run: Setpoints
+    approach: Setpoints | None
+    rehearsal: Setpoints | None
     repeat: int
     notes: tuple[str, ...]
 
@@ -53,8 +53,8 @@ def check_playback(
 
 def play(
     family: Family,
-    found: Found,
-    dynamics: Dynamics,
+    found: SearchResult,
+    dynamics: ExcitedModel,
     chain: Chain,
     limits: MotionLimits,
     *,
@@ -73,7 +73,7 @@ def play(
     period = family.period * found.factor
     count = round(period * rate)
     motion = dense_motion(family, found.x, np.arange(count + 1) * (period / count), found.factor)
-    once = _with_torque(Track(rate, motion.q, motion.v, motion.a), dynamics)
+    once = _with_torque(Setpoints(rate, motion.q, motion.v, motion.a), dynamics)
     lead, notes = None, ()
     if start is not None:
         lead, notes = approach_to(start, once.q[0], rate, limits, chain)
@@ -85,14 +85,14 @@ def play(
     return Playback(joined([*ahead, repeated(once, repeat)]), lead, slow, repeat, notes)
 
 
-def _with_torque(track: Track, dynamics: Dynamics) -> Track:
+def _with_torque(track: Setpoints, dynamics: ExcitedModel) -> Setpoints:
     """Return the track with the torques the model predicts, where it knows its parameters."""
     if dynamics.values is None:
         return track
     return replace(track, tau=_torque(dynamics.exact, dynamics.values, track))
 
 
-def _torque(model: BaseModel, values: np.ndarray, track: Track) -> np.ndarray:
+def _torque(model: BaseModel, values: np.ndarray, track: Setpoints) -> np.ndarray:
     parts = []
     for begin in range(0, len(track), BLOCK):
         part = (np.ascontiguousarray(x[begin : begin + BLOCK]) for x in (track.q, track.v, track.a))
@@ -100,7 +100,7 @@ def _torque(model: BaseModel, values: np.ndarray, track: Track) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def _torques(name: str, track: Track | None, limits: MotionLimits, chain: Chain) -> tuple[str, ...]:
+def _torques(name: str, track: Setpoints | None, limits: MotionLimits, chain: Chain) -> tuple[str, ...]:
     """Return a note where a track needs more torque than there is: slow motion can, where speed helped the arm up."""
     if track is None or track.tau is None:
         return ()

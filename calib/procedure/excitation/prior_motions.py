@@ -11,7 +11,7 @@ import numpy as np
 from calib.dynamics.base import BaseModel
 from calib.errors import UsageError
 from calib.procedure.excitation import coefficients
-from calib.procedure.excitation.model import Dynamics
+from calib.procedure.excitation.model import ExcitedModel
 from calib.robot.chain import Chain
 
 BLOCK = 4000
@@ -36,7 +36,7 @@ class Existing:
         return self.information * (count / duration)
 
 
-def read_existing(paths: Sequence[str], dynamics: Dynamics, chain: Chain) -> Existing | None:
+def read_existing(paths: Sequence[str], dynamics: ExcitedModel, chain: Chain) -> Existing | None:
     """Read recordings (``log.npz@0:9.4`` cuts) and folders of `calib excite`; None where there are none.
 
     Recordings are filtered and differentiated as `calib identify` does it.

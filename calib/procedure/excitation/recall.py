@@ -21,7 +21,7 @@ from calib.errors import MeasurementError, UsageError
 from calib.procedure.excitation import coefficients
 from calib.procedure.excitation.coefficients import Periodic
 from trajectories.errors import BadInput
-from trajectories.recall import Averaged, Recalled, average, recall
+from trajectories.recall import Averaged, Recalled, average, find_periods
 
 SUFFIXES = (".npz", ".csv")
 HEADERS = {"effort": "tau", "tau_link": "tau_link", "tau_motor": "tau_motor", "q_link": "q_link"}
@@ -72,7 +72,7 @@ def find(folder: Path, log: str, skip: int = 0) -> Recollection:
     count = round(motion.period * rate)
     reference = motion.orders(np.arange(count) / rate)[0]
     try:
-        found = recall(series["q"], reference, skip)
+        found = find_periods(series["q"], reference, skip)
         averages = {name: average(values, found) for name, values in series.items() if np.isfinite(values).all()}
     except BadInput as error:
         raise MeasurementError(str(error), recording.file) from error

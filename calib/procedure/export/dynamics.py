@@ -39,7 +39,7 @@ from calib.dynamics.bodies import with_gravity
 from calib.errors import RobotError, UsageError
 from calib.identification.friction.drive_table import Drives, drive_table
 from calib.identification.model_file import refuse_currents
-from calib.identification.possible.information import Told
+from calib.identification.possible.information import Information
 from calib.identification.possible.information import read as read_told
 from calib.identification.possible.solve import Consistent, find_consistent
 from calib.procedure.export import geometry
@@ -70,7 +70,7 @@ class Exported:
     """
 
     calibration: geometry.Calibration
-    told: Told
+    told: Information
     found: Consistent
     bodies: np.ndarray
     drives: Drives

@@ -26,6 +26,7 @@ from calib.geometry.result import GeometricFit
 from calib.geometry.weighing import Settings, combine
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.outliers import Outlier, named_outliers, plateau, remains
+from calib.procedure.kinematic_stage.proof import doubtful
 from calib.procedure.kinematic_stage.validation import (
     Comparison,
     compare,
@@ -57,6 +58,7 @@ class Outcome:
         verdict: pass, marginal or fail, with its reason.
         seed: that reproduces it.
         tolerance: largest rms on unseen poses that is good enough [m]; None where none was given.
+        said: those warnings that the fit alone gives, whatever the unseen rows are.
     """
 
     inputs: Inputs
@@ -70,6 +72,24 @@ class Outcome:
     verdict: Verdict
     seed: int = 0
     tolerance: float | None = None
+    said: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Assessment:
+    """Both arms on the same rows, and what that comes to.
+
+    Attributes:
+        fit: on the fit's rows.
+        validation: on unseen rows, by file name.
+        verdict: pass, marginal or fail, with its reason.
+        warnings: what a user should know, of the inputs, the fit and the unseen rows.
+    """
+
+    fit: Comparison
+    validation: Mapping[str, Comparison]
+    verdict: Verdict
+    warnings: tuple[str, ...]
 
 
 def run(
@@ -119,27 +139,64 @@ def run(
     if not status.good:
         raise NotConverged(f"the fit of model '{found.chosen}' did not converge: {status.value}", found.fit)
     say("comparing on unseen poses")
-    nominal, calibrated = found.nominal.cell, found.fit.cell
     rigid = rigid_fit(found, inputs.fit, settings)
-    alone = without_corrections(calibrated, rigid.cell.chain, inputs.fit, settings)
+    named = named_outliers(found.fit)
+    known = judged(inputs, found, named)
+    unexplained = plateau(found, known["reach"])
+    said = (
+        *moved_between(found.nominal.cell, inputs.fit, settings), *((unexplained,) if unexplained else ()),
+        *diagnose(found.fit),
+    )  # fmt: skip
+    both = found.nominal.cell, found.fit.cell
+    result = assess(*both, rigid.cell.chain, inputs, settings, known, said, asked=asked, tolerance=tolerance, seed=seed)
+    return Outcome(
+        inputs, found, rigid, result.fit, result.validation, named, tuple(explain(found.fit)), result.warnings,
+        result.verdict, seed, tolerance, said,
+    )  # fmt: skip
+
+
+def assess(
+    nominal: Installation,
+    calibrated: Installation,
+    rigid: Chain,
+    inputs: Inputs,
+    settings: Settings,
+    known: Mapping[str, Any],
+    said: Sequence[str],
+    *,
+    asked: str,
+    tolerance: float | None = None,
+    seed: int = 0,
+) -> Assessment:
+    """Compare both arms on fitted and on unseen rows, and judge: in the command, and of a fit read from its folder.
+
+    Args:
+        nominal, calibrated: installations, frames fitted to the fit's rows.
+        rigid: the best geometry without joint corrections.
+        inputs: the rows.
+        settings: of the fit, as asked for.
+        known: what `judged` says of the fit.
+        said: what the fit says of itself (`Outcome.said`).
+        asked: the model asked for.
+        tolerance: largest rms on unseen poses that is good enough [m].
+        seed: of the pairs whose distances are compared.
+    """
+    torques = [gravity_of(inputs.chain, block) for block in inputs.fit]
+    alone = without_corrections(calibrated, rigid, inputs.fit, settings)
     fitted = compare(nominal, calibrated, inputs.fit, torques, "fitted on these rows", False, seed, alone=alone)
     validation = {
         name: compare_unseen(nominal, calibrated, unseen, lambda b: gravity_of(inputs.chain, b), settings, seed, alone)
         for name, unseen in inputs.unseen.items()
     }
-    named = named_outliers(found.fit)
-    unexplained = plateau(found, reach(inputs.chain))
-    verdict = judge(fitted, validation, asked=asked, tolerance=tolerance, **judged(inputs, found, named))
+    verdict = judge(fitted, validation, asked=asked, tolerance=tolerance, **known)
     clause, loud = urdf_alone(fitted, validation)
     verdict = verdict if not clause else replace(verdict, reason=f"{verdict.reason}; {clause}")
-    notes = (
-        *inputs.notes, *(note for block in inputs.fit for note in block.notes), *elsewhere(fitted, validation),
-        *moved_between(nominal, inputs.fit, settings),
+    blocks = (*inputs.fit, *(unseen.block for unseen in inputs.unseen.values()))
+    warnings = (
+        *loud, *inputs.notes, *(note for block in blocks for note in block.notes), *elsewhere(fitted, validation),
+        *said, *doubtful(validation),
     )  # fmt: skip
-    warnings = (*loud, *notes, *((unexplained,) if unexplained else ()), *diagnose(found.fit))
-    return Outcome(
-        inputs, found, rigid, fitted, validation, named, tuple(explain(found.fit)), warnings, verdict, seed, tolerance
-    )
+    return Assessment(fitted, validation, verdict, tuple(dict.fromkeys(warnings)))
 
 
 def rigid_fit(found: Climb, measured: Sequence[PoseMeasurements], settings: Settings) -> GeometricFit:
@@ -226,8 +283,10 @@ def moved_between(nominal: Installation, blocks: Sequence[PoseMeasurements], set
     if len({block.file for block in own}) < 2 or len({block.station for block in own}) > 1:
         return []
     apart = [replace(block, station=f"{number}") for number, block in enumerate(own)]
-    before = _rms(nominal, own)
-    after = _rms(polish_frames(install(nominal.chain, apart, nominal.known), apart, settings).cell, apart)
+    torques = [gravity_of(nominal.chain, block) for block in own]
+    before = _rms(nominal, own, torques)
+    placed = polish_frames(install(nominal.chain, apart, nominal.known), apart, settings, torques).cell
+    after = _rms(placed, apart, torques)
     if before < MOVED * after:
         return []
     return [
@@ -237,5 +296,5 @@ def moved_between(nominal: Installation, blocks: Sequence[PoseMeasurements], set
     ]
 
 
-def _rms(cell: Installation, blocks: Sequence[PoseMeasurements]) -> float:
-    return float(np.sqrt(np.mean(errors(cell, blocks).main ** 2)))
+def _rms(cell: Installation, blocks: Sequence[PoseMeasurements], torques: list[np.ndarray | None]) -> float:
+    return float(np.sqrt(np.mean(errors(cell, blocks, torques).main ** 2)))

@@ -100,6 +100,7 @@ def metrics(outcome: Outcome) -> dict[str, object]:
         "fit": {"parameters": len(outcome.climb.fit.free), **outcome.fit.table()},
         "validation": {name: comparison.table() for name, comparison in outcome.validation.items()},
         "model": outcome.climb.chosen,
+        "loss": outcome.climb.loss,
         "ladder": [
             {
                 "model": rung.model,

@@ -43,7 +43,7 @@ from calib.geometry.observability import Target, TargetJacobian
 from calib.robot.chain import sampling_limits
 from calib.robot.tables import check_keys, load, number, placement, vector
 from poses import constraints
-from poses.space import Constraint
+from poses.space import PoseConstraint
 
 MOTION = ("velocity", "acceleration", "jerk", "torque", "friction", "point", "frequency")  # `motion_limits` reads them
 MARGIN, RADIUS = 0.01, 0.05  # [m], where the file does not tell (our choice)
@@ -60,7 +60,7 @@ class Limits:
 
     lower: np.ndarray
     upper: np.ndarray
-    constraints: tuple[Constraint, ...] = ()
+    constraints: tuple[PoseConstraint, ...] = ()
     feasible: Callable[[np.ndarray], np.ndarray] | None = None
     notes: tuple[str, ...] = field(default=())
     collision: Any = None
@@ -118,7 +118,7 @@ def _span(value: Any, where: str, quantity: str) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _target(table: Mapping[str, Any], cell: Installation, where: str) -> list[Constraint]:
+def _target(table: Mapping[str, Any], cell: Installation, where: str) -> list[PoseConstraint]:
     check_keys(table, ("height", "axis_distance", "reach", "facing"), f"{where}, target")
     target, slope, result = Target(cell), TargetJacobian(cell), []
     if "height" in table:
@@ -136,7 +136,7 @@ def _target(table: Mapping[str, Any], cell: Installation, where: str) -> list[Co
     return result
 
 
-def _instrument(tables: Mapping[str, Any], cell: Installation, where: str) -> list[Constraint]:
+def _instrument(tables: Mapping[str, Any], cell: Installation, where: str) -> list[PoseConstraint]:
     if "instrument" not in tables:
         return []
     table, where = tables["instrument"], f"{where}, instrument"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ PLACES = tuple(
 )
 
 
-def doubtful(validation: dict[str, Comparison]) -> list[str]:
+def doubtful(validation: Mapping[str, Comparison]) -> list[str]:
     """Name unseen rows whose error is more than `GROSS` times the median: they may be wrong measurements."""
     result = []
     for name, each in validation.items():
@@ -38,7 +39,7 @@ def doubtful(validation: dict[str, Comparison]) -> list[str]:
     return result
 
 
-def write_errors(path: Path, chain: Chain, validation: dict[str, Comparison]) -> None:
+def write_errors(path: Path, chain: Chain, validation: Mapping[str, Comparison]) -> None:
     """Write the errors of both arms at every unseen row; where positions were measured, with where and whither.
 
     Then ``x y z`` is where the target was seen, ``to_nominal`` and ``to_calibrated`` lead from there to where each arm

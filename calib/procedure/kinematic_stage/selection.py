@@ -15,7 +15,7 @@ from calib.procedure.kinematic_stage.inputs import joint_kinds, load_robot
 from calib.procedure.kinematic_stage.pose_limits import read_limits
 from calib.robot.chain import Chain
 from poses.indices import observability
-from poses.select import Selection, select
+from poses.select import Selection, select_poses
 from poses.space import SearchSpace, is_feasible
 
 Progress = Callable[[int, int, str], None]
@@ -65,7 +65,7 @@ def choose(
         m: how many.
         kind: what will be measured, ``pose`` or ``position``.
         tools: places of the targets in the tip's frame [m].
-        index, method: see `poses.select.select`.
+        index, method: see `poses.select.select_poses`.
         constraints: see `calib.procedure.kinematic_stage.pose_limits`.
         existing: CSV of poses measured before, which count.
         candidates: poses to draw.
@@ -89,7 +89,7 @@ def choose(
         value = observability(before, index) or None
         if not is_feasible(space, q).all():
             notes.append(f"{int((~is_feasible(space, q)).sum())} of the {len(q)} existing poses break the constraints")
-    found = select(
+    found = select_poses(
         None, m, space=space, index=index, method=method, existing=before, count=candidates, seed=seed, map=map,
         progress=progress,
     )  # fmt: skip

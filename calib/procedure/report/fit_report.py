@@ -7,8 +7,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,7 @@ class Report:
             per row q (rows, n) and points (rows, 3) in the arm's base.
         noise: what the stated sigmas alone give, rms by nature [m, rad]; None where none were stated.
         judged: what `calib.procedure.kinematic_stage.verdict.judge` needs besides the errors.
+        said: warnings that the fit alone gives, whatever the unseen rows are.
     """
 
     schema: int
@@ -64,6 +65,7 @@ class Report:
     sets: list[dict[str, Any]]
     noise: dict[str, float | None]
     judged: dict[str, Any]
+    said: list[str] = field(default_factory=list)
 
 
 def collect(outcome: Outcome) -> Report:
@@ -93,6 +95,7 @@ def collect(outcome: Outcome) -> Report:
         sets=sets,
         noise=_noise(outcome.fit.blocks),
         judged=judged(outcome.inputs, outcome.climb, outcome.outliers),
+        said=list(outcome.said),
     )
 
 
@@ -106,6 +109,12 @@ def rows_of(name: str, comparison: Comparison, unseen: bool) -> dict[str, Any]:
     if len(comparison.errors[1].main) == len(q):
         entry |= {"q": _plain(q), "points": _plain(_points(comparison))}
     return entry
+
+
+def with_unseen(report: Report, metrics: Mapping[str, Any], sets: Sequence[Mapping[str, Any]]) -> Report:
+    """Return a fit's report with rows it has not seen (`rows_of`), and verdict, reason and warnings that follow."""
+    merged = {key: metrics[key] for key in ("validation", "verdict", "reason", "warnings")}
+    return replace(report, metrics=report.metrics | merged, sets=[*report.sets, *map(dict, sets)])
 
 
 def _points(comparison: Comparison) -> np.ndarray:

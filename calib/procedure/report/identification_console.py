@@ -37,7 +37,7 @@ def read_lines(inputs: IdentificationInputs) -> Iterator[RenderableType]:
 def outcome_lines(outcome: IdentificationOutcome) -> Iterator[RenderableType]:
     """Say what came of it."""
     found = outcome.found
-    if found.rungs:
+    if found.friction.steps:
         yield ladder_table(outcome)
     for one in found.ripples:
         waves = (f"{k}" if source == one.joint else f"{k} of joint {source + 1}" for source, k in one.waves)
@@ -47,7 +47,7 @@ def outcome_lines(outcome: IdentificationOutcome) -> Iterator[RenderableType]:
     yield f"method {found.fitted.method}: takes for granted that {ASSUMES[found.fitted.method]}"
     base = found.base
     words = f"{found.dynamics.model.p} standard parameters: {len(base.without_effect)} without effect, "
-    words += f"{len(base.regrouped)} regrouped, {base.b} base; {len(found.climb.terms)} of richer friction; "
+    words += f"{len(base.regrouped)} regrouped, {base.b} base; {len(found.friction.terms)} of richer friction; "
     words += f"condition {raw:.0f}, with unit columns {normalised:.0f}"
     yield words
     if found.elimination is not None:
@@ -83,7 +83,7 @@ def ladder_table(outcome: IdentificationOutcome) -> Table:
     for name in ("p", "total", *(f"{j + 1}" for j in range(outcome.inputs.chain.n))):
         table.add_column(name, justify="right")
     table.add_column("kept at joints")
-    for rung in outcome.found.rungs:
+    for rung in outcome.found.friction.steps:
         at = ", ".join(str(j + 1) for j in rung.kept_at)
         joints = [f"{x:.1f}" for x in rung.joints]
         table.add_row(rung.model, str(rung.parameters), f"{rung.cross_validated:.2f}", *joints, at or escape(rung.note))

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 from calib import files
 from calib.procedure.report import fit_report, viewer
 from calib.procedure.report import page as certificate
 from calib.procedure.session.dynamics_steps import recordings
 from calib.procedure.session.folder import MARK, Session, fingerprint, read_state
-from calib.procedure.session.geometry_steps import measured_files, robot_file
+from calib.procedure.session.geometry_steps import SCHEMA, measured_files, robot_file
 
 Say = Callable[[str], None]
 ROLES = {
@@ -28,13 +29,8 @@ def certify(session: Session, say: Say) -> list[str]:
     from calib.procedure.report import dynamics_section, figures
 
     say("drawing")
-    found = fit_report.read(session.path("4-fit"))
     outside = json.loads(session.path("5-validation/metrics.json").read_text())
-    rows = session.path("5-validation/rows.json")
-    merged = {key: outside[key] for key in ("validation", "verdict", "reason")}
-    merged["warnings"] = [*found.metrics["warnings"], *outside["warnings"]]
-    sets = [*found.sets, *(json.loads(rows.read_text()) if rows.exists() and outside["validation"] else [])]
-    whole = replace(found, metrics=found.metrics | merged, sets=sets)
+    whole = whole_report(session, outside)
     drawn = figures.draw(whole)
     judged = [with_arrival(certificate.geometry_stage(whole, drawn), noticed(session, "3-measured", "validate"))]
     notes = [f"geometry {outside['verdict']}: {outside['reason']}"]
@@ -54,8 +50,17 @@ def certify(session: Session, say: Say) -> list[str]:
         listed(session),
     )
     files.write(session.path("certificate.html"), certificate.render(page))
-    files.write_json(session.path("5-validation/report.json"), asdict(whole))
     return [*notes, "certificate.html", viewer.write_beside(session.folder)]
+
+
+def whole_report(session: Session, outside: dict[str, Any]) -> fit_report.Report:
+    """Return the fit's report with what the step validate found, whose ``metrics.json`` is `outside`."""
+    if outside.get("schema", 1) >= SCHEMA:
+        return fit_report.read(session.path("5-validation"))
+    found, rows = fit_report.read(session.path("4-fit")), session.path("5-validation/rows.json")
+    sets = json.loads(rows.read_text()) if rows.exists() and outside["validation"] else []
+    warnings = [*found.metrics["warnings"], *outside["warnings"]]
+    return fit_report.with_unseen(found, outside | {"warnings": warnings}, sets)
 
 
 def noticed(session: Session, place: str, unseen: str) -> list[str]:

@@ -35,7 +35,7 @@ LOGS = (("training", 2), ("validation", 3))  # and the numbers of their noise
 
 
 @dataclass(frozen=True)
-class Found:
+class DemoResult:
     """What the demonstration came to: the session, its verdict ("" where it stopped), what to look at, and how long.
 
     Attributes:
@@ -56,7 +56,7 @@ class Found:
 
 def run(
     folder: Path, robot: str, seed: int, say: Say, progress: Say, *, dynamics: bool = True, guided: bool = False
-) -> Found:
+) -> DemoResult:
     """Calibrate a simulated robot in a session, and compare with its hidden truth.
 
     Args:
@@ -87,10 +87,10 @@ def run(
     if waiting is not None:
         if not guided:
             raise SessionError(f"the demonstration stopped at {waiting.step.name}: {waiting.words}")
-        return Found(session, "", (), time.perf_counter() - started, stopped(session, waiting))
+        return DemoResult(session, "", (), time.perf_counter() - started, stopped(session, waiting))
     before, after = told_truth(session, cell, say)
     seconds = time.perf_counter() - started
-    return Found(session, verdict_of(session), results(session), seconds, (), before, after, largest_memory())
+    return DemoResult(session, verdict_of(session), results(session), seconds, (), before, after, largest_memory())
 
 
 def largest_memory() -> float:

@@ -20,7 +20,7 @@ from calib.procedure.dynamic_stage import validation
 from calib.procedure.excitation import coefficients
 from calib.procedure.excitation.coefficients import Periodic
 from calib.procedure.session import motion_check
-from calib.procedure.session.folder import Session
+from calib.procedure.session.folder import Session, read_state
 from calib.robot.chain import Chain
 from calib.robot.load import load
 
@@ -174,7 +174,7 @@ def identify(session: Session, say: Say) -> list[str]:
     raw, normalised = found.condition
     own = next(iter(outcome.fit.values()))
     notes = [
-        f"{len(found.names)} parameters by {found.fitted.method}, friction {found.climb.chosen or 'standard'}, "
+        f"{len(found.names)} parameters by {found.fitted.method}, friction {found.friction.chosen or 'standard'}, "
         "condition "
         f"number {raw:.3g}, with unit columns {normalised:.3g}; {own.raw.total:.2f} % of the torque unexplained"
     ]
@@ -196,4 +196,6 @@ def predict(session: Session, say: Say) -> list[str]:
     )  # fmt: skip
     held = validation.hold(given, session.path("8-dynamics"), session.settings.dynamics.tolerance_percent)
     validation.write(held, session.path("8-dynamics/unseen"))
-    return [*notes, f"verdict {held.verdict.level}: {held.verdict.reason}", *held.warnings]
+    verdict, identified = held.result.verdict, read_state(session)["steps"].get("identify", {}).get("notes", [])
+    fresh = [words for words in held.result.warnings if words not in identified]
+    return [*notes, f"verdict {verdict.level}: {verdict.reason}", *fresh]

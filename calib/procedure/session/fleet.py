@@ -28,7 +28,7 @@ COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red", DONE: "green", 
 
 
 @dataclass(frozen=True)
-class Outcome:
+class FleetRow:
     """How one session ended.
 
     Attributes:
@@ -69,7 +69,7 @@ def folders_of(given: Sequence[Path]) -> list[Path]:
     return found
 
 
-def run(folders: Sequence[Path], workers: Workers, command: str) -> Iterator[Outcome]:
+def run(folders: Sequence[Path], workers: Workers, command: str) -> Iterator[FleetRow]:
     """Run every session as far as it goes, and yield each outcome when its session ends.
 
     Args:
@@ -81,10 +81,10 @@ def run(folders: Sequence[Path], workers: Workers, command: str) -> Iterator[Out
     for number, outcome in workers.completed(partial(run_one, command=command), sent):
         name = str(folders[number])
         lost = isinstance(outcome, TaskLost)
-        yield Outcome(name, FAILED, words=str(outcome), code=2) if lost else replace(outcome, folder=name)
+        yield FleetRow(name, FAILED, words=str(outcome), code=2) if lost else replace(outcome, folder=name)
 
 
-def run_one(folder: Path, command: str = "calib run") -> Outcome:
+def run_one(folder: Path, command: str = "calib run") -> FleetRow:
     """Run one session as far as it goes; what it says goes into its ``run.log``. Only Ctrl-C leaves this function."""
     started, said = time.perf_counter(), []
     try:
@@ -95,21 +95,21 @@ def run_one(folder: Path, command: str = "calib run") -> Outcome:
         if code is None:
             said.append(traceback.format_exc())
         said.append(f"failed: {words}")
-        outcome = Outcome(str(folder), FAILED, words=words, code=code or 1)
+        outcome = FleetRow(str(folder), FAILED, words=words, code=code or 1)
     if (folder / "session.toml").exists():
         with suppress(CalibError):  # a full disk, a folder that cannot be written: said already
             files.write(folder / LOG, "\n".join(said) + "\n")
     return replace(outcome, seconds=time.perf_counter() - started)
 
 
-def _go_on(folder: Path, say: Callable[[str], None], command: str) -> Outcome:
+def _go_on(folder: Path, say: Callable[[str], None], command: str) -> FleetRow:
     session = open_session(folder)
     with locked(session, say):
         waiting = steps.run_next(session, say, lambda words: None, command)
     if waiting is not None:
         for line in instructions.asks(session, waiting):
             say(line)
-        return Outcome(
+        return FleetRow(
             str(folder), WAITS, words=f"{waiting.words} (step {waiting.step.name}); {LOG} says what to bring"
         )
     verdict = verdict_of(session)
@@ -118,7 +118,7 @@ def _go_on(folder: Path, say: Callable[[str], None], command: str) -> Outcome:
         unseen = json.loads(session.path("8-dynamics/unseen/report.json").read_text(encoding="utf-8"))
         sets = (unseen["validation"] or unseen["fit"]).values()
         torque = max((one["raw"]["relative_error_percent"]["total"] or 0.0 for one in sets), default=None)
-    return Outcome(str(folder), DONE, verdict, "", *errors, torque, code=1 if verdict == "fail" else 0)
+    return FleetRow(str(folder), DONE, verdict, "", *errors, torque, code=1 if verdict == "fail" else 0)
 
 
 def _figures(path: Path) -> tuple[float | None, float | None]:
@@ -133,7 +133,7 @@ def _figures(path: Path) -> tuple[float | None, float | None]:
     return max(pairs, key=lambda pair: pair[1]) if pairs else (None, None)
 
 
-def line(one: Outcome) -> str:
+def line(one: FleetRow) -> str:
     """Return one session's end in a line."""
     errors = one.nominal is not None and f"{one.nominal:.3g} → {one.calibrated:.3g} mm"
     torque = one.torque is not None and f"torque {one.torque:.3g} %"
@@ -141,7 +141,7 @@ def line(one: Outcome) -> str:
     return f"{one.folder}: {', '.join(words)}"
 
 
-def table(outcomes: Sequence[Outcome]) -> RenderableType:
+def table(outcomes: Sequence[FleetRow]) -> RenderableType:
     """Return the summary, a line per robot: errors on unseen poses, rms, and on unseen motion."""
     found = Table("session", "state", "verdict", box=None, pad_edge=False)
     for name in ("nominal mm", "calibrated mm", "torque %", "s"):
@@ -155,14 +155,14 @@ def table(outcomes: Sequence[Outcome]) -> RenderableType:
     return found
 
 
-def remarks(outcomes: Sequence[Outcome]) -> Iterator[str]:
+def remarks(outcomes: Sequence[FleetRow]) -> Iterator[str]:
     """Say of every session that is not done what it waits for, or what went wrong."""
     for one in outcomes:
         if one.state != DONE:
             yield f"{one.folder} {one.state}{' for ' if one.state == WAITS else ': '}{one.words}"
 
 
-def summary(outcomes: Sequence[Outcome], seconds: float) -> str:
+def summary(outcomes: Sequence[FleetRow], seconds: float) -> str:
     """Return one line on all of them."""
     counts = {state: sum(one.state == state for one in outcomes) for state in (DONE, WAITS, FAILED)}
     judged = {level: sum(one.verdict == level for one in outcomes) for level in ("pass", "marginal", "fail")}
@@ -172,6 +172,6 @@ def summary(outcomes: Sequence[Outcome], seconds: float) -> str:
     return f"{', '.join(parts)}; {seconds:.1f} s"
 
 
-def worst_code(outcomes: Sequence[Outcome]) -> int:
+def worst_code(outcomes: Sequence[FleetRow]) -> int:
     """Return the exit code of all: of the first kind that occurred out of 3, 2 (they failed), 1 (verdict fail), 0."""
     return max((one.code for one in outcomes), default=0)

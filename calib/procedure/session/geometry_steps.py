@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -20,8 +21,6 @@ from calib.procedure.kinematic_stage import fit as fitting
 from calib.procedure.kinematic_stage import folder as outputs
 from calib.procedure.kinematic_stage import inputs, proof
 from calib.procedure.kinematic_stage import robot_file as calibrated
-from calib.procedure.kinematic_stage import validation as comparing
-from calib.procedure.kinematic_stage.verdict import judge
 from calib.procedure.report import fit_certificate, fit_report
 from calib.procedure.session import arrival
 from calib.procedure.session.folder import Session
@@ -29,6 +28,7 @@ from calib.procedure.session.outcome import mark_failed
 from calib.robot.chain import Chain
 
 Say = Callable[[str], None]
+SCHEMA = 2  # of 5-validation/metrics.json: from 2 on all warnings are in it, and report.json beside it is the step's
 
 
 def robot_file(session: Session) -> Path:
@@ -191,54 +191,50 @@ def fit(session: Session, say: Say) -> list[str]:
 
 
 def validate(session: Session, say: Say) -> list[str]:
-    """Hold the fitted robot against poses it has not seen, and judge."""
+    """Hold the fitted robot against poses it has not seen, and judge, as `calib fit` does with validation files."""
     chain, unseen = chain_of(session), measured_files(session)[1]
     folder, found, notes = session.path("5-validation"), fit_report.read(session.path("4-fit")), []
+    metrics: dict[str, Any] = {
+        "validation": {},
+        **{key: found.metrics[key] for key in ("verdict", "reason", "warnings")},
+    }
     if not session.settings.poses.validation and not unseen:
-        files.write_json(folder / "metrics.json", _verdict(found.metrics, {}))
+        _write_validation(folder, found, {"validation": {}, **metrics}, [])
         return ["no validation asked for: judged by cross-validation only"]
     plan = planned(session, chain, "validation")
     for path in unseen:
         notes += check_file(session, chain, path, plan)
     say("comparing on unseen poses")
     given = gathered(session, unseen)
-    fitted, validation = compared(session, given)
-    asked = session.settings.fit.model
-    verdict = judge(fitted, validation, asked=asked, tolerance=tolerance_of(session), **found.judged)
-    clause, loud = comparing.urdf_alone(fitted, validation)
-    verdict = verdict if not clause else replace(verdict, reason=f"{verdict.reason}; {clause}")
-    warnings = [*loud, *fitting.elsewhere(fitted, validation), *proof.doubtful(validation)]
-    metrics: dict[str, object] = {"validation": {name: each.table() for name, each in validation.items()}}
-    metrics |= {"verdict": verdict.level, "reason": verdict.reason, "warnings": warnings}
-    sets = [fit_report.rows_of(name, each, each.proves) for name, each in validation.items()]
-    proof.write_errors(folder / "errors.csv", given.chain, validation)
+    result = assessed(session, given, found)
+    metrics = {"validation": {name: each.table() for name, each in result.validation.items()}}
+    metrics |= {"verdict": result.verdict.level, "reason": result.verdict.reason, "warnings": list(result.warnings)}
+    proof.write_errors(folder / "errors.csv", given.chain, result.validation)
+    sets = [fit_report.rows_of(name, each, each.proves) for name, each in result.validation.items()]
     files.write_json(folder / "rows.json", sets)
-    files.write_json(folder / "metrics.json", metrics)
-    return [*notes, f"verdict {verdict.level}: {verdict.reason}", *warnings]
+    _write_validation(folder, found, metrics, sets)
+    fresh = [words for words in result.warnings if words not in found.metrics["warnings"]]
+    return [*notes, f"verdict {result.verdict.level}: {result.verdict.reason}", *fresh]
 
 
-def compared(session: Session, given: inputs.Inputs) -> tuple[comparing.Comparison, dict[str, comparing.Comparison]]:
-    """Return nominal beside calibrated arm on fitted and on unseen rows."""
-    options, seed = options_of(session), session.settings.seed
-    loss = session.settings.fit.loss
-    settings = combine(FitSettings(), loss=loss, loss_scale=options.loss_scale)
+def _write_validation(
+    folder: Path, found: fit_report.Report, metrics: dict[str, Any], sets: list[dict[str, Any]]
+) -> None:
+    files.write_json(folder / "report.json", asdict(fit_report.with_unseen(found, metrics, sets)))
+    files.write_json(folder / "metrics.json", metrics | {"schema": SCHEMA})
+
+
+def assessed(session: Session, given: inputs.Inputs, found: fit_report.Report) -> fitting.Assessment:
+    """Return the assessment of the session's fit, read from its folder, on its own rows and on unseen ones."""
+    options, wanted, place = options_of(session), session.settings.fit, session.path("4-fit")
+    settings = combine(FitSettings(), loss=wanted.loss, loss_scale=options.loss_scale)
+    chosen = combine(settings, loss=found.metrics.get("loss", wanted.loss))
     torques = [fitting.gravity_of(given.chain, block) for block in given.fit]
-    nominal = polish_frames(fitting.install(given.chain, given.fit), given.fit, settings, torques).cell
-    cell = calibrated.read(session.path("4-fit"))
-    rigid = calibrated.rigid_chain(session.path("4-fit"))
-    alone = comparing.without_corrections(cell, rigid, given.fit, settings)
-    fitted = comparing.compare(nominal, cell, given.fit, torques, "fitted on these rows", False, seed, alone=alone)
-    unseen = {
-        name: comparing.compare_unseen(
-            nominal, cell, each, lambda block: fitting.gravity_of(given.chain, block), settings, seed, alone
-        )
-        for name, each in given.unseen.items()
-    }
-    return fitted, unseen
-
-
-def _verdict(metrics: dict, validation: dict) -> dict:
-    return {"validation": validation, "verdict": metrics["verdict"], "reason": metrics["reason"], "warnings": []}
+    nominal = polish_frames(fitting.install(given.chain, given.fit, given.known), given.fit, chosen, torques).cell
+    return fitting.assess(
+        nominal, calibrated.read(place), calibrated.rigid_chain(place), given, settings, found.judged, found.said,
+        asked=wanted.model, tolerance=tolerance_of(session), seed=session.settings.seed,
+    )  # fmt: skip
 
 
 def export(session: Session, say: Say) -> list[str]:

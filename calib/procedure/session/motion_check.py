@@ -19,7 +19,7 @@ from calib.errors import MeasurementError
 from calib.procedure.excitation.coefficients import Periodic
 from calib.robot.chain import Chain
 from trajectories.errors import BadInput
-from trajectories.recall import recall
+from trajectories.recall import find_periods
 
 STEP = 0.01  # of the coarse grid [s] (this and all below: our choice)
 LIKE = 0.9  # share of the motion's variance a recorded period has to explain
@@ -71,7 +71,7 @@ def find_motion(recording: Recording, motion: Periodic, others: Mapping[str, Per
     q = _sampled(recording.t, recording.q, grid)
     reference = coarse(motion)
     try:
-        found = recall(q, reference, likeness=LIKE)
+        found = find_periods(q, reference, likeness=LIKE)
     except BadInput:
         raise _explain(recording, q, motion, others) from None
     start, stop = grid[found.start], grid[min(found.rows.stop, len(grid) - 1)]
@@ -122,7 +122,7 @@ def _explain(recording: Recording, q: np.ndarray, motion: Periodic, others: Mapp
 
 def _heard(q: np.ndarray, reference: np.ndarray) -> bool:
     try:
-        recall(q, reference, likeness=LIKE)
+        find_periods(q, reference, likeness=LIKE)
     except BadInput:
         return False
     return True

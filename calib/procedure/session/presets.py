@@ -8,7 +8,7 @@ from calib.errors import UsageError
 
 
 @dataclass(frozen=True)
-class Instrument:
+class InstrumentPreset:
     """What is measured (``pose`` or ``position``) and the sigmas of one measurement [m], [rad]; 0: to be estimated."""
 
     label: str
@@ -19,17 +19,21 @@ class Instrument:
 
 
 INSTRUMENTS = {
-    "cmm": Instrument("optical CMM", "pose", 60e-6, 0.2e-3, "Nikon K610: 60 µm volumetric; orientation our guess"),
-    "tracker": Instrument("laser tracker", "position", 20e-6, 0.0, "about 15 µm + 6 µm/m in a small cell; our guess"),
-    "tracker6d": Instrument("laser tracker, 6-D probe", "pose", 30e-6, 0.1e-3, "our guess"),
-    "mocap": Instrument("motion capture", "pose", 0.0, 0.0, "estimated from the residuals"),
-    "camera": Instrument("camera and board", "pose", 0.0, 0.0, "estimated from the residuals"),
-    "other-pose": Instrument("instrument", "pose", 0.0, 0.0, "estimated from the residuals"),
-    "other-position": Instrument("instrument", "position", 0.0, 0.0, "estimated from the residuals"),
+    "cmm": InstrumentPreset(
+        "optical CMM", "pose", 60e-6, 0.2e-3, "Nikon K610: 60 µm volumetric; orientation our guess"
+    ),
+    "tracker": InstrumentPreset(
+        "laser tracker", "position", 20e-6, 0.0, "about 15 µm + 6 µm/m in a small cell; our guess"
+    ),
+    "tracker6d": InstrumentPreset("laser tracker, 6-D probe", "pose", 30e-6, 0.1e-3, "our guess"),
+    "mocap": InstrumentPreset("motion capture", "pose", 0.0, 0.0, "estimated from the residuals"),
+    "camera": InstrumentPreset("camera and board", "pose", 0.0, 0.0, "estimated from the residuals"),
+    "other-pose": InstrumentPreset("instrument", "pose", 0.0, 0.0, "estimated from the residuals"),
+    "other-position": InstrumentPreset("instrument", "position", 0.0, 0.0, "estimated from the residuals"),
 }
 
 
-def instrument(name: str) -> Instrument:
+def instrument(name: str) -> InstrumentPreset:
     """Return an instrument by name.
 
     Raises:

@@ -14,7 +14,7 @@ Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Step:
+class SessionStep:
     """One step.
 
     Attributes:
@@ -132,42 +132,45 @@ def _keys(names: str) -> tuple[str, ...]:
 
 
 STEPS = (
-    Step("describe", "read the robot", ("robot",), _robot, geometry_steps.describe, ("1-robot/summary.txt",)),
-    Step(
+    SessionStep("describe", "read the robot", ("robot",), _robot, geometry_steps.describe, ("1-robot/summary.txt",)),
+    SessionStep(
         "select", "choose the poses to measure", ("robot", "instrument", "poses", "seed"), _plan, geometry_steps.select,
         ("2-poses/poses.csv", "2-poses/validation.csv", "2-poses/selection.json"),
     ),
-    Step(
+    SessionStep(
         "measure", "check what was measured", ("robot", "instrument", "poses", "fit"), _arrived, geometry_steps.arrive,
         ("3-measured/checked.txt",),
     ),
-    Step("fit", "fit the geometry", ("robot", "instrument", "fit", "seed"), _fitted, geometry_steps.fit, ("4-fit/*",)),
-    Step(
-        "validate", "hold it against unseen poses", ("robot", "instrument", "poses", "fit", "seed"), _validated,
-        geometry_steps.validate, ("5-validation/metrics.json", "5-validation/errors.csv", "5-validation/rows.json"),
+    SessionStep(
+        "fit", "fit the geometry", ("robot", "instrument", "fit", "seed"), _fitted, geometry_steps.fit, ("4-fit/*",),
     ),
-    Step(
+    SessionStep(
+        "validate", "hold it against unseen poses", ("robot", "instrument", "poses", "fit", "seed"), _validated,
+        geometry_steps.validate,
+        ("5-validation/metrics.json", "5-validation/errors.csv", "5-validation/rows.json", "5-validation/report.json"),
+    ),
+    SessionStep(
         "excite", "design the motions to record", (*_keys(PLAN), "seed"), _excited, dynamics_steps.excite,
         ("6-excitation/*/*",), True,
     ),
-    Step(
+    SessionStep(
         "record", "check what was recorded", _keys("plan repeats torques options payloads"), _recorded,
         dynamics_steps.record, ("7-recorded/checked.txt", "7-recorded/cuts.json"), True,
     ),
-    Step(
+    SessionStep(
         "identify", "identify the dynamics", (*_keys(MODEL), "seed"), _identified, dynamics_steps.identify,
         ("8-dynamics/*",), True,
     ),
-    Step(
+    SessionStep(
         "predict", "hold it against unseen motion",
         (*_keys(f"plan validation repeats tolerance_percent {MODEL}"), "seed"), _predicted, dynamics_steps.predict,
         ("8-dynamics/unseen/*",), True,
     ),
-    Step(
+    SessionStep(
         "export", "write the calibrated robot", ("robot",), _exported, geometry_steps.export,
         ("6-export/*", "9-export/*", "9-export/dynamics/*"),
     ),
-    Step(
+    SessionStep(
         "certificate", "print the certificate",
         ("name", "created", "instrument", "poses", "fit", *_keys("torques payloads tolerance_percent")), _certified,
         certificate.certify, ("certificate.html",),

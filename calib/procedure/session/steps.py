@@ -18,7 +18,7 @@ from calib.errors import SessionError
 from calib.procedure.report import page
 from calib.procedure.session import dynamics_steps, geometry_steps
 from calib.procedure.session.folder import EXPORT, Session, fingerprint, read_state, write_state
-from calib.procedure.session.step_list import STEPS, Step
+from calib.procedure.session.step_list import STEPS, SessionStep
 
 Say = Callable[[str], None]
 DONE, READY, WAITING, STALE, KEPT, AFTER = "done", "ready", "waiting", "stale", "kept", "after"
@@ -30,17 +30,17 @@ PLANS = ("poses.csv", "validation.csv", "selection.json", "trajectory.toml")  # 
 class State:
     """How a step stands, and why."""
 
-    step: Step
+    step: SessionStep
     kind: str
     words: str
 
 
-def walk(session: Session) -> tuple[Step, ...]:
+def walk(session: Session) -> tuple[SessionStep, ...]:
     """Return the steps of a session."""
     return tuple(step for step in STEPS if session.dynamic or not step.dynamic)
 
 
-def find(session: Session, name: str) -> Step:
+def find(session: Session, name: str) -> SessionStep:
     """Return a step by its name or number.
 
     Raises:
@@ -67,12 +67,12 @@ def states(session: Session) -> list[State]:
     return result
 
 
-def _behind(session: Session, step: Step, recorded: dict[str, Any]) -> State:
+def _behind(session: Session, step: SessionStep, recorded: dict[str, Any]) -> State:
     words = "made before; an earlier step comes first" if step.name in recorded["steps"] else "comes later"
     return State(step, AFTER, words)
 
 
-def _state(session: Session, step: Step, recorded: dict[str, Any]) -> State:
+def _state(session: Session, step: SessionStep, recorded: dict[str, Any]) -> State:
     entry = recorded["steps"].get(step.name)
     if missing := _missing(session, step):
         return State(step, WAITING, missing)
@@ -92,7 +92,7 @@ def _state(session: Session, step: Step, recorded: dict[str, Any]) -> State:
     return State(step, DONE, f"{entry['finished'][:16].replace('T', ' ')}{by_hand}")
 
 
-def _used(session: Session, step: Step) -> str:
+def _used(session: Session, step: SessionStep) -> str:
     """Say why a plan is not replaced: people have worked to it."""
     if step.name == "select" and geometry_steps.measured_files(session)[0]:
         return "files were measured to it (calib redo select: new poses)"
@@ -101,7 +101,7 @@ def _used(session: Session, step: Step) -> str:
     return ""
 
 
-def _missing(session: Session, step: Step) -> str:
+def _missing(session: Session, step: SessionStep) -> str:
     """Say which of people's files a step waits for."""
     fit, unseen = geometry_steps.measured_files(session)
     if step.name == "measure" and not fit:
@@ -119,7 +119,7 @@ def _missing(session: Session, step: Step) -> str:
     return f"{own[0].relative_to(session.folder)}, which is missing" if own else ""
 
 
-def _inputs(session: Session, step: Step) -> dict[str, str]:
+def _inputs(session: Session, step: SessionStep) -> dict[str, str]:
     """Return the fingerprints of what a step depends on."""
     marks = {str(path.relative_to(session.folder)): fingerprint(path) for path in step.inputs(session) if path.exists()}
     settings = asdict(session.settings)
@@ -166,7 +166,7 @@ def run_next(session: Session, say: Say, progress: Say, command: str = "calib ne
         _run(session, state.step, say, progress, command)
 
 
-def _run(session: Session, step: Step, say: Say, progress: Say, command: str) -> None:
+def _run(session: Session, step: SessionStep, say: Say, progress: Say, command: str) -> None:
     number = walk(session).index(step) + 1
     recorded = read_state(session)
     recorded["steps"].pop(step.name, None)
@@ -196,7 +196,7 @@ def _run(session: Session, step: Step, say: Say, progress: Say, command: str) ->
         say(f"    {note}")
 
 
-def forget(session: Session, step: Step) -> None:
+def forget(session: Session, step: SessionStep) -> None:
     """Let a step and all behind it be made again."""
     recorded = read_state(session)
     own = walk(session)

@@ -58,7 +58,7 @@ def _rms(arm: Installation, q: np.ndarray, points: np.ndarray) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Torques:
+class TorqueErrors:
     """Errors of predicted torques against the noise-free truth on motion nobody has seen.
 
     Attributes:
@@ -76,7 +76,7 @@ class Torques:
     nominal: float
 
 
-def torques_against_truth(session: Session, cell: Cell, arm: MovingArm, seed: int = 4321) -> Torques:
+def torques_against_truth(session: Session, cell: Cell, arm: MovingArm, seed: int = 4321) -> TorqueErrors:
     """Compare predicted torques with the noise-free truth along a random motion, and parameters with theirs."""
     chain, dynamics = read_dynamics(session.path("8-dynamics"))
     lower, upper = sampling_limits(chain)
@@ -92,7 +92,7 @@ def torques_against_truth(session: Session, cell: Cell, arm: MovingArm, seed: in
     nominal = inverse_dynamics(tree(cell.nominal), standard_parameters(cell.nominal), *states) + friction
     error = predicted - true
     within, count = _parameters(session, dynamics.model, cell, arm)
-    return Torques(
+    return TorqueErrors(
         _percent(error, true), np.sqrt(np.mean(error**2, axis=0)), within, count, _percent(nominal - link, link)
     )
 

@@ -24,7 +24,7 @@ from calib.transforms import invert, pose
 
 
 @dataclass(frozen=True)
-class Instrument:
+class SimulatedInstrument:
     """An instrument that sees frames (or points), with white noise.
 
     Attributes:
@@ -61,7 +61,7 @@ class Cell:
 
     nominal: Chain
     truth: Installation
-    instrument: Instrument = field(default_factory=Instrument)
+    instrument: SimulatedInstrument = field(default_factory=SimulatedInstrument)
     note: str = ""
 
 
@@ -128,7 +128,7 @@ def wandering(measured: PoseMeasurements, drift: float, seed: int, begin: float 
     return replace(measured, position=measured.position + drift * way)
 
 
-def _noisy(poses: np.ndarray, instrument: Instrument, rng: np.random.Generator) -> np.ndarray:
+def _noisy(poses: np.ndarray, instrument: SimulatedInstrument, rng: np.random.Generator) -> np.ndarray:
     """Return poses (m, 4, 4) as seen: noise along and about the instrument's axes."""
     m = len(poses)
     turn = Rotation.from_rotvec(rng.normal(0.0, instrument.orientation_sigma or 0.0, (m, 3))).as_matrix()
@@ -136,7 +136,7 @@ def _noisy(poses: np.ndarray, instrument: Instrument, rng: np.random.Generator) 
     return pose(turn @ poses[:, :3, :3], poses[:, :3, 3] + shift)
 
 
-def _stated(instrument: Instrument, lever: np.ndarray, frames: int = 1) -> tuple[np.ndarray, np.ndarray]:
+def _stated(instrument: SimulatedInstrument, lever: np.ndarray, frames: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """Return sigmas of position [m] and orientation [rad], each (m, 3).
 
     Seen from a noisy base frame at the distance l, σ_x² = 2 σ_p² + σ_r² (l_y² + l_z²), and so on.
@@ -147,7 +147,7 @@ def _stated(instrument: Instrument, lever: np.ndarray, frames: int = 1) -> tuple
     return sigma, np.full(lever.shape, turning * np.sqrt(frames))
 
 
-def _gross_errors(instrument: Instrument, m: int, rng: np.random.Generator) -> np.ndarray:
+def _gross_errors(instrument: SimulatedInstrument, m: int, rng: np.random.Generator) -> np.ndarray:
     """Return drift and outliers of m rows (m, 3) [m]."""
     directions = rng.normal(size=(m + 1, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

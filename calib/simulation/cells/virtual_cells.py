@@ -12,7 +12,7 @@ from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from calib.robot.load import load
 from calib.simulation.cells import lwr4plus
-from calib.simulation.cells.cell import Cell, Instrument
+from calib.simulation.cells.cell import Cell, SimulatedInstrument
 from calib.simulation.cells.deflections import deflection
 from calib.transforms import pose
 
@@ -20,15 +20,15 @@ LENGTH, ANGLE, OFFSET = 0.3e-3, 0.5e-3, 3e-3  # how far a made-up arm is from it
 COMPLIANCE, AMPLITUDE, HIDDEN_SEED = 2e-5, 6e-4, 2  # hidden part of the LWR4+ [rad/(N m)], [rad]
 
 
-def virtual_cell(robot: str = "lwr4plus", seed: int = 0, instrument: Instrument | None = None) -> Cell:
+def virtual_cell(robot: str = "lwr4plus", seed: int = 0, instrument: SimulatedInstrument | None = None) -> Cell:
     """Return the simulated cell of a robot: the study's for the LWR4+, otherwise a perturbed one by seed."""
-    instrument = instrument or Instrument()
+    instrument = instrument or SimulatedInstrument()
     if robot == "lwr4plus":
         return lwr4plus_cell(instrument)
     return perturbed_cell(load(robot), seed, instrument)
 
 
-def lwr4plus_cell(instrument: Instrument | None = None, hidden: float = 1.0) -> Cell:
+def lwr4plus_cell(instrument: SimulatedInstrument | None = None, hidden: float = 1.0) -> Cell:
     """Return the paper's cell: truth is the calibrated column of Table 2, instrument its optical CMM.
 
     The hidden part, 20 µrad/(N m) and two harmonics of 0.6 mrad per joint, is chosen so that 17 poses chosen under
@@ -51,13 +51,13 @@ def lwr4plus_cell(instrument: Instrument | None = None, hidden: float = 1.0) -> 
         "simulated LWR4+: truth = calibrated column of Table 2 of Kolyubin et al. (2019), plus joint deflections of "
         f"{hidden * COMPLIANCE * 1e6:g} µrad/(N m) and two harmonics of {hidden * AMPLITUDE * 1e3:g} mrad per joint"
     )
-    return Cell(lwr4plus.nominal_chain(), truth, instrument or Instrument(), note)
+    return Cell(lwr4plus.nominal_chain(), truth, instrument or SimulatedInstrument(), note)
 
 
 def perturbed_cell(
     nominal: Chain,
     seed: int = 0,
-    instrument: Instrument | None = None,
+    instrument: SimulatedInstrument | None = None,
     *,
     size: float = 1.0,
     hidden: float = 0.2,
@@ -85,7 +85,7 @@ def perturbed_cell(
         f"simulated {nominal.name}: every element off its nominal by {size * LENGTH * 1e3:g} mm or "
         f"{size * ANGLE * 1e3:g} mrad, joint offsets by {size * OFFSET * 1e3:g} mrad (1 sigma), plus hidden deflections"
     )
-    return Cell(nominal, truth, instrument or Instrument(), note)
+    return Cell(nominal, truth, instrument or SimulatedInstrument(), note)
 
 
 def perturbed(chain: Chain, seed: int | np.random.Generator, size: float = 1.0) -> Chain:

@@ -16,7 +16,7 @@ import numpy as np
 
 from calib.arrays import frozen, shaped
 from calib.dynamics.bodies import Tree
-from calib.dynamics.drives import Term
+from calib.dynamics.drives import DriveTerm
 from calib.errors import CalibError, NotConverged
 from calib.simulation.loop.controllers import Controller
 from calib.simulation.loop.references import Reference
@@ -39,7 +39,7 @@ class Plant:
     """
 
     tree: Tree
-    terms: tuple[Term, ...]
+    terms: tuple[DriveTerm, ...]
     parameters: np.ndarray
 
     def __post_init__(self) -> None:
@@ -76,7 +76,7 @@ class Sensing:
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class SimulatedRun:
     """A simulated motion; M samples.
 
     Attributes:
@@ -104,7 +104,7 @@ def simulate(
     seed: int | np.random.Generator = 0,
     start: tuple[np.ndarray, np.ndarray] | None = None,
     push: np.ndarray | None = None,
-) -> Run:
+) -> SimulatedRun:
     """Let the robot follow a reference.
 
     Args:
@@ -142,7 +142,7 @@ def simulate(
     heard = drawn["sigma_tau"][:: sensing.every] if len(drawn["sigma_tau"]) else 0.0
     t = reference.t[:: sensing.every]
     motion = [frozen(x) for x in out]
-    return Run(t, motion[0], motion[1], motion[2], motion[3], frozen(out[4] + heard), motion[4])
+    return SimulatedRun(t, motion[0], motion[1], motion[2], motion[3], frozen(out[4] + heard), motion[4])
 
 
 def forward_dynamics(plant: Plant, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> np.ndarray:
@@ -214,7 +214,7 @@ def _body(tree: Tree, parameters: np.ndarray) -> np.ndarray:
     return result
 
 
-def _drives(terms: Sequence[Term], values: np.ndarray, n: int) -> tuple[np.ndarray, list]:
+def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int) -> tuple[np.ndarray, list]:
     """Return linear (n, 2 n + 1) and the acts: row, code, amount, three settings, weights (n,)."""
     linear, acts = np.zeros((n, 2 * n + 1)), []
     for one, value in zip(terms, values, strict=True):

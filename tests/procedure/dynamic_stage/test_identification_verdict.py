@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import planted_motion as planted
 import pytest
 
 from calib.data.signals.persistency import report_excitation
-from calib.identification.scores import Part, Score
+from calib.identification.scores import Score, TorqueErrors
 from calib.procedure.dynamic_stage import verdict
-from calib.procedure.dynamic_stage.verdict import judge, with_prior
+from calib.procedure.dynamic_stage.verdict import Resting, judge, with_prior
 from calib.procedure.kinematic_stage.verdict import Verdict
 
 TORQUE = np.array([10.0, 100.0, 0.5])  # rms of each joint: the third does not matter
@@ -21,7 +20,7 @@ TORQUE = np.array([10.0, 100.0, 0.5])  # rms of each joint: the third does not m
 def scored(joints, moving=None, total=5.0, share=1.0) -> Score:
     """Return a score of which `joints` [%] are unexplained in the band."""
     joints = np.asarray(joints, dtype=float)
-    part = Part(total, joints, joints * TORQUE / 100.0, 300)
+    part = TorqueErrors(total, joints, joints * TORQUE / 100.0, 300)
     moved = part if moving is None else replace(part, joints=np.asarray(moving, dtype=float))
     return Score(part, part, moved, part, 0.0 * joints, 1.0 - joints / 100.0, (None,) * 3, 20.0, share)
 
@@ -78,10 +77,8 @@ def test_motion_far_beyond_the_limits_is_a_warning():
 
 
 @pytest.mark.parametrize("drawn, told", [(5, False), (6, True)])
-def test_most_parameters_from_the_cad_are_told_in_the_reason(monkeypatch, drawn, told):
-    names = [f"p{k}" for k in range(drawn)]
-    monkeypatch.setattr(verdict, "resting_names", lambda found: names)
-    found = SimpleNamespace(base=SimpleNamespace(b=10), prior=SimpleNamespace(source="cad"))
-    reason = with_prior(Verdict("marginal", "why"), found).reason
+def test_most_parameters_from_the_cad_are_told_in_the_reason(drawn, told):
+    rests = Resting(tuple(f"p{k}" for k in range(drawn)), 10, "cad")
+    reason = with_prior(Verdict("marginal", "why"), rests).reason
     assert (reason == f"why; {drawn} of 10 parameters are the CAD's: this motion does not tell them") == told
     assert told or reason == "why"

@@ -29,9 +29,9 @@ from calib.procedure.excitation.prior_motions import read_existing
 from calib.procedure.report import motion_figures
 from calib.robot.kinematics import forward
 from calib.robot.load import load
-from trajectories.basis import Motion
+from trajectories.basis import SampledMotion
 from trajectories.design.objectives import condition_numbers
-from trajectories.design.search import Run
+from trajectories.design.search import StartSearch
 from trajectories.design.verify import dense_motion
 from trajectories.fourier import evaluate
 
@@ -204,14 +204,14 @@ def test_bad_recalls(earlier, cell, calib, options, words):
 
 def test_ctrl_c_keeps_the_best_motion_so_far(cell, calib, monkeypatch):
     """An interrupt in the middle of the search: the folder is written, verified, and says so."""
-    remember = Run._remember
+    remember = StartSearch._remember
 
     def interrupting(run, y, found):
         remember(run, y, found)
         if run.kept == 5:
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(Run, "_remember", interrupting)
+    monkeypatch.setattr(StartSearch, "_remember", interrupting)
     code, out, err = calib("excite", "lwr4plus", "--out", "e", "--goal", "wrist=0.1", *QUICK)
     assert code == 0 and "interrupted: this is the best" in out, err
     assert "note: interrupted before any motion met the goals" in out
@@ -342,7 +342,7 @@ def test_collision_distances_are_kept_with_a_slope(tmp_path):
 
     def total(x):
         still = np.zeros((1, 7))
-        return clearance.values(Motion(np.zeros(1), x[None], still, still, still)).sum()
+        return clearance.values(SampledMotion(np.zeros(1), x[None], still, still, still)).sum()
 
-    motion = Motion(np.zeros(1), q, 0 * q, 0 * q, 0 * q)
+    motion = SampledMotion(np.zeros(1), q, 0 * q, 0 * q, 0 * q)
     check(total, clearance.slopes(motion, weights)[0, 0], q[0], tolerance=1e-4)

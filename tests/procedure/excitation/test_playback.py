@@ -8,21 +8,21 @@ import numpy as np
 import pytest
 import yaml
 
-from trajectories.approach import approach
+from trajectories.approach import straight_approach
 from trajectories.errors import BadInput
 from trajectories.messages import joint_trajectory, to_json, to_yaml
-from trajectories.recall import average, recall
-from trajectories.track import Track, joined, repeated, slowed
+from trajectories.recall import average, find_periods
+from trajectories.setpoints import Setpoints, joined, repeated, slowed
 
 RATE, PERIOD = 500.0, 1000
 V, A, J = (np.full(3, x) for x in (1.5, 4.0, 40.0))
 T = np.arange(PERIOD + 1) / RATE
 PHASE = 2 * np.pi * T[:, None] / T[-1] * [1, 2, 3]
-LOOP = Track(RATE, np.sin(PHASE), np.cos(PHASE) * [np.pi, 2 * np.pi, 3 * np.pi], np.zeros((PERIOD + 1, 3)))
+LOOP = Setpoints(RATE, np.sin(PHASE), np.cos(PHASE) * [np.pi, 2 * np.pi, 3 * np.pi], np.zeros((PERIOD + 1, 3)))
 
 
 def test_an_approach_keeps_its_limits_and_reaches_one_of_them():
-    found = approach(np.array([0.3, -1.0, 0.5]), np.array([-1.2, 0.4, 0.6]), V, A, J, RATE)
+    found = straight_approach(np.array([0.3, -1.0, 0.5]), np.array([-1.2, 0.4, 0.6]), V, A, J, RATE)
     np.testing.assert_allclose(found.q[[0, -1]], [[0.3, -1.0, 0.5], [-1.2, 0.4, 0.6]], atol=1e-9)
     for values, bound in ((found.v, V), (found.a, A), (np.diff(found.a, axis=0) * RATE, J)):
         assert (np.abs(values) <= bound * (1 + 1e-9)).all()
@@ -31,7 +31,7 @@ def test_an_approach_keeps_its_limits_and_reaches_one_of_them():
     np.testing.assert_allclose(np.gradient(found.q, 1 / RATE, axis=0)[1:-1], found.v[1:-1], atol=1e-4)
     straight = (found.q - found.q[0]) / (found.q[-1] - found.q[0])
     np.testing.assert_allclose(straight, straight[:, :1] + np.zeros(3), atol=1e-9)
-    assert approach(V, V, V, A, J, RATE).duration == 0.0
+    assert straight_approach(V, V, V, A, J, RATE).duration == 0.0
 
 
 @pytest.mark.parametrize(
@@ -46,17 +46,17 @@ def test_an_approach_keeps_its_limits_and_reaches_one_of_them():
 def test_bad_approaches_are_named(change, message):
     given = {"start": np.zeros(3), "goal": np.ones(3), "velocity": V, "acceleration": A, "jerk": J, "rate": RATE}
     with pytest.raises(BadInput, match=message):
-        approach(**given | change)
+        straight_approach(**given | change)
 
 
 def test_motions_join_only_where_they_meet():
-    start = approach(np.ones(3), LOOP.q[0], V, A, J, RATE)
+    start = straight_approach(np.ones(3), LOOP.q[0], V, A, J, RATE)
     whole = repeated(LOOP, 3)
     assert len(whole) == 3 * PERIOD + 1
     with pytest.raises(BadInput, match=r"begins .* away .*\(speed of joint 3\)"):
         joined([start, whole])
     with pytest.raises(BadInput, match="position of joint 1"):
-        joined([start, Track(RATE, LOOP.q + 0.1, LOOP.v * 0, LOOP.a)])
+        joined([start, Setpoints(RATE, LOOP.q + 0.1, LOOP.v * 0, LOOP.a)])
 
 
 def test_a_rehearsal_is_the_same_path_slower():
@@ -70,7 +70,7 @@ def test_a_rehearsal_is_the_same_path_slower():
 
 
 def test_messages_read_back_as_they_were():
-    track = Track(RATE, LOOP.q[:7], LOOP.v[:7] * 1e-6, LOOP.a[:7], LOOP.q[:7] * 3)
+    track = Setpoints(RATE, LOOP.q[:7], LOOP.v[:7] * 1e-6, LOOP.a[:7], LOOP.q[:7] * 3)
     message = joint_trajectory(track, ["a", "b", "c"], every=3)
     assert json.loads(to_json(message)) == message
     assert yaml.safe_load(to_yaml(message)) == message
@@ -84,7 +84,7 @@ def test_messages_read_back_as_they_were():
 def recorded(sigma: float, periods: int = 5, seed: int = 0) -> tuple[np.ndarray, int]:
     """Return a noisy log: standing, an approach, the periods, part of another, standing elsewhere."""
     rng = np.random.default_rng(seed)
-    start = approach(np.array([2.0, -2.0, 1.0]), LOOP.q[0], V, A, J, RATE).q
+    start = straight_approach(np.array([2.0, -2.0, 1.0]), LOOP.q[0], V, A, J, RATE).q
     parts = [
         np.tile(start[0], (333, 1)),
         start,
@@ -98,28 +98,28 @@ def recorded(sigma: float, periods: int = 5, seed: int = 0) -> tuple[np.ndarray,
 
 def test_a_motion_is_found_in_a_log_and_cut_to_whole_periods():
     log, start = recorded(0.01)
-    found = recall(log, LOOP.q[:-1])
+    found = find_periods(log, LOOP.q[:-1])
     assert (found.start, found.periods, found.period) == (start, 5, PERIOD)
     assert min(found.likeness) > 0.99 and abs(found.lag) < 0.1
-    assert recall(log, LOOP.q[:-1], skip=1).start == start + PERIOD
+    assert find_periods(log, LOOP.q[:-1], skip=1).start == start + PERIOD
 
 
 def test_the_variance_over_periods_is_that_of_the_noise_and_the_mean_is_better():
     sigma = np.array([0.01, 0.02, 0.03])
     log, start = recorded(0.0, periods=12)
     noisy = log + sigma * np.random.default_rng(1).normal(size=log.shape)
-    result = average(noisy, recall(noisy, LOOP.q[:-1]))
+    result = average(noisy, find_periods(noisy, LOOP.q[:-1]))
     np.testing.assert_allclose(np.sqrt(result.pooled), sigma, rtol=0.03)
     error = (result.mean - LOOP.q[:-1]).std(axis=0)
     np.testing.assert_allclose(error, sigma / np.sqrt(12), rtol=0.08)
-    assert start == recall(noisy, LOOP.q[:-1]).start
+    assert start == find_periods(noisy, LOOP.q[:-1]).start
 
 
 def test_what_is_not_there_is_not_found():
     log, start = recorded(0.0)
     with pytest.raises(BadInput, match="not in the recording"):
-        recall(log, np.roll(LOOP.q[:-1], 1, axis=1))
+        find_periods(log, np.roll(LOOP.q[:-1], 1, axis=1))
     with pytest.raises(BadInput, match="not all there"):
-        recall(log[:500], LOOP.q[:-1])
+        find_periods(log[:500], LOOP.q[:-1])
     with pytest.raises(BadInput, match="record two or more"):
-        average(log, recall(log[: start + 1700], LOOP.q[:-1]))
+        average(log, find_periods(log[: start + 1700], LOOP.q[:-1]))

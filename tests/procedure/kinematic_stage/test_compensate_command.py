@@ -17,7 +17,7 @@ from calib.geometry.inverse import Goal
 from calib.procedure.kinematic_stage import compensation
 from calib.robot.kinematics import forward
 from calib.robot.load import load
-from calib.simulation.cells.cell import Cell, Instrument, measure, true_poses
+from calib.simulation.cells.cell import Cell, SimulatedInstrument, measure, true_poses
 from calib.simulation.cells.virtual_cells import perturbed_cell
 from calib.transforms import from_xyz_rpy, rotation_vector, to_quaternion
 
@@ -27,7 +27,9 @@ SIGMA = 20e-6
 @pytest.fixture(scope="module")
 def cell() -> Cell:
     """A UR5 with errors in every element, gear harmonics and compliance, seen by a fine instrument."""
-    return perturbed_cell(load("ur5"), 4, Instrument(position_sigma=SIGMA, orientation_sigma=5e-5, encoder_sigma=0.0))
+    return perturbed_cell(
+        load("ur5"), 4, SimulatedInstrument(position_sigma=SIGMA, orientation_sigma=5e-5, encoder_sigma=0.0)
+    )
 
 
 def drawn(cell: Cell, count: int, seed: int) -> np.ndarray:

@@ -17,7 +17,7 @@ from calib.geometry.installation import Installation, see
 from calib.procedure.kinematic_stage import inputs
 from calib.procedure.report.page import iso9283_tables
 from calib.robot.load import load
-from calib.simulation.cells.cell import Instrument, measure
+from calib.simulation.cells.cell import SimulatedInstrument, measure
 from calib.simulation.cells.virtual_cells import perturbed_cell
 from calib.transforms import from_xyz_rpy
 
@@ -111,7 +111,7 @@ def files(tmp_path, monkeypatch) -> Path:
     """Forty poses once, five of them thirty times, and a validation file at the fit's joints."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("calib.procedure.report.fit_certificate.write", lambda outcome, folder: None)
-    cell = perturbed_cell(load("ur5"), 1, Instrument(position_sigma=2e-5, orientation_sigma=5e-5))
+    cell = perturbed_cell(load("ur5"), 1, SimulatedInstrument(position_sigma=2e-5, orientation_sigma=5e-5))
     rng = np.random.default_rng(3)
     once, five = rng.uniform(-2, 2, (60, 6)), rng.uniform(-2, 2, (5, 6))
     for name, q, seed in (("fit", once, 1), ("iso", np.tile(five, (30, 1)), 2), ("again", once, 3)):

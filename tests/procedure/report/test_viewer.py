@@ -20,7 +20,7 @@ from calib.robot.formats import urdf_write
 from calib.robot.kinematics import forward
 from calib.robot.load import load
 from calib.robot.visuals import visuals
-from calib.simulation.cells.cell import Instrument, measure
+from calib.simulation.cells.cell import SimulatedInstrument, measure
 from calib.simulation.cells.virtual_cells import perturbed_cell
 
 
@@ -28,7 +28,7 @@ from calib.simulation.cells.virtual_cells import perturbed_cell
 def fitted(tmp_path_factory) -> Path:
     """A fit of 60 poses of a UR5, 15 of them kept aside."""
     folder = tmp_path_factory.mktemp("viewer")
-    cell = perturbed_cell(load("ur5"), 2, Instrument(position_sigma=3e-5, orientation_sigma=1e-4))
+    cell = perturbed_cell(load("ur5"), 2, SimulatedInstrument(position_sigma=3e-5, orientation_sigma=1e-4))
     q = np.random.default_rng(0).uniform(-2, 2, (60, 6))
     seen = measure(cell, q, 1)
     with (folder / "seen.csv").open("w", newline="") as file:

@@ -16,7 +16,7 @@ from calib.robot.chain import random_joints
 from calib.robot.kinematics import forward
 from calib.robot.load import load
 from calib.simulation.cells import lwr4plus
-from calib.simulation.cells.cell import Cell, Instrument, measure, true_poses
+from calib.simulation.cells.cell import Cell, SimulatedInstrument, measure, true_poses
 from calib.simulation.cells.virtual_cells import lwr4plus_cell, perturbed_cell, rigid, virtual_cell
 from calib.transforms import invert, rotation_vector
 
@@ -43,7 +43,7 @@ def study_poses(count: int, seed: int) -> np.ndarray:
 def test_planted_truth_is_recovered_within_its_covariance(robot: str) -> None:
     # Prediction errors at unseen poses against what the covariance says of them: their mean square in sigmas is 1.
     q, ratios = random_joints(load(robot), 60, 1), []
-    cell = rigid(perturbed_cell(load(robot), 3, Instrument(encoder_sigma=0.0)))
+    cell = rigid(perturbed_cell(load(robot), 3, SimulatedInstrument(encoder_sigma=0.0)))
     for seed in range(30):
         found = calibrate(cell, q, seed)
         part = next(p.part for p in found.pieces if p.part.label == "position")
@@ -63,8 +63,8 @@ def test_hidden_part_has_the_size_of_the_paper() -> None:
 
 
 def test_stated_sigma_is_the_spread_of_repeated_measurements() -> None:
-    bars = Instrument(base_frame=np.eye(4), encoder_sigma=0.0)
-    for instrument in (Instrument(encoder_sigma=0.0), bars):
+    bars = SimulatedInstrument(base_frame=np.eye(4), encoder_sigma=0.0)
+    for instrument in (SimulatedInstrument(encoder_sigma=0.0), bars):
         cell = rigid(lwr4plus_cell(instrument))
         q = np.repeat(study_poses(3, 5), 3000, axis=0)
         measured = measure(cell, q, 1)
@@ -78,7 +78,7 @@ def test_stated_sigma_is_the_spread_of_repeated_measurements() -> None:
 
 
 def test_base_leds_measure_the_arm_from_its_base() -> None:
-    quiet = Instrument(position_sigma=1e-12, orientation_sigma=1e-12, encoder_sigma=0.0, base_frame=np.eye(4))
+    quiet = SimulatedInstrument(position_sigma=1e-12, orientation_sigma=1e-12, encoder_sigma=0.0, base_frame=np.eye(4))
     cell = lwr4plus_cell(quiet)
     measured = measure(cell, study_poses(5, 2), 0)
     seen = invert(cell.truth.stations[0]) @ true_poses(cell, measured.q)
@@ -87,7 +87,7 @@ def test_base_leds_measure_the_arm_from_its_base() -> None:
 
 def test_drift_and_outliers_are_where_they_are_said_to_be() -> None:
     q = study_poses(200, 3)
-    cell = lwr4plus_cell(Instrument(encoder_sigma=0.0))
+    cell = lwr4plus_cell(SimulatedInstrument(encoder_sigma=0.0))
     plain = measure(cell, q, 4).position
     wandering = measure(replace(cell, instrument=replace(cell.instrument, drift=1e-3)), q, 4).position
     assert plain is not None and wandering is not None

@@ -14,7 +14,7 @@ JUMP = 1e-6  # of a joint [rad or m] at a seam between two tracks
 
 
 @dataclass(frozen=True, eq=False)
-class Track:
+class Setpoints:
     """Samples at a constant rate, both ends included.
 
     Attributes:
@@ -45,7 +45,7 @@ class Track:
         return (len(self) - 1) / self.rate
 
 
-def joined(tracks: Sequence[Track]) -> Track:
+def joined(tracks: Sequence[Setpoints]) -> Setpoints:
     """Return tracks one after the other; each begins where the one before ends, at that very sample.
 
     Raises:
@@ -69,17 +69,17 @@ def joined(tracks: Sequence[Track]) -> Track:
     parts = {key: np.vstack([getattr(t, key)[r] for t, r in zip(tracks, rows)]) for key in ("q", "v", "a")}
     torques = [t.tau for t in tracks]
     tau = None if any(x is None for x in torques) else np.vstack([x[r] for x, r in zip(torques, rows) if x is not None])
-    return Track(first.rate, **parts, tau=tau)
+    return Setpoints(first.rate, **parts, tau=tau)
 
 
-def repeated(track: Track, times: int) -> Track:
+def repeated(track: Setpoints, times: int) -> Setpoints:
     """Return a closed motion `times` times over: a periodic one with both ends included, so N - 1 samples a period."""
     if times < 1:
         raise BadInput(f"a motion can be repeated once or more often, not {times} times")
     return joined([track] * times)
 
 
-def slowed(track: Track, factor: float) -> Track:
+def slowed(track: Setpoints, factor: float) -> Setpoints:
     """Return the same path `factor` times slower, for a rehearsal: v / factor, a / factor²; torques are not known.
 
     Positions between the samples come from cubic Hermite pieces, which meet q and v at every sample.
@@ -101,4 +101,4 @@ def slowed(track: Track, factor: float) -> Track:
     q = q0 + x * (v0 + x * (bend + x * twist))
     v = (v0 + x * (2 * bend + 3 * x * twist)) * track.rate
     a = track.a[k] * (1 - x) + track.a[k + 1] * x
-    return Track(track.rate, q, v / factor, a / factor**2)
+    return Setpoints(track.rate, q, v / factor, a / factor**2)

@@ -1,0 +1,154 @@
+"""`calib identify` and a session's steps identify and predict give one answer to the same recordings."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import planted_motion as planted
+import pytest
+from both_ways import Judgement, agree, command, read, refusal
+from sessions import quiet
+
+from calib.procedure.report import dynamics_section, identification_figures, motion_figures
+from calib.procedure.session import dynamics_steps, geometry_steps
+from calib.procedure.session.folder import Session, open_session
+
+pytestmark = pytest.mark.usefixtures("plain", "unplotted")
+Series = dict[str, np.ndarray]
+DYNAMICS = {
+    "wanted": "true", "plan": "false", "validation": "false", "friction": '"standard"', "period": "4.0",
+    "harmonics": "2", "rate": "100.0", "repeats": "1", "starts": "1", "evaluations": "20",
+}  # fmt: skip
+MODEL = ("parameters", "condition_number", "friction", "method", "ladder", "elimination", "geometry", "resting", "unit")
+
+
+@pytest.fixture(scope="module")
+def unplotted() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(identification_figures, "write", lambda outcome, folder: None)
+        yield
+
+
+@pytest.fixture(scope="module")
+def with_dynamics(fitted: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session whose geometry is calibrated; its dynamics are identified in copies of it."""
+    place = tmp_path_factory.mktemp("dynamics") / "cell"
+    shutil.copytree(fitted, place)
+    settings = place / "session.toml"
+    head, dynamics = settings.read_text().split("[dynamics]", 1)
+    for key, value in DYNAMICS.items():
+        dynamics = re.sub(rf"(?m)^{key} = .*$", f"{key} = {value}", dynamics, count=1)
+    settings.write_text(f"{head}[dynamics]{dynamics}")
+    (place / "7-recorded").mkdir()
+    return place
+
+
+@pytest.fixture
+def session(with_dynamics: Path, tmp_path: Path) -> Session:
+    shutil.copytree(with_dynamics, tmp_path / "cell")
+    return open_session(tmp_path / "cell")
+
+
+def clean(training: Series, unseen: Series) -> None:
+    """Change nothing."""
+
+
+def reversed_torque(training: Series, unseen: Series) -> None:
+    """Turn the sign of the joint about the vertical, which no check of the nominal masses can see."""
+    for series in (training, unseen):
+        series["tau"][:, 0] *= -1.0
+
+
+def swapped_columns(training: Series, unseen: Series) -> None:
+    for series in (training, unseen):
+        series["tau"] = series["tau"][:, [0, 2, 1]]
+
+
+def another_joint_order(training: Series, unseen: Series) -> None:
+    for series in (training, unseen):
+        series["q"] = series["q"][:, [1, 0, 2]]
+
+
+def copied(training: Series, unseen: Series) -> None:
+    unseen.update(training)
+
+
+def standing(training: Series, unseen: Series) -> None:
+    unseen["q"] = np.repeat(unseen["q"][:1], len(unseen["q"]), axis=0)
+
+
+def by_command(session: Session, out: Path) -> Judgement:
+    place = session.path("7-recorded")
+    refused = command(
+        "identify", session.path("4-fit"), place / "training.npz", "--validate", place / "validation.npz", "--friction",
+        "standard", "--out", out,
+    )  # fmt: skip
+    if refused:
+        return Judgement(refused=refused)
+    found = read(out / "metrics.json")
+    numbers = {"fit": found["identification"], **{key: found[key] for key in ("validation", *MODEL)}}
+    return Judgement(found["verdict"], found["reason"], numbers, frozenset(found["warnings"]))
+
+
+def by_session(session: Session) -> Judgement:
+    refused = refusal(lambda: dynamics_steps.record(session, quiet))
+    refused = refused or refusal(lambda: dynamics_steps.identify(session, quiet))
+    if refused:
+        return Judgement(refused=refused)
+    notes = dynamics_steps.predict(session, quiet)
+    found = read(session.path("8-dynamics/unseen/report.json"))
+    assert set(found["warnings"]) <= set(notes)
+    own, printed = read(session.path("8-dynamics/metrics.json")), dynamics_section.read(session.path("8-dynamics"))
+    numbers = {key: found[key] for key in ("fit", "validation")} | {key: own[key] for key in MODEL}
+    assert (printed.verdict, printed.reason) == (found["verdict"], found["reason"])
+    return Judgement(found["verdict"], found["reason"], numbers, frozenset(found["warnings"]))
+
+
+@pytest.mark.parametrize(
+    ("change", "verdict"),
+    [
+        (clean, "pass"),
+        (reversed_torque, "fail"),
+        (swapped_columns, ""),
+        (another_joint_order, "fail"),
+        (copied, "marginal"),
+        (standing, "marginal"),
+    ],
+)
+def test_command_and_session_agree(
+    session: Session, tmp_path: Path, change: Callable[[Series, Series], None], verdict: str
+) -> None:
+    training, unseen = planted.series(0, noise=0.02), planted.series(7, noise=0.02)
+    change(training, unseen)
+    for name, series in (("training", training), ("validation", unseen)):
+        np.savez(session.path(f"7-recorded/{name}.npz"), allow_pickle=False, **series)
+    two = by_session(session)
+    agree(by_command(session, tmp_path / "model"), two)
+    assert two.verdict == verdict
+
+
+@pytest.mark.slow
+def test_the_same_motion_is_designed(session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(motion_figures, "write_design", lambda designed, folder: None)
+    dynamics_steps.excite(session, quiet)
+    words = "--period 4 --harmonics 2 --rate 100 --starts 1 --evaluations 20 --repeat 1"
+    assert not command("excite", session.path("4-fit"), *words.split(), "--out", tmp_path / "motion")
+    names = {path.name for path in (tmp_path / "motion").iterdir()}
+    assert names == {path.name for path in session.path("6-excitation/training").iterdir()}
+    for name in names - {"metrics.json"}:
+        own = session.path("6-excitation/training") / name
+        assert own.read_bytes() == (tmp_path / "motion" / name).read_bytes(), name
+
+
+def test_the_same_robot_is_exported(session: Session, tmp_path: Path) -> None:
+    for name, seed in (("training", 0), ("validation", 7)):
+        np.savez(session.path(f"7-recorded/{name}.npz"), allow_pickle=False, **planted.series(seed, noise=0.02))
+    by_session(session)
+    geometry_steps.export(session, quiet)
+    assert not command("export", session.path("8-dynamics"), "--into", tmp_path / "export")
+    for path in (tmp_path / "export").iterdir():
+        assert path.read_bytes() == (session.path(session.export) / path.name).read_bytes(), path.name

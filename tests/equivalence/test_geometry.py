@@ -1,0 +1,150 @@
+"""`calib fit` and a session's steps fit, validate and certificate give one answer to the same files."""
+
+from __future__ import annotations
+
+import html
+import shutil
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from both_ways import Judgement, agree, command, go_on, read, session_with
+
+from calib.data.poses.plans import read_poses
+from calib.procedure.session.folder import open_session
+from calib.robot.load import load
+
+pytestmark = pytest.mark.usefixtures("plain")
+
+
+def by_command(robot: Path, out: Path, model: str, fit: Path, unseen: Path) -> Judgement:
+    refused = command("fit", robot, fit, "--validate", unseen, "--model", model, "--out", out)
+    if refused:
+        return Judgement(refused=refused)
+    found = read(out / "metrics.json")
+    numbers = {key: found[key] for key in ("fit", "validation", "model", "ladder", "outliers", "not_identifiable")}
+    return Judgement(
+        found["verdict"], found["reason"], numbers, plainly(found["warnings"], robot.parent, fit.parent, unseen.parent)
+    )
+
+
+def flat(words: str) -> str:
+    """Return words as a page may print them: whatever their case, line breaks and capitals are the page's own."""
+    return " ".join(words.split()).casefold()
+
+
+def plainly(notes: Iterable[str], *folders: Path) -> frozenset[str]:
+    """Return notes without the folders that files lie in."""
+    for folder in folders:
+        notes = [note.replace(f"{folder}/", "") for note in notes]
+    return frozenset(notes)
+
+
+def by_session(robot: Path, folder: Path, model: str, fit: Path, unseen: Path) -> Judgement:
+    session = session_with(folder, robot, model, fit, unseen)
+    refused = go_on(session)
+    if refused:
+        return Judgement(refused=refused.replace(str(session.path("3-measured")), str(fit.parent)))
+    fitted, held = read(session.path("4-fit/metrics.json")), read(session.path("5-validation/metrics.json"))
+    numbers = {key: fitted[key] for key in ("fit", "model", "ladder", "outliers", "not_identifiable")}
+    numbers["validation"] = held["validation"]
+    page = flat(html.unescape(session.path("certificate.html").read_text()))
+    for words in (held["reason"], *held["warnings"]):
+        assert flat(words) in page
+    notes = [note for step in read(session.path("state.json"))["steps"].values() for note in step["notes"]]
+    assert set(held["warnings"]) <= {*notes, *fitted["warnings"]}
+    assert set(fitted["warnings"]) <= {*notes, *held["warnings"]}
+    notes = plainly(held["warnings"], session.path("3-measured"), session.path("1-robot"))
+    return Judgement(held["verdict"], held["reason"], numbers, notes)
+
+
+def clean(files: Path, place: Path) -> tuple[Path, Path, Path]:
+    return files / "robot.toml", files / "measured.csv", files / "validation.csv"
+
+
+def copied(files: Path, place: Path) -> tuple[Path, Path, Path]:
+    lines = (files / "measured.csv").read_text().splitlines()
+    (place / "validation.csv").write_text("\n".join([lines[0], *lines[5:25]]) + "\n")
+    return files / "robot.toml", files / "measured.csv", place / "validation.csv"
+
+
+def swapped(files: Path, place: Path) -> tuple[Path, Path, Path]:
+    for name in ("measured", "validation"):
+        head, rest = (files / f"{name}.csv").read_text().split("\n", 1)
+        head = head.replace("joint2", "?").replace("joint3", "joint2").replace("?", "joint3")
+        (place / f"{name}.csv").write_text(f"{head}\n{rest}")
+    return files / "robot.toml", place / "measured.csv", place / "validation.csv"
+
+
+def moved(files: Path, place: Path) -> tuple[Path, Path, Path]:
+    """An instrument that stood half a metre off for validation."""
+    head, *lines = (files / "validation.csv").read_text().splitlines()
+    column = head.split(",").index("x [mm]")
+    table = np.array([line.split(",") for line in lines], dtype=float)
+    table[:, column] += 500.0
+    np.savetxt(place / "validation.csv", table, delimiter=",", header=head, comments="", fmt="%.12g")
+    return files / "robot.toml", files / "measured.csv", place / "validation.csv"
+
+
+def named_oddly(files: Path, place: Path) -> tuple[Path, Path, Path]:
+    fit, unseen = place / 'day1, "left"\nof it.csv', place / "validation, too.csv"
+    shutil.copyfile(files / "measured.csv", fit)
+    shutil.copyfile(files / "validation.csv", unseen)
+    return files / "robot.toml", fit, unseen
+
+
+@pytest.mark.parametrize("case", [clean, copied, swapped, moved, named_oddly])
+def test_command_and_session_agree(files: Path, tmp_path: Path, case: Callable[[Path, Path], tuple[Path, ...]]) -> None:
+    robot, fit, unseen = case(files, tmp_path)
+    one = by_command(robot, tmp_path / "out", "geometry", fit, unseen)
+    two = by_session(robot, tmp_path / "cell", "geometry", fit, unseen)
+    agree(one, two)
+    if case is copied:
+        assert any("20 rows" in note and "not unseen" in note for note in two.notes)
+
+
+def test_a_robot_that_comes_with_corrections_keeps_them_as_its_nominal(files: Path, tmp_path: Path) -> None:
+    assert not command(
+        "fit", files / "robot.toml", files / "bent_first.csv", "--model", "harmonics", "--out", tmp_path / "0"
+    )
+    fit, unseen = tmp_path / "measured.csv", tmp_path / "validation.csv"
+    for path in (fit, unseen):
+        shutil.copyfile(files / f"bent_{path.name}", path)
+    one = by_command(tmp_path / "0/robot.toml", tmp_path / "1", "geometry", fit, unseen)
+    two = by_session(tmp_path / "0/robot.toml", tmp_path / "cell", "geometry", fit, unseen)
+    agree(one, two)
+    rms = {
+        arm: two.numbers["validation"]["validation.csv"][arm]["position_mm"]["rms"] for arm in ("nominal", "calibrated")
+    }
+    assert rms["nominal"] < 1.5 * rms["calibrated"]  # it is calibrated already
+
+
+def test_a_files_name_may_hold_commas_quotes_and_line_breaks(files: Path, tmp_path: Path) -> None:
+    robot, fit, unseen = named_oddly(files, tmp_path)
+    out = tmp_path / "out"
+    assert not command("fit", robot, fit, "--validate", unseen, "--model", "harmonics", "--out", out)
+    targets = tmp_path / "targets.csv"
+    targets.write_text("joint1 [rad],joint2 [rad],joint3 [rad]\n0.1,0.2,0.3\n-0.4,0.5,0.6\n")
+    assert not command("compensate", out, targets, "--dof", "3", "--tolerance", "10,1000", "--out", tmp_path / "q.csv")
+    assert not command("export", out, "--offsets", tmp_path / "offsets.csv")
+    assert len((tmp_path / "q.csv").read_text().splitlines()) == 3
+    assert load(out).n == 3
+
+
+def test_the_same_poses_are_chosen(fitted: Path, files: Path, tmp_path: Path) -> None:
+    out, session = tmp_path / "poses.csv", open_session(fitted)
+    device, place = session.settings.instrument, ",".join(map(str, session.settings.instrument.tool))
+    sigmas = f"{device.sigma_position},{device.sigma_orientation}"
+    assert not command("select", files / "robot.toml", "-m", 4, "--tool", place, "--sigma", sigmas, "--out", out)
+    names = load(fitted / "4-fit").joint_names
+    chosen = read_poses(session.path("2-poses/poses.csv"), names)
+    np.testing.assert_allclose(chosen, read_poses(out, names), atol=1e-6)
+
+
+def test_the_same_robot_is_exported(fitted: Path, tmp_path: Path) -> None:
+    out = tmp_path / "joint_offsets.csv"
+    assert not command("export", fitted / "4-fit", "--offsets", out)
+    assert out.read_bytes() == (fitted / "6-export/joint_offsets.csv").read_bytes()
+    for name in ("robot.toml", "robot.urdf"):
+        assert (fitted / "4-fit" / name).read_bytes() == (fitted / "6-export" / name).read_bytes()
