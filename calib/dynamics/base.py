@@ -157,7 +157,7 @@ def random_samples(
     upper: np.ndarray | None = None,
 ) -> States:
     """Draw states: q uniform within its limits (default ±π), v and a uniform within ±3 per s and ±3 per s²."""
-    rng, n = np.random.default_rng(seed), model.tree.n
+    rng, n = np.random.default_rng(seed), model.bodies.n
     low = np.full(n, -np.pi) if lower is None else lower
     q = rng.uniform(low, np.full(n, np.pi) if upper is None else upper, (count, n))
     v, a, load = rng.uniform(-3.0, 3.0, (3, count, n))
@@ -209,11 +209,11 @@ def regroup(base: Base, model: IdentificationModel, samples: States | None = Non
 
 def preference(model: IdentificationModel) -> np.ndarray:
     """Return all columns in the order they are tried: of moving links what Khalil keeps, drives, the rest, payloads."""
-    bodies = model.tree
+    bodies = model.bodies
     first: list[int] = []
     late: list[int] = []
     fixed: list[int] = []
-    for i in range(0 if model.kind == "drive" else bodies.bodies):
+    for i in range(0 if model.kind == "drive" else bodies.count):
         if bodies.kinds[i] == FIXED:
             fixed += range(10 * i, 10 * i + 10)
             continue
@@ -274,7 +274,7 @@ def _load_cases(model: IdentificationModel, loads: Loads | None) -> Loads:
     """Return the load cases: all payloads and none, where the model has payloads."""
     if loads is not None:
         return loads
-    return (None, ()) if model.kind != "drive" and np.any(model.tree.kinds == FIXED) else (None,)
+    return (None, ()) if model.kind != "drive" and np.any(model.bodies.kinds == FIXED) else (None,)
 
 
 def _updated(triangle: np.ndarray, columns: np.ndarray) -> np.ndarray:

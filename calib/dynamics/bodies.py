@@ -25,7 +25,7 @@ UNITS = ("kg m²",) * 6 + ("kg m",) * 3 + ("kg",)
 
 
 @dataclass(frozen=True, eq=False)
-class Tree:
+class Bodies:
     """B rigid bodies moved by n coordinates, parents before children.
 
     Attributes:
@@ -60,7 +60,7 @@ class Tree:
     order: np.ndarray
 
     @property
-    def bodies(self) -> int:
+    def count(self) -> int:
         return len(self.parents)
 
     @property
@@ -74,10 +74,10 @@ class Tree:
 
     @property
     def units(self) -> tuple[str, ...]:
-        return UNITS * self.bodies
+        return UNITS * self.count
 
 
-def tree(chain: Chain) -> Tree:
+def bodies_of(chain: Chain) -> Bodies:
     """Return the bodies of a chain: one behind each moving element (a mimic joint's followers are bodies, too).
 
     Body j is numbered like its joint, from 1; a follower of joint 2 is ``2b``, the next one ``2c``.
@@ -109,49 +109,49 @@ def tree(chain: Chain) -> Tree:
     )
 
 
-def with_payload(tree: Tree, placement: np.ndarray, label: str | None = None, on: int = -1) -> Tree:
-    """Return the tree with one more body, fixed to body `on` (default the last).
+def with_payload(bodies: Bodies, placement: np.ndarray, label: str | None = None, on: int = -1) -> Bodies:
+    """Return the bodies with one more body, fixed to body `on` (default the last).
 
     Args:
         placement: (4, 4), the frame of the payload's parameters in the frame of the body it is fixed to; `Chain.tail`
             for the tip of a chain.
         label: default the number after the last joint's, so 8 on an arm of seven joints.
     """
-    parent = range(tree.bodies)[on]
-    label = str(tree.n + 1) if label is None else label
-    if label in tree.labels:
+    parent = range(bodies.count)[on]
+    label = str(bodies.n + 1) if label is None else label
+    if label in bodies.labels:
         raise RobotError(f"a body '{label}' is there already; give the payload another label")
     return _assemble(
-        [*tree.labels, label],
-        [*tree.parents, parent],
-        [*tree.kinds, FIXED],
-        [*tree.axes, 2],
-        [*tree.scales, 0.0],
-        [*tree.coordinates, -1],
-        [*tree.placements, shaped(placement, (4, 4), "payload placement")],
-        tree.gravity,
-        tree.n,
+        [*bodies.labels, label],
+        [*bodies.parents, parent],
+        [*bodies.kinds, FIXED],
+        [*bodies.axes, 2],
+        [*bodies.scales, 0.0],
+        [*bodies.coordinates, -1],
+        [*bodies.placements, shaped(placement, (4, 4), "payload placement")],
+        bodies.gravity,
+        bodies.n,
     )
 
 
-def with_gravity(tree: Tree, gravity: np.ndarray) -> Tree:
-    """Return the tree under another gravity vector (3,) in the base frame [m/s²]."""
+def with_gravity(bodies: Bodies, gravity: np.ndarray) -> Bodies:
+    """Return the bodies under another gravity vector (3,) in the base frame [m/s²]."""
     gravity = shaped(gravity, (3,), "gravity")
-    constants = np.array(tree.constants)
+    constants = np.array(bodies.constants)
     constants[-1, :3] = gravity
-    return replace(tree, gravity=frozen(gravity), constants=frozen(constants))
+    return replace(bodies, gravity=frozen(gravity), constants=frozen(constants))
 
 
 def standard_parameters(chain: Chain) -> np.ndarray:
-    """Return the 10·B standard parameters of `tree(chain)` from the chain's inertias; followers have none.
+    """Return the 10·B standard parameters of `bodies_of(chain)` from the chain's inertias; followers have none.
 
     Raises:
         RobotError: where the chain has no inertias.
     """
     if chain.inertias is None:
         raise RobotError(f"robot '{chain.name}': its masses are not known; add 'inertia' to its joints")
-    bodies = tree(chain)
-    result = np.zeros((bodies.bodies, 10))
+    bodies = bodies_of(chain)
+    result = np.zeros((bodies.count, 10))
     for row, label in enumerate(bodies.labels):
         if label.isdigit():
             result[row] = chain.inertias[int(label) - 1]
@@ -170,7 +170,7 @@ def _elementary(element: Element) -> np.ndarray:
     return pose(turn)
 
 
-def _assemble(labels, parents, kinds, axes, scales, coordinates, placements, gravity, n) -> Tree:
+def _assemble(labels, parents, kinds, axes, scales, coordinates, placements, gravity, n) -> Bodies:
     """Freeze the arrays and list the coordinates that move each body."""
     paths = np.full((len(labels), n), -1)
     depths = np.zeros(len(labels), dtype=int)
@@ -183,7 +183,7 @@ def _assemble(labels, parents, kinds, axes, scales, coordinates, placements, gra
     constants = np.zeros((len(labels) + 1, 13))
     constants[:-1, :12], constants[:-1, 12] = upright[:, :3].reshape(-1, 12), scales
     constants[-1, :3] = gravity
-    return Tree(
+    return Bodies(
         labels=tuple(labels),
         parents=frozen(parents, np.int64),
         kinds=frozen(kinds, np.int64),

@@ -19,7 +19,7 @@ import numpy as np
 
 from calib.arrays import shaped
 from calib.dynamics import drives, rigid_body
-from calib.dynamics.bodies import Tree, tree, with_payload
+from calib.dynamics.bodies import Bodies, bodies_of, with_payload
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.shapes import V0
 from calib.errors import CalibError
@@ -34,12 +34,12 @@ class IdentificationModel:
     """Bodies and drives as one regressor.
 
     Attributes:
-        tree: the bodies.
+        bodies: of the robot.
         terms: the drives' terms.
         kind: one of `KINDS`.
     """
 
-    tree: Tree
+    bodies: Bodies
     terms: tuple[DriveTerm, ...] = ()
     kind: str = "motor"
 
@@ -51,18 +51,18 @@ class IdentificationModel:
             raise CalibError(f"parameter '{doubled[0]}' occurs twice; remove one of its terms")
         for one in self.terms:
             for row, motion in one.acts:
-                if not all(0 <= joint < self.tree.n for joint in (row, *(j for j, _ in motion))):
-                    raise CalibError(f"term '{one.name}' names a joint beyond the robot's {self.tree.n}")
+                if not all(0 <= joint < self.bodies.n for joint in (row, *(j for j, _ in motion))):
+                    raise CalibError(f"term '{one.name}' names a joint beyond the robot's {self.bodies.n}")
 
     @property
     def names(self) -> tuple[str, ...]:
         own = tuple(one.name for one in self.columns)
-        return own if self.kind == "drive" else self.tree.names + own
+        return own if self.kind == "drive" else self.bodies.names + own
 
     @property
     def units(self) -> tuple[str, ...]:
         own = tuple(one.unit for one in self.columns)
-        return own if self.kind == "drive" else self.tree.units + own
+        return own if self.kind == "drive" else self.bodies.units + own
 
     @property
     def columns(self) -> tuple[DriveTerm, ...]:
@@ -73,7 +73,7 @@ class IdentificationModel:
     @property
     def rows(self) -> int:
         """Torque rows per sample: n, or 2 n where sensors and motors are stacked."""
-        return self.tree.n * (2 if self.kind == "both" else 1)
+        return self.bodies.n * (2 if self.kind == "both" else 1)
 
     @property
     def p(self) -> int:
@@ -96,12 +96,12 @@ class IdentificationModel:
             carried: labels of the fixed bodies (payloads) present; None for all. Columns of absent ones are zero.
             states: (s, N), of `friction_states`; None: computed, taking q for one uninterrupted record.
         """
-        q, v, a = (shaped(x, (len(q), self.tree.n), name) for x, name in ((q, "q"), (v, "v"), (a, "a")))
+        q, v, a = (shaped(x, (len(q), self.bodies.n), name) for x, name in ((q, "q"), (v, "v"), (a, "a")))
         loads = None if load is None else shaped(load, q.shape, "load").T
-        n, first = self.tree.n, 0 if self.kind == "drive" else 10 * self.tree.bodies
+        n, first = self.bodies.n, 0 if self.kind == "drive" else 10 * self.bodies.count
         out = np.zeros((self.p, self.rows, len(q)))
         if first:
-            rigid_body.fill_regressor(self.tree, q, v, a, out[:first])
+            rigid_body.fill_regressor(self.bodies, q, v, a, out[:first])
             self._drop_absent(out, carried)
         motions = [np.ascontiguousarray(x.T) for x in (q, v, a)]
         states = drives.friction_states(self.columns, motions[0]) if states is None else states
@@ -123,14 +123,14 @@ class IdentificationModel:
         Args:
             weights: (N, rows, p).
         """
-        n, first = self.tree.n, 0 if self.kind == "drive" else 10 * self.tree.bodies
+        n, first = self.bodies.n, 0 if self.kind == "drive" else 10 * self.bodies.count
         weights = shaped(weights, (len(q), self.rows, self.p), "weights of the regressor")
         if self.kind == "both":
             linked = [True] * first + [one.side == "link" for one in self.columns]
             weights = weights[:, n:] + weights[:, :n] * np.array(linked, dtype=float)
         out = np.zeros((3, *np.shape(q)))
         if first:
-            out[:] = rigid_body.regressor_gradient(self.tree, q, v, a, weights[:, :, :first])
+            out[:] = rigid_body.regressor_gradient(self.bodies, q, v, a, weights[:, :, :first])
         motions = [np.ascontiguousarray(np.asarray(x, dtype=float).T) for x in (q, v, a)]
         drives.slopes(self.columns, motions, weights[:, :, first:].transpose(2, 1, 0), [out[0].T, out[1].T, out[2].T])
         return out[0], out[1], out[2]
@@ -139,11 +139,11 @@ class IdentificationModel:
         """Zero the columns of fixed bodies that are not carried."""
         if carried is None:
             return
-        payloads = {label for label, c in zip(self.tree.labels, self.tree.coordinates) if c < 0}
+        payloads = {label for label, c in zip(self.bodies.labels, self.bodies.coordinates) if c < 0}
         if unknown := sorted(set(carried) - payloads):
             raise CalibError(f"no payload '{unknown[0]}' in the model; it has {', '.join(sorted(payloads)) or 'none'}")
         for label in payloads - set(carried):
-            index = self.tree.labels.index(label)
+            index = self.bodies.labels.index(label)
             out[10 * index : 10 * index + 10] = 0.0
 
 
@@ -164,7 +164,7 @@ def from_chain(
     each = [sets] * chain.n if isinstance(sets, str) else list(sets)
     if len(each) != chain.n:
         raise CalibError(f"robot '{chain.name}' has {chain.n} joints, but drive sets are given for {len(each)}")
-    bodies = tree(chain)
+    bodies = bodies_of(chain)
     bodies = bodies if payload is None else with_payload(bodies, payload)
     linear = [joint.kind == "prismatic" for joint in chain.joints]
     return IdentificationModel(bodies, drives.standard(each, v0, linear), kind)
@@ -172,7 +172,7 @@ def from_chain(
 
 def friction_states(model: IdentificationModel, q: np.ndarray) -> np.ndarray:
     """Return the states (s, N) of friction with memory along one uninterrupted record q (N, n), to slice in blocks."""
-    return drives.friction_states(model.columns, np.ascontiguousarray(shaped(q, (None, model.tree.n), "q").T))
+    return drives.friction_states(model.columns, np.ascontiguousarray(shaped(q, (None, model.bodies.n), "q").T))
 
 
 def with_terms(model: IdentificationModel, *terms: DriveTerm) -> IdentificationModel:

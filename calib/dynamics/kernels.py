@@ -1,4 +1,4 @@
-"""Compiled rigid-body kernels (numba) on the arrays of a `Tree`: the only module of dynamics that knows numba.
+"""Compiled rigid-body kernels (numba) on the arrays of `Bodies`: the only module of dynamics that knows numba.
 
 Notation, all in body i's own frame: w angular velocity, dw its derivative, a acceleration of the frame's origin minus
 gravity, (u_j, s_j) angular and linear velocity of the frame per unit rate of coordinate j. The wrench of body i,
@@ -9,8 +9,8 @@ J the inertia about the origin, h = [MX, MY, MZ] (Gautier & Khalil 1990), is lin
 tau_j = Σ_i (u_j · n_i + s_j · f_i): the regressor needs no backward pass. Products and sums may be fused ("contract");
 nothing else of IEEE arithmetic is given up.
 
-``links`` and ``constants`` are those of a `Tree` with B bodies and n coordinates: every frame is turned so that its
-joint's axis is z, and ``parameters`` (10 B) follow (`Tree.order`). Row 0 of ``motion`` and ``twists`` is the base, row
+``links`` and ``constants`` are those of `Bodies` with B bodies and n coordinates: every frame is turned so that its
+joint's axis is z, and ``parameters`` (10 B) follow `Bodies.order`. Row 0 of ``motion`` and ``twists`` is the base, row
 i + 1 body i; row i of ``frames`` is its rotation (0 to 8) and origin (9 to 11) in its parent's frame.
 """
 
@@ -223,7 +223,7 @@ def regressor(links, constants, order, amount, v, a, out):
     L samples at a time, the sample index innermost, so that the compiler turns every line into vector instructions.
 
     Args:
-        order: (B, 10), `Tree.order`: where the columns go.
+        order: (B, 10), `Bodies.order`: where the columns go.
         amount: (B, N), each body's own motion, angles below 1e6.
         v, a: (n, N).
     """

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from calib.arrays import shaped
-from calib.dynamics.bodies import PRISMATIC, Tree, tree
+from calib.dynamics.bodies import PRISMATIC, Bodies, bodies_of
 from calib.errors import RobotError
 from calib.robot.chain import Chain
 
@@ -29,8 +29,8 @@ def model(chain: Chain, parameters: np.ndarray | None = None) -> Any:
         RobotError: for mimic joints, and for a body without mass that has moments or inertia.
     """
     pin = _pinocchio()
-    bodies = tree(chain)
-    if bodies.bodies != chain.n or np.any(np.abs(bodies.scales) != 1.0):
+    bodies = bodies_of(chain)
+    if bodies.count != chain.n or np.any(np.abs(bodies.scales) != 1.0):
         raise RobotError(f"robot '{chain.name}': the Pinocchio model has no mimic joints; the kernels handle them")
     values = chain.inertias if parameters is None else parameters
     values = np.zeros((chain.n, 10)) if values is None else np.reshape(values, (chain.n, 10))
@@ -112,7 +112,7 @@ def _rnea(made: Any, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
     return np.array([pin.rnea(made, data, q[k], v[k], a[k]).copy() for k in range(len(q))])
 
 
-def _joint(bodies: Tree, j: int) -> Any:
+def _joint(bodies: Bodies, j: int) -> Any:
     """Return the joint of body j; Pinocchio's plain ones where the axis points forward."""
     pin = _pinocchio()
     axis = bodies.scales[j] * np.eye(3)[bodies.axes[j]]

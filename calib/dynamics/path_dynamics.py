@@ -19,7 +19,7 @@ import numpy as np
 from calib.arrays import frozen, shaped
 from calib.dynamics import drives, rigid_body
 from calib.dynamics.base import BaseModel, to_standard
-from calib.dynamics.bodies import Tree
+from calib.dynamics.bodies import Bodies
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import CalibError
@@ -40,24 +40,24 @@ class PathDynamics:
         regressor: q, v, a (N, n) to (N, rows, b); the last n rows are the torques that are limited.
         parameters: (b,) X, zero for friction.
         terms, amounts: all drive terms and their (k,) values; Coulomb's sign is the exact one.
-        tree, bodies: bodies and their (10 B,) parameters.
+        bodies, inertial: bodies and their (10 B,) parameters.
     """
 
     regressor: Regressor
     parameters: np.ndarray
     terms: tuple[DriveTerm, ...]
     amounts: np.ndarray
-    tree: Tree
-    bodies: np.ndarray
+    bodies: Bodies
+    inertial: np.ndarray
 
     def __post_init__(self) -> None:
-        for key in ("parameters", "amounts", "bodies"):
+        for key in ("parameters", "amounts", "inertial"):
             value = np.asarray(getattr(self, key), dtype=float)
             object.__setattr__(self, key, frozen(shaped(value, (None,), f"path dynamics, {key}")))
 
     @property
     def n(self) -> int:
-        return self.tree.n
+        return self.bodies.n
 
     def along(
         self, q: np.ndarray, slope: np.ndarray, curvature: np.ndarray
@@ -75,12 +75,12 @@ class PathDynamics:
         """Return the friction torques (N, n); friction with memory (stop operators) counts as fully stressed."""
         rubbing = [k for k, one in enumerate(self.terms) if one.shape not in AFFINE]
         loaded = any(self.terms[k].form.loaded for k in rubbing)
-        load = rigid_body.inverse_dynamics(self.tree, np.array(self.bodies), q, v, a) if loaded else None
+        load = rigid_body.inverse_dynamics(self.bodies, np.array(self.inertial), q, v, a) if loaded else None
         return self._drives(rubbing, q, v, a, load)
 
     def torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the torques (N, n) of a motion, friction included: recursive Newton-Euler, not the regressor."""
-        load = rigid_body.inverse_dynamics(self.tree, np.array(self.bodies), q, v, a)
+        load = rigid_body.inverse_dynamics(self.bodies, np.array(self.inertial), q, v, a)
         return load + self._drives(range(len(self.terms)), q, v, a, load)
 
     def _drives(self, chosen: Sequence[int], q, v, a, load: np.ndarray | None) -> np.ndarray:
@@ -97,10 +97,10 @@ def of_standard(model: IdentificationModel, values: np.ndarray) -> PathDynamics:
     values = shaped(values, (model.p,), "parameters of the model")
     _require_torques(model)
     rubbing = _is_friction(model)
-    first = 10 * model.tree.bodies
+    first = 10 * model.bodies.count
     without = replace(model, terms=tuple(one for one in model.columns if one.shape in AFFINE))
     return PathDynamics(
-        without.regressor, values[~rubbing], *_valued(model, values), model.tree, np.array(values[:first])
+        without.regressor, values[~rubbing], *_valued(model, values), model.bodies, np.array(values[:first])
     )
 
 
@@ -119,9 +119,9 @@ def of_base(model: BaseModel, values: np.ndarray) -> PathDynamics:
         name = model.names[int(mixed.max(axis=1).argmax())]
         raise CalibError(f"base parameter {name} holds friction and other effects: their torques cannot be told apart")
     standard = to_standard(model.base, values)
-    bodies = standard[: 10 * model.model.tree.bodies]
+    bodies = standard[: 10 * model.model.bodies.count]
     terms, amounts = _valued(model.model, standard)
-    return PathDynamics(model.regressor, np.where(kept, 0.0, values), terms, amounts, model.model.tree, bodies)
+    return PathDynamics(model.regressor, np.where(kept, 0.0, values), terms, amounts, model.model.bodies, bodies)
 
 
 def _require_torques(model: IdentificationModel) -> None:
@@ -131,13 +131,13 @@ def _require_torques(model: IdentificationModel) -> None:
 
 def _is_friction(model: IdentificationModel) -> np.ndarray:
     """Tell which of the p columns depend on speed."""
-    bodies = np.zeros(10 * model.tree.bodies, dtype=bool)
+    bodies = np.zeros(10 * model.bodies.count, dtype=bool)
     return np.concatenate([bodies, np.array([one.shape not in AFFINE for one in model.columns], dtype=bool)])
 
 
 def _valued(model: IdentificationModel, values: np.ndarray) -> tuple[tuple[DriveTerm, ...], np.ndarray]:
     """Return the drive terms with a value and an exact sign, and the values."""
-    found = [(one, x) for one, x in zip(model.columns, values[10 * model.tree.bodies :]) if x]
+    found = [(one, x) for one, x in zip(model.columns, values[10 * model.bodies.count :]) if x]
     return tuple(_sharp(one) for one, _ in found), np.array([x for _, x in found], dtype=float)
 
 

@@ -1,4 +1,4 @@
-"""Regressor, torques, inertia matrix and accelerations of a `Tree` in batch: shape checks around the kernels.
+"""Regressor, torques, inertia matrix and accelerations of a `Bodies` in batch: shape checks around the kernels.
 
     tau = Y(q, v, a) · chi,    chi the standard parameters XX XY XZ YY YZ ZZ MX MY MZ M, body after body.
 
@@ -10,11 +10,11 @@ from __future__ import annotations
 import numpy as np
 
 from calib.arrays import shaped
-from calib.dynamics.bodies import REVOLUTE, Tree
+from calib.dynamics.bodies import REVOLUTE, Bodies
 from calib.errors import CalibError
 
 
-def regressor(tree: Tree, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+def regressor(bodies: Bodies, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
     """Return the regressor of the standard parameters, (N, n, 10 B).
 
     Its memory is ordered (10 B, n, N), so that each column is contiguous in time and stacking it copies nothing.
@@ -22,25 +22,25 @@ def regressor(tree: Tree, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.nda
     Args:
         q, v, a: (N, n) [rad or m, and per s, per s²].
     """
-    q, v, a = _states(tree, q=q, v=v, a=a)
-    out = np.zeros((10 * tree.bodies, tree.n, len(q)))
-    fill_regressor(tree, q, v, a, out)
+    q, v, a = _states(bodies, q=q, v=v, a=a)
+    out = np.zeros((10 * bodies.count, bodies.n, len(q)))
+    fill_regressor(bodies, q, v, a, out)
     return out.transpose(2, 1, 0)
 
 
-def fill_regressor(tree: Tree, q: np.ndarray, v: np.ndarray, a: np.ndarray, out: np.ndarray) -> None:
+def fill_regressor(bodies: Bodies, q: np.ndarray, v: np.ndarray, a: np.ndarray, out: np.ndarray) -> None:
     """Write the regressor into out (10 B, n or more, N), zero on entry; q, v, a (N, n) already checked."""
     from calib.dynamics import kernels
 
-    amount = q.T[tree.coordinates] * tree.scales[:, None]
+    amount = q.T[bodies.coordinates] * bodies.scales[:, None]
     if np.abs(amount).max(initial=0.0) >= 1e6:  # beyond what the kernel's sine is made for
-        amount = np.where(tree.kinds[:, None] == REVOLUTE, np.remainder(amount, 2 * np.pi), amount)
+        amount = np.where(bodies.kinds[:, None] == REVOLUTE, np.remainder(amount, 2 * np.pi), amount)
     v, a = np.ascontiguousarray(v.T), np.ascontiguousarray(a.T)
-    kernels.regressor(tree.links, tree.constants, tree.order, amount, v, a, out)
+    kernels.regressor(bodies.links, bodies.constants, bodies.order, amount, v, a, out)
 
 
 def regressor_gradient(
-    tree: Tree, q: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
+    bodies: Bodies, q: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the slopes of s = Σ weights · Y(q, v, a) by q, v and a, three arrays (N, n), exactly.
 
@@ -50,14 +50,16 @@ def regressor_gradient(
     """
     from calib.dynamics import kernels
 
-    q, v, a = _states(tree, q=q, v=v, a=a)
-    weights = np.ascontiguousarray(shaped(weights, (len(q), tree.n, 10 * tree.bodies), "weights of the regressor"))
+    q, v, a = _states(bodies, q=q, v=v, a=a)
+    weights = np.ascontiguousarray(shaped(weights, (len(q), bodies.n, 10 * bodies.count), "weights of the regressor"))
     slopes = np.zeros((3, *q.shape))
-    kernels.regressor_gradient(tree.links, tree.constants, tree.order, *_placed(tree, q), v, a, weights, *slopes)
+    kernels.regressor_gradient(
+        bodies.links, bodies.constants, bodies.order, *_placed(bodies, q), v, a, weights, *slopes
+    )
     return slopes[0], slopes[1], slopes[2]
 
 
-def inverse_dynamics(tree: Tree, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+def inverse_dynamics(bodies: Bodies, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
     """Return the rigid-body torques (N, n) [N m or N]: no motor inertia, no friction.
 
     Args:
@@ -65,26 +67,31 @@ def inverse_dynamics(tree: Tree, parameters: np.ndarray, q: np.ndarray, v: np.nd
     """
     from calib.dynamics import kernels
 
-    q, v, a = _states(tree, q=q, v=v, a=a)
+    q, v, a = _states(bodies, q=q, v=v, a=a)
     out = np.zeros_like(q)
     kernels.inverse_dynamics(
-        tree.links, tree.constants, kernel_parameters(tree, parameters), *_placed(tree, q), v, a, out
+        bodies.links, bodies.constants, kernel_parameters(bodies, parameters), *_placed(bodies, q), v, a, out
     )
     return out
 
 
-def mass_matrix(tree: Tree, parameters: np.ndarray, q: np.ndarray) -> np.ndarray:
+def mass_matrix(bodies: Bodies, parameters: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Return the joint-space inertia M(q) of the bodies, (N, n, n)."""
     from calib.dynamics import kernels
 
-    (q,) = _states(tree, q=q)
-    out = np.zeros((len(q), tree.n, tree.n))
-    kernels.mass_matrix(tree.links, tree.constants, kernel_parameters(tree, parameters), *_placed(tree, q), out)
+    (q,) = _states(bodies, q=q)
+    out = np.zeros((len(q), bodies.n, bodies.n))
+    kernels.mass_matrix(bodies.links, bodies.constants, kernel_parameters(bodies, parameters), *_placed(bodies, q), out)
     return out
 
 
 def forward_dynamics(
-    tree: Tree, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, tau: np.ndarray, added: np.ndarray | None = None
+    bodies: Bodies,
+    parameters: np.ndarray,
+    q: np.ndarray,
+    v: np.ndarray,
+    tau: np.ndarray,
+    added: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return the accelerations (N, n) that solve (M(q) + added) a = tau - c(q, v) - g(q).
 
@@ -97,12 +104,12 @@ def forward_dynamics(
     """
     from calib.dynamics import kernels
 
-    q, v, tau = _states(tree, q=q, v=v, tau=tau)
-    extra = np.zeros((tree.n, tree.n)) if added is None else shaped(added, (tree.n, tree.n), "added inertia")
+    q, v, tau = _states(bodies, q=q, v=v, tau=tau)
+    extra = np.zeros((bodies.n, bodies.n)) if added is None else shaped(added, (bodies.n, bodies.n), "added inertia")
     out = np.empty_like(q)
     extra = np.ascontiguousarray(extra)
     failed = kernels.forward_dynamics(
-        tree.links, tree.constants, kernel_parameters(tree, parameters), extra, q, v, tau, out
+        bodies.links, bodies.constants, kernel_parameters(bodies, parameters), extra, q, v, tau, out
     )
     if failed >= 0:
         raise CalibError(
@@ -112,26 +119,26 @@ def forward_dynamics(
     return out
 
 
-def kernel_parameters(tree: Tree, parameters: np.ndarray) -> np.ndarray:
+def kernel_parameters(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
     """Return standard parameters (10 B,) as `kernels.accelerate` wants them: about frames whose moving axis is z."""
-    rows = shaped(parameters, (10 * tree.bodies,), "standard parameters").reshape(tree.bodies, 10)
-    return np.take_along_axis(rows, tree.order, axis=1).ravel()
+    rows = shaped(parameters, (10 * bodies.count,), "standard parameters").reshape(bodies.count, 10)
+    return np.take_along_axis(rows, bodies.order, axis=1).ravel()
 
 
 _NAMES = {"q": "joint positions q", "v": "joint velocities v", "a": "joint accelerations a", "tau": "torques tau"}
 
 
-def _states(tree: Tree, **arrays: np.ndarray) -> list[np.ndarray]:
+def _states(bodies: Bodies, **arrays: np.ndarray) -> list[np.ndarray]:
     """Return q, v, a as finite C-contiguous (N, n) arrays of one length."""
     rows: int | None = None
     checked = []
     for key, array in arrays.items():
-        checked.append(np.ascontiguousarray(shaped(array, (rows, tree.n), _NAMES[key])))
+        checked.append(np.ascontiguousarray(shaped(array, (rows, bodies.n), _NAMES[key])))
         rows = len(checked[0])
     return checked
 
 
-def _placed(tree: Tree, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _placed(bodies: Bodies, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return each body's own motion and its cosine and sine, (N, B): numpy's are vectorised, the kernels' are not."""
-    amount = q[:, tree.coordinates] * tree.scales
+    amount = q[:, bodies.coordinates] * bodies.scales
     return amount, np.cos(amount), np.sin(amount)

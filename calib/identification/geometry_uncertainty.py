@@ -34,7 +34,7 @@ from calib.arrays import frozen, shaped
 from calib.data.signals.decimation import Decimator, decimate, kept, spread
 from calib.dynamics import base as bases
 from calib.dynamics import rigid_body
-from calib.dynamics.bodies import Tree
+from calib.dynamics.bodies import Bodies
 from calib.identification.cases import Case
 from calib.identification.identify import Identification, common_decimator
 from calib.identification.prediction import carried_columns
@@ -180,7 +180,7 @@ def sensitivity(
     return solved, _rms(change[seen]), _rms(after[seen])
 
 
-def neighbours(found: Identification, chain: Chain) -> list[tuple[Tree, Tree]]:
+def neighbours(found: Identification, chain: Chain) -> list[tuple[Bodies, Bodies]]:
     """Return the bodies with each element, then with each tilt of gravity, `STEP` above and below its value."""
     result = []
     for k in range(len(chain.elements)):
@@ -188,16 +188,16 @@ def neighbours(found: Identification, chain: Chain) -> list[tuple[Tree, Tree]]:
         beside[0][k] += STEP
         beside[1][k] -= STEP
         result.append((_tree(found, chain.with_values(beside[0])), _tree(found, chain.with_values(beside[1]))))
-    gravity = np.array(found.dynamics.model.tree.gravity)
+    gravity = np.array(found.dynamics.model.bodies.gravity)
     for axis in np.eye(3)[:2]:
         turned = [Rotation.from_rotvec(sign * STEP * axis).apply(gravity) for sign in (1.0, -1.0)]
         tilted = [replace(found.settings, gravity=tuple(map(float, one))) for one in turned]
-        result.append((make_model(chain, tilted[0]).tree, make_model(chain, tilted[1]).tree))
+        result.append((make_model(chain, tilted[0]).bodies, make_model(chain, tilted[1]).bodies))
     return result
 
 
-def _tree(found: Identification, chain: Chain) -> Tree:
-    return make_model(chain, found.settings).tree
+def _tree(found: Identification, chain: Chain) -> Bodies:
+    return make_model(chain, found.settings).bodies
 
 
 def pieces(case: Case, decimator: Decimator, step: int = 1) -> list[tuple[slice, slice]]:
@@ -221,7 +221,7 @@ def pieces(case: Case, decimator: Decimator, step: int = 1) -> list[tuple[slice,
 
 
 def _differences(
-    found: Identification, moved: Sequence[tuple[Tree, Tree]], case: Case, span: slice, residual: np.ndarray,
+    found: Identification, moved: Sequence[tuple[Bodies, Bodies]], case: Case, span: slice, residual: np.ndarray,
     decimator: Decimator,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return (∂W/∂g) φ (M, rows, K + 2), filtered and thinned, and (∂W/∂g)ᵀ R⁻¹ (y - W φ) (b, K + 2).
@@ -230,13 +230,13 @@ def _differences(
         residual: (M, rows) R⁻¹ (y - W φ) of the rows that the samples in `span` make.
     """
     model, motion, b = found.dynamics.model, case.motion, found.base.b
-    bodies = 10 * model.tree.bodies
+    bodies = 10 * model.bodies.count
     onboard = carried_columns(model, case.carried)
     parameters = bases.to_standard(found.base, found.fitted.estimate.values[:b])[:bodies] * onboard
     q, v, a = (np.asarray(x[span]) for x in (motion.q, motion.v, motion.a))
-    times = model.rows // model.tree.n
+    times = model.rows // model.bodies.n
     felt = spread(residual, decimator, len(q)).reshape(len(q), times, -1).sum(axis=1)
-    change = np.empty((len(moved), model.tree.n, len(q)))
+    change = np.empty((len(moved), model.bodies.n, len(q)))
     pulled = np.zeros((bodies, len(moved)))
     for start in range(0, len(q), BLOCK):
         part = slice(start, min(start + BLOCK, len(q)))
@@ -244,7 +244,7 @@ def _differences(
         for k, (above, below) in enumerate(moved):
             for sign, one in ((1.0, above), (-1.0, below)):
                 regressor = rigid_body.regressor(one, q[part], v[part], a[part]).transpose(2, 1, 0).reshape(bodies, -1)
-                torque = (parameters @ regressor).reshape(model.tree.n, -1)
+                torque = (parameters @ regressor).reshape(model.bodies.n, -1)
                 change[k, :, part] = torque if sign > 0 else (change[k, :, part] - torque) / (2.0 * STEP)
                 pulled[:, k] += sign / (2.0 * STEP) * (regressor @ weights)
     thinned = decimate(change.transpose(2, 1, 0), decimator)

@@ -154,7 +154,7 @@ def _with_payloads(
     result = np.array(standard)
     for label, known in settings.payload_values.items():
         if not any(label in case.carried for case in cases):
-            first = 10 * model.tree.labels.index(label)
+            first = 10 * model.bodies.labels.index(label)
             result[first : first + 10] = known
     return result
 

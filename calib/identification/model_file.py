@@ -39,7 +39,7 @@ from typing import Any
 import numpy as np
 
 from calib.dynamics.base import Base, expressions
-from calib.dynamics.bodies import tree, with_gravity, with_payload
+from calib.dynamics.bodies import bodies_of, with_gravity, with_payload
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import RobotError, UsageError
@@ -123,13 +123,13 @@ def read_covariance(folder: Path) -> tuple[tuple[str, ...], np.ndarray] | None:
 def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, Any]:
     """Return the model as what JSON can hold; `unit` is that of its torques."""
     model = dynamics.model
-    bodies = 10 * model.tree.bodies if model.kind != "drive" else 0
-    payloads = [label for label, coordinate in zip(model.tree.labels, model.tree.coordinates) if coordinate < 0]
+    bodies = 10 * model.bodies.count if model.kind != "drive" else 0
+    payloads = [label for label, coordinate in zip(model.bodies.labels, model.bodies.coordinates) if coordinate < 0]
     return {
         "robot": "robot.toml",
         "kind": model.kind,
         "unit": unit,
-        "gravity": model.tree.gravity.tolist(),
+        "gravity": model.bodies.gravity.tolist(),
         "payloads": payloads,
         "bodies": dict(zip(model.names[:bodies], dynamics.values[:bodies].tolist())),
         "terms": [
@@ -172,7 +172,7 @@ def regrouping(base: Base) -> dict[str, dict[str, float]]:
 
 def from_table(chain: Chain, table: Mapping[str, Any]) -> Dynamics:
     """Return the model of a table that `to_table` made, on the chain it was made for."""
-    bodies = with_gravity(tree(chain), np.array(table["gravity"], dtype=float))
+    bodies = with_gravity(bodies_of(chain), np.array(table["gravity"], dtype=float))
     for label in table.get("payloads", ()):
         bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1)
     terms = tuple(_term(entry) for entry in table["terms"])

@@ -38,7 +38,7 @@ def predict(dynamics: Dynamics, case: Case) -> np.ndarray:
     result = np.zeros((len(case.motion), model.rows))
     first, load = 0, None
     if model.kind != "drive":
-        first, load = 10 * model.tree.bodies, transmitted(dynamics, case)
+        first, load = 10 * model.bodies.count, transmitted(dynamics, case)
         result[:, :n] = result[:, -n:] = load
     for one, value in zip(model.columns, dynamics.values[first:]):
         for row, values in term_columns(one, case, load):
@@ -51,15 +51,15 @@ def predict(dynamics: Dynamics, case: Case) -> np.ndarray:
 def transmitted(dynamics: Dynamics, case: Case) -> np.ndarray:
     """Return the torques (N, n) the gears pass on to the bodies, by the model: what load-dependent friction feels."""
     model, motion = dynamics.model, case.motion
-    bodies = np.array(dynamics.values[: 10 * model.tree.bodies]) * carried_columns(model, case.carried)
+    bodies = np.array(dynamics.values[: 10 * model.bodies.count]) * carried_columns(model, case.carried)
     result = np.empty(motion.q.shape)
     for start in range(0, len(motion), BLOCK):
         part = slice(start, start + BLOCK)
-        result[part] = inverse_dynamics(model.tree, bodies, motion.q[part], motion.v[part], motion.a[part])
+        result[part] = inverse_dynamics(model.bodies, bodies, motion.q[part], motion.v[part], motion.a[part])
     return result
 
 
 def carried_columns(model: IdentificationModel, carried: Collection[str]) -> np.ndarray:
     """Return (10 B,) one for parameters of bodies that are there, zero for those of payloads that are not."""
-    present = [kind != FIXED or label in carried for label, kind in zip(model.tree.labels, model.tree.kinds)]
+    present = [kind != FIXED or label in carried for label, kind in zip(model.bodies.labels, model.bodies.kinds)]
     return np.repeat(np.array(present, dtype=float), 10)

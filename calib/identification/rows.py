@@ -164,11 +164,11 @@ def _live(model: IdentificationModel, columns: np.ndarray) -> tuple[np.ndarray, 
 
     A body's parameters reach the joints before it, a drive's its own: half of all entries, or less.
     """
-    first = 0 if model.kind == "drive" else 10 * model.tree.bodies
+    first = 0 if model.kind == "drive" else 10 * model.bodies.count
     entries = np.zeros((model.p, model.rows), dtype=bool)
     if first:  # what is zero at a random state is zero everywhere
-        state = np.random.default_rng(0).uniform(0.5, 1.5, (3, 4, model.tree.n))
-        entries[:first] = (rigid_body.regressor(model.tree, *state) != 0.0).any(axis=0).T
+        state = np.random.default_rng(0).uniform(0.5, 1.5, (3, 4, model.bodies.n))
+        entries[:first] = (rigid_body.regressor(model.bodies, *state) != 0.0).any(axis=0).T
     for k, one in enumerate(model.columns):
         entries[first + k, [row for row, _ in one.acts]] = True
     column, row = np.nonzero(entries[columns])

@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from calib.dynamics import drives
-from calib.dynamics.bodies import tree, with_gravity, with_payload
+from calib.dynamics.bodies import bodies_of, with_gravity, with_payload
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.shapes import V0
@@ -97,7 +97,7 @@ class IdentificationSettings:
 
 def make_model(chain: Chain, settings: IdentificationSettings) -> IdentificationModel:
     """Return the model of a chain: its bodies, payloads at its tip, and the drives' standard terms."""
-    bodies = tree(chain)
+    bodies = bodies_of(chain)
     if settings.gravity is not None:
         bodies = with_gravity(bodies, np.array(settings.gravity))
     for label in settings.payloads:

@@ -43,8 +43,8 @@ class Uncertainty:
             q, v, a = (np.ascontiguousarray(x[part]) for x in (sampled.q, sampled.v, sampled.a))
             load = None
             if with_load(model):
-                bodies = np.array(self.dynamics.values[: 10 * model.tree.bodies])
-                load = inverse_dynamics(model.tree, bodies, q, v, a)
+                bodies = np.array(self.dynamics.values[: 10 * model.bodies.count])
+                load = inverse_dynamics(model.bodies, bodies, q, v, a)
             W = model.regressor(q, v, a, load, self.carried)[:, -n:][:, :, self.columns]
             variance = np.einsum("Nib,bc,Nic->Ni", W, self.covariance, W, optimize=True)
             largest = np.maximum(largest, np.sqrt(np.maximum(variance, 0.0)).max(axis=0))

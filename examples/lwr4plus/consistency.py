@@ -119,7 +119,7 @@ def true_torques(
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return the true standard parameters, and the torques without and with the payload (N, n)."""
     known, model = known_robots.truth("lwr4plus"), make_model(true, settings)
-    drives = [drive_values(known)[name] for name in model.names[10 * model.tree.bodies :]]
+    drives = [drive_values(known)[name] for name in model.names[10 * model.bodies.count :]]
     values = np.concatenate([standard_parameters(true), known["payload"]["inertia"], drives])
     loads = ((), (PAYLOAD,))
     return values, [model.regressor(motion.q, motion.v, motion.a, carried=load) @ values for load in loads]

@@ -29,7 +29,7 @@ from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics import base as bases
 from calib.dynamics import drives
 from calib.dynamics.base import Base
-from calib.dynamics.bodies import standard_parameters, tree, with_gravity, with_payload
+from calib.dynamics.bodies import bodies_of, standard_parameters, with_gravity, with_payload
 from calib.dynamics.idim import MODELS, IdentificationModel
 from calib.estimation.essential import Elimination, Rule, eliminate
 from calib.estimation.linear import LinearFit, settled_std, wls
@@ -80,7 +80,7 @@ class Data:
 def model(chain: Chain, kind: str, gravity: np.ndarray | None = None) -> IdentificationModel:
     """Return the study's model: seven links and a payload, seven drive terms each; the payload's move nothing."""
     bodies = with_payload(
-        tree(chain), pose(position=np.array([0.0, 0.0, known_robots.truth("lwr4plus")["payload"]["r"]]))
+        bodies_of(chain), pose(position=np.array([0.0, 0.0, known_robots.truth("lwr4plus")["payload"]["r"]]))
     )
     bodies = bodies if gravity is None else with_gravity(bodies, gravity)
     terms = drives.standard([" ".join(known_robots.SIDED)] * chain.n)
@@ -141,7 +141,7 @@ def _record(chain: Chain, reference: Reference, loaded: bool, seed: list[int]) -
     whole = model(chain, "motor")
     if not loaded:
         values[10 * chain.n : 10 * (chain.n + 1)] = 0.0
-    plant = Plant(whole.tree, whole.terms, values)
+    plant = Plant(whole.bodies, whole.terms, values)
     run = simulate(plant, controller(plant, reference), reference, Sensing(noise["sigma_q"]), seed)
     link = model(chain, "link")
     shared = np.array([name in link.names for name in whole.names])
@@ -209,7 +209,7 @@ def computed_torque(found: Fit, data: Data) -> dict[str, Any]:
     for case in data.cases(found.model.kind):
         rows = observe(found.model, found.base.kept, case, case.motion.decimator)
         error = rows.target - rows.matrix @ values_of(found)
-        n = found.model.tree.n
+        n = found.model.bodies.n
         raw = np.asarray(case.target)
         above = raw[:: case.motion.decimator.factor][: len(error)]
         for name, part in (("sensor", slice(0, n)), ("motor", slice(n, 2 * n))):
@@ -227,11 +227,11 @@ def computed_torque(found: Fit, data: Data) -> dict[str, Any]:
 def tracking(chain: Chain, fits: dict[str, Fit], reference: Reference) -> dict[str, list[float]]:
     """Return rms tracking errors [mrad] of the true loaded arm, fed forward by nothing and by each estimate."""
     whole = model(chain, "motor")
-    robot = Plant(whole.tree, whole.terms, true_parameters(chain))
+    robot = Plant(whole.bodies, whole.terms, true_parameters(chain))
     bare = replace(controller(robot, reference), ahead=None)
     result = {"feedback alone": tracking_error(robot, None, bare, reference)}
     for name, found in fits.items():
-        believed = Plant(found.model.tree, whole.terms, bases.to_standard(found.base, values_of(found)))
+        believed = Plant(found.model.bodies, whole.terms, bases.to_standard(found.base, values_of(found)))
         result[name] = tracking_error(robot, believed, bare, reference)
     return {name: (1e3 * error).tolist() for name, error in result.items()}
 

@@ -32,7 +32,7 @@ from excitation_moves import moves
 from calib import files
 from calib.dynamics import base, drives
 from calib.dynamics.base import BaseModel
-from calib.dynamics.bodies import standard_parameters, tree
+from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import MODELS, IdentificationModel
 from calib.procedure.excitation.limits import Points
 from calib.procedure.report.style import save
@@ -79,8 +79,8 @@ def plant(where: str, kind: str) -> Plant:
         total = [known["drives"][key] for key in ("Ia", "Fv", "Fc")]
         values = np.column_stack([*total, np.add(known["drives"]["offl"], known["drives"]["offm"])])
         names = "Ia Fv Fc off"
-    models = [IdentificationModel(tree(chain), drives.standard([names] * 7, v0), kind) for v0 in (0.05, 0.01)]
-    nominal = IdentificationModel(tree(geometry("CAD")), models[0].terms, kind)
+    models = [IdentificationModel(bodies_of(chain), drives.standard([names] * 7, v0), kind) for v0 in (0.05, 0.01)]
+    nominal = IdentificationModel(bodies_of(geometry("CAD")), models[0].terms, kind)
     found = base.regroup(base.find(nominal), models[0])
     amounts = dict(zip([f"{key}{j + 1}" for j in range(7) for key in names.split()], values.ravel()))
     bodies = np.zeros(0) if kind == "drive" else standard_parameters(chain)

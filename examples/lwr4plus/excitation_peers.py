@@ -38,7 +38,7 @@ from matplotlib.figure import Figure
 from calib import files
 from calib.dynamics import base, drives
 from calib.dynamics.base import BaseModel
-from calib.dynamics.bodies import standard_parameters, tree
+from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.procedure.excitation.limits import Points
 from calib.procedure.report.style import AFTER, BEFORE, INK, MARK, QUIET, WIDE, save, sheet, styled
@@ -77,7 +77,7 @@ def problem(
 
 
 def model(chain: Chain, v0: float, friction: tuple | None) -> tuple[BaseModel, np.ndarray | None]:
-    full = IdentificationModel(tree(chain), drives.standard(["Fv Fc off"] * chain.n, v0))
+    full = IdentificationModel(bodies_of(chain), drives.standard(["Fv Fc off"] * chain.n, v0))
     found = base.find(full)
     if chain.inertias is None:
         return BaseModel(full, found), None

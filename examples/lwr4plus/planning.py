@@ -22,7 +22,7 @@ import numpy as np
 from calib import files
 from calib.dynamics import base, drives
 from calib.dynamics.base import BaseModel
-from calib.dynamics.bodies import standard_parameters, tree
+from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.path_dynamics import PathDynamics, of_base, of_standard
 from calib.robot import description, library
@@ -58,13 +58,13 @@ def true_robot(chain: Chain) -> tuple[IdentificationModel, np.ndarray]:
     known = truth("lwr4plus")["drives"]
     offsets = np.array(known["offl"]) + np.array(known["offm"])
     amounts = np.column_stack([known["Ia"], known["Fv"], known["Fc"], offsets]).ravel()
-    model = IdentificationModel(tree(chain), drives.standard(["Ia Fv Fc off"] * chain.n))
+    model = IdentificationModel(bodies_of(chain), drives.standard(["Ia Fv Fc off"] * chain.n))
     return model, np.concatenate([standard_parameters(chain), amounts])
 
 
 def identified(model: IdentificationModel, values: np.ndarray, seed: int) -> tuple[PathDynamics, BaseModel, np.ndarray]:
     """Return the path dynamics of base parameters fitted to a noisy simulated motion, its model and covariance."""
-    rng, n = np.random.default_rng(seed), model.tree.n
+    rng, n = np.random.default_rng(seed), model.bodies.n
     times = np.arange(0, SECONDS, 1 / RATE)[:, None, None]
     pace = 2 * np.pi / SECONDS * np.arange(1, SINES + 1)
     size, phase = rng.normal(size=(n, SINES)) / np.sqrt(np.arange(1, SINES + 1)), rng.uniform(0, 2 * np.pi, (n, SINES))
@@ -111,7 +111,7 @@ def run(paths: int, seed: int) -> dict[str, Any]:
     chain = true_chain()
     model, values = true_robot(chain)
     robot = of_standard(model, values)
-    bodies_alone = IdentificationModel(tree(nominal()))
+    bodies_alone = IdentificationModel(bodies_of(nominal()))
     cad = of_standard(bodies_alone, standard_parameters(nominal()))
     fitted, seen, covariance = identified(model, values, seed)
     models = {"CAD bodies": cad, "identified": fitted, "truth": robot}

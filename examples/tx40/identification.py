@@ -142,7 +142,7 @@ def with_measured(study: Study, log: Log, values: np.ndarray) -> tuple[np.ndarra
 
 def with_simulated(study: Study, log: Log, values: np.ndarray, controller: Controller) -> tuple[np.ndarray, np.ndarray]:
     """Return decimated torque and prediction Z x, Z from a noise-free simulation with x itself."""
-    plant = Plant(study.model.tree, study.model.terms, bases.to_standard(study.base, values))
+    plant = Plant(study.model.bodies, study.model.terms, bases.to_standard(study.base, values))
     loop = Loop(controller, log.reference, EVERY)
     own = simulated_case(log.case, simulate(plant, controller, log.reference, Sensing(every=EVERY)), loop)
     rows = observe(study.model, study.base.kept, own, log.case.motion.decimator)

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from calib.dynamics import base, drives, model, rigid_body
-from calib.dynamics.bodies import standard_parameters, tree
+from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.robot.load import load
 
 COUNT = 10_000
 CHAIN = load("lwr4plus")
-BODIES = tree(CHAIN)
+BODIES = bodies_of(CHAIN)
 STATES = np.random.default_rng(0).normal(size=(3, COUNT, 7))
 
 
@@ -114,7 +114,7 @@ def test_inverse_dynamics(benchmark):
 @pytest.mark.parametrize("robot", ["lwr4plus", "tx40"])
 def test_forward_dynamics(benchmark, robot):
     chain = load(robot)
-    chi, bodies = standard_parameters(chain), tree(chain)
+    chi, bodies = standard_parameters(chain), bodies_of(chain)
     q, v, tau = STATES[:, :, : chain.n]
     benchmark.pedantic(rigid_body.forward_dynamics, (bodies, chi, q, v, tau), rounds=20, warmup_rounds=2)
     per_sample(benchmark, f"forward dynamics, {robot}")

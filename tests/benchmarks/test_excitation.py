@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from calib.dynamics import base, drives
-from calib.dynamics.bodies import standard_parameters, tree
+from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.procedure.excitation.limits import Points
 from calib.robot import library, mdh
@@ -38,7 +38,7 @@ FV = (14.4, 15.3, 6.55, 11.0, 4.29, 2.26, 1.6)
 
 @cache
 def model() -> tuple[base.BaseModel, np.ndarray]:
-    full = IdentificationModel(tree(CHAIN), drives.standard(["Fv Fc off"] * 7, 0.05))
+    full = IdentificationModel(bodies_of(CHAIN), drives.standard(["Fv Fc off"] * 7, 0.05))
     found = base.find(full)
     values = np.concatenate([standard_parameters(CHAIN), np.column_stack([FV, FC, np.zeros(7)]).ravel()])
     return base.BaseModel(full, found), found.transform @ values
@@ -106,7 +106,7 @@ def first_joints(count: int) -> Chain:
 @pytest.mark.parametrize("samples", [200, 1000])
 def test_growth_with_joints_and_samples(benchmark, joints, samples):
     chain = first_joints(joints)
-    full = IdentificationModel(tree(chain), drives.standard(["Fv Fc off"] * joints, 0.05))
+    full = IdentificationModel(bodies_of(chain), drives.standard(["Fv Fc off"] * joints, 0.05))
     columns = base.BaseModel(full, base.find(full))
     spot = ExcitationProblem(
         fourier_family(5, 20.0, joints), columns.regressor, columns.regressor_gradient, samples=samples
@@ -128,7 +128,9 @@ def test_condition_number_under_all_constraints(benchmark, period, goals):
     found = benchmark.pedantic(design, (spot,), {"starts": 4, "seed": 0}, rounds=1)
     found, proof = ensured(spot, found)
     motion = dense_motion(spot.family, found.x, period / 1000 * np.arange(1000))
-    sharp = base.BaseModel(IdentificationModel(tree(CHAIN), drives.standard(["Fv Fc off"] * 7, 0.01)), model()[0].base)
+    sharp = base.BaseModel(
+        IdentificationModel(bodies_of(CHAIN), drives.standard(["Fv Fc off"] * 7, 0.01)), model()[0].base
+    )
     reached = condition_numbers(sharp.regressor(motion.q, motion.v, motion.a))
     print(
         f"\nT0 = {period:g} s, n_f 5, 64 columns, 1000 samples, sign smoothed at 0.01 rad/s: {reached['raw']:.1f} raw, "

@@ -14,7 +14,7 @@ import pytest
 
 from calib.data.recordings.recording_files import read_recording
 from calib.data.signals.motion import make_motion
-from calib.dynamics.bodies import standard_parameters, tree
+from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.rigid_body import inverse_dynamics
 from calib.identification.cases import make_case
 from calib.identification.identify import identify
@@ -35,7 +35,7 @@ def write(folder: Path, seed: int) -> tuple[Path, Path]:
     motion = random_fourier(-reach, reach, speed, SECONDS, RATE, 60, acceleration=6.0, seed=seed)
     q, v, a = motion.q, motion.v, motion.a
     random = np.random.default_rng(seed)
-    link = inverse_dynamics(tree(CHAIN), standard_parameters(CHAIN), q, v, a) + 0.3 * v + 0.5 * np.tanh(v / 0.01)
+    link = inverse_dynamics(bodies_of(CHAIN), standard_parameters(CHAIN), q, v, a) + 0.3 * v + 0.5 * np.tanh(v / 0.01)
     motor = link + a + 3.0 * v + 2.0 * np.tanh(v / 0.01) + 0.2
     parts = {
         "t": np.arange(len(q)) / RATE,

@@ -16,7 +16,7 @@ from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics import base as bases
 from calib.dynamics import model, rigid_body
-from calib.dynamics.bodies import standard_parameters, tree
+from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.identification.cases import Case, make_case
 from calib.identification.methods.instrumental import Loop, identify_instrumental
 from calib.robot import description, library
@@ -68,7 +68,7 @@ def python_loop(plant, controller, reference, count):
 
     chain = description.read(library.path("tx40"))
     made = model.model(chain)
-    bodies = 10 * plant.tree.bodies
+    bodies = 10 * plant.bodies.count
     values = dict(zip((one.name for one in plant.terms), plant.parameters[bodies:]))
     fv, fc, offset = (np.array([values[f"{name}{j + 1}"] for j in range(6)]) for name in ("Fv", "Fc", "off"))
     coupled, added = np.zeros((6, 6)), np.diag([values[f"Ia{j + 1}"] for j in range(6)])
@@ -109,7 +109,7 @@ def test_forward_dynamics(benchmark, what):
     if what.startswith("about"):
         call = lambda: forward_dynamics(plant, q, v, tau)  # noqa: E731
     elif what.startswith("body"):
-        call = lambda: rigid_body.forward_dynamics(tree(chain), parameters, q, v, tau)  # noqa: E731
+        call = lambda: rigid_body.forward_dynamics(bodies_of(chain), parameters, q, v, tau)  # noqa: E731
     else:
         call = lambda: model.forward_dynamics(chain, parameters, q, v, tau)  # noqa: E731
     call()

@@ -8,7 +8,7 @@ from arms import motley, physical, states
 from differences import check
 
 from calib.dynamics import base, drives, friction, model, rigid_body
-from calib.dynamics.bodies import standard_parameters, tree, with_gravity, with_payload
+from calib.dynamics.bodies import bodies_of, standard_parameters, with_gravity, with_payload
 from calib.dynamics.idim import MODELS, IdentificationModel, from_chain
 from calib.errors import CalibError
 from calib.robot.load import load
@@ -21,7 +21,7 @@ SENSED = "Ia Fvl Fcl offl Fvm Fcm offm"
 def arm(kind, tilted=False):
     """The study's model: seven joints with torque sensors, payload as body 8, its drive parameters counted too."""
     chain = load("lwr4plus")
-    bodies = with_payload(tree(chain), chain.tail)
+    bodies = with_payload(bodies_of(chain), chain.tail)
     bodies = with_gravity(bodies, np.array([1.0, 2.0, -9.5])) if tilted else bodies
     return IdentificationModel(bodies, drives.standard([SENSED] * 7) + drives.without_effect("8"), kind)
 
@@ -71,13 +71,13 @@ def test_tilted_gravity_adds_two():
 )
 def test_counts_of_other_arms(robot, sets, count):
     chain = load(robot)
-    assert base.find(IdentificationModel(tree(chain), drives.standard([sets] * chain.n))).b == count
+    assert base.find(IdentificationModel(bodies_of(chain), drives.standard([sets] * chain.n))).b == count
 
 
 @pytest.mark.parametrize(("sets", "count"), [("Ia Fv Fc", 54), ("Ia Fv Fc off", 60)])
 def test_counts_of_the_coupled_wrist(sets, count):
     terms = drives.standard([sets] * 6) + drives.coupled(4, 5)[1:]
-    assert base.find(IdentificationModel(tree(load("tx40")), terms)).b == count
+    assert base.find(IdentificationModel(bodies_of(load("tx40")), terms)).b == count
 
 
 R3, R5 = 0.40, 0.39
@@ -133,12 +133,12 @@ def test_base_parameters_predict_what_the_standard_ones_do(kind):
 def test_inertia_matrix_survives_the_regrouping():
     """Dropped parameters at zero leave M(q) as it is: a base estimate can be simulated."""
     chain = load("tx40")
-    full = IdentificationModel(tree(chain))
+    full = IdentificationModel(bodies_of(chain))
     result, chi = base.find(full), standard_parameters(chain)
     q = states(6)[0]
-    wanted = rigid_body.mass_matrix(full.tree, chi, q)
+    wanted = rigid_body.mass_matrix(full.bodies, chi, q)
     values = base.to_standard(result, result.transform @ chi)
-    assert np.allclose(rigid_body.mass_matrix(full.tree, values, q), wanted, rtol=0, atol=1e-12)
+    assert np.allclose(rigid_body.mass_matrix(full.bodies, values, q), wanted, rtol=0, atol=1e-12)
 
 
 def test_gradient_through_the_base_columns():
@@ -157,8 +157,8 @@ def test_gradient_through_the_base_columns():
 
 def test_regrouping_on_the_calibrated_geometry():
     """The nominal columns stay, K moves (LWR4+ of the 2019 study, Table 2, rows 2 to 7), and it holds exactly."""
-    nominal = IdentificationModel(tree(load("lwr4plus")))
-    calibrated = IdentificationModel(tree(lwr4plus.arm(lwr4plus.table_2()[1])))
+    nominal = IdentificationModel(bodies_of(load("lwr4plus")))
+    calibrated = IdentificationModel(bodies_of(lwr4plus.arm(lwr4plus.table_2()[1])))
     first = base.find(nominal)
     second = base.regroup(first, calibrated)
     assert np.array_equal(first.kept, second.kept) and first.names != second.names
@@ -175,8 +175,8 @@ def test_regrouping_on_the_calibrated_geometry():
 def test_a_leaning_axis_adds_weak_directions_and_the_remainder_says_what_they_carry():
     """Axis 1 at 1 mrad from the vertical: rank 43 -> 45 by columns of 0.01 N m per kg m, left out and reported."""
     chain = load("lwr4plus")
-    leaning = IdentificationModel(with_gravity(tree(chain), 9.81 * np.array([np.sin(1e-3), 0.0, -np.cos(1e-3)])))
-    first = base.find(IdentificationModel(tree(chain)))
+    leaning = IdentificationModel(with_gravity(bodies_of(chain), 9.81 * np.array([np.sin(1e-3), 0.0, -np.cos(1e-3)])))
+    first = base.find(IdentificationModel(bodies_of(chain)))
     second = base.regroup(first, leaning)
     assert base.find(leaning).b == 45
     assert second.split.singular_values[45] < 1e-12 * second.split.singular_values[0]
@@ -198,7 +198,7 @@ def test_choice_of_columns_does_not_hang_on_rounding(robot):
 
 
 def test_memory_stays_bounded_and_blocks_do_not_matter(monkeypatch):
-    full = IdentificationModel(tree(load("ur5")))
+    full = IdentificationModel(bodies_of(load("ur5")))
     samples = base.random_samples(full, 300)
     whole = base.r_factor(full, samples)
     monkeypatch.setattr(base, "BLOCK", 64)
@@ -221,7 +221,7 @@ def test_memory_stays_bounded_and_blocks_do_not_matter(monkeypatch):
 def test_prismatic_joints_and_tilted_gravity(name):
     """The rank of the whole matrix is what the search in order finds, and the prediction stays exact."""
     chain = motley()
-    bodies = with_payload(tree(chain), np.eye(4)) if "payload" in name else tree(chain)
+    bodies = with_payload(bodies_of(chain), np.eye(4)) if "payload" in name else bodies_of(chain)
     full = IdentificationModel(bodies)
     result = base.find(full)
     q, v, a = states(5, 300)
@@ -232,7 +232,7 @@ def test_prismatic_joints_and_tilted_gravity(name):
     )
     matrix = np.concatenate([case.reshape(-1, full.p) for case in cases])
     assert result.b == np.linalg.matrix_rank(matrix, tol=1e-9 * np.linalg.norm(matrix))
-    chi = physical(bodies.bodies).ravel()
+    chi = physical(bodies.count).ravel()
     for case in cases:
         assert np.allclose(case[:, :, result.kept] @ (result.transform @ chi), case @ chi, rtol=0, atol=1e-10)
     moved = [k for k in range(50, 60) if k in result.kept] if "payload" in name else range(10)
@@ -244,7 +244,7 @@ def test_counts_do_not_depend_on_the_frames():
     chain = motley(7)
     q, v, a = states(5, 200)
     matrix = model.regressor(chain, q, v, a).reshape(-1, 50)
-    assert base.find(IdentificationModel(tree(chain))).b == np.linalg.matrix_rank(
+    assert base.find(IdentificationModel(bodies_of(chain))).b == np.linalg.matrix_rank(
         matrix, tol=1e-9 * np.linalg.norm(matrix)
     )
 
@@ -252,8 +252,8 @@ def test_counts_do_not_depend_on_the_frames():
 def test_richer_friction_has_columns_of_its_own():
     chain = load("ur5")
     rich = friction.asymmetric(1) + friction.load_dependent(1) + friction.presliding(1, [0.01, 0.05])
-    plain = IdentificationModel(tree(chain), drives.standard(["Ia Fv Fc off"] * 6))
-    full = IdentificationModel(tree(chain), plain.terms + rich)
+    plain = IdentificationModel(bodies_of(chain), drives.standard(["Ia Fv Fc off"] * 6))
+    full = IdentificationModel(bodies_of(chain), plain.terms + rich)
     assert base.find(full).b == base.find(plain).b + 4
 
 

@@ -6,7 +6,7 @@ from arms import motley, states
 from differences import check
 
 from calib.dynamics import drives, friction
-from calib.dynamics.bodies import tree
+from calib.dynamics.bodies import bodies_of
 from calib.dynamics.idim import IdentificationModel, friction_states, from_chain, stacked, with_load, with_terms
 from calib.errors import CalibError
 from calib.robot.load import load
@@ -29,7 +29,7 @@ def column(model, name, *motion, **more):
 
 def test_standard_columns():
     q, v, a = states(6)
-    model = IdentificationModel(tree(TX40), drives.standard(["Ia Fv Fc off"] * 6, v0=0.0))
+    model = IdentificationModel(bodies_of(TX40), drives.standard(["Ia Fv Fc off"] * 6, v0=0.0))
     assert model.p == 84 and model.names[60:64] == ("Ia1", "Fv1", "Fc1", "off1")
     assert model.units[60:64] == ("kg m²", "N m s/rad", "N m", "N m")
     for name, wanted in (("Ia", a), ("Fv", v), ("Fc", np.sign(v)), ("off", np.ones_like(v))):
@@ -40,14 +40,14 @@ def test_standard_columns():
 
 def test_smoothing_is_the_stated_one():
     q, v, a = states(6)
-    model = IdentificationModel(tree(TX40), drives.standard(["Fc"] * 6, v0=0.2))
+    model = IdentificationModel(bodies_of(TX40), drives.standard(["Fc"] * 6, v0=0.2))
     assert np.allclose(column(model, "Fc2", q, v, a)[:, 1], np.tanh(v[:, 1] / 0.2), rtol=0, atol=1e-15)
 
 
 def test_coupled_wrist():
     """tau5 += Iam6 a6 + Fvm6 v6 + Fcm6 sign(v5 + v6), tau6 += Iam6 a5 + Fvm6 v5 + Fcm6 sign(v5 + v6)."""
     q, v, a = states(6)
-    model = IdentificationModel(tree(TX40), drives.coupled(4, 5, v0=0.0))
+    model = IdentificationModel(bodies_of(TX40), drives.coupled(4, 5, v0=0.0))
     assert model.names[-3:] == ("Iam6", "Fvm6", "Fcm6")
     sign = np.sign(v[:, 4] + v[:, 5])
     for name, fifth, sixth in (("Iam6", a[:, 5], a[:, 4]), ("Fvm6", v[:, 5], v[:, 4]), ("Fcm6", sign, sign)):
@@ -62,7 +62,7 @@ def test_coupled_wrist():
 def test_gradient_of_the_model(kind):
     chain = motley()
     terms = drives.standard(["Ia Fvl Fcl offl Fvm Fcm offm"] * 5, v0=0.5)
-    model = IdentificationModel(tree(chain), terms, kind)
+    model = IdentificationModel(bodies_of(chain), terms, kind)
     rng = np.random.default_rng(1)
     x, weights = rng.normal(size=15), rng.normal(size=(1, model.rows, model.p))
 
@@ -74,7 +74,7 @@ def test_gradient_of_the_model(kind):
 
 
 def test_gradient_of_every_smooth_term():
-    model = IdentificationModel(tree(TX40), SMOOTH)
+    model = IdentificationModel(bodies_of(TX40), SMOOTH)
     rng = np.random.default_rng(1)
     x, weights = rng.normal(size=18), rng.normal(size=(1, 6, model.p))
     slopes = model.regressor_gradient(*x.reshape(3, 1, 6), weights)
@@ -83,7 +83,7 @@ def test_gradient_of_every_smooth_term():
 
 def test_terms_that_depend_on_more_say_so():
     q, v, a = states(6)
-    model = with_terms(IdentificationModel(tree(TX40)), *friction.load_dependent(1, viscous=True))
+    model = with_terms(IdentificationModel(bodies_of(TX40)), *friction.load_dependent(1, viscous=True))
     assert with_load(model) == ("Ft2", "Fvt2")
     with pytest.raises(CalibError, match="'Ft2' needs the transmitted torque"):
         model.regressor(q, v, a)
@@ -96,7 +96,7 @@ def test_terms_that_depend_on_more_say_so():
 
 def test_stop_operator_is_coulomb_in_motion_and_a_spring_at_rest():
     """Stiff within a width of the turning point, ±1 beyond; the loop closes and remembers its side."""
-    model = IdentificationModel(tree(TX40), friction.presliding(2, [0.1]))
+    model = IdentificationModel(bodies_of(TX40), friction.presliding(2, [0.1]))
     x = np.concatenate([np.linspace(0, 1, 101), np.linspace(1, 0.95, 6)[1:], np.linspace(0.95, 0, 96)[1:]])
     q = np.zeros((len(x), 6))
     q[:, 2] = x
@@ -108,13 +108,13 @@ def test_stop_operator_is_coulomb_in_motion_and_a_spring_at_rest():
     assert np.array_equal(whole, state) and np.array_equal(later, state[150:])
     v = np.gradient(q, axis=0)
     sliding = np.abs(state) == 1.0
-    off = column(IdentificationModel(tree(TX40), friction.presliding(2, [0.1], 0.0)), "Fp3.1", q, v, 0 * q)[:, 2]
+    off = column(IdentificationModel(bodies_of(TX40), friction.presliding(2, [0.1], 0.0)), "Fp3.1", q, v, 0 * q)[:, 2]
     assert np.array_equal(off, state - np.sign(v[:, 2])) and np.all(off[sliding & (np.abs(v[:, 2]) > 0)] == 0.0)
 
 
 def test_ripple_fades_with_speed():
     q, v, a = states(6)
-    model = IdentificationModel(tree(TX40), friction.ripple(0, [241.0], 0.5))
+    model = IdentificationModel(bodies_of(TX40), friction.ripple(0, [241.0], 0.5))
     assert model.names[-2:] == ("Rs1.241", "Rc1.241")
     wanted = np.sin(241 * q[:, 0]) / (1 + (v[:, 0] / 0.5) ** 2)
     assert np.allclose(column(model, "Rs1.241", q, v, a)[:, 0], wanted, rtol=0, atol=1e-14)
@@ -147,7 +147,7 @@ def test_absent_payload_has_no_columns():
 
 def test_stacking_copies_nothing():
     q, v, a = states(6)
-    model = IdentificationModel(tree(TX40), drives.standard(["Ia Fv"] * 6))
+    model = IdentificationModel(bodies_of(TX40), drives.standard(["Ia Fv"] * 6))
     regressor = model.regressor(q, v, a)
     matrix = stacked(regressor)
     assert np.shares_memory(matrix, regressor) and matrix.flags.f_contiguous
@@ -163,9 +163,9 @@ def test_stacking_copies_nothing():
         (lambda: drives.term("F", "sign", 0), r"needs \(v0\)"),
         (lambda: drives.term("F", "curly", 0), "shape 'curly' is none of"),
         (lambda: drives.DriveTerm("F", "one", (), side="left"), "neither 'link' nor 'motor'"),
-        (lambda: IdentificationModel(tree(TX40), drives.standard(["Ia"]) * 2), "'Ia1' occurs twice"),
-        (lambda: IdentificationModel(tree(TX40), drives.standard(["Ia"] * 7)), "'Ia7' names a joint beyond"),
-        (lambda: IdentificationModel(tree(TX40), (), "torque"), "kind 'torque' is none of"),
+        (lambda: IdentificationModel(bodies_of(TX40), drives.standard(["Ia"]) * 2), "'Ia1' occurs twice"),
+        (lambda: IdentificationModel(bodies_of(TX40), drives.standard(["Ia"] * 7)), "'Ia7' names a joint beyond"),
+        (lambda: IdentificationModel(bodies_of(TX40), (), "torque"), "kind 'torque' is none of"),
     ],
 )
 def test_bad_terms_are_named(make, message):

@@ -8,7 +8,7 @@ import pinocchio
 import pytest
 
 from calib.dynamics import base, drives, friction
-from calib.dynamics.bodies import standard_parameters, tree
+from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel, with_terms
 from calib.dynamics.model import model as pinocchio_model
 from calib.dynamics.path_dynamics import of_base, of_standard
@@ -20,7 +20,7 @@ IA, FV, FC, OFF = (np.array(x) for x in ((2.0, 0.7), (9.0, 3.0), (11.0, 4.0), (0
 
 def driven(chain):
     """Return a model of the chain with Ia Fv Fc off per joint, and all its values."""
-    model = IdentificationModel(tree(chain), drives.standard(["Ia Fv Fc off"] * chain.n, 0.01))
+    model = IdentificationModel(bodies_of(chain), drives.standard(["Ia Fv Fc off"] * chain.n, 0.01))
     amounts = np.column_stack([np.resize(x, chain.n) for x in (IA, FV, FC, OFF)])
     return model, np.concatenate([standard_parameters(chain), amounts.ravel()])
 
@@ -85,14 +85,14 @@ def test_motor_torques_are_the_last_rows_of_a_model_with_joint_torque_sensors():
     terms = drives.standard(["Ia Fvl Fcl Fvm Fcm"] * 7)
     values = np.concatenate([standard_parameters(chain), np.tile([0.5, 1.0, 2.0, 3.0, 4.0], 7)])
     q, v, a = arms.states(7, 5)
-    one = of_standard(IdentificationModel(tree(chain), terms, "motor"), values)
-    two = of_standard(IdentificationModel(tree(chain), terms, "both"), values)
+    one = of_standard(IdentificationModel(bodies_of(chain), terms, "motor"), values)
+    two = of_standard(IdentificationModel(bodies_of(chain), terms, "both"), values)
     np.testing.assert_allclose(two.torque(q, v, a), one.torque(q, v, a), atol=1e-12)
 
 
 def test_rows_without_bodies_and_values_that_are_no_numbers_are_refused():
     model, values = driven(load("lwr4plus"))
     with pytest.raises(CalibError, match="no bodies"):
-        of_standard(IdentificationModel(model.tree, model.terms, "drive"), values[70:])
+        of_standard(IdentificationModel(model.bodies, model.terms, "drive"), values[70:])
     with pytest.raises(CalibError, match="not finite"):
         of_standard(model, np.where(np.arange(model.p) == 3, np.nan, values))

@@ -6,7 +6,7 @@ from arms import LIBRARY, motley, physical, states
 from differences import check
 
 from calib.dynamics import model, rigid_body
-from calib.dynamics.bodies import standard_parameters, tree, with_gravity, with_payload
+from calib.dynamics.bodies import bodies_of, standard_parameters, with_gravity, with_payload
 from calib.dynamics.gravity import gravity_torques
 from calib.errors import CalibError, RobotError
 from calib.robot.chain import Chain, Element, Joint
@@ -23,7 +23,7 @@ def relative(found, wanted):
 @pytest.mark.parametrize("name", ARMS)
 def test_agrees_with_pinocchio(name):
     chain = ARMS[name]
-    bodies, chi = tree(chain), physical(chain.n).ravel()
+    bodies, chi = bodies_of(chain), physical(chain.n).ravel()
     q, v, a = states(chain.n)
     assert relative(rigid_body.regressor(bodies, q, v, a), model.regressor(chain, q, v, a)) < 1e-12
     tau = rigid_body.inverse_dynamics(bodies, chi, q, v, a)
@@ -41,7 +41,7 @@ def test_pinocchio_carries_bodies_without_mass():
     chi[9::10] = rng.uniform(1.0, 2.0, 7)
     chi[[9, 39]] = 0.0
     q, v, a = states(7)
-    tau = rigid_body.inverse_dynamics(tree(chain), chi, q, v, a)
+    tau = rigid_body.inverse_dynamics(bodies_of(chain), chi, q, v, a)
     assert relative(model.inverse_dynamics(chain, chi, q, v, a), tau) < 1e-12
     with pytest.raises(RobotError, match="moments but no mass"):
         model.model(chain, chi)
@@ -55,7 +55,7 @@ def test_inertia_round_trip():
 @pytest.mark.parametrize("name", ARMS)
 def test_mass_matrix_is_the_part_linear_in_acceleration(name):
     chain = ARMS[name]
-    bodies, chi = tree(chain), physical(chain.n).ravel()
+    bodies, chi = bodies_of(chain), physical(chain.n).ravel()
     q, v, _ = states(chain.n, 5)
     matrix = rigid_body.mass_matrix(bodies, chi, q)
     rest = rigid_body.inverse_dynamics(bodies, chi, q, v, 0 * q)
@@ -68,18 +68,18 @@ def test_mass_matrix_is_the_part_linear_in_acceleration(name):
 def test_static_torques_are_those_of_gravity():
     chain = ARMS["motley"]
     q = states(5)[0]
-    found = rigid_body.inverse_dynamics(tree(chain), standard_parameters(chain), q, 0 * q, 0 * q)
+    found = rigid_body.inverse_dynamics(bodies_of(chain), standard_parameters(chain), q, 0 * q, 0 * q)
     assert np.allclose(found, gravity_torques(chain, q), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["lwr4plus", "motley", "mimic", "payload"])
 def test_gradient_of_the_regressor(name):
-    bodies = {"mimic": lambda: tree(mimic()), "payload": lambda: with_payload(tree(motley()), np.eye(4))}.get(
-        name, lambda: tree(ARMS[name])
+    bodies = {"mimic": lambda: bodies_of(mimic()), "payload": lambda: with_payload(bodies_of(motley()), np.eye(4))}.get(
+        name, lambda: bodies_of(ARMS[name])
     )()
     n, rng = bodies.n, np.random.default_rng(5)
     x = rng.normal(size=3 * n)
-    weights = rng.normal(size=(1, n, 10 * bodies.bodies))
+    weights = rng.normal(size=(1, n, 10 * bodies.count))
 
     def weighted(x):
         return np.sum(weights * rigid_body.regressor(bodies, *x.reshape(3, 1, n)))
@@ -94,7 +94,7 @@ def test_gradient_of_torques_agrees_with_pinocchio_in_batch():
     chain, chi = ARMS["lwr4plus"], physical(7).ravel()
     q, v, a = states(7, 4)
     push = np.random.default_rng(2).normal(size=(4, 7))
-    found = rigid_body.regressor_gradient(tree(chain), q, v, a, push[:, :, None] * chi)
+    found = rigid_body.regressor_gradient(bodies_of(chain), q, v, a, push[:, :, None] * chi)
     made = model.model(chain, chi)
     data = made.createData()
     for k in range(4):
@@ -119,7 +119,7 @@ def mimic() -> Chain:
 
 
 def test_mimic_is_a_chain_of_three_with_tied_coordinates():
-    tied = tree(mimic())
+    tied = bodies_of(mimic())
     free = Chain(
         "free",
         (Joint("a"), Joint("b"), Joint("c")),
@@ -128,7 +128,7 @@ def test_mimic_is_a_chain_of_three_with_tied_coordinates():
     q, v, a = states(2)
     spread = np.array([[1.0, 0.0], [0.0, 1.0], [-1.5, 0.0]])
     wanted = np.einsum(
-        "jc,kjp->kcp", spread, rigid_body.regressor(tree(free), q @ spread.T, v @ spread.T, a @ spread.T)
+        "jc,kjp->kcp", spread, rigid_body.regressor(bodies_of(free), q @ spread.T, v @ spread.T, a @ spread.T)
     )
     assert tied.labels == ("1", "2", "1b")
     assert relative(rigid_body.regressor(tied, q, v, a), wanted) < 1e-13
@@ -146,14 +146,14 @@ def test_payload_is_a_body_of_its_own():
 
     chain, load_ = ARMS["lwr4plus"], physical(1, 4)[0]
     placement = displace(np.eye(4), [0.1, -0.2, 0.3, 0.4, 0.5, 0.6])
-    loaded = with_payload(tree(chain), placement)
-    assert loaded.names[-1] == "M8" and loaded.bodies == 8 and loaded.n == 7
+    loaded = with_payload(bodies_of(chain), placement)
+    assert loaded.names[-1] == "M8" and loaded.count == 8 and loaded.n == 7
     chi = standard_parameters(chain)
     merged = chi.copy()
     merged[-10:] += transform_body(load_, placement)
     q, v, a = states(7)
     found = rigid_body.inverse_dynamics(loaded, np.concatenate([chi, load_]), q, v, a)
-    wanted = rigid_body.inverse_dynamics(tree(chain), merged, q, v, a)
+    wanted = rigid_body.inverse_dynamics(bodies_of(chain), merged, q, v, a)
     assert relative(found, wanted) < 1e-13
     assert relative(rigid_body.regressor(loaded, q, v, a) @ np.concatenate([chi, load_]), wanted) < 1e-13
     with pytest.raises(RobotError, match="there already"):
@@ -162,7 +162,7 @@ def test_payload_is_a_body_of_its_own():
 
 def test_added_inertia_joins_the_bodies():
     chain = ARMS["tx40"]
-    bodies, chi = tree(chain), standard_parameters(chain)
+    bodies, chi = bodies_of(chain), standard_parameters(chain)
     added = np.diag(np.arange(1.0, 7.0))
     added[4, 5] = added[5, 4] = 0.3
     q, v, a = states(6)
@@ -181,7 +181,7 @@ def test_sine_and_cosine_of_the_kernels():
 
 
 def test_angles_of_many_turns():
-    bodies = tree(ARMS["ur5"])
+    bodies = bodies_of(ARMS["ur5"])
     q, v, a = states(6)
     turns = 2 * np.pi * 1e6
     far = rigid_body.regressor(bodies, q + turns, v, a)
@@ -191,7 +191,7 @@ def test_angles_of_many_turns():
 def test_gravity_is_a_parameter():
     chain = ARMS["lwr4plus"]
     q, v, a = states(7)
-    still = with_gravity(tree(chain), np.zeros(3))
+    still = with_gravity(bodies_of(chain), np.zeros(3))
     chi = standard_parameters(chain)
     assert np.abs(rigid_body.inverse_dynamics(still, chi, q, 0 * v, 0 * a)).max() == 0.0
 
@@ -206,11 +206,11 @@ def test_gravity_is_a_parameter():
 )
 def test_bad_input_is_named(change, message):
     with pytest.raises(CalibError, match=message):
-        rigid_body.regressor(tree(ARMS["lwr4plus"]), *change(states(7)))
+        rigid_body.regressor(bodies_of(ARMS["lwr4plus"]), *change(states(7)))
 
 
 def test_impossible_inertia_is_no_answer():
-    bodies = tree(ARMS["lwr4plus"])
+    bodies = bodies_of(ARMS["lwr4plus"])
     q, v, tau = states(7)
     with pytest.raises(CalibError, match="sample 0: the inertia matrix is not positive definite"):
         rigid_body.forward_dynamics(bodies, -standard_parameters(ARMS["lwr4plus"]), q, v, tau)

@@ -17,7 +17,7 @@ from calib.data.poses.measurements import PoseMeasurements
 from calib.data.signals.decimation import decimate, design_decimator, spread
 from calib.dynamics import base as bases
 from calib.dynamics import rigid_body
-from calib.dynamics.bodies import tree
+from calib.dynamics.bodies import bodies_of
 from calib.errors import RobotError
 from calib.identification import geometry_uncertainty, reweighted
 from calib.identification.identify import identify
@@ -100,7 +100,7 @@ def test_an_element_is_a_joint_that_nobody_moves():
     for k in arm.moving:
         weights = np.zeros((len(case.motion), count, 10 * count))
         weights[:, k] = values.ravel()
-        square += np.mean(rigid_body.regressor_gradient(tree(loose), *states, weights)[0] ** 2, axis=0)
+        square += np.mean(rigid_body.regressor_gradient(bodies_of(loose), *states, weights)[0] ** 2, axis=0)
     np.testing.assert_allclose(felt[:-2], np.sqrt(square / 3), rtol=1e-7, atol=1e-9)
 
 

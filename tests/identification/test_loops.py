@@ -30,7 +30,7 @@ def plant() -> Plant:
 
     model = planted.model()
     terms = tuple(replace(one, settings=(V0,)) if one.shape == "sign" else one for one in model.terms)
-    return Plant(model.tree, terms, planted.truth())
+    return Plant(model.bodies, terms, planted.truth())
 
 
 @cache

@@ -23,7 +23,7 @@ PD = controllers.pd(np.array([900.0, 700.0, 120.0]), np.array([80.0, 60.0, 10.0]
 
 
 def plant() -> Plant:
-    return Plant(planted.model().tree, planted.model().terms, planted.truth())
+    return Plant(planted.model().bodies, planted.model().terms, planted.truth())
 
 
 @cache

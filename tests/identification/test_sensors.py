@@ -12,7 +12,7 @@ import pytest
 
 from calib import cli
 from calib.dynamics import drives
-from calib.dynamics.bodies import tree, with_payload
+from calib.dynamics.bodies import bodies_of, with_payload
 from calib.dynamics.idim import IdentificationModel
 
 SIDED = {
@@ -23,7 +23,7 @@ NOISE = {"tau_l": 0.05, "tau_m": 0.2}
 
 
 def model(kind: str) -> IdentificationModel:
-    bodies = with_payload(tree(planted.arm()), np.asarray(planted.arm().tail), "tool", on=planted.N - 1)
+    bodies = with_payload(bodies_of(planted.arm()), np.asarray(planted.arm().tail), "tool", on=planted.N - 1)
     return IdentificationModel(bodies, drives.standard([" ".join(SIDED)] * planted.N), kind)
 
 

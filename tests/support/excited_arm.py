@@ -7,7 +7,7 @@ from functools import cache, partial
 import numpy as np
 
 from calib.dynamics import base, drives
-from calib.dynamics.bodies import standard_parameters, tree
+from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.robot.chain import Chain
 from calib.robot.kinematics import element_jacobian, joint_jacobian, sweep
@@ -21,7 +21,7 @@ FV = (14.4, 15.3, 6.55, 11.0, 4.29, 2.26, 1.6)  # [N m s/rad]
 def lwr(v0: float = 0.05) -> tuple[base.BaseModel, np.ndarray, Chain]:
     """Return the base model with 64 columns (43 inertial, Fv Fc off), its parameters, and the chain."""
     chain = load("lwr4plus")
-    model = IdentificationModel(tree(chain), drives.standard(["Fv Fc off"] * 7, v0))
+    model = IdentificationModel(bodies_of(chain), drives.standard(["Fv Fc off"] * 7, v0))
     found = base.find(model)
     values = np.concatenate([standard_parameters(chain), np.column_stack([FV, FC, np.zeros(7)]).ravel()])
     return base.BaseModel(model, found), found.transform @ values, chain

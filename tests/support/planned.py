@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from calib.dynamics import drives
-from calib.dynamics.bodies import standard_parameters, tree
+from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.path_dynamics import PathDynamics, of_standard
 from calib.robot.load import load
@@ -27,7 +27,7 @@ def lwr(viscous: float = 1.0) -> PathDynamics:
     """Return the arm with Ia, Fv, Fc of the truth, viscous friction times a factor."""
     known = truth("lwr4plus")["drives"]
     amounts = np.column_stack([known["Ia"], viscous * np.array(known["Fv"]), known["Fc"]]).ravel()
-    model = IdentificationModel(tree(CHAIN), drives.standard(["Ia Fv Fc"] * 7))
+    model = IdentificationModel(bodies_of(CHAIN), drives.standard(["Ia Fv Fc"] * 7))
     return of_standard(model, np.concatenate([standard_parameters(CHAIN), amounts]))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics import drives
-from calib.dynamics.bodies import tree, with_payload
+from calib.dynamics.bodies import bodies_of, with_payload
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.identification.cases import Case, make_case
@@ -44,7 +44,7 @@ def arm() -> Chain:
 
 def model(terms: tuple[DriveTerm, ...] = (), payload: bool = False) -> IdentificationModel:
     """Return the truth's model; v0 of the sign is the default."""
-    bodies = tree(arm())
+    bodies = bodies_of(arm())
     if payload:
         bodies = with_payload(bodies, np.asarray(arm().tail), "load", on=N - 1)
     return IdentificationModel(bodies, (*drives.standard(["Ia Fv Fc off"] * N), *terms))
@@ -76,7 +76,7 @@ def torques(
 ) -> np.ndarray:  # fmt: skip
     """Return the true torques (N, 3); load-dependent friction feels the bodies' torque."""
     plain = model(payload=payload)
-    bodies = 10 * plain.tree.bodies
+    bodies = 10 * plain.bodies.count
     load = plain.regressor(q, v, a)[:, :, :bodies] @ truth(payload=payload)[:bodies]
     full = model(terms, payload)
     return full.regressor(q, v, a, load) @ truth(values, payload)

@@ -27,8 +27,8 @@ class Drives:
 def drive_table(dynamics: Dynamics) -> Drives:
     """Return the drive terms of an identified model by joint, those of motor and link side added."""
     model = dynamics.model
-    values, left = np.zeros((model.tree.n, 4)), []
-    for one, value in zip(model.columns, dynamics.values[10 * model.tree.bodies :]):
+    values, left = np.zeros((model.bodies.n, 4)), []
+    for one, value in zip(model.columns, dynamics.values[10 * model.bodies.count :]):
         if not one.acts or value == 0.0:
             continue
         row, motion = one.acts[0]

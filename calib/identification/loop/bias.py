@@ -85,7 +85,7 @@ def try_loop(
     try:
         if settings.kind != "motor":
             raise UsageError("instruments from simulation are for motor torques alone")
-        loops = close_loops(chain, model.tree, cases, decimator, loop)
+        loops = close_loops(chain, model.bodies, cases, decimator, loop)
         start = per_joint(loop, "inertia", chain.n) if loop.inertia else None
         found = identify_instrumental(
             model, base, loops.pairs, decimator, method=loop.instruments, inertia=start, positive=loop.positive

@@ -17,7 +17,7 @@ from calib.data.signals.bandwidth import USABLE
 from calib.data.signals.decimation import Decimator
 from calib.data.signals.filtering import border, low_pass
 from calib.data.signals.motion import ROWS, Motion
-from calib.dynamics.bodies import Tree, standard_parameters
+from calib.dynamics.bodies import Bodies, standard_parameters
 from calib.errors import MeasurementError, NotConverged, UsageError
 from calib.identification.cases import Case
 from calib.identification.loop.controller import IdentifiedController, identify_controller
@@ -56,13 +56,13 @@ class ClosedLoops:
 
 
 def close_loops(
-    chain: Chain, tree: Tree, cases: Sequence[Case], decimator: Decimator, loop: LoopSettings
+    chain: Chain, bodies: Bodies, cases: Sequence[Case], decimator: Decimator, loop: LoopSettings
 ) -> ClosedLoops:
     """Return the loops of recordings whose motions hold `q_ref`.
 
     Args:
         chain: the robot; its inertias serve a feed-forward of kind ``cad``.
-        tree: the model's bodies.
+        bodies: the model's.
         decimator: of the rows; stretches that it eats up are left out.
 
     Raises:
@@ -83,7 +83,7 @@ def close_loops(
     design = per_joint(loop, "design", chain.n) if loop.design else None
     pairs = []
     for _, part, reference, every in stretches:
-        own = _fed_forward(controller, loop, chain, tree, part.motion, reference, every)
+        own = _fed_forward(controller, loop, chain, bodies, part.motion, reference, every)
         pairs.append((take(part, _inside(part.motion)), Loop(own, reference, every, design)))
     return ClosedLoops(tuple(pairs), controller, identified, notes)
 
@@ -207,7 +207,7 @@ def _controller(
 
 
 def _fed_forward(
-    controller: Controller, loop: LoopSettings, chain: Chain, tree: Tree, motion: Motion, reference: Reference,
+    controller: Controller, loop: LoopSettings, chain: Chain, bodies: Bodies, motion: Motion, reference: Reference,
     every: int,
 ) -> Controller:  # fmt: skip
     """Return the controller with the torques it adds along the reference."""
@@ -221,5 +221,5 @@ def _fed_forward(
     if chain.inertias is None:
         raise UsageError(f"[loop] feedforward = 'cad': robot '{chain.name}' has no inertias")
     own = standard_parameters(chain)
-    bodies = frozen(np.concatenate([own, np.zeros(10 * tree.bodies - len(own))]))
-    return with_feedforward(controller, feed_forward(Plant(tree, (), bodies), reference))
+    inertial = frozen(np.concatenate([own, np.zeros(10 * bodies.count - len(own))]))
+    return with_feedforward(controller, feed_forward(Plant(bodies, (), inertial), reference))

@@ -117,10 +117,10 @@ def replay(
     measured = controlled(np.asarray(case.target))
     ahead: dict[str, np.ndarray | None] = {FEEDBACK: None}
     if chain.inertias is not None:
-        values = np.zeros(10 * model.tree.bodies)
+        values = np.zeros(10 * model.bodies.count)
         own = standard_parameters(chain)
         values[: len(own)] = own
-        ahead[CAD] = feed_forward(Plant(model.tree, (), values), reference)
+        ahead[CAD] = feed_forward(Plant(model.bodies, (), values), reference)
     ahead |= {IDENTIFIED: controlled(predicted), FLOOR: measured}
     push = feed_forward(robot, reference) - measured
     rms = {name: replayed_error(robot, control, reference, one, push) for name, one in ahead.items()}
@@ -137,12 +137,12 @@ def _stretch(case: Case) -> slice:
 def _robot(dynamics: Dynamics, case: Case) -> tuple[Plant, tuple[str, ...]]:
     """Return the model as a robot, with what the case carries, and the names of terms that cannot be simulated."""
     model = dynamics.model
-    bodies = 10 * model.tree.bodies
+    bodies = 10 * model.bodies.count
     kept = [k for k, one in enumerate(model.columns) if one.shape in SIMULATED]
     terms = tuple(replace(model.columns[k], side="motor") for k in kept)
     values = dynamics.values[:bodies] * carried_columns(model, case.carried)
     left_out = tuple(one.name for one in model.columns if one.shape not in SIMULATED)
-    return Plant(model.tree, terms, np.concatenate([values, dynamics.values[bodies:][kept]])), left_out
+    return Plant(model.bodies, terms, np.concatenate([values, dynamics.values[bodies:][kept]])), left_out
 
 
 def _reference(part: Case, rate: float | None) -> tuple[Reference, int]:
@@ -160,7 +160,7 @@ def _possible(robot: Plant, reference: Reference) -> tuple[Plant, np.ndarray]:
 
     The least eigenvalue of its inertia matrix along the reference, scaled by the joints' own, is brought to `MARGIN`.
     """
-    tree, bodies = robot.tree, 10 * robot.tree.bodies
+    tree, bodies = robot.bodies, 10 * robot.bodies.count
     inertia = mass_matrix(tree, robot.parameters[:bodies], np.ascontiguousarray(reference.q[::50]))
     inertia = inertia + added_inertia(robot.terms, robot.parameters[bodies:], tree.n)
     size = np.maximum(np.abs(np.einsum("kii->i", inertia)) / len(inertia), LEAST)

@@ -305,9 +305,9 @@ def _regular(model: IdentificationModel, loop: Loop, inertia: np.ndarray | None)
             inertia = loop.controller.kd**2 / (2.0 * loop.controller.kp)
         if not np.all(np.isfinite(inertia)) or not np.all(inertia > 0.0):
             raise UsageError("no regular inertia follows from these gains; state it, (n,) [kg m²]")
-    n = model.tree.n
+    n = model.bodies.n
     extra = tuple(replace(one, name=f"regular {one.name}") for one in standard(["Ia"] * n))
-    return Plant(model.tree, (*model.terms, *extra), np.concatenate([np.zeros(model.p), inertia]))
+    return Plant(model.bodies, (*model.terms, *extra), np.concatenate([np.zeros(model.p), inertia]))
 
 
 def _with_values(plant: Plant, values: np.ndarray) -> Plant:
@@ -327,7 +327,7 @@ def _runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
 
 def _loaded(plant: Plant, case: Case) -> Plant:
     """Return the plant without the payloads that the case does not carry."""
-    there = carried_columns(IdentificationModel(plant.tree), case.carried)
+    there = carried_columns(IdentificationModel(plant.bodies), case.carried)
     return with_parameters(plant, plant.parameters * np.append(there, np.ones(len(plant.terms))))
 
 

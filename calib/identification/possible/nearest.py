@@ -68,7 +68,7 @@ def nearest(problem: BodyCost, spared: int | None = None) -> np.ndarray:
 def blame(problem: BodyCost, told: Information, most: int = 3) -> tuple[tuple[str, float], ...]:
     """Return whose possibility costs most: label or name, and the distance left without the demand on it."""
     model = told.dynamics.model
-    found = [(f"body {label}", i) for i, label in enumerate(model.tree.labels)]
+    found = [(f"body {label}", i) for i, label in enumerate(model.bodies.labels)]
     found += [
         (one.name, problem.bodies + k)
         for k, one in enumerate(model.columns)

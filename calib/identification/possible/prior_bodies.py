@@ -45,7 +45,7 @@ class PriorBodies:
 
 def find_prior_bodies(chain: Chain, model: IdentificationModel) -> Iterator[PriorBodies]:
     """Yield the references between which the evidence decides: one of the CAD, or rods of several total masses."""
-    carried = model.tree.coordinates < 0
+    carried = model.bodies.coordinates < 0
     if chain.inertias is not None and chain.inertias[:, 9].max() > 0.0:
         yield _cad(chain, model, carried)
         return
@@ -56,11 +56,11 @@ def find_prior_bodies(chain: Chain, model: IdentificationModel) -> Iterator[Prio
 
 
 def _cad(chain: Chain, model: IdentificationModel, carried: np.ndarray) -> PriorBodies:
-    bodies = np.zeros((model.tree.bodies, 10))
+    bodies = np.zeros((model.bodies.count, 10))
     own = standard_parameters(chain).reshape(-1, 10)
     bodies[: len(own)] = own
     heaviest, notes, drawn = float(own[:, 9].max()), [], ~carried
-    for i, label in enumerate(model.tree.labels):
+    for i, label in enumerate(model.bodies.labels):
         if carried[i]:
             bodies[i] = pseudo_inertia.ball(*PAYLOAD)
         elif not own[i, 9] > 0.0:
@@ -84,12 +84,12 @@ def _thickened(body: np.ndarray) -> np.ndarray:
 
 def _rods(chain: Chain, model: IdentificationModel, total: float) -> np.ndarray:
     """Return rods from each body's frame to the next one's, mass by length and thickness."""
-    tree = model.tree
-    ends = np.array([np.asarray(chain.tail)[:3, 3]] * tree.bodies)
-    for i, parent in enumerate(tree.parents):
-        if parent >= 0 and tree.coordinates[i] >= 0:
-            ends[parent] = tree.placements[i][:3, 3]
-    moving = tree.coordinates >= 0
+    arm = model.bodies
+    ends = np.array([np.asarray(chain.tail)[:3, 3]] * arm.count)
+    for i, parent in enumerate(arm.parents):
+        if parent >= 0 and arm.coordinates[i] >= 0:
+            ends[parent] = arm.placements[i][:3, 3]
+    moving = arm.coordinates >= 0
     share = np.where(moving, np.linalg.norm(ends, axis=1) + 2 * RADIUS, 0.0)
     masses = total * share / share.sum()
     return np.array(

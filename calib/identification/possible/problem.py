@@ -51,7 +51,7 @@ class BodyCost:
 def make_problem(told: Information, references: PriorBodies) -> BodyCost:
     """Return the cost of an identified model; sizes of drive terms come from the torque they could explain."""
     model = told.dynamics.model
-    bodies = model.tree.bodies
+    bodies = model.bodies.count
     columns = told.factor[:, :-1] @ told.transform
     norms, target = np.linalg.norm(columns, axis=0)[10 * bodies :], np.linalg.norm(told.factor[:, -1])
     seen = norms > 1e-9 * np.linalg.norm(columns, axis=0).max()

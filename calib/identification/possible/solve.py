@@ -268,7 +268,7 @@ def _notes(
             f"the consistent parameters are {away:.3g} standard deviations from the estimate, beyond {allowed:.3g} (95 "
             f"% for {told.b} parameters): the torques no longer are quite those identified"
         )
-    for label, body in zip(model.tree.labels, _bodies(problem, values)):
+    for label, body in zip(model.bodies.labels, _bodies(problem, values)):
         if pseudo_inertia.margin(body) < 1e-3:
             found.append(f"body {label} is thinner than a millimetre: hardly possible")
     return found

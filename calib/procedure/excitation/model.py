@@ -11,7 +11,7 @@ import numpy as np
 from calib.dynamics import base as base_parameters
 from calib.dynamics import drives
 from calib.dynamics.base import BaseModel
-from calib.dynamics.bodies import standard_parameters, tree, with_gravity
+from calib.dynamics.bodies import bodies_of, standard_parameters, with_gravity
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.shapes import V0
@@ -64,7 +64,7 @@ def read_dynamics(chain: Chain, folder: Path | None, sets: str, limits: MotionLi
     friction = limits.friction is not None
     if values is not None and not friction:
         notes.append("friction is not known (no --model, no [friction]): torques are predicted without it")
-    model = IdentificationModel(tree(chain), terms)
+    model = IdentificationModel(bodies_of(chain), terms)
     return _dynamics(model, values, None, friction, tuple(notes))
 
 
@@ -82,9 +82,9 @@ def _identified(chain: Chain, folder: Path) -> ExcitedModel:
             message = f"{folder} is of a robot with {theirs.n} joints ({theirs.name}), {chain.name} has {chain.n}"
             raise UsageError(message) from error
         raise UsageError(f"{folder}/dynamics.json does not fit robot '{chain.name}': {error!r}") from error
-    bodies = with_gravity(tree(chain), np.asarray(found.model.tree.gravity))
-    numbers = found.values[: 10 * bodies.bodies]
-    terms = list(zip(found.model.columns, found.values[10 * found.model.tree.bodies :]))
+    bodies = with_gravity(bodies_of(chain), np.asarray(found.model.bodies.gravity))
+    numbers = found.values[: 10 * bodies.count]
+    terms = list(zip(found.model.columns, found.values[10 * found.model.bodies.count :]))
     kept = [(one, value) for one, value in terms if one.form.slopes is not None]
     left = [one.name for one, _ in terms if one.form.slopes is None]
     values = np.array([*numbers, *(value for _, value in kept)])

@@ -11,7 +11,7 @@ import numpy as np
 
 from calib.data.poses.fit_options import FitOptions
 from calib.dynamics import drives
-from calib.dynamics.bodies import standard_parameters, tree
+from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.path_dynamics import PathDynamics, of_standard
 from calib.errors import RobotError, UsageError
@@ -202,7 +202,7 @@ def _law(
     except RobotError as error:
         raise UsageError(str(error)) from error
     linear = [joint.kind == "prismatic" for joint in chain.joints]
-    model = IdentificationModel(tree(chain), drives.standard([" ".join(DRIVES)] * chain.n, linear=linear))
+    model = IdentificationModel(bodies_of(chain), drives.standard([" ".join(DRIVES)] * chain.n, linear=linear))
     missing = [what for what, key in (("motor inertia", "Ia"), ("friction", "Fc")) if key not in stated]
     note = (
         f"{' and '.join(missing)} not known (no --model, no --drives): planned without, a real robot needs more torque"
@@ -218,13 +218,13 @@ def _identified(chain: Chain, folder: Path, payloads: Sequence[str]) -> tuple[Pa
     if arm.n != chain.n:
         raise UsageError(f"{folder} is of a robot with {arm.n} joints, {chain.name} has {chain.n}")
     model = dynamics.model
-    known = [label for label, coordinate in zip(model.tree.labels, model.tree.coordinates) if coordinate < 0]
+    known = [label for label, coordinate in zip(model.bodies.labels, model.bodies.coordinates) if coordinate < 0]
     if unknown := sorted(set(payloads) - set(known)):
         raise UsageError(f"{folder}: no payload '{unknown[0]}' was identified; it knows {', '.join(known) or 'none'}")
     if model.kind == "drive":
         return of_standard(model, dynamics.values), None  # which says why that cannot be
     values = np.array(dynamics.values)
-    values[: 10 * model.tree.bodies] *= carried_columns(model, payloads)
+    values[: 10 * model.bodies.count] *= carried_columns(model, payloads)
     return of_standard(model, values), read_uncertainty(folder, Dynamics(model, values), payloads)
 
 

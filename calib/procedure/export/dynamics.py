@@ -33,9 +33,7 @@ from scipy.spatial.transform import Rotation
 
 from calib import files
 from calib.dynamics import pseudo_inertia, rigid_body
-from calib.dynamics.bodies import Tree as Bodies
-from calib.dynamics.bodies import tree as bodies_of
-from calib.dynamics.bodies import with_gravity
+from calib.dynamics.bodies import Bodies, bodies_of, with_gravity
 from calib.errors import RobotError, UsageError
 from calib.identification.friction.drive_table import Drives, drive_table
 from calib.identification.model_file import refuse_currents
@@ -80,9 +78,9 @@ class Exported:
         return self.calibration.chain
 
     @property
-    def tree(self) -> Bodies:
+    def arm(self) -> Bodies:
         """The arm's bodies under the gravity it was identified with."""
-        return with_gravity(bodies_of(self.chain), self.found.dynamics.model.tree.gravity)
+        return with_gravity(bodies_of(self.chain), self.found.dynamics.model.bodies.gravity)
 
 
 def is_identified(folder: Path) -> bool:
@@ -95,7 +93,7 @@ def read(folder: Path) -> Exported:
     refuse_currents(folder, "an export of masses")
     told = read_told(folder)
     found = find_consistent(told)
-    own = bodies_of(told.chain).bodies
+    own = bodies_of(told.chain).count
     bodies = found.dynamics.values[: 10 * own].reshape(own, 10)
     return Exported(geometry.read(folder), told, found, bodies, drive_table(found.dynamics))
 
@@ -165,8 +163,8 @@ def drive_notes(given: Exported) -> list[str]:
         names = [*(["offsets"] if np.any(given.drives.values[:, 3]) else []), *given.drives.left]
         more = f" and {len(names) - 8} more" if len(names) > 8 else ""
         notes.append(f"in parameters.json alone: {', '.join(names[:8])}{more}")
-    tree = given.found.dynamics.model.tree
-    if payloads := [label for label, c in zip(tree.labels, tree.coordinates) if c < 0]:
+    carried = given.found.dynamics.model.bodies
+    if payloads := [label for label, c in zip(carried.labels, carried.coordinates) if c < 0]:
         notes.append(f"payload {', '.join(payloads)} is not part of the robot: in parameters.json alone")
     return notes
 
@@ -236,7 +234,7 @@ def parameters(given: Exported) -> dict[str, Any]:
             "covariance": None if covariance is None else np.asarray(covariance).tolist(),
         },
         "dynamics": {
-            "gravity": model.tree.gravity.tolist(),
+            "gravity": model.bodies.gravity.tolist(),
             "rows": model.kind,
             "base": {**_columns(told.names, told.units, told.values), "covariance": told.covariance.tolist()},
             "standard": {
@@ -249,7 +247,7 @@ def parameters(given: Exported) -> dict[str, Any]:
                 "nearest": found.nearest,
                 "distance": found.distance,
                 "allowed": found.allowed,
-                "margins_m": dict(zip(model.tree.labels, found.margins.tolist())),
+                "margins_m": dict(zip(model.bodies.labels, found.margins.tolist())),
                 "weight": found.weight,
                 "sigmas_widened_by": found.doubt,
                 "drawn_to": found.source,
@@ -316,7 +314,7 @@ def _check(given: Exported, source: str, chain: Chain, where: str, mjcf: bool = 
     q = random_joints(given.chain, 20, 0)
     v, a = rng.uniform(-1.0, 1.0, (2, *q.shape))
     torques, frames, damping, friction = motion_torques(source, chain, q, v, a, mjcf)
-    wanted = rigid_body.inverse_dynamics(given.tree, given.bodies.ravel(), q, v, a)
+    wanted = rigid_body.inverse_dynamics(given.arm, given.bodies.ravel(), q, v, a)
     if mjcf:
         wanted = wanted + given.drives.values[:, 0] * a
         away = float(np.abs(frames - urdf_write.moving_frames(given.chain, q)).max())

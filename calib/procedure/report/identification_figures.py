@@ -76,7 +76,7 @@ def friction(outcome: IdentificationOutcome) -> Figure:
     """Draw each joint's friction over its velocity: what the rigid model leaves, and the model's terms of velocity."""
     found, case = outcome.found, outcome.inputs.cases[0]
     model, values = found.dynamics.model, found.dynamics.values
-    bodies = 10 * model.tree.bodies if model.kind != "drive" else 0
+    bodies = 10 * model.bodies.count if model.kind != "drive" else 0
     n, rows = case.motion.n, case.target.shape[1]
     columns = min(n, 4)
     shown = {"velocity", "sign", "one", "speed", "cubic", "root", "stribeck"}

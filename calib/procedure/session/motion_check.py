@@ -13,7 +13,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.signal import fftconvolve, savgol_filter
 
 from calib.data.recordings.recording import Recording
-from calib.dynamics.bodies import standard_parameters, tree
+from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.rigid_body import inverse_dynamics
 from calib.errors import MeasurementError
 from calib.procedure.excitation.coefficients import Periodic
@@ -197,7 +197,7 @@ def _against_masses(recording: Recording, chain: Chain) -> tuple[np.ndarray, np.
     place = _sampled(recording.t, recording.q, grid)
     q, v, a = (_smooth(place, order) for order in range(3))
     torque = _smooth(_sampled(recording.t, recording.effort, grid))
-    rigid = inverse_dynamics(tree(chain), standard_parameters(chain), q, v, a)
+    rigid = inverse_dynamics(bodies_of(chain), standard_parameters(chain), q, v, a)
     limit = np.array([joint.effort for joint in chain.joints])
     share, alike = np.zeros(chain.n), np.zeros(chain.n)
     for j in range(chain.n):

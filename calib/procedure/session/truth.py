@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements
 from calib.dynamics import base as bases
-from calib.dynamics.bodies import standard_parameters, tree
+from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.gravity import gravity_torques
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.rigid_body import inverse_dynamics
@@ -88,8 +88,8 @@ def torques_against_truth(session: Session, cell: Cell, arm: MovingArm, seed: in
     true = {"both": np.hstack([link, motor]), "link": link}.get(kind, motor)
     load = transmitted_along(dynamics, *states)
     predicted = np.einsum("kij,j->ki", dynamics.model.regressor(*states, load, ()), dynamics.values)
-    friction = link - inverse_dynamics(arm.plant.tree, arm.plant.parameters[: 10 * arm.plant.tree.bodies], *states)
-    nominal = inverse_dynamics(tree(cell.nominal), standard_parameters(cell.nominal), *states) + friction
+    friction = link - inverse_dynamics(arm.plant.bodies, arm.plant.parameters[: 10 * arm.plant.bodies.count], *states)
+    nominal = inverse_dynamics(bodies_of(cell.nominal), standard_parameters(cell.nominal), *states) + friction
     error = predicted - true
     within, count = _parameters(session, dynamics.model, cell, arm)
     return TorqueErrors(
@@ -104,8 +104,8 @@ def _percent(error: np.ndarray, size: np.ndarray) -> float:
 def transmitted_along(dynamics: Dynamics, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
     """Return what the gears pass on to the bodies by the model, without payloads (N, n): load-dependent friction."""
     model = dynamics.model
-    bodies = dynamics.values[: 10 * model.tree.bodies] * carried_columns(model, ())
-    return inverse_dynamics(model.tree, bodies, q, v, a)
+    bodies = dynamics.values[: 10 * model.bodies.count] * carried_columns(model, ())
+    return inverse_dynamics(model.bodies, bodies, q, v, a)
 
 
 def _parameters(session: Session, model: IdentificationModel, cell: Cell, arm: MovingArm) -> tuple[float, int]:
@@ -122,13 +122,13 @@ def _parameters(session: Session, model: IdentificationModel, cell: Cell, arm: M
 
 def true_base(model: IdentificationModel, cell: Cell, arm: MovingArm, seed: int) -> dict[str, float]:
     """Return the true base parameters of a model by name: columns of the nominal arm, regrouped on the true one."""
-    known = dict(zip((*arm.plant.tree.names, *(one.name for one in arm.plant.terms)), arm.plant.parameters))
+    known = dict(zip((*arm.plant.bodies.names, *(one.name for one in arm.plant.terms)), arm.plant.parameters))
     for j in range(arm.chain.n):  # whole drives, where the model does not part motor and link
         for name in ("Fv", "Fc", "off"):
             known[f"{name}{j + 1}"] = known[f"{name}l{j + 1}"] + known[f"{name}m{j + 1}"]
     names = tuple(name for name in model.names if name in known)
     terms = tuple(one for one in model.terms if one.name in names)
-    bare = [replace(model, tree=tree(chain), terms=terms) for chain in (cell.nominal, arm.chain)]
+    bare = [replace(model, bodies=bodies_of(chain), terms=terms) for chain in (cell.nominal, arm.chain)]
     lower, upper = sampling_limits(arm.chain)
     samples = bases.random_samples(bare[0], seed=seed, lower=lower, upper=upper)
     base = bases.regroup(bases.find(bare[0], samples), bare[1], samples)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from calib.dynamics import drives
-from calib.dynamics.bodies import standard_parameters, tree
+from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.robot import description, library
 from calib.simulation.loop.closed_loop import Plant
@@ -47,7 +47,7 @@ def plant(name: str, coupled: bool = False, offset: np.ndarray | None = None) ->
         terms[place] = replace(terms[place], acts=both)
         terms += gear[1:]
         amounts += [link["Fvm"], link["Fcm"]]
-    return Plant(tree(chain), tuple(terms), np.concatenate([standard_parameters(chain), amounts]))
+    return Plant(bodies_of(chain), tuple(terms), np.concatenate([standard_parameters(chain), amounts]))
 
 
 def controller(name: str) -> Controller:
@@ -58,4 +58,4 @@ def controller(name: str) -> Controller:
 
 def model(plant: Plant) -> IdentificationModel:
     """Return the identification model whose parameters are those of the plant."""
-    return IdentificationModel(plant.tree, plant.terms)
+    return IdentificationModel(plant.bodies, plant.terms)

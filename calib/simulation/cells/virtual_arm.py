@@ -14,7 +14,7 @@ import numpy as np
 
 from calib.data.recordings.recording import Recording
 from calib.dynamics import drives
-from calib.dynamics.bodies import standard_parameters, tree
+from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import CalibError
 from calib.robot import library
@@ -76,7 +76,7 @@ def moving_arm(cell: Cell, robot: str, seed: int = 0) -> MovingArm:
         [" ".join(known_robots.SIDED)] * chain.n, linear=[j.kind == "prismatic" for j in chain.joints]
     )
     values, source = _drives(robot, nominal, effort)
-    plant = Plant(tree(chain), tuple(terms), np.concatenate([standard_parameters(chain), values.ravel()]))
+    plant = Plant(bodies_of(chain), tuple(terms), np.concatenate([standard_parameters(chain), values.ravel()]))
     share = np.array([KNOWN if name[:1] == "F" else 1.0 for name in known_robots.SIDED])
     told = np.concatenate([standard_parameters(nominal), (values * share).ravel()])
     inertia = inertia_diagonal(plant, random_joints(chain, 200, 0))
@@ -86,7 +86,8 @@ def moving_arm(cell: Cell, robot: str, seed: int = 0) -> MovingArm:
         f"{SIGMA_MOTOR:.1%} (motors) and {SIGMA_LINK:.1%} (sensors) of the limits"
     )
     return MovingArm(
-        chain, plant, IdentificationModel(plant.tree, plant.terms, "link"), Plant(tree(nominal), tuple(terms), told),
+        chain, plant, IdentificationModel(plant.bodies, plant.terms, "link"),
+        Plant(bodies_of(nominal), tuple(terms), told),
         replace(pd(omega**2 * inertia, 2 * DAMPING * omega * inertia), cutoff=CUTOFF), effort, note,
     )  # fmt: skip
 
@@ -136,13 +137,13 @@ def _held(torque: np.ndarray) -> np.ndarray:
 
 def true_torque(arm: MovingArm, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
     """Return the motors' torques (N, n) without noise [N m or N]."""
-    model = IdentificationModel(arm.plant.tree, arm.plant.terms)
+    model = IdentificationModel(arm.plant.bodies, arm.plant.terms)
     return np.einsum("kij,j->ki", model.regressor(q, v, a), arm.plant.parameters)
 
 
 def link_torque(arm: MovingArm, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
     """Return the torques behind the gears (N, n) without noise [N m or N]."""
-    whole = IdentificationModel(arm.plant.tree, arm.plant.terms)
+    whole = IdentificationModel(arm.plant.bodies, arm.plant.terms)
     shared = np.isin(whole.names, arm.link.names)
     return np.einsum("kij,j->ki", arm.link.regressor(q, v, a), arm.plant.parameters[shared])
 
@@ -159,7 +160,7 @@ def _drives(robot: str, chain: Chain, effort: np.ndarray) -> tuple[np.ndarray, s
             [rows.get(name, zero) for name in known_robots.SIDED]
         ), "drives as published for the type"
     speed = np.array([joint.velocity if np.isfinite(joint.velocity) else 2.0 for joint in chain.joints])
-    bare = Plant(tree(chain), (), standard_parameters(chain))
+    bare = Plant(bodies_of(chain), (), standard_parameters(chain))
     rows = {
         "Ia": 0.5 * inertia_diagonal(bare, random_joints(chain, 200, 0)),
         "Fvm": 0.05 * effort / speed,

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.arrays import frozen, shaped
-from calib.dynamics.bodies import Tree
+from calib.dynamics.bodies import Bodies
 from calib.dynamics.drives import DriveTerm
 from calib.errors import CalibError, NotConverged
 from calib.simulation.loop.controllers import Controller
@@ -32,18 +32,18 @@ class Plant:
     """A robot to simulate.
 
     Attributes:
-        tree: its bodies.
+        bodies: of the robot.
         terms: its drives; shapes out of `SIMULATED`, signs with a smoothing above zero.
         parameters: (10 B + k,) standard parameters of the bodies, then one value per term. Any values that give a
             positive definite inertia will do: base parameters, zeros for the others, too.
     """
 
-    tree: Tree
+    bodies: Bodies
     terms: tuple[DriveTerm, ...]
     parameters: np.ndarray
 
     def __post_init__(self) -> None:
-        size = 10 * self.tree.bodies + len(self.terms)
+        size = 10 * self.bodies.count + len(self.terms)
         object.__setattr__(self, "parameters", frozen(shaped(self.parameters, (size,), "parameters of the plant")))
         for one in self.terms:
             if one.shape not in SIMULATED:
@@ -120,7 +120,7 @@ def simulate(
     from calib.simulation.loop import loop_kernels
 
     sensing = Sensing() if sensing is None else sensing
-    n, count = plant.tree.n, len(reference.t)
+    n, count = plant.bodies.n, len(reference.t)
     rng = np.random.default_rng(seed)
     noise = {name: np.broadcast_to(getattr(sensing, name), (n,)) for name in ("sigma_q", "push", "sigma_tau")}
     drawn = {name: _draw(rng, size, count) for name, size in noise.items()}
@@ -131,7 +131,7 @@ def simulate(
         drawn["push"] = np.ascontiguousarray(own + drawn["push"] if len(drawn["push"]) else own)
     q, v = (np.array(x, dtype=float) for x in (start if start is not None else (reference.q[0], reference.v[0])))
     out = np.empty((5, -(-count // sensing.every), n))
-    model = np.empty((0, 0)) if controller.model is None else _body(plant.tree, controller.model)
+    model = np.empty((0, 0)) if controller.model is None else _body(plant.bodies, controller.model)
     status, reached = loop_kernels.closed_loop(
         *_packed(plant), model, controller.rows, controller.sampled(reference), drawn["sigma_q"],
         np.ascontiguousarray(np.broadcast_to(sensing.quantum, (n,)), dtype=float), drawn["push"], reference.period,
@@ -149,7 +149,7 @@ def forward_dynamics(plant: Plant, q: np.ndarray, v: np.ndarray, tau: np.ndarray
     """Return the accelerations (N, n) under torques (N, n) of the drives, friction and motor inertia included."""
     from calib.simulation.loop import loop_kernels
 
-    q, v, tau = (np.ascontiguousarray(shaped(x, (len(q), plant.tree.n), "states")) for x in (q, v, tau))
+    q, v, tau = (np.ascontiguousarray(shaped(x, (len(q), plant.bodies.n), "states")) for x in (q, v, tau))
     out = np.empty_like(q)
     failed = loop_kernels.forward_dynamics(*_packed(plant), q, v, tau, out)
     if failed >= 0:
@@ -167,9 +167,9 @@ def inertia_diagonal(plant: Plant, q: np.ndarray) -> np.ndarray:
     from calib.dynamics import rigid_body
     from calib.dynamics.drives import added_inertia
 
-    bodies = 10 * plant.tree.bodies
-    inertia = rigid_body.mass_matrix(plant.tree, plant.parameters[:bodies], np.asarray(q, dtype=float))
-    added = added_inertia(plant.terms, plant.parameters[bodies:], plant.tree.n)
+    bodies = 10 * plant.bodies.count
+    inertia = rigid_body.mass_matrix(plant.bodies, plant.parameters[:bodies], np.asarray(q, dtype=float))
+    added = added_inertia(plant.terms, plant.parameters[bodies:], plant.bodies.n)
     return np.einsum("kii->i", inertia) / len(inertia) + np.diag(added)
 
 
@@ -190,27 +190,27 @@ def _coloured(white: np.ndarray, step: float) -> np.ndarray:
 
 def _packed(plant: Plant) -> Packed:
     """Return tree, body, linear, kinds and acts as the kernels lay them out."""
-    bodies, n = plant.tree.bodies, plant.tree.n
-    parents = np.where(plant.tree.parents < 0, bodies, plant.tree.parents)
-    links = np.column_stack([parents, plant.tree.kinds, plant.tree.coordinates]).astype(np.int64)
+    bodies, n = plant.bodies.count, plant.bodies.n
+    parents = np.where(plant.bodies.parents < 0, bodies, plant.bodies.parents)
+    links = np.column_stack([parents, plant.bodies.kinds, plant.bodies.coordinates]).astype(np.int64)
     linear, acts = _drives(plant.terms, plant.parameters[10 * bodies :], n)
     kinds = np.array([[row, code] for row, code, *_ in acts], dtype=np.int64).reshape(-1, 2)
     values = np.array([[amount, *settings, *weights] for _, _, amount, settings, weights in acts])
-    body = _body(plant.tree, plant.parameters[: 10 * bodies])
+    body = _body(plant.bodies, plant.parameters[: 10 * bodies])
     return np.ascontiguousarray(links), body, linear, kinds, values.reshape(-1, 4 + n)
 
 
-def _body(tree: Tree, parameters: np.ndarray) -> np.ndarray:
+def _body(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
     """Return placements and parameters between frames turned so that each joint moves about or along z."""
-    result = np.zeros((tree.bodies + 1, 23))
-    result[-1, :3] = -tree.gravity
-    turns = [np.eye(3)[:, _TURNS[axis]] for axis in tree.axes]
-    for i, parent in enumerate(tree.parents):
+    result = np.zeros((bodies.count + 1, 23))
+    result[-1, :3] = -bodies.gravity
+    turns = [np.eye(3)[:, _TURNS[axis]] for axis in bodies.axes]
+    for i, parent in enumerate(bodies.parents):
         before = np.eye(3) if parent < 0 else turns[parent].T
-        result[i, :9] = (before @ tree.placements[i, :3, :3] @ turns[i]).ravel()
-        result[i, 9:12] = before @ tree.placements[i, :3, 3]
-        result[i, 12:22] = parameters[10 * i : 10 * i + 10][tree.order[i]]
-    result[:-1, 22] = tree.scales
+        result[i, :9] = (before @ bodies.placements[i, :3, :3] @ turns[i]).ravel()
+        result[i, 9:12] = before @ bodies.placements[i, :3, 3]
+        result[i, 12:22] = parameters[10 * i : 10 * i + 10][bodies.order[i]]
+    result[:-1, 22] = bodies.scales
     return result
 
 

@@ -18,7 +18,7 @@ BLOCK = 4096  # instants at a time
 
 def feed_forward(believed: Plant, reference: Reference) -> np.ndarray:
     """Return the torques (N, n) that the believed robot needs along the reference, drives included [N m or N]."""
-    model = IdentificationModel(believed.tree, believed.terms)
+    model = IdentificationModel(believed.bodies, believed.terms)
     parts = [slice(k, k + BLOCK) for k in range(0, len(reference.t), BLOCK)]
     regressors = (model.regressor(reference.q[part], reference.v[part], reference.a[part]) for part in parts)
     return np.concatenate([regressor @ believed.parameters for regressor in regressors])

@@ -11,7 +11,7 @@ from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics import base as bases
 from calib.dynamics import drives
-from calib.dynamics.bodies import tree
+from calib.dynamics.bodies import bodies_of
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import MeasurementError, NotConverged, Unidentifiable, UsageError
 from calib.estimation import instrumental_variables
@@ -38,9 +38,9 @@ def arm(v0: float = 0.5) -> tuple[Plant, IdentificationModel, bases.Base]:
     chain = mdh.chain("two joints", ROWS)
     coulomb = np.isfinite(v0)
     terms = drives.standard(["Ia Fv Fc" if coulomb else "Ia Fv"] * 2, v0)
-    model = IdentificationModel(tree(chain), terms)
+    model = IdentificationModel(bodies_of(chain), terms)
     values = DRIVES if coulomb else DRIVES[[0, 1, 3, 4]]
-    return Plant(model.tree, terms, np.concatenate([LINKS, values])), model, bases.find(model)
+    return Plant(model.bodies, terms, np.concatenate([LINKS, values])), model, bases.find(model)
 
 
 @cache

@@ -19,7 +19,7 @@ from differences import check
 
 from calib.data.recordings.recording_files import read_recording
 from calib.dynamics import base, drives
-from calib.dynamics.bodies import standard_parameters, tree
+from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.procedure.excitation import coefficients, design, design_folder
 from calib.procedure.excitation.limits import Points, read_motion_limits
@@ -281,13 +281,13 @@ def identified(folder: Path, spoil: str = "") -> None:
     """Write what `calib identify` writes of the LWR4+'s model."""
     chain = load("lwr4plus")
     terms = drives.standard(["Ia Fv Fc off"] * 7)
-    model = IdentificationModel(tree(chain), terms)
+    model = IdentificationModel(bodies_of(chain), terms)
     values = np.concatenate([standard_parameters(chain), np.tile([1.0, 5.0, 6.0, 0.1], 7)])
     found = base.find(model)
     folder.mkdir()
     table = {
         "gravity": [0, 0, -9.81],
-        "bodies": dict(zip(model.tree.names, values[:70].tolist())),
+        "bodies": dict(zip(model.bodies.names, values[:70].tolist())),
         "terms": [
             {
                 "name": one.name, "shape": one.shape, "acts": [[r, [list(p) for p in m]] for r, m in one.acts],
@@ -312,7 +312,7 @@ def test_an_identified_model_predicts_torques_with_their_uncertainty(tmp_path):
     assert len(dynamics.values) == len(dynamics.exact.names) == 69  # 43 + 28, less Ia1 and Ia2
     assert np.allclose(dynamics.covariance, 0.01 * np.eye(69))
     q, v, a = np.random.default_rng(0).normal(size=(3, 5, 7))
-    full = IdentificationModel(tree(chain), drives.standard(["Ia Fv Fc off"] * 7))
+    full = IdentificationModel(bodies_of(chain), drives.standard(["Ia Fv Fc off"] * 7))
     values = np.concatenate([standard_parameters(chain), np.tile([1.0, 5.0, 6.0, 0.1], 7)])
     assert np.allclose(dynamics.exact.regressor(q, v, a) @ dynamics.values, full.regressor(q, v, a) @ values)
 

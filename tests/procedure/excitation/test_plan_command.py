@@ -43,7 +43,7 @@ def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ]  # fmt: skip
     table = {
         "kind": "motor", "gravity": list(CHAIN.gravity), "payloads": [],
-        "bodies": dict(zip(law.tree.names, law.bodies.tolist())), "terms": terms,
+        "bodies": dict(zip(law.bodies.names, law.inertial.tolist())), "terms": terms,
     }  # fmt: skip
     files.write_json(folder / "dynamics.json", table)
     return tmp_path

@@ -105,7 +105,7 @@ def check_torques_with_pinocchio(path: Path, given: dynamics.Exported) -> None:
     rng = np.random.default_rng(5)
     q, v, a = rng.uniform(-0.4, 0.4, (3, 10, 2))
     identified = given.found.dynamics
-    drives = identified.values[10 * identified.model.tree.bodies :].reshape(2, 4)
+    drives = identified.values[10 * identified.model.bodies.count :].reshape(2, 4)
     wanted = identified.model.regressor(q, v, a) @ identified.values
     sign = np.tanh(v / identified.model.columns[2].settings[0])
     for k in range(10):
@@ -206,5 +206,5 @@ def test_mujoco_reads_the_mjcf(tmp_path):
         json.dumps([q.tolist(), v.tolist(), a.tolist()]),
     ]
     answer = subprocess.run(arguments, capture_output=True, text=True, check=True).stdout
-    wanted = rigid_body.inverse_dynamics(given.tree, given.bodies.ravel(), q, v, a) + given.drives.values[:, 0] * a
+    wanted = rigid_body.inverse_dynamics(given.arm, given.bodies.ravel(), q, v, a) + given.drives.values[:, 0] * a
     assert np.abs(np.array(json.loads(answer)) - wanted).max() < 1e-9 * np.abs(wanted).max()

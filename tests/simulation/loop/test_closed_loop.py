@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib.dynamics import drives, rigid_body
-from calib.dynamics.bodies import standard_parameters, tree, with_payload
+from calib.dynamics.bodies import bodies_of, standard_parameters, with_payload
 from calib.errors import CalibError, NotConverged
 from calib.robot import description, library
 from calib.robot.chain import Chain, Element, Joint
@@ -48,7 +48,7 @@ def motley() -> Chain:
 
 
 def bare(chain: Chain) -> Plant:
-    return Plant(tree(chain), (), standard_parameters(chain))
+    return Plant(bodies_of(chain), (), standard_parameters(chain))
 
 
 def motion(seed: int = 1, duration: float = 2.0, rate: float = 5000.0) -> Reference:
@@ -67,12 +67,12 @@ def free(n: int) -> controllers.Controller:
 @pytest.mark.parametrize("chain", [description.read(library.path(x)) for x in ("tx40", "lwr4plus")] + [motley()],
                          ids=lambda chain: chain.name)  # fmt: skip
 def test_forward_dynamics_are_those_of_the_dynamics_room(chain):
-    bodies = tree(chain)
+    bodies = bodies_of(chain)
     bodies = with_payload(bodies, displace(np.eye(4), np.full(6, 0.2)), "load")
     terms = drives.standard(["Ia Fv Fc off"] * chain.n, 0.05)
     rng = np.random.default_rng(0)
     amounts = rng.uniform(0.1, 1.0, len(terms))
-    inertial = physical(bodies.bodies).ravel()
+    inertial = physical(bodies.count).ravel()
     q, v, tau = rng.normal(size=(3, 50, chain.n))
     zero = np.zeros_like(q)
     columns = np.zeros((len(terms), chain.n, 50))
@@ -211,7 +211,7 @@ def test_what_cannot_be_simulated_is_refused():
     with pytest.raises(CalibError, match="exact sign"):
         replace(plant, terms=drives.standard(["Ia Fv Fc"] * 6, 0.0))
     with pytest.raises(CalibError, match="'position'"):
-        Plant(plant.tree, (drives.term("k1", "position", 0),), np.zeros(61))
+        Plant(plant.bodies, (drives.term("k1", "position", 0),), np.zeros(61))
 
 
 def test_references_are_their_own_derivatives_and_keep_the_limits():
