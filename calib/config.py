@@ -29,6 +29,7 @@ LARGEST = 8_000_000  # bytes of a file, and below: levels of tables in tables, s
 DEEPEST = 32
 LONGEST = 200
 ENDINGS = ("csv", "npz", "txt", "tsv", "dat", "mcap", "bag", "db3")  # of measured files
+UNKNOWN = "unexpected_keyword_argument"  # as pydantic calls it
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 _BINARY = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv}
 
@@ -89,12 +90,7 @@ def _check_size(found: Any, place: str, error: type[CalibError]) -> None:
         ahead += [((*loc, key), item) for key, item in inner]
 
 
-def read(kind: type[T], path: str | Path, error: type[CalibError] = UsageError, **given: Any) -> T:
-    """Return the file at `path` as a `kind`; see `parse`."""
-    return parse(kind, read_toml(path, error), str(path), error, **given)
-
-
-def parse(kind: type[T], found: Mapping[str, Any], place: str, error: type[CalibError] = UsageError, **given: Any) -> T:
+def parse(kind: type[T], found: Any, place: str, error: type[CalibError] = UsageError) -> T:
     """Return a parsed table as a `kind`.
 
     Args:
@@ -102,20 +98,16 @@ def parse(kind: type[T], found: Mapping[str, Any], place: str, error: type[Calib
         found: the table, lists and tables in it as tomllib makes them.
         place: names it in complaints.
         error: the class of complaints.
-        given: fields that no file may state.
 
     Raises:
         CalibError: `error`, for the first key that is unknown, missing, or holds what it cannot hold.
     """
     from pydantic import ValidationError
 
-    own = tuple(given)
     try:
-        if isinstance(found, Mapping) and (stated := [key for key in own if key in found]):
-            raise error(f"{place}: {_no_key(stated[0], _keys(kind, own))}")
-        return _adapter(kind).validate_python({**found, **given} if isinstance(found, Mapping) else found)
+        return _adapter(kind).validate_python(found)
     except ValidationError as wrong:
-        raise error(_complaint(wrong.errors(include_url=False), kind, place, own)) from None
+        raise error(_complaint(wrong.errors(include_url=False), kind, place)) from None
 
 
 def strict(kind: type[T]) -> type[T]:
@@ -131,31 +123,54 @@ def _adapter(kind: Any) -> Any:
     return TypeAdapter(kind)
 
 
-def schema(kind: type, title: str, hidden: Collection[str] = ()) -> dict[str, Any]:
-    """Return the JSON schema (draft 2020-12) of the files that `parse` reads as a `kind`; `hidden` are its `given`."""
+def schema(kind: type, title: str) -> dict[str, Any]:
+    """Return the JSON schema (draft 2020-12) of the files that `parse` reads as a `kind`."""
     from pydantic.json_schema import GenerateJsonSchema
 
-    found = _without_null(_adapter(kind).json_schema())
-    for key in hidden:
-        found["properties"].pop(key)
-    return {"$schema": GenerateJsonSchema.schema_dialect, **found, "title": title}
+    found = _adapter(kind).json_schema()
+    return {"$schema": GenerateJsonSchema.schema_dialect, **_for_toml(found), "title": title}
 
 
-def _without_null(found: Any) -> Any:
-    """Return a schema without the nulls that TOML does not have, and without titles that repeat the key."""
+def _for_toml(found: Any) -> Any:
+    """Return a schema without nulls, which TOML does not have, hidden fields, and titles that repeat the key."""
     if isinstance(found, list):
-        return [_without_null(item) for item in found]
+        return [_for_toml(item) for item in found]
     if not isinstance(found, dict):
         return found
-    result = {
-        key: {name: _without_null(item) for name, item in value.items()} if key in ("properties", "$defs")
-        else value if key == "default" else _without_null(value)
-        for key, value in found.items() if key != "title" and not (key == "default" and value is None)
-    }  # fmt: skip
+    result = {}
+    for key, value in found.items():
+        if key in ("properties", "$defs"):
+            result[key] = {name: _for_toml(item) for name, item in value.items() if item.get("not") != {}}
+        elif key == "default" and value is not None:
+            result[key] = value
+        elif key not in ("title", "default"):
+            result[key] = _for_toml(value)
     choices = [item for item in result.get("anyOf", ()) if item != {"type": "null"}]
-    if len(choices) == 1 and len(result["anyOf"]) == 2:
-        return {**choices[0], **{key: value for key, value in result.items() if key != "anyOf"}}
+    if len(choices) == 1:
+        del result["anyOf"]
+        return {**choices[0], **result}
     return result
+
+
+def inherited(table: Mapping[str, Any], kind: type) -> dict[str, Any]:
+    """Return a file's table whose ``[files.NAME]`` tables hold what is said for every file, where they say nothing.
+
+    Args:
+        table: the file.
+        kind: the dataclass of one file; its fields are the keys that are handed down, tables key by key.
+    """
+    files = table.get("files")
+    if not isinstance(files, Mapping):
+        return dict(table)
+    every = {key: table[key] for key in _keys(kind) if key in table}
+
+    def filled(own: Any) -> Any:
+        if not isinstance(own, Mapping):
+            return own
+        both = [key for key in own if isinstance(own[key], Mapping) and isinstance(every.get(key), Mapping)]
+        return {**every, **own, **{key: {**every[key], **own[key]} for key in both}}
+
+    return {**table, "files": {name: filled(own) for name, own in files.items()}}
 
 
 def own_table(files: Mapping[str, T], path: str | Path) -> T | None:
@@ -205,42 +220,39 @@ def _no_key(key: str, keys: Collection[str]) -> str:
     return f"there is no key '{key}'{suggestion(key, keys)}; {there}"
 
 
-def _complaint(errors: list[Any], kind: type, place: str, own: tuple[str, ...]) -> str:
+def _complaint(errors: list[Any], kind: type, place: str) -> str:
     """Return the first of pydantic's errors in our form; a key that is not known explains one that is missing."""
-    unknown = ("unexpected_keyword_argument", "extra_forbidden")
-    first = next((one for one in errors if one["type"] in unknown), errors[0])
+    first = next((one for one in errors if one["type"] == UNKNOWN), errors[0])
     loc, name, found, context = first["loc"], first["type"], first["input"], first.get("ctx", {})
-    tables = (*loc[:-1],) if name in (*unknown, "missing") else loc
-    while name == "expected" and tables and isinstance(tables[-1], int):  # one of several numbers
-        tables = tables[:-1]
-    where = f"{place}: {located(tables)}" if tables else place
-    if name in unknown:
-        hint = _quotes(kind, loc)
-        return f"{where}: {hint or _no_key(str(loc[-1]), _keys(_type_at(kind, tables), own))}"
+    table = _type_at(kind, loc[:-1]) if name in (UNKNOWN, "missing") else None
+    at = loc if table is None else loc[:-1]
+    while (
+        at and isinstance(at[-1], int) and name not in (UNKNOWN, "missing", "dataclass_type")
+    ):  # one of several values
+        at = at[:-1]
+    where = f"{place}: {located(at)}" if at else place
+    if name == UNKNOWN and len(loc) == 3 and loc[0] == "files" and isinstance(found, dict) and "." not in loc[1]:
+        return f'{where}: the dot needs quotes: [files."{loc[1]}.{loc[2]}"]'
+    if name == UNKNOWN:
+        return f"{where}: {_no_key(str(loc[-1]), _keys(table))}"
     if name == "missing":
-        return f"{where}: there is no '{loc[-1]}'{_needed(_type_at(kind, tables))}"
-    if name == "one_of":
-        near = suggestion(found, context["allowed"]) if isinstance(found, str) else ""
-        return f"{where}: expected one of {', '.join(context['allowed'])}{near}, found {shown(found)}"
+        return f"{where}: there is no '{loc[-1]}'{_needed(table)}"
     if name == "value_error":
         return f"{where}: {context['error']}"
-    if name == "tuple_type":
-        what = f"a list of tables, [[{loc[-1]}]]"
+    if name == "one_of":
+        near = suggestion(found, context["allowed"]) if isinstance(found, str) else ""
+        words = f"one of {', '.join(context['allowed'])}{near}"
+    elif name == "expected":
+        words = first["msg"]
     else:
-        what = first["msg"] if name == "expected" else "a table"
-    return f"{where}: expected {what}, found {shown(found)}"
+        words = f"a list of tables, [[{loc[-1]}]]" if name == "tuple_type" else "a table"
+    return f"{where}: expected {words}, found {shown(found)}"
 
 
-def _quotes(kind: type, loc: Sequence[Any]) -> str:
-    """Say that the dot in [files.a.csv] needs quotes."""
-    if len(loc) == 3 and loc[0] == "files" and loc[2] not in _keys(_type_at(kind, loc[:2]), ()):
-        inner = str(loc[2])
-        return f'the dot needs quotes: [files."{loc[1]}.{inner}"]' if inner in ENDINGS else ""
-    return ""
-
-
-def _keys(kind: Any, own: tuple[str, ...]) -> list[str]:
-    return [each.name for each in fields(kind) if each.name not in own] if is_dataclass(kind) else []
+def _keys(kind: Any) -> list[str]:
+    """Return the keys of the table that a dataclass stands for."""
+    hints = get_type_hints(kind, include_extras=True)
+    return [key for key, hint in hints.items() if Hidden() not in getattr(hint, "__metadata__", ())]
 
 
 def _needed(kind: Any) -> str:
@@ -475,6 +487,23 @@ class Spread:
         if not value or len(value) != (self.count or len(value)):
             raise ValueError(f"expected {self.words}, found {shown(value)}")
         return value
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """A field that no file states: as a key it is unknown."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        from pydantic_core import PydanticCustomError
+        from pydantic_core import core_schema as core
+
+        def refuse(value: Any) -> Any:
+            raise PydanticCustomError(UNKNOWN, "unknown")
+
+        return core.no_info_before_validator_function(refuse, core.any_schema())
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
+        return {"not": {}}
 
 
 @dataclass(frozen=True)

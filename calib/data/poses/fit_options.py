@@ -37,22 +37,60 @@ TOML; every key is optional, and a key that is none of these is refused. Lengths
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from calib.data import values
-from calib.data.csv_table import nearest
+from calib.config import (
+    Expect,
+    Flag,
+    Hidden,
+    Label,
+    Name,
+    Names,
+    OneOf,
+    Positive,
+    Real,
+    Spread,
+    inherited,
+    own_table,
+    parse,
+    read_toml,
+    strict,
+)  # fmt: skip
 from calib.data.poses.measurements import KINDS
-from calib.errors import UsageError
+from calib.errors import UsageError, suggestion
+from calib.units import ANGLES, LENGTHS
 
 FORMATS = ("csv", "robodk", "three_smr")
 EULER = ("wpr", "xyz", "vector")
 MODELS = ("auto", "frames", "offsets", "geometry", "stiffness", "bending", "coupling", "harmonics", "wobble")
 LOSSES = ("auto", "none", "huber", "cauchy")
 
+Metres = Annotated[float, Real(above=0, most=0.1, unit="m")]
+Radians = Annotated[float, Real(above=0, most=1.0, unit="rad")]
+Each = Spread(3, "a number or three")
 
+
+@strict
+@dataclass(frozen=True)
+class Sigma:
+    """Standard deviations of measurements; None where not stated.
+
+    Attributes:
+        position, orientation: per axis [m], [rad].
+        distance: [m].
+        floor: what sigmas in the file's columns are raised to [m].
+    """
+
+    position: Annotated[tuple[Metres, Metres, Metres], Each] | None = None
+    orientation: Annotated[tuple[Radians, Radians, Radians], Each] | None = None
+    distance: Metres | None = None
+    floor: Metres = 0.0
+
+
+@strict
 @dataclass(frozen=True)
 class FileOptions:
     """How one measurement file is to be read; the defaults leave everything to its header. Keys as in the file.
@@ -60,54 +98,50 @@ class FileOptions:
     Attributes:
         columns: our column name → the file's.
         units: our column name or a family of columns → unit.
-        sigma_position, sigma_orientation: standard deviation per axis [m], [rad]; None where not stated.
-        sigma_distance, sigma_floor: [m].
         where: column → the texts whose rows are kept.
     """
 
-    kind: str = ""
-    format: str = ""
-    euler: str = "wpr"
-    columns: Mapping[str, str] = field(default_factory=dict)
-    units: Mapping[str, str] = field(default_factory=dict)
-    sigma_position: values.Triple | None = None
-    sigma_orientation: values.Triple | None = None
-    sigma_distance: float | None = None
-    sigma_floor: float = 0.0
-    groups: tuple[str, ...] = ()
-    where: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    station: str = ""
-    tool: str = "tool"
-    socket_distance: float | None = None
-    socket_pairs: tuple[tuple[str, str], ...] = ()
-    check_limits: bool = True
+    kind: Annotated[str, OneOf(KINDS)] = ""
+    format: Annotated[str, OneOf(FORMATS)] = ""
+    euler: Annotated[str, OneOf(EULER)] = "wpr"
+    columns: Mapping[str, Name] = field(default_factory=dict)
+    units: Mapping[str, Annotated[str, OneOf((*ANGLES, *LENGTHS))]] = field(default_factory=dict)
+    sigma: Sigma = field(default_factory=Sigma)
+    groups: Names = ()
+    where: Mapping[str, Annotated[tuple[Label, ...], Spread(words="a text, a number, or a list of them")]] = field(
+        default_factory=dict
+    )
+    station: Name = ""
+    tool: Name = "tool"
+    socket_distance: Annotated[float, Real(above=0, most=10.0, unit="m")] | None = None
+    socket_pairs: Annotated[tuple[tuple[Label, Label], ...], Expect('pairs of socket labels, [["0", "1"]]')] = ()
+    check_limits: Flag = True
 
 
+@strict
 @dataclass(frozen=True)
-class FitOptions:
-    """The options of one fit.
+class FitOptions(FileOptions):
+    """The options of one fit: how files are read that have no table of their own, and how to fit.
 
     Attributes:
-        every: how files are read.
         files: file name → how that file is read.
         model, loss, loss_scale, beta, fix, free, prior: as in the options file.
         source: the options file, for messages.
     """
 
-    every: FileOptions = field(default_factory=FileOptions)
     files: Mapping[str, FileOptions] = field(default_factory=dict)
-    model: str = "auto"
-    loss: str = "auto"
-    loss_scale: float | None = None
-    beta: bool = True
-    fix: tuple[str, ...] = ()
-    free: tuple[str, ...] = ()
-    prior: Mapping[str, float] = field(default_factory=dict)
-    source: str = ""
+    model: Annotated[str, OneOf(MODELS)] = "auto"
+    loss: Annotated[str, OneOf(LOSSES)] = "auto"
+    loss_scale: Positive | None = None
+    beta: Flag = True
+    fix: Names = ()
+    free: Names = ()
+    prior: Mapping[str, Positive] = field(default_factory=dict)
+    source: Annotated[str, Hidden()] = ""
 
     def for_file(self, path: str | Path) -> FileOptions:
         """Return the options for the file at `path`: its own where there is a [files] table of that name."""
-        return values.own_table(self.files, path) or self.every
+        return own_table(self.files, path) or self
 
 
 def read_options(path: str | Path | None = None) -> FitOptions:
@@ -116,28 +150,16 @@ def read_options(path: str | Path | None = None) -> FitOptions:
     Raises:
         UsageError: for a file that is missing or no TOML, an unknown key, or a value that a key cannot have.
     """
-    if path is None:
-        return FitOptions()
-    return parse_options(values.read_toml(path), str(path))
+    return FitOptions() if path is None else parse_options(read_toml(path), str(path))
 
 
 def parse_options(table: Mapping[str, Any], source: str = "options") -> FitOptions:
     """Return the options that a parsed TOML table holds; `source` is for messages."""
-    values.known(table, {*_FILE, *_FIT, "files"}, source)
-    every = _file_options({key: value for key, value in table.items() if key in _FILE}, FileOptions(), source)
-    own = values.table(table.get("files", {}), f"{source}: files")
-    files = {}
-    for name, entries in own.items():
-        place = f'{source}: files."{name}"'
-        if isinstance(entries, Mapping) and set(entries) == {"csv"}:
-            raise UsageError(f'{place}: the dot needs quotes: [files."{name}.csv"]')
-        values.known(values.table(entries, place), set(_FILE), place)
-        files[name] = _file_options(entries, every, place)
-    fit = {key: _FIT[key](value, f"{source}: {key}") for key, value in table.items() if key in _FIT}
-    both = set(fit.get("fix", ())) & set(fit.get("free", ()))
+    found = replace(parse(FitOptions, inherited(table, FileOptions), source), source=source)
+    both = set(found.fix) & set(found.free)
     if both:
         raise UsageError(f"{source}: '{min(both)}' stands in fix and in free; take it out of one")
-    return FitOptions(every, files, source=source, **fit)
+    return found
 
 
 def check_files(options: FitOptions, paths: Sequence[str | Path]) -> None:
@@ -146,55 +168,5 @@ def check_files(options: FitOptions, paths: Sequence[str | Path]) -> None:
     for name in options.files:
         wanted = Path(name).parts
         if not any(Path(path).parts[-len(wanted) :] == wanted for path in paths):
-            message = f'{options.source}: files."{name}" is none of the files given{nearest(name, names)}'
+            message = f'{options.source}: files."{name}" is none of the files given{suggestion(name, names)}'
             raise UsageError(f"{message}: {', '.join(names)}")
-
-
-def _file_options(table: Mapping[str, Any], base: FileOptions, source: str) -> FileOptions:
-    read = {key: _FILE[key](value, f"{source}: {key}") for key, value in table.items()}
-    for key in ("columns", "units", "where"):
-        if key in read:
-            read[key] = {**getattr(base, key), **read[key]}
-    read |= {f"sigma_{key}": value for key, value in read.pop("sigma", {}).items()}
-    return replace(base, **read)
-
-
-def _sigma(value: Any, place: str) -> dict[str, Any]:
-    parsers = {
-        "position": values.triple(0.1, "m"),
-        "orientation": values.triple(1.0, "rad"),
-        "distance": values.positive(0.1, "m"),
-        "floor": values.positive(0.1, "m"),
-    }
-    values.known(values.table(value, place), set(parsers), place)
-    return {key: parsers[key](item, f"{place}.{key}") for key, item in value.items()}
-
-
-def _prior(value: Any, place: str) -> dict[str, float]:
-    return {key: values.positive()(item, f"{place}.{key}") for key, item in values.table(value, place).items()}
-
-
-_FILE: dict[str, Callable[[Any, str], Any]] = {
-    "kind": values.one_of(*KINDS),
-    "format": values.one_of(*FORMATS),
-    "euler": values.one_of(*EULER),
-    "columns": values.texts,
-    "units": values.units,
-    "sigma": _sigma,
-    "groups": values.names,
-    "where": values.where,
-    "station": values.text,
-    "tool": values.text,
-    "socket_distance": values.positive(10.0, "m"),
-    "socket_pairs": values.pairs,
-    "check_limits": values.flag,
-}
-_FIT: dict[str, Callable[[Any, str], Any]] = {
-    "model": values.one_of(*MODELS),
-    "loss": values.one_of(*LOSSES),
-    "loss_scale": values.positive(),
-    "beta": values.flag,
-    "fix": values.names,
-    "free": values.names,
-    "prior": _prior,
-}

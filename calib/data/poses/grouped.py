@@ -22,8 +22,8 @@ def read_groups(table: Table, options: FileOptions, layout: Layout, q: np.ndarra
     distance, sigma = _read_distance(table, options, layout)
     if layout.kind == "distance" and distance is not None:
         _check_pairs(table, layout, group, names, distance)
-    if sigma is None and options.sigma_position is not None:
-        sigma = np.tile(options.sigma_position, (len(q), 1))
+    if sigma is None and options.sigma.position is not None:
+        sigma = np.tile(options.sigma.position, (len(q), 1))
     single = [name for name, size in zip(names, np.bincount(group)) if size == 1]
     return PoseMeasurements(
         layout.kind,
@@ -61,10 +61,10 @@ def _read_distance(table: Table, options: FileOptions, layout: Layout) -> tuple[
     value = table.numbers(layout.distance, "length", options.units.get("distance", ""))[:, None]
     plausible.check_lengths(value, table, (layout.distance,))
     plausible.check_positive(value, table, (layout.distance,), "a distance must be above 0")
-    sigma = None if options.sigma_distance is None else np.full((len(value), 3), options.sigma_distance)
+    sigma = None if options.sigma.distance is None else np.full((len(value), 3), options.sigma.distance)
     if layout.sigma_distance:
         column = table.numbers(layout.sigma_distance, "length", options.units.get("sigma", ""))
-        column = np.maximum(column, options.sigma_floor)[:, None]
+        column = np.maximum(column, options.sigma.floor)[:, None]
         plausible.check_positive(column, table, (layout.sigma_distance,), "a sigma must be above 0 (see sigma.floor)")
         sigma = np.repeat(column, 3, axis=1)
     return value[:, 0], sigma

@@ -204,11 +204,11 @@ def _orientation(table: Table, options: FileOptions, layout: Layout) -> np.ndarr
 def _sigma(table: Table, options: FileOptions, layout: Layout, seen: np.ndarray) -> np.ndarray | None:
     """Return sigmas (m, targets, 3) [m] from columns, else from the options, else None."""
     if not layout.sigmas:
-        return None if options.sigma_position is None else np.tile(options.sigma_position, (*seen.shape, 1))
+        return None if options.sigma.position is None else np.tile(options.sigma.position, (*seen.shape, 1))
     stack = []
     for k, names in enumerate(layout.sigmas):
         sigma = _numbers(table, options, names, "length", "sigma", gaps=not seen[:, k].all())
-        sigma = np.maximum(sigma, options.sigma_floor)
+        sigma = np.maximum(sigma, options.sigma.floor)
         advice = "a sigma must be above 0; where it was rounded to 0, set sigma.floor in the options"
         plausible.check_positive(np.where(seen[:, k : k + 1], sigma, np.nan), table, names, advice)
         _no_gaps(sigma, seen[:, k], table, names)
@@ -227,7 +227,7 @@ def _sigma_rotation(table: Table, options: FileOptions, layout: Layout) -> np.nd
     if layout.kind != "pose":
         return None
     if not layout.sigma_rotation:
-        return None if options.sigma_orientation is None else np.tile(options.sigma_orientation, (len(table), 1))
+        return None if options.sigma.orientation is None else np.tile(options.sigma.orientation, (len(table), 1))
     values = _numbers(table, options, layout.sigma_rotation, "angle", "sigma_rotation")
     plausible.check_positive(values, table, layout.sigma_rotation, "a sigma must be above 0")
     return values

@@ -50,13 +50,14 @@ def options_of(session: Session) -> FitOptions:
     position, turn = instrument.sigma_position, instrument.sigma_orientation
 
     def stated(each: FileOptions) -> FileOptions:
-        if position and each.sigma_position is None:
-            each = replace(each, sigma_position=(position,) * 3)
-        return replace(each, sigma_orientation=(turn,) * 3) if turn and each.sigma_orientation is None else each
+        sigma = each.sigma
+        if position and sigma.position is None:
+            sigma = replace(sigma, position=(position,) * 3)
+        if turn and sigma.orientation is None:
+            sigma = replace(sigma, orientation=(turn,) * 3)
+        return replace(each, sigma=sigma)
 
-    return replace(
-        options, every=stated(options.every), files={name: stated(each) for name, each in options.files.items()}
-    )
+    return replace(options, sigma=stated(options).sigma, files={n: stated(each) for n, each in options.files.items()})
 
 
 def tolerance_of(session: Session) -> float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 
 import pytest
@@ -14,7 +15,7 @@ from calib.errors import UsageError
 def test_defaults_without_a_file():
     options = read_options()
     assert options == FitOptions() and options.model == "auto" and options.loss == "auto"
-    assert options.for_file("any.csv") is options.every and options.every.check_limits
+    assert options.for_file("any.csv") is options and options.check_limits
 
 
 def test_the_schema_of_the_docstring_is_valid_and_complete(tmp_path):
@@ -22,14 +23,14 @@ def test_the_schema_of_the_docstring_is_valid_and_complete(tmp_path):
     path = tmp_path / "fit.toml"
     path.write_text(re.sub(r"(?m)^    ", "", schema))
     options = read_options(path)
-    every = options.every
+    every, sigma = options.for_file("any.csv"), options.sigma
     assert every.kind == "position" and every.groups == ("tool_position",) and every.socket_pairs == (("0", "1"),)
-    assert every.sigma_position == (1e-5, 1e-5, 2e-5) and every.sigma_orientation == (1e-4,) * 3
-    assert (every.sigma_distance, every.sigma_floor) == (1e-5, 1e-6)
+    assert sigma.position == (1e-5, 1e-5, 2e-5) and sigma.orientation == (1e-4,) * 3
+    assert (sigma.distance, sigma.floor) == (1e-5, 1e-6)
     assert every.where == {"tool_position": ("back_left", "high")} and every.columns == {"x": "X_leica"}
     assert options.prior == {"theta2": 1e-3}
     assert options.fix == ("theta1",) and options.free == ("d3",) and options.loss_scale == 1.345
-    for key in (*module._FILE, *module._FIT):
+    for key in (f.name for f in dataclasses.fields(FitOptions) if f.name != "source"):
         assert re.search(rf"(?m)^    \[?{key}\b", schema), f"{key} is not in the docstring"
 
 
@@ -46,7 +47,7 @@ def test_a_files_table_adds_to_what_holds_for_every_file():
     options = parse_options(text)
     own = options.for_file("/data/day2.csv")
     assert own.kind == "pose" and own.units == {"joints": "deg", "position": "m"} and own.station == "B"
-    assert own.sigma_position == (1e-5,) * 3
+    assert own.sigma.position == (1e-5,) * 3
     assert options.for_file("/data/a/day3.csv").tool == "T" and options.for_file("/data/day3.csv").tool == "tool"
     assert options.for_file("/data/day1.csv").kind == "position"
     check_files(options, ["/data/day2.csv", "a/day3.csv"])

@@ -7,7 +7,7 @@ import pytest
 from measured_rows import JOINTS, POSE
 from scipy.spatial.transform import Rotation
 
-from calib.data.poses.fit_options import FileOptions
+from calib.data.poses.fit_options import FileOptions, Sigma
 from calib.data.poses.pose_files import joint_columns, read_measurements
 
 
@@ -94,7 +94,9 @@ def test_several_reflectors_with_gaps(write, good):
     rows = [[*row[:6], *row[3:6]] for row in good]
     rows[1][3:6] = ["", "", ""]
     rows[4][6:9] = ["NaN"] * 3
-    block = read(write("q1,q2,q3,x1,y1,z1,x2,y2,z2", rows), FileOptions(tool="ball", sigma_position=(1e-5, 1e-5, 2e-5)))
+    block = read(
+        write("q1,q2,q3,x1,y1,z1,x2,y2,z2", rows), FileOptions(tool="ball", sigma=Sigma(position=(1e-5, 1e-5, 2e-5)))
+    )
     assert block.kind == "position" and len(block) == 18 and block.tool_names == ("ball 1", "ball 2")
     assert block.rows is not None and block.rows.tolist()[:4] == [1, 1, 2, 3]
     assert block.tool is not None and block.tool.tolist()[:4] == [0, 1, 1, 0]
@@ -127,7 +129,7 @@ def test_distances_between_two_poses(write, good):
 
 def test_distances_to_the_ends_of_bars(write, good):
     rows = [[*row[:3], 500, i // 5] for i, row in enumerate(good)]
-    block = read(write("q1,q2,q3,distance [mm],bar", rows), FileOptions(sigma_distance=1e-5))
+    block = read(write("q1,q2,q3,distance [mm],bar", rows), FileOptions(sigma=Sigma(distance=1e-5)))
     assert block.kind == "bar" and block.group_names == ("0", "1")
     np.testing.assert_allclose(block.distance, 0.5)
     np.testing.assert_array_equal(block.sigma, np.full((10, 3), 1e-5))
@@ -190,7 +192,7 @@ def test_sigmas_of_columns_win_and_are_raised_to_the_floor(write, good):
     path = write(
         POSE + ",sigma_x,sigma_y,sigma_z,sigma_rx,sigma_ry,sigma_rz", [[*row, 0, 2e-6, 1, 1, 1, 1] for row in good]
     )
-    options = FileOptions(sigma_position=(1, 1, 1), sigma_orientation=(9, 9, 9), sigma_floor=1e-6)
+    options = FileOptions(sigma=Sigma(position=(1, 1, 1), orientation=(9, 9, 9), floor=1e-6))
     block = read(path, options)
     np.testing.assert_array_equal(block.sigma[0], [1e-6, 2e-6, 1])
     np.testing.assert_array_equal(block.sigma_rotation, np.ones((10, 3)))

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.data.poses.fit_options import FileOptions
+from calib.data.poses.fit_options import FileOptions, Sigma
 from calib.data.poses.pose_files import joint_columns, read_measurements
 
 
@@ -41,7 +41,7 @@ def test_ur10_poses(data):
 
 def test_motoman_joints_by_name_and_uncertainties_by_options(data):
     joints = ["E_external", "S", "L", "U", "R", "B", "T"]
-    options = FileOptions(columns={f"sigma_{axis}": f"unc_{axis}" for axis in "xyz"}, sigma_floor=1e-6)
+    options = FileOptions(columns={f"sigma_{axis}": f"unc_{axis}" for axis in "xyz"}, sigma=Sigma(floor=1e-6))
     block = load(data, "motoman_leica/right_wide_386.csv", "model_right.urdf", options=options)
     assert block.q.shape == (386, 7) and block.joint_names == tuple(f"q_{joint}" for joint in joints)
     assert block.ignored == ("pose_id", "unc") and block.sigma is not None and block.sigma.min() == 1e-6
