@@ -186,9 +186,10 @@ def export(
             f"{offsets}: offset of each joint, the rest of the geometry left out; --model offsets fits the best ones",
             soft_wrap=True, markup=False,
         )  # fmt: skip
-    if found.corrected:
+    if found.corrections is not None:
         note = f"note: the corrections in {folder}/joint_corrections.csv are in none of these files"
-        note += f": {found.alone}" if found.alone else ""
+        left = geometry.without_corrections(folder)
+        note += f": {left}" if left else ""
         console.print(note, soft_wrap=True, markup=False)
 
 

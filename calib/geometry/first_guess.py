@@ -19,10 +19,10 @@ from scipy.spatial.transform import Rotation
 
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.errors import MeasurementError
-from calib.geometry.deflection import Deflection
 from calib.geometry.installation import Installation
 from calib.geometry.observation import has_instrument
 from calib.robot.chain import Chain
+from calib.robot.deflection import Deflection
 from calib.robot.kinematics import forward
 from calib.transforms import invert, orthonormal, pose
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from calib.arrays import frozen
-from calib.geometry.deflection import Deflection, extra_displacements
 from calib.robot.chain import Chain
+from calib.robot.deflection import Deflection, extra_displacements
 from calib.robot.kinematics import Sweep, sweep
 
 FRAME_AXES = ("x", "y", "z", "rx", "ry", "rz")

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.geometry.deflection import evaluate
 from calib.geometry.installation import Installation, Seen, see
+from calib.robot.deflection import evaluate
 from calib.robot.kinematics import element_jacobian, joint_jacobian
 
 LENGTH = 0.3  # an orientation counts as its displacement at this distance [m]; as all constants here, our choice

@@ -9,10 +9,10 @@ import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import UsageError
-from calib.geometry import deflection
 from calib.geometry.installation import Installation, Seen, see
 from calib.geometry.parameters import layout_counts
 from calib.geometry.residuals import Part, parts
+from calib.robot import deflection
 from calib.robot.kinematics import element_jacobian
 
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.errors import UsageError
-from calib.geometry import deflection
 from calib.geometry.installation import FRAME_AXES, Installation
+from calib.robot import deflection
 from calib.transforms import displace
 
 

@@ -6,13 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib.errors import UsageError
 from calib.estimation import robust
 from calib.estimation.base_columns import ColumnSplit
 from calib.estimation.estimate import Estimate
 from calib.estimation.nonlinear import Solution
-from calib.geometry.installation import Installation
+from calib.geometry.installation import Installation, merged
 from calib.geometry.observation import Block
 from calib.geometry.residuals import Part
+from calib.robot.calibrated import CalibratedChain, CorrectedChain
+from calib.robot.chain import Chain
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +63,40 @@ class GeometricFit:
     blocks: list[Block]
     pieces: list[Piece]
     prior: np.ndarray | None = None
+
+    @property
+    def calibrated(self) -> CalibratedChain:
+        """The calibrated robot of a fit without joint corrections; with some, see `calibrated_chain`."""
+        return calibrated_chain(self)
+
+
+def calibrated_chain(
+    found: GeometricFit, rigid: GeometricFit | None = None, nominal: Chain | None = None
+) -> CalibratedChain:
+    """Return the calibrated robot that fits of one arm make, with the covariance of its element values.
+
+    Args:
+        found: the fit that predicts best.
+        rigid: the best fit without joint corrections; None where `found` has none.
+        nominal: the arm before any calibration; None for the one that the fit began with.
+
+    Raises:
+        UsageError: for a fit with joint corrections and no rigid one: without them its geometry is no robot's.
+    """
+    whole, nominal = merged(found.cell), nominal or found.start.chain
+    if not whole.deflection.terms:
+        rigid = found
+    if rigid is None:
+        raise UsageError("a fit with joint corrections needs the best fit without them beside it")
+    chain = rigid.cell.chain
+    own = np.flatnonzero(rigid.free < len(chain.elements))
+    covariance = None
+    if len(own):
+        covariance = np.zeros((len(chain.elements), len(chain.elements)))
+        where = rigid.free[own]
+        covariance[np.ix_(where, where)] = rigid.estimate.covariance[np.ix_(own, own)]
+    corrections = CorrectedChain(whole.chain, whole.deflection) if whole.deflection.terms else None
+    return CalibratedChain(chain, nominal, covariance, corrections)
 
 
 def used_sigmas(found: GeometricFit) -> list[dict[str, float]]:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements
-from calib.geometry.deflection import evaluate
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, predict, target_jacobian
+from calib.robot.deflection import evaluate
 
 CHUNK = 500  # poses at once: the Jacobian has a column per parameter
 

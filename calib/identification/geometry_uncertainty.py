@@ -30,7 +30,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.arrays import frozen, shaped
+from calib.arrays import frozen
 from calib.data.signals.decimation import Decimator, decimate, kept, spread
 from calib.dynamics import base as bases
 from calib.dynamics import rigid_body
@@ -41,6 +41,7 @@ from calib.identification.prediction import carried_columns
 from calib.identification.reweighted import cut, estimator, inverted, stacked, weights
 from calib.identification.rows import ObservationRows, segments
 from calib.identification.settings import make_model
+from calib.robot.calibrated import CalibratedChain, as_calibrated
 from calib.robot.chain import Chain
 
 STEP = 1e-5  # of the central differences [m or rad]
@@ -114,25 +115,21 @@ class GeometryUncertainty:
 
 
 def propagate(
-    found: Identification,
-    chain: Chain,
-    cases: Sequence[Case],
-    covariance: np.ndarray | None = None,
-    progress: Progress | None = None,
+    found: Identification, robot: Chain | CalibratedChain, cases: Sequence[Case], progress: Progress | None = None
 ) -> GeometryUncertainty:
-    """Carry the covariance of a chain into the dynamics identified on it.
+    """Return what the covariance of a calibrated robot's geometry adds to that of the dynamics identified on it.
 
     Args:
         found: the identification.
-        chain: the one it was made on.
+        robot: the one it was made on; where it brings no covariance (K, K), the geometry is taken as exact.
         cases: those it learnt from.
-        covariance: (K, K) of the chain's element values, zero where an element was not fitted; None: not known.
     """
+    robot = as_calibrated(robot)
+    chain, covariance = robot.chain, robot.covariance
     matrix, felt, left = sensitivity(found, chain, cases, progress)
     count = len(chain.elements)
     geometry, deviations = None, np.full(count + len(TILTS), np.nan)
     if covariance is not None:
-        covariance = shaped(covariance, (count, count), "covariance of the chain's elements")
         geometry = frozen(matrix[:, :count] @ covariance @ matrix[:, :count].T)
         own = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
         deviations[:count] = np.where(own > 0.0, own, np.nan)

@@ -31,6 +31,7 @@ from calib.identification.prediction import Dynamics, predict, transmitted
 from calib.identification.prior import Prior, bounded, find_prior
 from calib.identification.rows import ObservationRows, extend, observe, observe_terms, pool, triangulate, with_blocks
 from calib.identification.settings import IdentificationSettings, make_model, per_joint
+from calib.robot.calibrated import CalibratedChain, as_calibrated
 from calib.robot.chain import Chain, sampling_limits
 
 CONDITION = 150.0  # of the observation matrix, unit columns, from which on the prior is used
@@ -75,21 +76,22 @@ class Identification:
 
 
 def identify(
-    chain: Chain,
+    robot: Chain | CalibratedChain,
     cases: Sequence[Case],
     settings: IdentificationSettings | None = None,
-    nominal: Chain | None = None,
     progress: Progress | None = None,
 ) -> Identification:
-    """Identify the dynamics of a chain from recordings.
+    """Identify the dynamics of a robot from recordings, on its calibrated geometry.
 
     Args:
-        chain: the calibrated robot (or the nominal one, where there is no other).
+        robot: as a geometric fit returns it, or a chain that no fit has moved. Base columns are chosen on its nominal
+            geometry; joint corrections take no part.
         cases: recordings to learn from.
-        nominal: the chain that base columns are chosen on; None: `chain`.
         progress: called with a few words at each stage.
     """
     settings, say = settings or IdentificationSettings(), progress or (lambda words: None)
+    robot = as_calibrated(robot)
+    chain, nominal = robot.chain, robot.nominal if robot.moved else None
     if not cases:
         raise UsageError("no recording to identify from")
     settings = require_loop(settings) if settings.method == "iv" else settings

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from calib.errors import RobotError
-from calib.robot import description, library
+from calib.robot import calibrated, description, library
+from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
 from calib.robot.formats import urdf
 from calib.robot.tables import nearest
@@ -28,13 +29,25 @@ def load(
     path = resolve(robot)
     if path.suffix == ".urdf":
         return urdf.read(path, base, tip, joint_names)
-    chain = description.read(path)
+    return _check_ends(path, description.read(path), base, tip)
+
+
+def _check_ends(path: Path, chain: Chain, base: str | None, tip: str | None) -> Chain:
     for option, wanted, found in (("base", base, chain.base), ("tip", tip, chain.tip)):
         if wanted is not None and wanted != found:
             raise RobotError(
                 f"{path}: its {option} is '{found}', not '{wanted}'; --base and --tip choose links of a URDF"
             )
     return chain
+
+
+def load_calibrated(robot: str | Path, base: str | None = None, tip: str | None = None) -> CalibratedChain:
+    """Return the robot that `robot` names, with what a fit has left beside it; arguments as of `load`."""
+    path = resolve(robot)
+    if path.suffix == ".urdf":
+        return CalibratedChain(load(path, base, tip), source=str(robot))
+    _check_ends(path, description.read(path), base, tip)
+    return calibrated.read(path)
 
 
 def resolve(robot: str | Path) -> Path:

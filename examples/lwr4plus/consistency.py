@@ -36,6 +36,7 @@ from calib.identification import geometry_uncertainty, reweighted
 from calib.identification.cases import Case, make_case
 from calib.identification.identify import Identification, common_decimator, find_base, identify
 from calib.identification.settings import IdentificationSettings, Payload, make_model
+from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, random_joints
 from calib.simulation.cells import known_robots
 from calib.simulation.cells.cell import Cell, SimulatedInstrument, measure
@@ -152,23 +153,18 @@ def cases_of(
     return result
 
 
-def calibrate(given: World, seed: list[int]) -> tuple[Chain, np.ndarray]:
-    """Measure the poses and fit: the calibrated chain and the covariance (K, K) of its elements."""
+def calibrate(given: World, seed: list[int]) -> CalibratedChain:
+    """Measure the poses and fit: the calibrated robot, with the covariance of its elements."""
     measured = measure(given.cell, given.poses, np.random.default_rng([*seed, 1]))
-    found = fit(install(given.cell.nominal, [measured]), [measured])
-    chain = found.cell.chain
-    own = np.flatnonzero(found.free < len(chain.elements))
-    covariance = np.zeros((len(chain.elements), len(chain.elements)))
-    covariance[np.ix_(found.free[own], found.free[own])] = found.estimate.covariance[np.ix_(own, own)]
-    return chain, covariance
+    return fit(install(given.cell.nominal, [measured]), [measured]).calibrated
 
 
 def once(given: World, seed: list[int]) -> np.ndarray:
     """Calibrate geometry and dynamics: errors, σ_torque and σ_geometry of the base parameters (3, b)."""
-    chain, covariance = calibrate(given, seed)
+    robot = calibrate(given, seed)
     cases = cases_of(given.motion, given.clean, given.settings.kind, given.noise, [*seed, 2], 1e-5)
-    found = identify(chain, cases, given.settings, given.cell.nominal)
-    carried = geometry_uncertainty.propagate(found, chain, cases, covariance)
+    found = identify(robot, cases, given.settings)
+    carried = geometry_uncertainty.propagate(found, robot, cases)
     off = found.fitted.estimate.values - given.base
     return np.stack([off, carried.sigma_torque, carried.sigma_geometry])
 
@@ -227,14 +223,14 @@ def geometries(kind: str, seed: int) -> dict[str, Any]:
     true, nominal = fine.cell.truth.chain, fine.cell.nominal
     chains = {"true geometry": true}
     chains |= {
-        f"calibrated, {setup.name}": calibrate(given, [seed, 0])[0] for setup, given in zip(SETUPS, (fine, coarse))
+        f"calibrated, {setup.name}": calibrate(given, [seed, 0]).chain for setup, given in zip(SETUPS, (fine, coarse))
     }
     for times in FURTHER:
         chains["CAD" if times == 1 else f"CAD, {times} times as far off"] = true.with_values(
             true.values + times * (nominal.values - true.values)
         )
     cases = cases_of(fine.motion, fine.clean, kind, fine.noise, [seed, 3], 1e-5)
-    found = identify(true, cases, fine.settings, nominal)
+    found = identify(CalibratedChain(true, nominal), cases, fine.settings)
     other = unseen(fine, seed)
     return {name: judged(fine, found, chain, cases, other) for name, chain in chains.items()}
 

@@ -11,10 +11,10 @@ from planted import cell, load, measure, perturb, random_joints
 
 from calib.dynamics.gravity import gravity_torques
 from calib.errors import UsageError
-from calib.geometry.deflection import Deflection, Term, evaluate, names
 from calib.geometry.first_guess import install
 from calib.geometry.installation import Installation, see
 from calib.geometry.model_choice.ladder import climb
+from calib.robot.deflection import Deflection, Term, evaluate, names
 
 SIGMA = 4e-5
 

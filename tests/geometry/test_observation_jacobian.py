@@ -10,10 +10,10 @@ from differences import check
 from planted import cell, load, measure, mixed_arm, perturb, random_joints
 from scipy.spatial.transform import Rotation
 
-from calib.geometry.deflection import Deflection, Term
 from calib.geometry.model_choice.effects import EFFECTS
 from calib.geometry.observation import observe, predict, prepare, target_jacobian
 from calib.geometry.parameters import layout, step
+from calib.robot.deflection import Deflection, Term
 from calib.transforms import pose
 
 CHAINS = {"lwr4plus": lambda: load("lwr4plus"), "ur5": lambda: load("ur5"), "mixed": mixed_arm}

@@ -11,10 +11,10 @@ from planted import cell, load, measure, perturb, random_joints
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.geometry.checks.diagnosis import diagnose, neighbour_floor
 from calib.geometry.checks.explanation import explain
-from calib.geometry.deflection import Deflection, Term
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit, polish_frames
 from calib.geometry.installation import Installation, see
+from calib.robot.deflection import Deflection, Term
 
 SIGMA = 5e-5
 

@@ -23,8 +23,8 @@ from calib.identification import geometry_uncertainty, reweighted
 from calib.identification.identify import identify
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage import geometry_tables
-from calib.procedure.kinematic_stage import robot_file
-from calib.robot import description
+from calib.robot import calibrated
+from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, Joint
 
 PLAIN = IdentificationSettings(friction="standard", essential="none")
@@ -54,7 +54,7 @@ def test_spreading_is_the_adjoint_of_decimation(factor):
 )
 def test_the_sensitivity_is_the_derivative_of_the_estimate(settings):
     arm, case = planted.arm().with_values(MOVED), planted.case("a", 0)
-    found = identify(arm, [case], settings, planted.arm())
+    found = identify(CalibratedChain(arm, planted.arm()), [case], settings)
     how = reweighted.estimator(found)
     again, _ = reweighted.estimate(how, found.rows)
     np.testing.assert_allclose(again, found.fitted.estimate.values, atol=1e-9)
@@ -122,7 +122,7 @@ def test_geometry_that_is_exact_adds_nothing():
     without = geometry_uncertainty.propagate(found, arm, [case])
     assert without.geometry is None and "taken as exact" in geometry_tables.summary(without)
     np.testing.assert_array_equal(without.covariance, found.fitted.estimate.covariance)
-    tiny = geometry_uncertainty.propagate(found, arm, [case], 1e-16 * np.eye(6))
+    tiny = geometry_uncertainty.propagate(found, CalibratedChain(arm, covariance=1e-16 * np.eye(6)), [case])
     assert not tiny.changed.any() and "no matter" in geometry_tables.summary(tiny)
     assert np.linalg.eigvalsh(tiny.covariance - tiny.torque).min() > -1e-12
 
@@ -139,8 +139,9 @@ def test_intervals_cover_the_truth_with_propagation_and_fail_without():
         believed = real.with_values(real.values + np.sqrt(np.diag(spread_of)) * rng.standard_normal(6))
         case = planted.case("a", 0, noise=0.0)
         noisy = replace(case, target=case.target + 0.2 * rng.normal(size=case.target.shape))
-        found = identify(believed, [noisy], settings, real)
-        carried = geometry_uncertainty.propagate(found, believed, [noisy], spread_of)
+        robot = CalibratedChain(believed, real, spread_of)
+        found = identify(robot, [noisy], settings)
+        carried = geometry_uncertainty.propagate(found, robot, [noisy])
         off = np.abs(found.fitted.estimate.values - truth)
         inside.append(off < 1.96 * carried.sigma)
         outside.append(off < 1.96 * carried.sigma_torque)
@@ -154,9 +155,8 @@ def fitted_folder(tmp_path: Path, covariance: float | None) -> Path:
     """Return the folder of a fit of the planted arm, with the covariance of two elements."""
     folder, nominal = tmp_path / "fit", planted.arm()
     moved = nominal.with_values(MOVED)
-    description.write(folder / "robot.toml", moved, {"provenance": {"nominal": nominal.values.tolist()}})
-    if covariance is not None:
-        robot_file.write_chain_covariance(["up", "shoulder"], covariance * np.eye(2), folder)
+    known = None if covariance is None else np.diag(np.where(np.isin(moved.names, ("up", "shoulder")), covariance, 0.0))
+    calibrated.write(folder, CalibratedChain(moved, nominal, known))
     return folder
 
 
@@ -180,7 +180,7 @@ def test_the_command_carries_the_fits_covariance(tmp_path, capsys):
     assert {row["element"] for row in ranked} > {"gravity.rx", "turn", "fore"}
     assert (out / "plot_geometries.png").is_file() and (out / "geometries.csv").is_file()
     assert "which geometric errors matter" in capsys.readouterr().out
-    kept = robot_file.chain_covariance(out, planted.arm())
+    kept = calibrated.read(out).covariance
     assert kept is not None and kept[1, 1] == pytest.approx(1e-6), "the identified robot carries it on"
 
 
@@ -188,7 +188,7 @@ def test_the_command_says_where_the_geometry_is_taken_as_exact(tmp_path, capsys)
     found, rows, out = run(fitted_folder(tmp_path, None), tmp_path)
     assert not found["propagated"] and {row["sigma_geometry"] for row in rows} == {""}
     assert "taken as exact" in capsys.readouterr().out.replace("\n", " ")
-    assert not (out / robot_file.COVARIANCE).exists()
+    assert not (out / calibrated.COVARIANCE).exists()
 
 
 def test_a_fit_leaves_the_covariance_of_its_chain(tmp_path):
@@ -201,14 +201,14 @@ def test_a_fit_leaves_the_covariance_of_its_chain(tmp_path):
     cell = lwr4plus_cell(hidden=0.0)
     measured: PoseMeasurements = measure(cell, random_joints(cell.nominal, 40, 1), 2)
     found = fit(install(cell.nominal, [measured]), [measured])
-    robot_file.write_covariance(found, tmp_path)
-    read = robot_file.chain_covariance(tmp_path, found.cell.chain)
+    calibrated.write(tmp_path, found.calibrated)
+    read = calibrated.read(tmp_path).covariance
     assert read is not None
     sigma = dict(zip(found.estimate.names, found.estimate.sigma))
     for name, variance in zip(found.cell.chain.names, np.diag(read)):
         assert np.sqrt(variance) == pytest.approx(sigma.get(name, 0.0), rel=1e-9)
     arm = set(found.estimate.names) & set(found.cell.chain.names)
     assert np.count_nonzero(np.diag(read)) == len(arm) > 20
-    files.write_table(tmp_path / robot_file.COVARIANCE, ("name", "alpha2"), [("d2", 1.0)])
+    files.write_table(tmp_path / calibrated.COVARIANCE, ("name", "alpha2"), [("d2", 1.0)])
     with pytest.raises(RobotError, match="do not name the same elements"):
-        robot_file.chain_covariance(tmp_path, found.cell.chain)
+        calibrated.read(tmp_path)

@@ -66,7 +66,7 @@ def measure(
     tool = np.resize(np.array(tools), count)
     if kind in ("sockets", "plane"):
         return _touched(truth, kind, q, tool, sigma, stated, file, rng)
-    from calib.geometry import deflection
+    from calib.robot import deflection
 
     bases = deflection.evaluate(truth.deflection, q, torque(q) if torque else None)
     seen = see(truth, q, station, tool, bases)

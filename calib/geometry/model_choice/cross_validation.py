@@ -14,7 +14,6 @@ import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.estimation.relevance import Gram, gram, relevance
-from calib.geometry.deflection import Deflection, Term
 from calib.geometry.fit import plausible_deviation
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.folds import Folds
@@ -22,6 +21,7 @@ from calib.geometry.observation import has_instrument, observe, prepare
 from calib.geometry.parameters import layout
 from calib.geometry.result import GeometricFit, row_weights, used_sigmas
 from calib.robot.chain import Chain
+from calib.robot.deflection import Deflection, Term
 
 CHUNK = 1000  # poses observed at once
 METRES = ("position", "consistency", "distance", "plane")

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.geometry.deflection import Term
 from calib.robot.chain import Chain
+from calib.robot.deflection import Term
 
 MAX_ORDER = 60
 WOBBLE_ORDER = 2

@@ -19,7 +19,6 @@ import numpy as np
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import UsageError
 from calib.estimation.relevance import relevance
-from calib.geometry.deflection import Deflection, Term
 from calib.geometry.fit import fit, fit_with_prior, polish_frames
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.cross_validation import Judge, judge
@@ -29,6 +28,7 @@ from calib.geometry.observation import has_instrument, prepare
 from calib.geometry.parameters import layout
 from calib.geometry.result import GeometricFit, outliers
 from calib.geometry.weighing import Settings
+from calib.robot.deflection import Deflection, Term
 
 GAIN = 0.03  # an effect has to lower the error on unseen rows by this share (our choice)
 POSES_PER_ORDER = 8  # harmonics of order k are offered to sets of at least 8 k poses (our choice)

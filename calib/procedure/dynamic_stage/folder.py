@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +24,12 @@ from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.loop_tables import loop_table, write_instrumental
 from calib.procedure.dynamic_stage.tracking import tracking_table
 from calib.procedure.dynamic_stage.verdict import resting_parameters
-from calib.procedure.kinematic_stage import robot_file
-from calib.robot import description
+from calib.robot import calibrated
 
 OURS = (
-    "robot.toml", "dynamics.json", "estimate.csv", "covariance.csv", "information.csv", "instrumental.csv",
+    calibrated.ROBOT, "dynamics.json", "estimate.csv", "covariance.csv", "information.csv", "instrumental.csv",
     "metrics.json", "drive_gains.csv",
-    "torques_1.csv", robot_file.COVARIANCE, geometry_tables.EFFECTS, geometry_tables.SENSITIVITY,
+    "torques_1.csv", calibrated.COVARIANCE, geometry_tables.EFFECTS, geometry_tables.SENSITIVITY,
     geometry_tables.GEOMETRIES,
 )  # fmt: skip
 """Files of an earlier identification that a new one replaces; besides plots, ``plot_*.png``."""
@@ -65,9 +64,8 @@ def write_folder(
 
 def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     inputs, found = outcome.inputs, outcome.found
-    nominal = (inputs.nominal or inputs.chain).values.tolist()
-    extra = {"provenance": {"robot": str(inputs.source), "nominal": nominal}}
-    description.write(folder / "robot.toml", inputs.chain, extra, source=f"identified from {inputs.source}")
+    robot = replace(inputs.robot, nominal=inputs.robot.nominal or inputs.chain, source=str(inputs.source))
+    calibrated.write(folder, robot, comment=f"identified from {inputs.source}")
     files.write_table(folder / "estimate.csv", HEADER, estimate_rows(outcome))
     estimate = found.fitted.estimate
     covariance = estimate.covariance if outcome.carried is None else outcome.carried.covariance

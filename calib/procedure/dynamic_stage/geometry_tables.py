@@ -29,7 +29,6 @@ from calib import files
 from calib.identification.geometry_uncertainty import NOTHING, TILTS, GeometryUncertainty
 from calib.identification.two_geometries import GeometryComparison
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
-from calib.procedure.kinematic_stage import robot_file
 
 EFFECTS, SENSITIVITY, GEOMETRIES = "geometry_effects.csv", "sensitivity.csv", "geometries.csv"
 SHOWN = 8  # rows on the console
@@ -45,7 +44,7 @@ GEOMETRIES_HEADER = (
 
 
 def write(outcome: IdentificationOutcome, folder: Path) -> None:
-    """Write sensitivities, the ranked effects, the two geometries' estimates, and the chain's covariance once more."""
+    """Write sensitivities, the ranked effects and the two geometries' estimates."""
     carried = outcome.carried
     if carried is None:
         return
@@ -56,11 +55,6 @@ def write(outcome: IdentificationOutcome, folder: Path) -> None:
     if outcome.geometries is not None:
         table = geometries(outcome.geometries, essential_names(outcome))
         files.write_table(folder / GEOMETRIES, GEOMETRIES_HEADER, table)
-    chain, covariance = outcome.inputs.chain, outcome.inputs.geometry
-    if covariance is not None:
-        own = np.flatnonzero(np.diag(covariance) > 0.0)
-        names = [chain.names[k] for k in own]
-        robot_file.write_chain_covariance(names, covariance[np.ix_(own, own)], folder)
 
 
 def ranking(carried: GeometryUncertainty) -> np.ndarray:

@@ -36,12 +36,11 @@ from calib.procedure.dynamic_stage.verdict import (
     warnings,
     with_prior,
 )
-from calib.procedure.kinematic_stage import robot_file
 from calib.procedure.kinematic_stage.inputs import joint_kinds
 from calib.procedure.kinematic_stage.verdict import Verdict
-from calib.robot import description
+from calib.robot.calibrated import CalibratedChain, without_corrections
 from calib.robot.chain import Chain
-from calib.robot.load import load, resolve
+from calib.robot.load import load_calibrated, resolve
 
 LOST = 0.05  # of a recording may fall to the windows of the parallel decimation (our choice)
 QUIET = 0.02  # noise of the accelerations that is no matter, of their rms (our choice)
@@ -56,9 +55,7 @@ class IdentificationInputs:
     """A robot and its recordings.
 
     Attributes:
-        chain: the calibrated arm.
-        nominal: the arm before calibration; None where the robot is not the outcome of a fit.
-        geometry: (K, K) covariance of the chain's element values; None where none is known.
+        robot: as a geometric fit has left it, or as it was described; joint corrections left out.
         source: the file it came from.
         cases: recordings to learn from.
         unseen: recordings to be predicted.
@@ -68,16 +65,19 @@ class IdentificationInputs:
         gains: drive gains that were identified; None where none were.
     """
 
-    chain: Chain
-    nominal: Chain | None
+    robot: CalibratedChain
     source: Path
     cases: tuple[Case, ...]
     unseen: tuple[Case, ...]
     options: IdentifyOptions
     notes: tuple[str, ...] = ()
     unit: str = "N m"
-    geometry: np.ndarray | None = None
     gains: DriveGains | None = None
+
+    @property
+    def chain(self) -> Chain:
+        """The arm that is identified."""
+        return self.robot.chain
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +114,7 @@ class IdentificationOutcome:
 
 
 def gather(
-    robot: str | Path,
+    robot: str | Path | CalibratedChain,
     recordings: Sequence[str],
     validate: Sequence[str] = (),
     *,
@@ -129,7 +129,7 @@ def gather(
     """Read the robot and all recordings, and make motions of them.
 
     Args:
-        robot: see `calib.robot.load`.
+        robot: see `calib.robot.load`; or as a geometric fit returns it.
         recordings, validate: paths, each with a cut if wanted (``log.npz@0:9.4``).
         options: the options file's content.
         method, friction: in place of the options'.
@@ -141,7 +141,9 @@ def gather(
     if not recordings:
         raise UsageError("no recording given")
     check_files(options, [*recordings, *validate])
-    chain, nominal, source = load_robot(robot, base, tip)
+    known = robot if isinstance(robot, CalibratedChain) else load_calibrated(robot, base, tip)
+    source = Path(known.source or known.chain.name) if isinstance(robot, CalibratedChain) else resolve(robot)
+    chain = known.chain
     paths = [*map(str, recordings), *map(str, validate)]
     names = case_names(paths)
     motions: list[Motion] = []
@@ -156,8 +158,8 @@ def gather(
     options = found.options
     cases = [read_case(path, name, motion, options, found) for name, path, motion in zip(names, paths, motions)]
     return IdentificationInputs(
-        chain, nominal, source, tuple(cases[:count]), tuple(cases[count:]), options, (*notes, *found.notes), found.unit,
-        robot_file.chain_covariance(source, chain) if source.suffix == ".toml" else None, found.found,
+        without_corrections(known), source, tuple(cases[:count]), tuple(cases[count:]), options,
+        (*notes, *found.notes), found.unit, found.found,
     )  # fmt: skip
 
 
@@ -186,7 +188,7 @@ class Assessment:
 def run(inputs: IdentificationInputs, progress: Progress | None = None) -> IdentificationOutcome:
     """Identify, predict every recording, and judge."""
     say, settings = progress or (lambda words: None), inputs.options.settings
-    found = identify(inputs.chain, inputs.cases, settings, inputs.nominal, progress)
+    found = identify(inputs.robot, inputs.cases, settings, progress)
     wrong = driven(found.dynamics, inputs.cases)  # refused before hours go into the geometry's share
     carried, geometries = carry(inputs, found, say)
     excitation = {case.name: report_excitation(case.motion) for case in inputs.cases}
@@ -258,11 +260,11 @@ def carry(
     inputs: IdentificationInputs, found: Identification, say: Progress
 ) -> tuple[GeometryUncertainty, GeometryComparison | None]:
     """Return what the geometry's uncertainty adds to the estimate, and the estimate on the nominal geometry beside."""
-    carried = propagate(found, inputs.chain, inputs.cases, inputs.geometry, say)
-    if inputs.nominal is None:
+    carried = propagate(found, inputs.robot, inputs.cases, say)
+    if inputs.robot.nominal is None or not inputs.robot.moved:
         return carried, None
     say("the same on the nominal geometry")
-    return carried, compare(found, carried, inputs.nominal, inputs.cases)
+    return carried, compare(found, carried, inputs.robot.nominal, inputs.cases)
 
 
 def with_choices(options: IdentifyOptions, method: str | None, friction: str | None, seed: int) -> IdentifyOptions:
@@ -278,21 +280,6 @@ def with_choices(options: IdentifyOptions, method: str | None, friction: str | N
             raise UsageError(f"--{key} {value}: expected {', '.join(allowed)}")
         settings = replace(settings, **{key: value})
     return replace(options, settings=settings)
-
-
-def load_robot(robot: str | Path, base: str | None, tip: str | None) -> tuple[Chain, Chain | None, Path]:
-    """Return the chain, the one before its calibration (None where there was none), and the file.
-
-    Of a fit with joint corrections the chain is the best geometry without them: torques know nothing of corrections,
-    and it is what a URDF of the fit holds.
-    """
-    source = resolve(robot)
-    chain = load(robot, base, tip)
-    values = description.read_extra(source).get("provenance", {}).get("nominal") if source.suffix == ".toml" else None
-    chain = robot_file.rigid_chain(source) if values is not None else chain
-    if values is None or len(values) != len(chain.elements) or np.array_equal(values, chain.values):
-        return chain, None, source
-    return chain, chain.with_values(np.asarray(values, dtype=float)), source
 
 
 def read_case(path: str, name: str, motion: Motion, options: IdentifyOptions, found: FoundGains) -> Case:

@@ -30,11 +30,14 @@ def deliver(fit: Path, source: Path, out: Path) -> list[str]:
             os.unlink(out / name)
     found = geometry.read(fit)
     given = source.suffix == ".urdf"
-    for name, chain in (("robot.urdf", found.chain), ("robot_for_corrections.urdf", found.complete)):
-        if chain is None:
-            (out / name).unlink(missing_ok=True)
-        elif given:
-            geometry.export_urdf(found, source, out / name, chain is found.complete)
+    urdfs = {"robot.urdf": found.chain}
+    if found.corrections is not None:
+        urdfs["robot_for_corrections.urdf"] = found.corrections.chain
+    else:
+        (out / "robot_for_corrections.urdf").unlink(missing_ok=True)
+    for name, chain in urdfs.items():
+        if given:
+            geometry.export_urdf(found, source, out / name, for_corrections=name != "robot.urdf")
         else:
             written = (fit / name).read_text(encoding="utf-8")
             geometry.check_readback(written, name, chain)
@@ -52,10 +55,11 @@ def deliver(fit: Path, source: Path, out: Path) -> list[str]:
         notes.append(f"{words}; {flange}" if flange else words)
     except (RobotError, UsageError):  # no UR arm
         (out / "ur_kinematics.yaml").unlink(missing_ok=True)
-    if found.corrected:
+    if found.corrections is not None:
+        left = geometry.without_corrections(fit)
         words = (
             "joint_corrections.csv: what a URDF cannot hold, on top of robot_for_corrections.urdf; formula in "
             "joint_corrections.txt"
         )
-        notes.append(f"{words}; {found.alone}" if found.alone else words)
+        notes.append(f"{words}; {left}" if left else words)
     return notes

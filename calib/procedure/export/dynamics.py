@@ -41,7 +41,7 @@ from calib.identification.possible.information import Information
 from calib.identification.possible.information import read as read_told
 from calib.identification.possible.solve import Consistent, find_consistent
 from calib.procedure.export import geometry
-from calib.procedure.kinematic_stage import robot_file
+from calib.robot.calibrated import CalibratedChain, nominal_of
 from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import mjcf, urdf, urdf_inertials, urdf_write
 from calib.robot.formats.markup import text
@@ -60,14 +60,14 @@ class Exported:
     """An identified robot, ready to be written.
 
     Attributes:
-        calibration: the geometry before and after.
+        robot: the geometry, with that before calibration.
         told: the estimate.
         found: all its parameters, of possible bodies.
         bodies: (B, 10) of the arm's own bodies, payloads left out.
         drives: by joint.
     """
 
-    calibration: geometry.Calibration
+    robot: CalibratedChain
     told: Information
     found: Consistent
     bodies: np.ndarray
@@ -75,7 +75,7 @@ class Exported:
 
     @property
     def chain(self) -> Chain:
-        return self.calibration.chain
+        return self.robot.chain
 
     @property
     def arm(self) -> Bodies:
@@ -115,7 +115,7 @@ def deliver_dynamics(identified: Path, source: Path | None, out: Path) -> list[s
     given = read(identified)
     content, encoding = (urdf_write.write_new(given.chain), "utf-8") if source is None else text(source)
     where = "the chain's own URDF" if source is None else str(source)
-    edited, notes = with_dynamics(given, content, where, given.chain if source is None else given.calibration.nominal)
+    edited, notes = with_dynamics(given, content, where, given.chain if source is None else nominal_of(given.robot))
     model = mjcf.text(given.chain, given.bodies, *given.drives.values.T[:3])
     check_mjcf(given, model)
     out.mkdir(parents=True, exist_ok=True)
@@ -225,12 +225,12 @@ def parameters(given: Exported) -> dict[str, Any]:
     """Return the content of ``parameters.json``."""
     told, found, chain = given.told, given.found, given.chain
     model = found.dynamics.model
-    covariance = robot_file.chain_covariance(given.calibration.folder, chain)
+    covariance = given.robot.covariance
     return {
         "robot": chain.name,
         "geometry": {
             **_columns(chain.names, chain.units, chain.values),
-            "nominal": given.calibration.nominal.values.tolist(),
+            "nominal": nominal_of(given.robot).values.tolist(),
             "covariance": None if covariance is None else np.asarray(covariance).tolist(),
         },
         "dynamics": {

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from calib import files
 from calib.errors import RobotError, UsageError
-from calib.procedure.kinematic_stage import robot_file
-from calib.robot import description
+from calib.robot import calibrated
+from calib.robot.calibrated import CalibratedChain, nominal_of
 from calib.robot.chain import AXES, Chain, random_joints
 from calib.robot.formats import urdf, urdf_write
 from calib.robot.formats.markup import text
@@ -29,47 +27,25 @@ UR_KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
 UR_LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 
 
-@dataclass(frozen=True, eq=False)
-class Calibration:
-    """A fit's folder, read back: the arm before and after, and the files beside.
-
-    Attributes:
-        chain: the best geometry that does without joint corrections.
-        complete: the geometry that joint corrections belong to; None where there are none.
-        corrected: whether there are joint corrections, which no URDF holds.
-        alone: what the URDF without them leaves, in words; empty where that is not known.
-    """
-
-    folder: Path
-    nominal: Chain
-    chain: Chain
-    corrected: bool
-    alone: str = ""
-    complete: Chain | None = None
-
-
-def read(folder: Path) -> Calibration:
-    """Read the folder of a fit.
+def read(folder: Path) -> CalibratedChain:
+    """Read the calibrated robot from the folder of a fit.
 
     Raises:
-        UsageError: where it is none.
+        UsageError: where it is none, or does not say what it was calibrated from.
     """
     if not (folder / "robot.toml").is_file():
         raise UsageError(f"{folder} holds no robot.toml; give the folder that `calib fit --out` has written")
-    cell = robot_file.read(folder)
-    provenance = description.read_extra(folder / "robot.toml").get("provenance", {})
-    values = provenance.get("nominal")
-    if values is None or len(values) != len(cell.chain.elements):
+    robot = calibrated.read(folder)
+    if robot.nominal is None:
         raise UsageError(f"{folder}/robot.toml does not say which nominal robot it was calibrated from; fit again")
-    nominal = cell.chain.with_values(np.array(values, dtype=float))
-    corrected = bool(cell.deflection.terms)
-    if not corrected:
-        return Calibration(folder, nominal, cell.chain, corrected)
-    return Calibration(folder, nominal, robot_file.rigid_chain(folder), corrected, _alone(folder), cell.chain)
+    return robot
 
 
-def _alone(folder: Path) -> str:
-    """Return what the fit's metrics say of the URDF without its corrections: on the first unseen file, or fitted."""
+def without_corrections(folder: Path) -> str:
+    """Return what a fit's metrics say of its URDF without the joint corrections, on the first unseen file, or fitted.
+
+    Empty where the fit has none, or does not say it.
+    """
     try:
         metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
         unseen = next(iter(metrics["validation"].items()), None)
@@ -101,21 +77,21 @@ def _same_file(one: Path, other: Path) -> bool:
     return one.resolve() == other.resolve() or (one.exists() and other.exists() and one.samefile(other))
 
 
-def export_urdf(found: Calibration, source: Path, out: Path, for_corrections: bool = False) -> Path:
+def export_urdf(robot: CalibratedChain, source: Path, out: Path, for_corrections: bool = False) -> Path:
     """Put the calibrated geometry into the XML of `source`, have Pinocchio read it back, and write it to `out`.
 
     Only the origins of the arm's joints change. The base link stays where the nominal robot has its base, and the fixed
     joints behind the last moving one stay as they are: the choice of base and flange is the source's.
 
     Args:
-        found: the fit.
+        robot: the calibrated robot.
         source: a URDF of the nominal robot.
         out: the file to write.
         for_corrections: take the geometry that the joint corrections belong to, which is worse without them.
     """
-    chain = found.complete if for_corrections and found.complete is not None else found.chain
+    chain = robot.complete if for_corrections else robot.chain
     content, encoding = text(source)
-    edited = urdf_write.edit(content, found.nominal, chain, str(source))
+    edited = urdf_write.edit(content, nominal_of(robot), chain, str(source))
     check_readback(edited, str(source), chain)
     return files.write(out, edited.encode(encoding))
 
@@ -132,28 +108,23 @@ def check_readback(edited: str, where: str, chain: Chain) -> None:
         raise RobotError(f"{where}: Pinocchio reads the calibrated URDF otherwise, by {error:.2g}; nothing was written")
 
 
-def export_offsets(found: Calibration, out: Path) -> Path:
+def export_offsets(robot: CalibratedChain, out: Path) -> Path:
     """Write calibrated minus nominal of each joint's own value: what a controller adds to the angle it reads.
 
-    The sigmas are left out where the fit has joint corrections: those of its table are for offsets beside corrections.
+    The sigmas are left out where the fit has joint corrections: the offsets are then for whoever does not apply them.
     """
-    sigmas = {} if found.corrected else _sigmas(found.folder)
+    nominal, sigma = nominal_of(robot), np.full(len(robot.chain.elements), np.nan)
+    if robot.covariance is not None and robot.corrections is None:
+        sigma = np.sqrt(np.diag(robot.covariance))
     rows = []
-    for joint, k in zip(found.chain.joints, found.chain.moving):
-        element, before = found.chain.elements[k], found.nominal.elements[k]
-        rows.append((joint.name, joint.unit, (element.value - before.value) / element.ratio, sigmas.get(element.name)))
+    for joint, k in zip(robot.chain.joints, robot.chain.moving):
+        element, before = robot.chain.elements[k], nominal.elements[k]
+        known = float(sigma[k]) if sigma[k] > 0.0 else None
+        rows.append((joint.name, joint.unit, (element.value - before.value) / element.ratio, known))
     return files.write_table(out, ("joint", "unit", "offset", "sigma"), rows)
 
 
-def _sigmas(folder: Path) -> dict[str, float]:
-    try:
-        with (folder / "estimate.csv").open(encoding="utf-8", newline="") as file:
-            return {row["name"]: float(row["sigma"]) for row in csv.DictReader(file) if row["sigma"]}
-    except (OSError, KeyError, ValueError) as error:
-        raise UsageError(f"{folder}/estimate.csv cannot be read: {error}") from error
-
-
-def export_ur_kinematics(found: Calibration, out: Path) -> Path:
+def export_ur_kinematics(robot: CalibratedChain, out: Path) -> Path:
     """Write the kinematics YAML of ur_description: x y z roll pitch yaw of the six joints' origins.
 
     The frames are UR's own (base_link_inertia, then each joint about its z). They follow from the nominal arm's axes,
@@ -163,11 +134,12 @@ def export_ur_kinematics(found: Calibration, out: Path) -> Path:
     Raises:
         UsageError: for an arm that has not UR's axes.
     """
+    nominal = nominal_of(robot)
     try:
-        template = ur_template(found.nominal)
-        edited = read_tree(urdf_write.edit(template, found.nominal, found.chain, "UR frames"), "UR frames")
+        template = ur_template(nominal)
+        edited = read_tree(urdf_write.edit(template, nominal, robot.chain, "UR frames"), "UR frames")
     except RobotError as error:
-        raise UsageError(f"{found.folder}: '{found.chain.name}' has not the axes of a UR arm: {error}") from error
+        raise UsageError(f"'{robot.chain.name}' has not the axes of a UR arm: {error}") from error
     lines = []
     for link in UR_LINKS:
         xyz, rpy = to_xyz_rpy(edited.joints[link].origin)
@@ -182,14 +154,15 @@ def export_ur_kinematics(found: Calibration, out: Path) -> Path:
     return files.write(out, "\n".join([*head, *lines, f"  hash: calib_{digest}"]) + "\n")
 
 
-def flange_note(found: Calibration) -> str:
+def flange_note(robot: CalibratedChain) -> str:
     """Say where UR's flange was taken to be, where the robot's file has something behind its last joint."""
-    zero = np.zeros((1, found.nominal.n))
-    behind = invert(joint_frames(found.nominal, zero)[-1, 0]) @ forward(found.nominal, zero)[0]
+    nominal = nominal_of(robot)
+    zero = np.zeros((1, nominal.n))
+    behind = invert(joint_frames(nominal, zero)[-1, 0]) @ forward(nominal, zero)[0]
     if np.abs(behind - np.eye(4)).max() < ON_AXIS:
         return ""
-    away = f"{found.nominal.tip}, {1e3 * float(np.linalg.norm(behind[:3, 3])):.4g} mm behind the last joint's frame"
-    if _wrist(found.nominal) > ON_AXIS:
+    away = f"{nominal.tip}, {1e3 * float(np.linalg.norm(behind[:3, 3])):.4g} mm behind the last joint's frame"
+    if _wrist(nominal) > ON_AXIS:
         return f"wrist_3 is the last joint's frame, as UR's tool0 is; the fixed joint to {away}, is not in it"
     return f"wrist_3 reaches to {away}: this file holds UR's d6 there; it has to be UR's own flange, without a tool"
 

@@ -29,7 +29,6 @@ import numpy as np
 from calib.data.poses.target_files import Targets
 from calib.errors import UsageError
 from calib.geometry import inverse
-from calib.geometry.deflection import Deflection
 from calib.geometry.installation import Installation, see
 from calib.geometry.inverse import Goal
 from calib.geometry.parameters import layout
@@ -37,6 +36,7 @@ from calib.geometry.spread import pose_sigmas
 from calib.procedure.kinematic_stage import robot_file
 from calib.procedure.kinematic_stage.tables import read_covariance
 from calib.robot.chain import Chain, sampling_limits
+from calib.robot.deflection import Deflection
 from calib.transforms import from_xyz_rpy, invert, pose, rotation_vector
 
 TOLERANCE = (1e-6, 1e-5)  # position [m] and orientation [rad] that a command may leave; our choice, as what follows

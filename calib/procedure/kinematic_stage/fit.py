@@ -14,7 +14,6 @@ from calib.errors import NotConverged
 from calib.geometry.accuracy import errors
 from calib.geometry.checks.diagnosis import diagnose
 from calib.geometry.checks.explanation import explain
-from calib.geometry.deflection import Deflection
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit, polish_frames
 from calib.geometry.installation import Installation
@@ -22,7 +21,7 @@ from calib.geometry.model_choice.folds import folds_by_name
 from calib.geometry.model_choice.ladder import Climb, climb
 from calib.geometry.observation import has_instrument
 from calib.geometry.parameters import layout
-from calib.geometry.result import GeometricFit
+from calib.geometry.result import GeometricFit, calibrated_chain
 from calib.geometry.weighing import Settings, combine
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.outliers import Outlier, named_outliers, plateau, remains
@@ -35,7 +34,9 @@ from calib.procedure.kinematic_stage.validation import (
     without_corrections,
 )
 from calib.procedure.kinematic_stage.verdict import OWN_FRAMES, Verdict, judge
+from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
+from calib.robot.deflection import Deflection
 
 Progress = Callable[[str], None]
 MOVED = 3.0  # nominal errors fall by this factor when each file gets a station of its own: it was moved (our choice)
@@ -73,6 +74,12 @@ class Outcome:
     seed: int = 0
     tolerance: float | None = None
     said: tuple[str, ...] = ()
+
+    @property
+    def calibrated(self) -> CalibratedChain:
+        """The calibrated robot, for all that goes on from here."""
+        found = calibrated_chain(self.climb.fit, self.rigid, self.inputs.nominal)
+        return replace(found, source=str(self.inputs.source))
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,19 +10,17 @@ import numpy as np
 from calib import files
 from calib.errors import UsageError
 from calib.folders import check_folder, write_staged
-from calib.geometry.deflection import Deflection
-from calib.geometry.installation import merged
 from calib.procedure.kinematic_stage import robot_file
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.residual_table import write_residuals
 from calib.procedure.kinematic_stage.tables import HEADER, estimate_table
-from calib.robot import description
-from calib.robot.chain import Chain
+from calib.robot import calibrated
+from calib.robot.calibrated import CorrectedChain
 from calib.robot.formats import urdf_write
 
 OURS = (
-    "robot.toml", "robot.urdf", "robot_for_corrections.urdf",
-    "estimate.csv", "covariance.csv", robot_file.COVARIANCE, "residuals.csv", "joint_corrections.csv",
+    calibrated.ROBOT, "robot.urdf", "robot_for_corrections.urdf",
+    "estimate.csv", "covariance.csv", calibrated.COVARIANCE, "residuals.csv", "joint_corrections.csv",
     "joint_corrections.txt", "report.json", "certificate.html", "metrics.json",
 )  # fmt: skip
 """Files of an earlier fit that a new one replaces; besides plots, ``plot_*.png``."""
@@ -45,7 +43,7 @@ At joint values q, add to the joint (or element) of each row of joint_correction
 
 To make the arm stand where the calibrated model says: predict with q + delta(q) in robot_for_corrections.urdf; to
 command a joint position for which that file wants q, send q - delta(q) (one step is enough; delta is small).
-robot.toml holds the same geometry and terms, and `calib.procedure.kinematic_stage.robot_file.read` reads them.
+robot.toml holds the same geometry and terms, and `calib.robot.calibrated.read` reads them.
 """
 
 
@@ -73,13 +71,12 @@ def write_folder(outcome: Outcome, out: Path, plots: Callable[[Outcome, Path], N
 
 def _write_all(outcome: Outcome, folder: Path) -> None:
     fit, chain = outcome.climb.fit, outcome.inputs.chain
-    extra = robot_file.tables(fit.cell) | {"provenance": _provenance(outcome)}
-    description.write(folder / "robot.toml", fit.cell.chain, extra, source=f"calibrated from {outcome.inputs.source}")
-    whole = merged(fit.cell)
-    urdfs = {"robot.urdf": outcome.rigid.cell.chain if whole.deflection.terms else fit.cell.chain}
-    if whole.deflection.terms:
-        urdfs["robot_for_corrections.urdf"] = fit.cell.chain
-        write_corrections(whole.chain, whole.deflection, folder)
+    robot, origin = outcome.calibrated, f"calibrated from {outcome.inputs.source}"
+    calibrated.write(folder, robot, robot_file.frame_tables(fit.cell), _record(outcome), origin)
+    urdfs = {"robot.urdf": robot.chain}
+    if robot.corrections is not None:
+        urdfs["robot_for_corrections.urdf"] = robot.corrections.chain
+        write_corrections(robot.corrections, folder)
     for name, geometry in urdfs.items():
         if outcome.inputs.source.suffix == ".urdf":
             urdf_write.edit_file(outcome.inputs.source, folder / name, chain, geometry)
@@ -89,7 +86,6 @@ def _write_all(outcome: Outcome, folder: Path) -> None:
     files.write_table(folder / "estimate.csv", HEADER, table.rows())
     rows = ([name, *map(float, row)] for name, row in zip(table.names, table.covariance))
     files.write_table(folder / "covariance.csv", ("name", *table.names), rows)
-    robot_file.write_covariance(outcome.rigid, folder)
     write_residuals(outcome, folder / "residuals.csv")
     files.write_json(folder / "metrics.json", metrics(outcome))
 
@@ -132,19 +128,13 @@ def metrics(outcome: Outcome) -> dict[str, object]:
     }
 
 
-def _provenance(outcome: Outcome) -> dict[str, object]:
+def _record(outcome: Outcome) -> dict[str, object]:
+    """Return what the provenance says of how the robot was calibrated, besides from what."""
     inputs = outcome.inputs
-    earlier = description.read_extra(inputs.source) if inputs.source.suffix == ".toml" else {}
-    rigid = (
-        {"rigid": outcome.rigid.cell.chain.values.tolist()} if merged(outcome.climb.fit.cell).deflection.terms else {}
-    )
-    frames = {} if "nominal" in earlier.get("provenance", {}) else robot_file.tables(outcome.climb.nominal.cell)
-    nominal = {f"nominal_{kind}": frames[kind] for kind in ("station", "tool") if kind in frames}
+    again = inputs.earlier is not None and inputs.earlier.nominal is not None
+    frames = {} if again else robot_file.frame_tables(outcome.climb.nominal.cell)
     return {
-        **rigid,
-        **nominal,
-        "robot": str(inputs.source),
-        "nominal": earlier.get("provenance", {}).get("nominal", inputs.chain.values.tolist()),
+        **{f"nominal_{kind}": table for kind, table in frames.items()},
         "files": [block.file for block in inputs.fit],
         "model": outcome.climb.chosen,
         "seed": outcome.seed,
@@ -153,8 +143,9 @@ def _provenance(outcome: Outcome) -> dict[str, object]:
     }
 
 
-def write_corrections(chain: Chain, deflection: Deflection, folder: Path) -> None:
+def write_corrections(corrections: CorrectedChain, folder: Path) -> None:
     """Write what a URDF cannot hold: the joint correction table and how to read it."""
+    chain, deflection = corrections.chain, corrections.deflection
     units = dict(zip(chain.names, chain.units))
     owners = {element.name: element.joint for element in chain.elements}
     rows = []

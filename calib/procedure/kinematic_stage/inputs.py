@@ -14,12 +14,12 @@ from calib.data.poses.pose_files import joint_columns, read_measurements
 from calib.errors import MeasurementError, UsageError
 from calib.geometry.checks.orientations import check_orientations
 from calib.geometry.checks.repeatability import repeated_rows
-from calib.geometry.deflection import Deflection
 from calib.geometry.first_guess import check_scale
-from calib.procedure.kinematic_stage import robot_file
 from calib.procedure.kinematic_stage.copied_rows import repeated
-from calib.robot import description
+from calib.robot import calibrated, description
+from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, Joint
+from calib.robot.deflection import Deflection
 from calib.robot.formats.markup import text
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.kinematics import forward
@@ -53,7 +53,7 @@ class Inputs:
         fit: blocks to fit on.
         unseen: by the name of the file they come from.
         notes: what a user should know about how the files were understood.
-        known: deflections that came with the robot, from an earlier fit.
+        earlier: the robot as its file has it, with what an earlier fit left there; None for a URDF.
     """
 
     chain: Chain
@@ -61,7 +61,17 @@ class Inputs:
     fit: tuple[PoseMeasurements, ...]
     unseen: Mapping[str, Unseen] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
-    known: Deflection = field(default_factory=Deflection)
+    earlier: CalibratedChain | None = None
+
+    @property
+    def known(self) -> Deflection:
+        """Joint corrections that came with the robot, from an earlier fit."""
+        return Deflection() if self.earlier is None else self.earlier.deflection
+
+    @property
+    def nominal(self) -> Chain:
+        """The arm before any calibration."""
+        return self.chain if self.earlier is None or self.earlier.nominal is None else self.earlier.nominal
 
 
 def gather(
@@ -123,10 +133,11 @@ def gather(
     copied, told = repeated(fit, unseen)
     notes += told
     unseen = {name: replace(each, seen=each.seen or name in copied) for name, each in unseen.items()}
-    known = robot_file.read(source).deflection if source.suffix == ".toml" else Deflection()
-    if known.terms:
-        notes.append(f"{robot} brings {len(known.terms)} deflection terms of an earlier fit; they stay as they are")
-    return Inputs(chain, source, tuple(fit), unseen, tuple(notes), known)
+    earlier = calibrated.read(source) if source.suffix == ".toml" else None
+    if earlier is not None and earlier.corrections is not None:
+        count = len(earlier.deflection.terms)
+        notes.append(f"{robot} brings {count} deflection terms of an earlier fit; they stay as they are")
+    return Inputs(chain, source, tuple(fit), unseen, tuple(notes), earlier)
 
 
 def load_robot(

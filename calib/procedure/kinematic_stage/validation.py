@@ -10,7 +10,6 @@ import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements
 from calib.geometry.accuracy import Errors, errors, pair_errors, statistics, summary
-from calib.geometry.deflection import Deflection
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation
@@ -18,6 +17,7 @@ from calib.geometry.weighing import Settings
 from calib.procedure.kinematic_stage import iso9283
 from calib.procedure.kinematic_stage.inputs import Unseen, pose_count
 from calib.robot.chain import Chain
+from calib.robot.deflection import Deflection
 
 Torques = list[np.ndarray | None]
 

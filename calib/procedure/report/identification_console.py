@@ -22,7 +22,7 @@ from calib.procedure.report.fit_console import COLOURS
 def read_lines(inputs: IdentificationInputs) -> Iterator[RenderableType]:
     """Say what was read."""
     chain = inputs.chain
-    how = "calibrated" if inputs.nominal is not None else "nominal geometry"
+    how = "calibrated" if inputs.robot.moved else "nominal geometry"
     yield f"robot [bold]{escape(chain.name)}[/]: {chain.n} joints, {escape(chain.base)} to {escape(chain.tip)}, {how}"
     for case in (*inputs.cases, *inputs.unseen):
         motion = case.motion

@@ -18,7 +18,7 @@ from calib.data.poses.plans import read_poses
 from calib.errors import UsageError
 from calib.geometry.installation import Installation, see
 from calib.procedure.kinematic_stage import robot_file
-from calib.robot import description, library
+from calib.robot import calibrated, library
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward, joint_frames
 from calib.robot.load import load, resolve
@@ -142,9 +142,8 @@ def _arm(folder: Path, robot: str | None) -> tuple[Chain | None, Path | None]:
         return load(robot), resolve(robot)
     for place in (folder, folder / "4-fit"):
         if (place / "robot.toml").is_file():
-            chain = robot_file.read(place).chain
-            source = description.read_extra(place / "robot.toml").get("provenance", {}).get("robot", "")
-            return chain, Path(source) if source and Path(source).is_file() else None
+            known = calibrated.read(place)
+            return known.complete, Path(known.source) if known.source and Path(known.source).is_file() else None
     for place in sorted(folder.glob("1-robot/robot.*")):
         return load(str(place)), place
     try:
@@ -222,7 +221,7 @@ def _groups(rows: list[dict[str, str]], cell: Installation) -> list[tuple[int, i
 
 def _points(cell: Installation, q: np.ndarray, station: int, tool: int) -> np.ndarray:
     """Return the tool's positions (m, 3) in the station's frame, by the arm without its deflections' torques."""
-    from calib.geometry.deflection import evaluate
+    from calib.robot.deflection import evaluate
 
     terms = cell.deflection.terms
     torque = None

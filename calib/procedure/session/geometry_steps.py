@@ -20,11 +20,12 @@ from calib.geometry.weighing import combine
 from calib.procedure.kinematic_stage import fit as fitting
 from calib.procedure.kinematic_stage import folder as outputs
 from calib.procedure.kinematic_stage import inputs, proof
-from calib.procedure.kinematic_stage import robot_file as calibrated
+from calib.procedure.kinematic_stage import robot_file as installation_file
 from calib.procedure.report import fit_certificate, fit_report
 from calib.procedure.session import arrival
 from calib.procedure.session.folder import Session
 from calib.procedure.session.outcome import mark_failed
+from calib.robot import calibrated
 from calib.robot.chain import Chain
 
 Say = Callable[[str], None]
@@ -233,7 +234,7 @@ def assessed(session: Session, given: inputs.Inputs, found: fit_report.Report) -
     torques = [fitting.gravity_of(given.chain, block) for block in given.fit]
     nominal = polish_frames(fitting.install(given.chain, given.fit, given.known), given.fit, chosen, torques).cell
     return fitting.assess(
-        nominal, calibrated.read(place), calibrated.rigid_chain(place), given, settings, found.judged, found.said,
+        nominal, installation_file.read(place), calibrated.read(place).chain, given, settings, found.judged, found.said,
         asked=wanted.model, tolerance=tolerance_of(session), seed=session.settings.seed,
     )  # fmt: skip
 

@@ -13,7 +13,6 @@ from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.gravity import gravity_torques
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.rigid_body import inverse_dynamics
-from calib.geometry.deflection import evaluate
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation, see
@@ -21,7 +20,9 @@ from calib.identification.model_file import read_dynamics
 from calib.identification.prediction import Dynamics, carried_columns
 from calib.procedure.kinematic_stage import robot_file
 from calib.procedure.session.folder import Session
+from calib.robot import calibrated
 from calib.robot.chain import random_joints, sampling_limits
+from calib.robot.deflection import evaluate
 from calib.simulation.cells.cell import Cell, true_poses
 from calib.simulation.cells.virtual_arm import MovingArm, link_torque, true_torque
 from calib.simulation.loop.references import random_fourier
@@ -40,7 +41,7 @@ def against_truth(session: Session, cell: Cell) -> tuple[float, float, float]:
     true = true_poses(cell, q)
     points = true[:, :3, 3]
     block = PoseMeasurements("pose", q, cell.nominal.joint_names, position=points, quaternion=to_quaternion(true))
-    rigid = robot_file.rigid_chain(session.path("4-fit"))
+    rigid = calibrated.read(session.path("4-fit")).chain
     nominal, alone = (polish_frames(install(chain, [block]), [block]).cell for chain in (cell.nominal, rigid))
     found = robot_file.read(session.path("4-fit"))
     before, after, bare = (_rms(arm, q, points) for arm in (nominal, found, alone))

@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 from calib.arrays import shaped
 from calib.data.poses.measurements import PoseMeasurements
 from calib.dynamics.gravity import gravity_torques
-from calib.geometry.deflection import evaluate
 from calib.geometry.installation import Installation, see
 from calib.robot.chain import Chain
+from calib.robot.deflection import evaluate
 from calib.transforms import invert, pose
 
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.geometry.deflection import Deflection, Term
 from calib.robot.chain import Chain
+from calib.robot.deflection import Deflection, Term
 
 ORDERS = (2, 3)
 

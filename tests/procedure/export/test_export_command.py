@@ -138,8 +138,9 @@ def test_what_is_mounted_behind_wrist_3_is_not_in_its_kinematics(cell, calib, ol
 
 
 def test_an_arm_without_ur_axes_has_no_ur_kinematics(cell, calib):
-    from calib.procedure.export.geometry import Calibration, export_ur_kinematics
+    from calib.procedure.export.geometry import export_ur_kinematics
+    from calib.robot.calibrated import CalibratedChain
 
     panda = load("panda")
     with pytest.raises(Exception, match="not the axes of a UR arm"):
-        export_ur_kinematics(Calibration(Path("x"), panda, panda, False), Path("y.yaml"))
+        export_ur_kinematics(CalibratedChain(panda, panda), Path("y.yaml"))

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.procedure.kinematic_stage import robot_file
+from calib.robot import calibrated
 from calib.robot.formats import urdf
 from calib.robot.formats.urdf_write import write_new
 from calib.robot.kinematics import forward
@@ -218,7 +219,7 @@ def test_deflections_go_out_as_a_table_with_its_formula_and_come_back(cell, cali
     with_corrections = forward(urdf.read("done/robot_for_corrections.urdf"), some)
     assert np.abs(with_corrections - forward(load("done"), some)).max() < 1e-9
     rigid = urdf.read("done/robot.urdf")
-    assert np.abs(forward(rigid, some) - forward(robot_file.rigid_chain("done"), some)).max() < 1e-9
+    assert np.abs(forward(rigid, some) - forward(calibrated.read("done").chain, some)).max() < 1e-9
     Path("ur5.urdf").write_text(write_new(load("ur5")))
     said = calib("export", "done", "--urdf", "ur5.urdf", "--out", "new.urdf")[1]
     assert f"the URDF alone leaves {alone:.3f} mm rms" in said

@@ -1,0 +1,226 @@
+"""The calibrated robot as it travels from the geometric fit to the dynamics, and its tables in the folder of a fit.
+
+``robot.toml`` holds the chain (`calib.robot.description`) and beside it::
+
+    [provenance]
+    robot = "ur5.urdf"               # the description that was calibrated
+    nominal = [0.0, 0.1625, ...]     # its element values
+    rigid = [0.0, 0.1627, ...]       # those of the best geometry without joint corrections, where there are any
+    [deflection]                     # the joint corrections; formula in `calib.robot.deflection`
+    reference = [0.0, 0.1, ...]      # element values of the chain that levers are taken from (the nominal one)
+    [[deflection.term]]
+    element = "q3.offset"            # the element it moves
+    basis = "sin"                    # torque, lever, joint, cos, sin
+    joint = "q4"                     # the joint (or the body behind it) it comes from
+    order = 2                        # k of sin and cos; axis of a lever (0 x, 1 y, 2 z)
+    coefficient = 1.2e-5
+
+``chain_covariance.csv`` beside it: the covariance [m, rad] of the element values of the best geometry without
+corrections (``provenance.rigid``, where there are any), by name; elements that are not in it were not fitted.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib import files
+from calib.arrays import frozen, shaped
+from calib.errors import RobotError
+from calib.robot import description
+from calib.robot.chain import Chain, element_index
+from calib.robot.deflection import Deflection, Term
+from calib.robot.tables import check_keys, number, vector
+
+ROBOT, COVARIANCE = "robot.toml", "chain_covariance.csv"
+
+
+@dataclass(frozen=True, eq=False)
+class CorrectedChain:
+    """A geometry with the joint corrections that belong to it; without them it is worse than the best rigid one.
+
+    Attributes:
+        chain: the geometry.
+        deflection: the corrections (at least one term).
+    """
+
+    chain: Chain
+    deflection: Deflection
+
+
+@dataclass(frozen=True, eq=False)
+class CalibratedChain:
+    """A robot as the geometric fit leaves it, and as identification, excitation, export and compensation take it.
+
+    Attributes:
+        chain: the best geometry that does without joint corrections: what a URDF holds and dynamics are identified on.
+        nominal: the arm before calibration; None where nothing says which that was.
+        covariance: (K, K) of the chain's element values [m, rad], zero where an element was not fitted; None where no
+            fit has left one.
+        corrections: the geometry that joint corrections belong to, and those; None without any.
+        source: the description that was calibrated, as its user named it; empty where unknown.
+    """
+
+    chain: Chain
+    nominal: Chain | None = None
+    covariance: np.ndarray | None = None
+    corrections: CorrectedChain | None = None
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        if self.covariance is not None:
+            count = len(self.chain.elements)
+            shaped(self.covariance, (count, count), "covariance of the chain's elements")
+            object.__setattr__(self, "covariance", frozen(self.covariance))
+
+    @property
+    def complete(self) -> Chain:
+        """The geometry that predicts best: with corrections the one they belong to, otherwise `chain`."""
+        return self.chain if self.corrections is None else self.corrections.chain
+
+    @property
+    def deflection(self) -> Deflection:
+        """The joint corrections, without terms where there are none."""
+        return Deflection() if self.corrections is None else self.corrections.deflection
+
+    @property
+    def moved(self) -> bool:
+        """Whether calibration changed an element's value of a nominal arm that is known."""
+        return self.nominal is not None and not np.array_equal(self.nominal.values, self.chain.values)
+
+
+def as_calibrated(robot: Chain | CalibratedChain) -> CalibratedChain:
+    """Return a robot as it is, and a plain chain as a robot of which nothing else is known."""
+    return robot if isinstance(robot, CalibratedChain) else CalibratedChain(robot)
+
+
+def read(path: str | Path) -> CalibratedChain:
+    """Return the calibrated robot of a fit's (or an identification's) folder, or of any ``robot.toml``.
+
+    Raises:
+        RobotError: naming the file and what in it is wrong.
+    """
+    path = Path(path) / ROBOT if Path(path).is_dir() else Path(path)
+    complete, extra, where = description.read(path), description.read_extra(path), str(path)
+    known = extra.get("provenance", {})
+
+    def valued(key: str) -> Chain | None:
+        if known.get(key) is None:
+            return None
+        return complete.with_values(vector(known[key], len(complete.elements), f"{where}, provenance.{key}"))
+
+    chain = valued("rigid") or complete
+    deflection = _deflection(extra.get("deflection", {}), complete, where)
+    return CalibratedChain(
+        chain, valued("nominal"), _covariance(path.parent / COVARIANCE, chain),
+        CorrectedChain(complete, deflection) if deflection.terms else None, str(known.get("robot", "")),
+    )  # fmt: skip
+
+
+def write(
+    folder: Path,
+    robot: CalibratedChain,
+    tables: Mapping[str, Any] | None = None,
+    record: Mapping[str, Any] | None = None,
+    comment: str = "",
+) -> None:
+    """Write ``robot.toml`` and, where there is one, ``chain_covariance.csv``, so that `read` returns the same robot.
+
+    Args:
+        folder: that exists.
+        robot: the calibrated robot.
+        tables: more tables of ``robot.toml`` (`calib.robot.description.EXTRA`).
+        record: more entries of its provenance.
+        comment: where the numbers come from.
+    """
+    extra: dict[str, Any] = dict(tables or {})
+    if robot.corrections is not None:
+        extra["deflection"] = _deflection_table(robot.corrections)
+    known: dict[str, Any] = dict(record or {}) | {"robot": robot.source}
+    if robot.nominal is not None:
+        known["nominal"] = robot.nominal.values.tolist()
+    if robot.corrections is not None:
+        known["rigid"] = robot.chain.values.tolist()
+    description.write(folder / ROBOT, robot.complete, {**extra, "provenance": known}, source=comment)
+    own = np.flatnonzero(np.diag(robot.covariance) > 0.0) if robot.covariance is not None else []
+    if robot.covariance is not None and len(own):
+        names = [robot.chain.names[k] for k in own]
+        rows = ([name, *map(float, row)] for name, row in zip(names, robot.covariance[np.ix_(own, own)]))
+        files.write_table(folder / COVARIANCE, ("name", *names), rows)
+
+
+def nominal_of(robot: CalibratedChain) -> Chain:
+    """Return the arm before calibration.
+
+    Raises:
+        RobotError: where nothing says which that was.
+    """
+    if robot.nominal is None:
+        raise RobotError(
+            f"robot '{robot.chain.name}' does not say which nominal robot it was calibrated from; fit again"
+        )
+    return robot.nominal
+
+
+def without_corrections(robot: CalibratedChain) -> CalibratedChain:
+    """Return the robot without its joint corrections, of which torques know nothing and which no URDF holds."""
+    return replace(robot, corrections=None)
+
+
+def _covariance(path: Path, chain: Chain) -> np.ndarray | None:
+    """Return the covariance (K, K) of the element values in a table by name; None where there is none."""
+    if not path.is_file():
+        return None
+    with path.open(newline="", encoding="utf-8") as file:
+        header, *rows = list(csv.reader(file)) or [[]]
+    index = element_index(chain, header[1:])
+    try:
+        values = np.array([row[1:] for row in rows], dtype=float)
+    except ValueError as error:
+        raise RobotError(f"{path}: not a table of numbers ({error}); fit again") from None
+    if values.shape != (len(index), len(index)) or [row[0] for row in rows] != header[1:]:
+        raise RobotError(f"{path}: rows and columns do not name the same elements; fit again")
+    result = np.zeros((len(chain.elements), len(chain.elements)))
+    result[np.ix_(index, index)] = values
+    return result
+
+
+def _deflection_table(corrections: CorrectedChain) -> dict[str, Any]:
+    deflection = corrections.deflection
+    table: dict[str, Any] = {}
+    if deflection.reference is not None:
+        table["reference"] = deflection.reference.values.tolist()
+    table["term"] = [
+        {
+            "element": term.element,
+            "basis": term.basis,
+            "joint": corrections.chain.joint_names[term.source],
+            "order": term.order,
+            "coefficient": float(value),
+        }
+        for term, value in zip(deflection.terms, np.asarray(deflection.coefficients))
+    ]
+    return table
+
+
+def _deflection(table: Any, chain: Chain, where: str) -> Deflection:
+    where = f"{where}, deflection"
+    check_keys(table, ("reference", "term"), where)
+    terms, coefficients = [], []
+    for entry in table.get("term", []):
+        check_keys(entry, ("element", "basis", "joint", "order", "coefficient"), where)
+        for key, known in (("element", chain.names), ("joint", chain.joint_names)):
+            if entry.get(key) not in known:
+                raise RobotError(f"{where}: {key} {entry.get(key)!r} is none of the robot's")
+        source = chain.joint_names.index(entry["joint"])
+        terms.append(Term(entry["element"], entry.get("basis", ""), source, int(entry.get("order", 0))))
+        coefficients.append(number(entry.get("coefficient"), f"{where}, coefficient"))
+    reference = chain
+    if "reference" in table:
+        reference = chain.with_values(vector(table["reference"], len(chain.elements), f"{where}, reference"))
+    return Deflection(tuple(terms), np.array(coefficients), reference)
