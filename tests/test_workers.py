@@ -29,7 +29,6 @@ from worker_tasks import (
     wait_or_square,
 )
 
-from calib import workers as work
 from calib.errors import CalibError, MeasurementError, TaskLost, UsageError
 from calib.workers import Workers, workers
 
@@ -78,6 +77,15 @@ def test_results_come_as_tasks_complete(crews: dict[str, Workers], where: str, t
     assert seen == [1, 2, 3, 4, 5, 0]
 
 
+@IN_PARALLEL
+def test_one_run_at_a_time(crews: dict[str, Workers], where: str) -> None:
+    results = crews[where].completed(square, range(9))
+    assert next(results)
+    with pytest.raises(RuntimeError, match="at work"):
+        list(crews[where].map(square, [1]))
+    assert len(list(results)) == 8
+
+
 @EVERYWHERE
 def test_of_a_million_tasks_few_are_taken_at_once(crews: dict[str, Workers], where: str) -> None:
     taken = []
@@ -90,7 +98,7 @@ def test_of_a_million_tasks_few_are_taken_at_once(crews: dict[str, Workers], whe
 def test_results_that_wait_for_their_turn_are_few(
     crews: dict[str, Workers], where: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(work, "AHEAD", 8)
+    monkeypatch.setattr("calib.workers.AHEAD", 8)
     taken = []
     results = crews[where].map(late_first, (taken.append(x) or x for x in range(40)))
     assert next(results) == 0 and len(taken) <= 8 + 2
@@ -129,6 +137,9 @@ def test_in_order_a_lost_task_is_raised_in_its_place() -> None:
     assert next(results) == 0
     with pytest.raises(TaskLost, match="task 2"):
         next(results)
+    lost = list[TaskLost]()
+    assert list(Workers(stream).map_without(lost)(square, range(3))) == [0, 4]
+    assert [one.number for one in lost] == [1]
 
 
 def test_a_cluster_loses_workers_and_no_result(tmp_path: Path) -> None:
@@ -147,7 +158,11 @@ def test_a_cluster_loses_workers_and_no_result(tmp_path: Path) -> None:
         found = dict(crew.completed(die_of_two, range(5)))
         lost = found.pop(2)
         assert found == {0: 0, 1: 1, 3: 3, 4: 4}
-        assert isinstance(lost, TaskLost) and (lost.number, lost.task) == (2, 2) and "2 workers died" in str(lost)
+        assert (
+            isinstance(lost, TaskLost)
+            and (lost.number, lost.task) == (2, 2)
+            and "it ended 2 of the cluster's workers" in str(lost)
+        )
         results = crew.completed(pid_a_little_later, range(100))
         assert next(results)[0] == 0
         cluster.scheduler.kill()
@@ -160,7 +175,7 @@ def test_a_cluster_loses_workers_and_no_result(tmp_path: Path) -> None:
 
 
 def test_a_cluster_without_workers_is_not_waited_for_long(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(work, "NO_WORKERS", 1.0)
+    monkeypatch.setattr("calib.workers.cluster.NO_WORKERS", 1.0)
     alone = dask_cluster.running(tmp_path, workers=0)
     complaint = pytest.raises(CalibError, match="has had no workers for 1 s")
     with alone as cluster, workers(cluster.address) as crew, complaint:
@@ -168,7 +183,7 @@ def test_a_cluster_without_workers_is_not_waited_for_long(tmp_path: Path, monkey
 
 
 def test_where_nothing_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(work, "ANSWER", 1.0)
+    monkeypatch.setattr("calib.workers.cluster.ANSWER", 1.0)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         port = silent.getsockname()[1]
         for wrong in (f"tcp://127.0.0.1:{port}", "tcp://127.0.0.1:1", "tcp://127.0.0.1", "smoke://127.0.0.1:8786"):
@@ -192,11 +207,11 @@ def test_this_process_takes_one_task_at_a_time() -> None:
 SCRIPT = """
 import sys
 from pathlib import Path
-from calib import workers as work
+from calib.workers import processes, workers
 from worker_tasks import until_told
 if {guard}:
-    work.GRACE = 0.5
-    with work.workers(2) as crew:
+    processes.GRACE = 0.5
+    with workers(2) as crew:
         for result in crew.{run}(until_told, [Path(sys.argv[1])] * 9):
             print(result, flush=True)
 """

@@ -1,0 +1,106 @@
+"""Where parallel work runs: this process, local processes, or a Dask scheduler by its address.
+
+`Workers.completed` hands results back as they come, `Workers.map` in order; ``poses`` and ``trajectories`` take the
+latter as a plain callable. Functions, tasks and results must pickle. A task whose process dies is tried again, here or
+by the scheduler: it may therefore run twice, yet its result counts once. One lost for good is a `TaskLost`, and costs
+no other result. Few tasks are under way at once (one a process, or a thread of the cluster), so that millions may be
+asked for; each should take a tenth of a second or more.
+
+Processes are spawned, not forked, so that threads of numerical libraries do no harm; a script that uses them needs
+``if __name__ == "__main__"``. BLAS, OpenMP and numba get one thread in every worker: the tasks are what runs in
+parallel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, closing, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from calib.errors import TaskLost, UsageError
+from calib.workers.crew import Crew, Stream, streamed
+
+AHEAD = 256  # tasks that may be ahead of the one whose turn it is, where results are wanted in order (our choice)
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Run many tasks; made by `workers`.
+
+    Attributes:
+        here: they work in this process's current folder.
+    """
+
+    _stream: Stream
+    here: bool = True
+
+    def completed(self, function: Callable[[Any], Any], tasks: Iterable[Any]) -> Iterator[tuple[int, Any]]:
+        """Yield (number of the task, its result) as tasks complete; tasks are taken as they are needed.
+
+        The result of a task lost for good is a `TaskLost`, yielded as the others are. What a task raises is raised.
+        """
+        with closing(self._stream(function, ((task,) for task in tasks), lambda number: True)) as answers:
+            for number, result, error in answers:
+                if error is not None and not isinstance(error, TaskLost):
+                    raise error
+                yield number, result if error is None else error
+
+    def map(self, function: Callable, *items: Iterable[Any]) -> Iterator[Any]:
+        """Yield results in order, as the builtin does; after Ctrl-C what could still be had, then KeyboardInterrupt.
+
+        Raises:
+            TaskLost: in the place of a result that is lost for good.
+        """
+        return self._in_order(None, function, *items)
+
+    def map_without(self, lost: list[TaskLost]) -> Callable[..., Iterator[Any]]:
+        """Return a `map` for searches that take the best of what they get: tasks lost for good are noted in `lost`."""
+        return partial(self._in_order, lost)
+
+    def _in_order(self, lost: list[TaskLost] | None, function: Callable, *items: Iterable[Any]) -> Iterator[Any]:
+        early, turn = dict[int, tuple[Any, BaseException | None]](), 0
+        with closing(self._stream(function, zip(*items), lambda number: number < turn + AHEAD)) as answers:
+            try:
+                for number, result, error in answers:
+                    early[number] = result, error
+                    while turn in early:
+                        result, error = early.pop(turn)
+                        turn += 1
+                        if error is None:
+                            yield result
+                        elif lost is not None and isinstance(error, TaskLost):
+                            lost.append(error)
+                        else:
+                            raise error
+            except KeyboardInterrupt:
+                yield from (result for _, (result, error) in sorted(early.items()) if error is None)
+                raise
+
+
+@contextmanager
+def workers(where: str | int | None = None) -> Iterator[Workers]:
+    """Yield workers, and end them and what they still run when the block ends.
+
+    Args:
+        where: None, 1 or "1" for this process; a number of local processes; or the address of a Dask scheduler, e.g.
+            ``tcp://host:8786`` (needs the extra ``cluster``, and this toolkit on its workers).
+
+    Raises:
+        UsageError: for anything else, a scheduler that does not answer, or Dask missing.
+        CalibError: while tasks run: the scheduler went away, or has had no workers for a minute.
+    """
+    text = str(where if where is not None else 1)
+    if "://" not in text and (not text.isdigit() or int(text) < 1):
+        raise UsageError(f"workers '{where}': expected a number of processes or an address such as tcp://host:8786")
+    if text.isdigit() and int(text) == 1:
+        yield Workers(lambda function, tasks, near: ((n, function(*task), None) for n, task in enumerate(tasks)))
+        return
+    from calib.workers import cluster, processes
+
+    made: AbstractContextManager[Crew] = (
+        cluster.dask(text) if "://" in text else closing(processes.Processes(int(text)))
+    )
+    with made as crew:
+        yield Workers(partial(streamed, crew), here="://" not in text)

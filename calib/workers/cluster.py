@@ -1,0 +1,168 @@
+"""A Dask cluster that runs tasks; the only module that knows Dask."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import pickle
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from queue import Empty, SimpleQueue
+from threading import Lock
+from typing import Any
+
+from calib.errors import CalibError, UsageError
+from calib.workers.crew import THREADS, Answer, Died, run_call
+
+ANSWER = 10.0  # [s] that a Dask scheduler has to answer (our choice)
+NO_WORKERS = 60.0  # [s] without any worker at a scheduler (our choice)
+CLOSING = 3.0  # [s] for leaving it (our choice)
+
+
+class _Cluster:
+    """A Dask scheduler's workers: it tries lost tasks again itself, as often as it is configured to."""
+
+    attempts = 1
+
+    def __init__(self, address: str, client: Any) -> None:
+        self.address, self.client, self.done, self.busy = address, client, SimpleQueue[Any](), Lock()
+        self.under_way = dict[str, tuple[int, Any]]()
+        self.threads, self.asked, self.manned = 1, -1.0, time.monotonic()
+
+    def free(self) -> int:
+        return self._threads() - len(self.under_way)
+
+    def _threads(self) -> int:
+        """Return the threads of all workers, asked for once a second at most; 1 while there are none."""
+        now = time.monotonic()
+        if now > self.asked + 1.0:
+            threads = self._said(lambda: sum(self.client.nthreads(callback_timeout=ANSWER).values()))
+            self.threads, self.asked = max(1, threads), now
+            if threads:
+                self.manned = now
+            elif now > self.manned + NO_WORKERS:
+                raise CalibError(f"the Dask scheduler at {self.address} has had no workers for {NO_WORKERS:g} s")
+        return self.threads
+
+    def _said(self, ask: Callable[[], Any]) -> Any:
+        """Return what a scheduler that is there answers."""
+        error = None
+        try:
+            if self.client.status == "running":
+                return ask()
+        except Exception as found:  # one of many of Dask, Tornado and asyncio
+            error = found
+        raise CalibError(
+            f"the Dask scheduler at {self.address} is gone, with {len(self.under_way)} tasks under way; results that "
+            "were handed back are good"
+        ) from error
+
+    def pickled(self, call: tuple[Callable, tuple]) -> bytes:
+        return _cloudpickled(call)
+
+    def begin(self, number: int, call: bytes) -> None:
+        future = self._said(lambda: self.client.submit(_on_cluster, call, pure=False))
+        self.under_way[future.key] = number, future
+        future.add_done_callback(self.done.put)
+
+    def ended(self) -> Iterator[Answer]:
+        try:
+            future = self.done.get(timeout=1.0)
+        except Empty:
+            self._threads()
+            return
+        if future.key not in self.under_way:  # given up
+            return
+        if future.status == "cancelled":  # not by us: the connection was lost
+            self._said(future.result)
+        try:
+            result, raised = pickle.loads(future.result(timeout=NO_WORKERS))
+        except TimeoutError:  # its worker died with the result, and it is run again
+            self.done.put(future)
+            self._threads()
+            return
+        except Exception as error:
+            result, raised = None, self._failed(error)
+        yield self.under_way.pop(future.key)[0], result, raised
+
+    def _failed(self, error: Exception) -> Exception:
+        """Return what stands for the result where Dask, not the task, raised."""
+        from distributed import KilledWorker  # pyright: ignore[reportMissingImports]
+
+        if isinstance(error, KilledWorker):
+            return Died(f"it ended {error.allowed_failures + 1} of the cluster's workers, as many as may be")
+        self._said(lambda: None)
+        failed = CalibError(f"a Dask worker could not run its task: {error}; workers need this toolkit, same version")
+        failed.__cause__ = error
+        return failed
+
+    def settled(self) -> Iterator[Answer]:
+        with suppress(CalibError):
+            while not self.done.empty():
+                yield from self.ended()
+
+    def drop(self) -> None:
+        if self.under_way and self.client.status == "running":
+            with suppress(Exception):  # closing the client does the same
+                self.client.cancel([future for _, future in self.under_way.values()])
+        self.under_way.clear()
+
+
+def _cloudpickled(value: Any) -> bytes:
+    import cloudpickle  # comes with Dask; a script's own functions are not on the workers
+
+    return cloudpickle.dumps(value)
+
+
+def _on_cluster(call: bytes) -> bytes:
+    """Run on a Dask worker."""
+    return run_call(call, _use_one_thread, _cloudpickled)
+
+
+def _use_one_thread() -> None:
+    """Bound threads of libraries in a process that another one started: of those loaded, and of those to come."""
+    from threadpoolctl import threadpool_limits  # pyright: ignore[reportMissingImports]
+
+    numba = sys.modules.get("numba")
+    later = [name for name in THREADS if numba is None or "NUMBA" not in name]  # it refuses a change once it runs
+    os.environ.update(dict.fromkeys(later, "1"))
+    threadpool_limits(1)
+    if numba is not None:
+        numba.set_num_threads(1)
+
+
+async def _answers(address: str) -> None:
+    """Shake hands, in bounded time: a client waits for ever on a port that listens and says nothing."""
+    from distributed.comm.core import connect  # pyright: ignore[reportMissingImports]
+
+    try:
+        comm = await asyncio.wait_for(connect(address, timeout=ANSWER), ANSWER + 1.0)
+    except TimeoutError:
+        raise OSError(f"nothing that Dask would say came in {ANSWER:g} s") from None
+    await comm.close()
+
+
+@contextmanager
+def dask(address: str) -> Iterator[_Cluster]:
+    try:
+        from distributed import Client  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise UsageError("a Dask scheduler needs Dask: pip install 'armature-calib[cluster]'") from error
+    try:
+        with ThreadPoolExecutor(1) as aside:  # a notebook has a loop of its own
+            aside.submit(asyncio.run, _answers(address)).result()
+        client: Any = Client(address, timeout=ANSWER, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise UsageError(f"no Dask scheduler answers at {address}: {error}") from error
+    log = logging.getLogger("distributed.client")
+    before = log.level
+    log.setLevel(logging.CRITICAL)  # what goes wrong is said here, once
+    try:
+        yield _Cluster(address, client)
+    finally:
+        client.close(timeout=CLOSING)
+        log.setLevel(before)

@@ -1,0 +1,180 @@
+"""Local processes that run tasks: spawned, one task each, so that who dies takes one task along."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+from multiprocessing import connection, get_context, parent_process, resource_tracker
+from threading import Lock, Thread
+from typing import Any
+
+from calib.errors import CalibError
+from calib.workers.crew import THREADS, Answer, Died, NotBegun, run_call
+
+GRACE = 3.0  # [s] that tasks have to hand back what they found after Ctrl-C (our choice)
+ATTEMPTS = 3  # processes that a task may take along before it is given up (our choice)
+
+
+class _Process:
+    """A spawned process that runs one task at a time: where it dies, it is known with which."""
+
+    def __init__(self) -> None:
+        context = get_context("spawn")
+        self.pipe, self.theirs = context.Pipe()
+        self.process = context.Process(target=_serve, args=(self.theirs,))
+        self.ready, self.number, self.call = False, -1, b""
+
+    def start(self) -> None:
+        resource_tracker.ensure_running()  # else the process's start does, and lets Ctrl-C through
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # inherited until `_serve` can deal with it
+        try:
+            with _one_thread_to_inherit():
+                self.process.start()
+        finally:
+            self.theirs.close()
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+    def run(self, number: int, call: bytes) -> None:
+        self.number, self.call = number, call
+        if self.ready:
+            self.send()
+
+    def send(self) -> None:
+        with suppress(OSError):  # it died: the pipe's end says so
+            self.pipe.send_bytes(self.call)
+        self.call = b""
+
+    def interrupt(self) -> None:
+        if self.process.is_alive() and self.process.pid is not None:
+            os.kill(self.process.pid, signal.SIGINT)
+
+
+class Processes:
+    """Local processes, started when there are tasks for them."""
+
+    attempts = ATTEMPTS
+
+    def __init__(self, count: int) -> None:
+        self.count, self.stillborn, self.stopping, self.busy = count, 0, False, Lock()
+        self.all, self.idle, self.working = list[_Process](), list[_Process](), dict[Any, _Process]()
+
+    def free(self) -> int:
+        return self.count - len(self.working)
+
+    def pickled(self, call: tuple[Callable, tuple]) -> bytes:
+        return pickle.dumps(call)
+
+    def begin(self, number: int, call: bytes) -> None:
+        self.idle = [process for process in self.idle if process.process.is_alive()]
+        if self.idle:
+            process = self.idle.pop()
+        else:
+            self.all.append(process := _Process())
+            process.start()
+        self.working[process.pipe] = process
+        process.run(number, call)
+
+    def ended(self, timeout: float | None = None) -> Iterator[Answer]:
+        for pipe in connection.wait(list(self.working), timeout):
+            process = self.working[pipe]
+            try:
+                answer = process.pipe.recv_bytes()
+            except (EOFError, OSError):
+                yield process.number, None, self._died(process)
+                continue
+            starting, process.ready = not process.ready, True
+            if starting and not self.stopping:
+                self.stillborn = 0
+                process.send()
+                continue
+            self.idle.append(self.working.pop(pipe))
+            if not starting:
+                yield process.number, *pickle.loads(answer)
+
+    def _died(self, process: _Process) -> Exception:
+        del self.working[process.pipe]
+        process.pipe.close()
+        process.process.join(GRACE)
+        code = process.process.exitcode
+        how = f"signal {-code}" if code and code < 0 else f"exit code {code}"
+        if process.ready:
+            return Died(f"{self.attempts} processes died of it, the last by {how}")
+        self.stillborn += 1
+        if self.stillborn < ATTEMPTS or self.stopping:
+            return NotBegun()
+        raise CalibError(
+            f"worker processes end as they start ({how}): memory ran out, or a script that uses them lacks "
+            'if __name__ == "__main__"'
+        )
+
+    def settled(self) -> Iterator[Answer]:
+        """Return what tasks hand back that Ctrl-C ended; where only this process got it, pass it on."""
+        self.stopping = True
+        for patience in (GRACE, 2 * GRACE):
+            until = time.monotonic() + patience
+            while self.working and (left := until - time.monotonic()) > 0:
+                yield from self.ended(left)
+            for process in self.working.values():
+                process.interrupt()
+
+    def drop(self) -> None:
+        for process in self.working.values():
+            process.interrupt()
+            process.pipe.close()
+        self.working.clear()
+        self.stopping = False
+
+    def close(self) -> None:
+        started = [process.process for process in self.all if process.process.pid is not None]
+        try:
+            self.drop()
+            for process in self.all:
+                process.pipe.close()  # this ends one that waits
+            until = time.monotonic() + GRACE
+            for process in started:
+                process.join(max(0.0, until - time.monotonic()))
+        finally:
+            for process in started:
+                process.kill()
+                process.join()
+
+
+@contextmanager
+def _one_thread_to_inherit() -> Iterator[None]:
+    """Let processes started meanwhile bound their threads: the libraries read these when they are loaded."""
+    before = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            del os.environ[name]
+            if value is not None:
+                os.environ[name] = value
+
+
+def _serve(pipe: connection.Connection) -> None:
+    """Run in a process: answer calls until the other end is closed. Only while a task runs, Ctrl-C is heard."""
+    hear = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
+    Thread(target=_end_with_parent, daemon=True).start()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
+    with suppress(EOFError, OSError):
+        pipe.send_bytes(b"ready")
+        while True:
+            try:
+                answer = run_call(pipe.recv_bytes(), hear, pickle.dumps)
+            finally:
+                signal.signal(signal.SIGINT, signal.SIG_IGN)
+            pipe.send_bytes(answer)
+
+
+def _end_with_parent() -> None:
+    if parent := parent_process():
+        parent.join()
+        os._exit(1)
