@@ -142,6 +142,15 @@ def test_in_order_a_lost_task_is_raised_in_its_place() -> None:
     assert [one.number for one in lost] == [1]
 
 
+def test_a_search_that_loses_every_task_says_so() -> None:
+    def stream(function: Callable, tasks: Iterable[tuple], near: Callable[[int], bool]) -> Generator:
+        yield from ((number, None, TaskLost(f"task {number + 1} is lost")) for number, _ in enumerate(tasks))
+
+    with pytest.raises(TaskLost, match="task 3"):
+        list(Workers(stream).map_without([])(square, range(3)))
+    assert list(Workers(stream).map_without([])(square, [])) == []
+
+
 def test_a_cluster_loses_workers_and_no_result(tmp_path: Path) -> None:
     """Of two workers one is killed in the middle; then a task kills whoever runs it, twice; then the scheduler goes."""
     with dask_cluster.running(tmp_path, workers=2, failures=1) as cluster, workers(cluster.address) as crew:

@@ -112,17 +112,18 @@ def select(
 
     targets = [numbers(text, 3, "--tool") for text in tool or []]
     sigmas = None if sigma is None else numbers(sigma, 2, "--sigma")
+    lost = []
     with work.workers(workers) as crew, progress() as say:
         chosen = selection.choose(
             robot, m, kind=kind, tools=targets, index=index, method=method, constraints=constraints, existing=existing,
             candidates=candidates, sigmas=(sigmas[0], sigmas[1]) if sigmas else None, base=base, tip=tip, seed=seed,
-            map=crew.map, progress=lambda done, total, what: say(f"{what} ({done} of {total})"),
+            map=crew.map_without(lost), progress=lambda done, total, what: say(f"{what} ({done} of {total})"),
         )  # fmt: skip
     selection.write(chosen, out)
     console = make_console()
     for words, number in selection.table(chosen):
         console.print(f"{words:38} {number}", soft_wrap=True, markup=False)
-    for note in chosen.notes:
+    for note in (*chosen.notes, *lost):
         console.print(f"note: {note}", soft_wrap=True, markup=False)
     console.print(f"{m} poses written to {out}", soft_wrap=True, markup=False)
 

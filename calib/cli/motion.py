@@ -51,18 +51,21 @@ def excite(
 
     design_folder.check_target(out)
     stands = None if start is None else numbers(start, start.count(",") + 1, "--start")
+    lost = []
     with work.workers(workers) as crew, progress() as say:
         designed = design.excite(
             robot, model=model, limits=limits, goals=goal or [], hard=hard or [], period=period, harmonics=harmonics,
             family=family, drives_=drives, rate=rate, starts=starts, evaluations=evaluations, front=front, start=stands,
             repeat=repeat, slower=slower, existing=existing or [], lock=lock or [], base=base, tip=tip, seed=seed,
-            map=crew.map, progress=say,
+            map=crew.map_without(lost), progress=say,
         )  # fmt: skip
         say("writing")
         design_folder.write_folder(designed, out, motion_figures.write_design)
     console = make_console()
     for line in design_folder.lines(designed):
         console.print(line, soft_wrap=True, markup=False)
+    for note in lost:
+        console.print(f"note: {note}", soft_wrap=True, markup=False)
     console.print(f"written to {out}", soft_wrap=True, markup=False)
 
 

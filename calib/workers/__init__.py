@@ -56,11 +56,14 @@ class Workers:
         return self._in_order(None, function, *items)
 
     def map_without(self, lost: list[TaskLost]) -> Callable[..., Iterator[Any]]:
-        """Return a `map` for searches that take the best of what they get: tasks lost for good are noted in `lost`."""
+        """Return a `map` for searches that take the best of what they get: tasks lost for good are noted in `lost`.
+
+        Where all are lost, it raises the last `TaskLost`.
+        """
         return partial(self._in_order, lost)
 
     def _in_order(self, lost: list[TaskLost] | None, function: Callable, *items: Iterable[Any]) -> Iterator[Any]:
-        early, turn = dict[int, tuple[Any, BaseException | None]](), 0
+        early, turn, missing = dict[int, tuple[Any, BaseException | None]](), 0, 0
         with closing(self._stream(function, zip(*items), lambda number: number < turn + AHEAD)) as answers:
             try:
                 for number, result, error in answers:
@@ -72,11 +75,14 @@ class Workers:
                             yield result
                         elif lost is not None and isinstance(error, TaskLost):
                             lost.append(error)
+                            missing += 1
                         else:
                             raise error
             except KeyboardInterrupt:
                 yield from (result for _, (result, error) in sorted(early.items()) if error is None)
                 raise
+        if lost and missing == turn > 0:
+            raise lost[-1]
 
 
 @contextmanager
