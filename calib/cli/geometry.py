@@ -54,7 +54,9 @@ def fit(
     from calib.procedure.kinematic_stage import fit as fitting
     from calib.procedure.kinematic_stage import folder as outputs
     from calib.procedure.kinematic_stage import inputs
-    from calib.procedure.report import fit_certificate, fit_console
+    from calib.procedure.report import console as shown
+    from calib.procedure.report import fit_certificate, geometry_section
+    from calib.procedure.report.fit_report import fit_metrics
 
     if model not in (None, "auto", *MODELS):
         raise UsageError(f"--model {model}: expected auto, {', '.join(MODELS)}")
@@ -68,7 +70,7 @@ def fit(
     )  # fmt: skip
     outputs.check_target(out, found.source)
     console = make_console()
-    for line in fit_console.read_lines(found):
+    for line in shown.rendered(geometry_section.read_blocks(found)):
         console.print(line, soft_wrap=True)
     with progress() as say:
         outcome = fitting.run(
@@ -77,7 +79,7 @@ def fit(
         )  # fmt: skip
         say("writing")
         outputs.write_folder(outcome, out, fit_certificate.write)
-    for line in fit_console.outcome_lines(outcome):
+    for line in shown.section(geometry_section.outcome_section(fit_metrics(outcome))):
         console.print(line, soft_wrap=True)
     console.print(f"written to {out}", soft_wrap=True, markup=False)
     if outcome.verdict.level == "fail":

@@ -108,6 +108,19 @@ def statistics(sizes: np.ndarray | None, factor: float = 1.0) -> dict[str, float
     }
 
 
+def rms_sigma(sizes: np.ndarray) -> float:
+    """Return the standard error of the rms of independent sizes: sd(e²) / (2 rms sqrt(N)), by the delta method.
+
+    Args:
+        sizes: (N,), N > 1.
+
+    Returns:
+        In the sizes' unit; NaN for fewer than two sizes.
+    """
+    rms = float(np.sqrt(np.mean(np.square(sizes)))) if len(sizes) > 1 else 0.0
+    return float(np.std(np.square(sizes), ddof=1) / (2.0 * rms * np.sqrt(len(sizes)))) if rms > 0.0 else np.nan
+
+
 def pair_errors(
     cell: Installation,
     measured: Sequence[PoseMeasurements],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from calib.data.poses.measurements import PoseMeasurements
 from calib.geometry.accuracy import Torques
 from calib.geometry.checks.repeatability import SAME, Repeats, repeats
 from calib.geometry.installation import Installation
+from calib.procedure.kinematic_stage.metrics import RepeatedPoses
 
 POSES, CYCLES, ENOUGH = 5, 30, 100  # what the norm asks for; how many poses makers judge accuracy by
 ARMS = ("nominal", "calibrated")
@@ -68,15 +69,16 @@ def _pose(k: int, one: Repeats, two: Repeats) -> dict[str, Any]:
     return entry if np.isnan(one.variation[k]) else entry | {"multidirectional_mm": 1e3 * one.variation[k]}
 
 
-def sentence(found: Mapping[str, Any]) -> str:
-    """Say in a sentence what repeated poses tell."""
-    least, most = found["cycles"]
+def sentence(found: RepeatedPoses) -> str:
+    """Return in a sentence what repeated poses tell."""
+    least, most = found.cycles
     cycles = f"{least}" if least == most else f"{least} to {most}"
-    before, after = (found["accuracy_mm"][arm]["mean"] for arm in ARMS)
+    accuracy, repeatability = found.accuracy_mm, found.repeatability_mm
     words = (
-        f"ISO 9283 on {found['poses']} poses repeated {cycles} times: RP {found['repeatability_mm']['mean']:.3f} mm "
-        f"(at most {found['repeatability_mm']['max']:.3f}), AP {before:.3f} mm nominal, {after:.3f} mm calibrated"
+        f"ISO 9283 on {found.poses} poses repeated {cycles} times: RP {repeatability.mean:.3f} mm "
+        f"(at most {repeatability.max:.3f}), AP {accuracy.nominal.mean:.3f} mm nominal, "
+        f"{accuracy.calibrated.mean:.3f} mm calibrated"
     )
-    few = [f"{POSES} poses"] * (found["poses"] < POSES) + [f"{CYCLES} cycles"] * (least < CYCLES)
+    few = [f"{POSES} poses"] * (found.poses < POSES) + [f"{CYCLES} cycles"] * (least < CYCLES)
     words += f"; the norm asks for {' and '.join(few)}" if few else ""
-    return words + (f"; too few poses to state an accuracy (makers take {ENOUGH})" if found["poses"] < ENOUGH else "")
+    return words + (f"; too few poses to state an accuracy (makers take {ENOUGH})" if found.poses < ENOUGH else "")

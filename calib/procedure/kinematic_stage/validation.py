@@ -57,7 +57,7 @@ class Comparison:
     def table(self) -> dict[str, object]:
         """Return the comparison as ``metrics.json`` holds it."""
         arms = ("nominal", "calibrated")
-        result: dict[str, object] = {"poses": self.poses, "frames": self.frames}
+        result: dict[str, object] = {"poses": self.poses, "frames": self.frames, "unseen": self.proves}
         result |= {arm: summary(found) for arm, found in zip(arms, self.errors)}
         if self.alone is not None:
             result["urdf_alone"] = summary(self.alone)

@@ -15,7 +15,7 @@ from calib.errors import UsageError
 from calib.procedure.dynamic_stage.validation import SCHEMA
 from calib.procedure.excitation import coefficients
 from calib.procedure.report import dynamics_figures, uncertainty_figures
-from calib.procedure.report.page import Block, Pictures, Stage, Table, Text
+from calib.procedure.report.page import Block, KeyFigure, Picture, Pictures, Section, Table, Text
 from calib.procedure.report.style import svg
 
 TOLD = 50.0  # RSD [%] from which on a parameter is not told from zero: two sigmas
@@ -60,7 +60,7 @@ def read(folder: Path) -> DynamicReport:
     return DynamicReport(unseen["verdict"], unseen["reason"], metrics, estimate, unseen)
 
 
-def dynamics_stage(found: DynamicReport, folder: Path, excitation: Path, exported: Sequence[str] = ()) -> Stage:
+def dynamics_stage(found: DynamicReport, folder: Path, excitation: Path, exported: Sequence[str] = ()) -> Section:
     """Return the stage of the dynamics: errors on unseen motion, torques, excitation, parameters, what is not told.
 
     Args:
@@ -73,7 +73,9 @@ def dynamics_stage(found: DynamicReport, folder: Path, excitation: Path, exporte
         figure = dynamics_figures.torques(curves, found.unseen["rows"], found.unseen["units"])
         seen = "unseen" if found.unseen["validation"] else "fitted"
         words = f"Torques on {curves['name']}, {seen}: measured, predicted, and what is left."
-        blocks.append(Pictures("Torques" if number == 0 else "", [(svg(figure, f"torques{number}"), words, True)]))
+        blocks.append(
+            Pictures("Torques" if number == 0 else "", [Picture(svg(figure, f"torques{number}"), words, True)])
+        )
     blocks += planned(excitation)
     if len(found.metrics["ladder"]) > 1:
         blocks.append(friction_table(found))
@@ -85,7 +87,7 @@ def dynamics_stage(found: DynamicReport, folder: Path, excitation: Path, exporte
     notes = [*found.metrics["warnings"], *(w for w in found.unseen["warnings"] if w not in found.metrics["warnings"])]
     if notes:
         blocks.append(Text("Notes on the dynamics", notes))
-    return Stage("Dynamics", found.verdict, found.reason, key_figures(found), blocks)
+    return Section("Dynamics", blocks, found.verdict, found.reason, key_figures(found))
 
 
 def proof_of(found: DynamicReport) -> tuple[Mapping[str, Any], str]:
@@ -96,18 +98,16 @@ def proof_of(found: DynamicReport) -> tuple[Mapping[str, Any], str]:
     return max(sets.values(), key=lambda one: one["raw"]["relative_error_percent"]["total"] or 0.0), where
 
 
-def key_figures(found: DynamicReport) -> list[tuple[str, str, str]]:
+def key_figures(found: DynamicReport) -> list[KeyFigure]:
     """Return four numbers for the head of the stage: label, value, remark."""
     proof, where = proof_of(found)
     raw, band = proof["raw"]["relative_error_percent"], proof["filtered"]["relative_error_percent"]
-    rows = [(x, name, y) for x, name, y in zip(band["joints"], found.unseen["rows"], raw["joints"]) if x is not None]
-    worst, name, recorded = max(rows, default=(None, "torque", None))
-    condition, counts = found.metrics["condition_number"], found.metrics["parameters"]
+    rows = [(x, name) for x, name in zip(band["joints"], found.unseen["rows"]) if x is not None]
+    worst, name = max(rows, default=(None, "torque"))
     return [
-        (f"torque unexplained on {where}", percent(raw["total"]), f"{percent(band['total'])} below the motion's band"),
-        (f"worst: {name}, in band", percent(worst), f"{percent(recorded)} as recorded"),
-        ("parameters identified", str(counts["base"]), f"{counts['essential']} essential"),
-        ("condition number", f"{condition['normalised']:.3g}", f"unit columns; {condition['raw']:.3g} raw"),
+        KeyFigure("torque unexplained", "", percent(raw["total"]), "", where),
+        KeyFigure("torque unexplained, in the motion's band", "", percent(band["total"]), "", where),
+        KeyFigure(f"the same, worst joint ({name})", "", percent(worst), "", where),
     ]
 
 
@@ -147,7 +147,7 @@ def error_table(found: DynamicReport) -> Table:
     return Table("Torque errors", header, rows, note, frozenset(strong), range(2, 7))
 
 
-def judged_figures(found: DynamicReport) -> list[tuple[str, str, bool]]:
+def judged_figures(found: DynamicReport) -> list[Picture]:
     """Return errors by row and autocorrelations of the recording that judges."""
     proof, where = proof_of(found)
     own = next(iter(found.unseen["fit"].values()))
@@ -159,12 +159,14 @@ def judged_figures(found: DynamicReport) -> list[tuple[str, str, bool]]:
     many = len(rows) > dynamics_figures.FEW
     drawn = dynamics_figures.whiteness(white["values"], white["bound"], rows)
     return [
-        (
+        Picture(
             svg(bars, "errors"),
             f"Share of each torque that the model leaves, on the training motion and on {where}.",
             many,
         ),
-        (svg(drawn, "white"), f"Autocorrelation of what is left below the band on {name}; dashed: white noise.", many),
+        Picture(
+            svg(drawn, "white"), f"Autocorrelation of what is left below the band on {name}; dashed: white noise.", many
+        ),
     ]
 
 
@@ -186,14 +188,14 @@ def planned(excitation: Path) -> list[Block]:
     )
     names = [f"joint {j + 1}" for j in range(q.shape[1])]
     figure = dynamics_figures.motion(t, q, v, names, ["rad"] * len(names))
-    return [Pictures("Excitation", [(svg(figure, "motion"), words, True)])]
+    return [Pictures("Excitation", [Picture(svg(figure, "motion"), words, True)])]
 
 
 def consistency(folder: Path) -> list[Block]:
     """Return what the geometry's uncertainty does to the dynamics: figures of `consistency_figures`, if there are "
     "any."""
     drawn = uncertainty_figures.from_folder(folder)
-    items = [(svg(one.figure, f"consistency-{name}"), one.caption, one.wide) for name, one in drawn.items()]
+    items = [Picture(svg(one.figure, f"consistency-{name}"), one.caption, one.wide) for name, one in drawn.items()]
     return [Pictures("Geometry and dynamics", items)] if items else []
 
 
@@ -240,7 +242,7 @@ def identifiability(found: DynamicReport) -> list[str]:
     return lines
 
 
-def significance(found: DynamicReport) -> tuple[str, str, bool]:
+def significance(found: DynamicReport) -> Picture:
     """Return the figure of parameters over their sigma."""
     names = [row["name"] for row in found.estimate]
     values, sigma = (np.array([float(row[key] or "nan") for row in found.estimate]) for key in ("value", "sigma"))
@@ -248,7 +250,7 @@ def significance(found: DynamicReport) -> tuple[str, str, bool]:
     shown = [name for name, use in zip(names, known) if use]
     figure = dynamics_figures.significance(shown, values[known], sigma[known])
     words = "How far each parameter is from zero, in its σ; grey, below the dashed line: not told from zero."
-    return svg(figure, "significance"), words, True
+    return Picture(svg(figure, "significance"), words, True)
 
 
 def parameter_table(found: DynamicReport) -> Table:

@@ -2,21 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from collections.abc import Mapping
 from pathlib import Path
 
 from calib import files
 from calib.procedure.kinematic_stage.fit import Outcome
-from calib.procedure.report import figures, page
-from calib.procedure.report.fit_report import collect
+from calib.procedure.report import certificate, figures, fit_report, geometry_section, html
+from calib.procedure.report.fit_report import Report
+from calib.procedure.report.page import Page
 from calib.procedure.report.style import save
 
 
 def write(outcome: Outcome, folder: Path) -> None:
     """Write ``report.json``, the figures, and a certificate of the fit alone into a fit's folder."""
-    report = collect(outcome)
-    files.write_json(folder / "report.json", asdict(report))
+    report = fit_report.collect(outcome)
+    fit_report.write(report, folder)
     drawn = figures.draw(report)
     for name, figure in drawn.items():
         save(figure.figure, folder / f"plot_{name}.png")
-    files.write(folder / "certificate.html", page.render(page.of_fit(report, drawn)))
+    files.write(folder / "certificate.html", html.render(of_fit(report, drawn)))
+
+
+def of_fit(report: Report, drawn: Mapping[str, figures.Drawn]) -> Page:
+    """Return the certificate of a fit alone, without a session around it."""
+    given = (
+        ("robot", f"{report.robot}, {report.base} to {report.tip}, {len(report.joints)} joints"),
+        ("model", report.metrics.model),
+        ("tolerance", certificate.tolerance(report.metrics.tolerance_mm)),
+        ("seed", str(report.metrics.seed)),
+        ("toolkit", certificate.versions()),
+    )
+    section = geometry_section.certificate_section(report, drawn)
+    return certificate.certificate(f"Calibration of {report.robot}", "Geometry", given, [section])

@@ -1,19 +1,16 @@
-"""What a certificate is made from: plain numbers beside the fit's own files, so that it can be printed again any day.
-
-`write` fits the place `plots` of `calib.procedure.kinematic_stage.folder.write_folder`: it leaves ``report.json`` and
-``plot_*.png``.
-"""
+"""What a certificate of a fit is made from: plain numbers in ``report.json``, so that it can be printed again later."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from calib import files
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import UsageError
 from calib.estimation.estimate import strong_correlations
@@ -21,12 +18,64 @@ from calib.geometry.observation import has_instrument, predict, prepare
 from calib.geometry.parameters import layout
 from calib.procedure.kinematic_stage.fit import Outcome, judged
 from calib.procedure.kinematic_stage.folder import metrics
+from calib.procedure.kinematic_stage.metrics import FitMetrics, ValidationMetrics
 from calib.procedure.kinematic_stage.tables import estimate_table
 from calib.procedure.kinematic_stage.validation import Comparison
+from calib.records import read_record
 from calib.transforms import invert
 
 SCHEMA = 1
+NAME = "report.json"
 NATURES = ("position", "orientation", "distance")
+
+
+class FittedParameter(NamedTuple):
+    """One parameter of the fit; `rsd` in percent, `group` arm, station, tool or deflection."""
+
+    name: str
+    unit: str
+    nominal: float
+    value: float
+    sigma: float
+    rsd: float | None
+    group: str
+
+
+class CorrelatedPair(NamedTuple):
+    """Two parameters that go together."""
+
+    first: str
+    second: str
+    correlation: float
+
+
+@dataclass(frozen=True)
+class CorrelationMatrix:
+    """Of those parameters that go together most."""
+
+    names: tuple[str, ...]
+    matrix: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True)
+class RowErrors:
+    """Sizes of errors on one set of rows.
+
+    Attributes:
+        name: of the set; ``fit``, or a validation file's.
+        unseen: whether the fit had not seen them.
+        poses: how many robot poses.
+        nominal, calibrated: by nature, the errors of that arm [m, rad].
+        q: (rows, n) joints, and points (rows, 3) in the arm's base, where there is one error per row.
+    """
+
+    name: str
+    unseen: bool
+    poses: int
+    nominal: Mapping[str, tuple[float, ...]]
+    calibrated: Mapping[str, tuple[float, ...]]
+    q: tuple[tuple[float, ...], ...] = ()
+    points: tuple[tuple[float, ...], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -37,13 +86,12 @@ class Report:
         robot: its name; base and tip links.
         joints: names; ``prismatic`` says which slide.
         metrics: as in ``metrics.json``.
-        parameters: name, unit, nominal, value, sigma, RSD [%] or None, and group (arm, station, tool, deflection).
+        parameters: all that were fitted.
         kept: arm parameters that stayed at their nominal.
-        correlations: pairs that go together, and their correlation.
-        correlated: names and correlation matrix of those parameters.
+        correlations: pairs that go together.
+        correlated: the parameters that go together most.
         singular_values: of the scaled observation matrix; `rank` of them are kept.
-        sets: per set of rows: name, unseen, poses, errors of both arms by nature [m, rad], and where there is one error
-            per row q (rows, n) and points (rows, 3) in the arm's base.
+        sets: errors per set of rows.
         noise: what the stated sigmas alone give, rms by nature [m, rad]; None where none were stated.
         judged: what `calib.procedure.kinematic_stage.verdict.judge` needs besides the errors.
         said: warnings that the fit alone gives, whatever the unseen rows are.
@@ -53,19 +101,24 @@ class Report:
     robot: str
     base: str
     tip: str
-    joints: list[str]
-    prismatic: list[bool]
-    metrics: dict[str, Any]
-    parameters: list[list[Any]]
-    kept: list[str]
-    correlations: list[list[Any]]
-    correlated: dict[str, Any]
-    singular_values: list[float]
+    joints: tuple[str, ...]
+    prismatic: tuple[bool, ...]
+    metrics: FitMetrics
+    parameters: tuple[FittedParameter, ...]
+    kept: tuple[str, ...]
+    correlations: tuple[CorrelatedPair, ...]
+    correlated: CorrelationMatrix
+    singular_values: tuple[float, ...]
     rank: int
-    sets: list[dict[str, Any]]
-    noise: dict[str, float | None]
-    judged: dict[str, Any]
-    said: list[str] = field(default_factory=list)
+    sets: tuple[RowErrors, ...]
+    noise: Mapping[str, float | None]
+    judged: Mapping[str, Any] = field(default_factory=dict)
+    said: tuple[str, ...] = ()
+
+
+def fit_metrics(outcome: Outcome) -> FitMetrics:
+    """Return the metrics of a fit as values."""
+    return read_record(FitMetrics, metrics(outcome), "metrics")
 
 
 def collect(outcome: Outcome) -> Report:
@@ -76,45 +129,47 @@ def collect(outcome: Outcome) -> Report:
     fitted = set(table.names)
     sets = [rows_of("fit", outcome.fit, False)]
     sets += [rows_of(name, found, found.proves) for name, found in outcome.validation.items()]
-    strong, matrix = _correlated(table.names, table.covariance)
     values = [] if fit.split is None else fit.split.singular_values.tolist()
     return Report(
         schema=SCHEMA,
         robot=chain.name,
         base=chain.base,
         tip=chain.tip,
-        joints=list(chain.joint_names),
-        prismatic=[joint.kind == "prismatic" for joint in chain.joints],
-        metrics=metrics(outcome),
-        parameters=[[*row, groups[row[0]]] for row in table.rows()],
-        kept=[name for name in chain.names if name not in fitted],
-        correlations=[list(pair) for pair in strong_correlations(fit.estimate, 0.9)],
-        correlated={"names": strong, "matrix": matrix},
-        singular_values=values,
+        joints=tuple(chain.joint_names),
+        prismatic=tuple(joint.kind == "prismatic" for joint in chain.joints),
+        metrics=fit_metrics(outcome),
+        parameters=tuple(FittedParameter(*row, groups[row[0]]) for row in table.rows()),
+        kept=tuple(name for name in chain.names if name not in fitted),
+        correlations=tuple(CorrelatedPair(*pair) for pair in strong_correlations(fit.estimate, 0.9)),
+        correlated=_correlated(table.names, table.covariance),
+        singular_values=tuple(values),
         rank=len(values) if fit.split is None else fit.split.rank,
-        sets=sets,
+        sets=tuple(sets),
         noise=_noise(outcome.fit.blocks),
         judged=judged(outcome.inputs, outcome.climb, outcome.outliers),
-        said=list(outcome.said),
+        said=tuple(outcome.said),
     )
 
 
-def rows_of(name: str, comparison: Comparison, unseen: bool) -> dict[str, Any]:
+def rows_of(name: str, comparison: Comparison, unseen: bool) -> RowErrors:
     """Return one set of rows: sizes of errors, and where they were measured if there is one error per row."""
-    entry: dict[str, Any] = {"name": name, "unseen": unseen, "poses": comparison.poses}
-    for arm, found in zip(("nominal", "calibrated"), comparison.errors):
-        sizes = ((nature, getattr(found, nature)) for nature in NATURES)
-        entry[arm] = {nature: _plain(size) for nature, size in sizes if size is not None}
+    nominal, calibrated = (
+        {nature: _plain(size) for nature in NATURES if (size := getattr(found, nature)) is not None}
+        for found in comparison.errors
+    )
     q = np.concatenate([block.q for block in comparison.blocks])
-    if len(comparison.errors[1].main) == len(q):
-        entry |= {"q": _plain(q), "points": _plain(_points(comparison))}
-    return entry
+    rows = RowErrors(name, unseen, comparison.poses, nominal, calibrated)
+    if len(comparison.errors[1].main) != len(q):
+        return rows
+    return replace(rows, q=_plain(q), points=_plain(_points(comparison)))
 
 
-def with_unseen(report: Report, metrics: Mapping[str, Any], sets: Sequence[Mapping[str, Any]]) -> Report:
+def with_unseen(report: Report, found: ValidationMetrics, sets: Sequence[RowErrors]) -> Report:
     """Return a fit's report with rows it has not seen (`rows_of`), and verdict, reason and warnings that follow."""
-    merged = {key: metrics[key] for key in ("validation", "verdict", "reason", "warnings")}
-    return replace(report, metrics=report.metrics | merged, sets=[*report.sets, *map(dict, sets)])
+    metrics = replace(
+        report.metrics, validation=found.validation, verdict=found.verdict, reason=found.reason, warnings=found.warnings
+    )
+    return replace(report, metrics=metrics, sets=(*report.sets, *sets))
 
 
 def _points(comparison: Comparison) -> np.ndarray:
@@ -128,13 +183,13 @@ def _points(comparison: Comparison) -> np.ndarray:
     return np.concatenate(points)
 
 
-def _correlated(names: Sequence[str], covariance: np.ndarray, most: int = 12) -> tuple[list[str], list[list[float]]]:
+def _correlated(names: Sequence[str], covariance: np.ndarray, most: int = 12) -> CorrelationMatrix:
     """Return those parameters that go together most, and their correlation matrix."""
     sigma = np.sqrt(np.clip(np.diag(covariance), 1e-300, None))
     matrix = covariance / np.outer(sigma, sigma)
     off = np.abs(matrix - np.diag(np.diag(matrix))).max(axis=1, initial=0.0)
     chosen = np.sort(np.argsort(-off, kind="stable")[:most])
-    return [str(names[k]) for k in chosen], _plain(matrix[np.ix_(chosen, chosen)])
+    return CorrelationMatrix(tuple(str(names[k]) for k in chosen), _plain(matrix[np.ix_(chosen, chosen)]))
 
 
 def _noise(blocks: Sequence[PoseMeasurements]) -> dict[str, float | None]:
@@ -146,10 +201,15 @@ def _noise(blocks: Sequence[PoseMeasurements]) -> dict[str, float | None]:
     return result
 
 
-def _plain(values: np.ndarray) -> Any:
-    """Return numbers with seven digits, which is more than any figure shows."""
-    rounded = np.array([float(f"{value:.7g}") for value in np.ravel(values)])
-    return rounded.reshape(np.shape(values)).tolist()
+def _plain(values: np.ndarray) -> tuple[Any, ...]:
+    """Return numbers with seven digits, which is more than any figure shows, in tuples."""
+    rounded = np.array([float(f"{value:.7g}") for value in np.ravel(values)]).reshape(np.shape(values))
+    return tuple(rounded.tolist()) if rounded.ndim == 1 else tuple(map(tuple, rounded.tolist()))
+
+
+def write(report: Report, folder: Path) -> None:
+    """Write ``report.json`` into a folder."""
+    files.write_json(folder / NAME, asdict(report))
 
 
 def read(folder: Path) -> Report:
@@ -158,11 +218,11 @@ def read(folder: Path) -> Report:
     Raises:
         UsageError: where it is missing or made by another version.
     """
-    path = Path(folder) / "report.json"
+    path = Path(folder) / NAME
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
+        if content.get("schema") != SCHEMA:
+            raise UsageError(f"{path}: schema {content.get('schema')}, this version reads {SCHEMA}; fit again")
+        return read_record(Report, content)
     except (OSError, ValueError) as error:
         raise UsageError(f"{path}: {error}; fit again") from error
-    if content.get("schema") != SCHEMA:
-        raise UsageError(f"{path}: schema {content.get('schema')}, this version reads {SCHEMA}; fit again")
-    return Report(**content)

@@ -16,7 +16,7 @@ from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.identify import IdentificationInputs, IdentificationOutcome
 from calib.procedure.dynamic_stage.loop_tables import loop_lines
 from calib.procedure.dynamic_stage.tracking import tracking_lines
-from calib.procedure.report.fit_console import COLOURS
+from calib.procedure.report.console import COLOURS
 
 
 def read_lines(inputs: IdentificationInputs) -> Iterator[RenderableType]:

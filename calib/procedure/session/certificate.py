@@ -7,14 +7,16 @@ from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 from calib import files
-from calib.procedure.report import fit_report, viewer
-from calib.procedure.report import page as certificate
+from calib.procedure.kinematic_stage.metrics import ValidationMetrics
+from calib.procedure.report import certificate, fit_report, html, viewer
+from calib.procedure.report.fit_report import RowErrors
+from calib.procedure.report.page import Section, Text
 from calib.procedure.session.dynamics_steps import recordings
 from calib.procedure.session.folder import MARK, Session, fingerprint, read_state
 from calib.procedure.session.geometry_steps import SCHEMA, measured_files, robot_file
+from calib.records import read_record
 
 Say = Callable[[str], None]
 ROLES = {
@@ -26,41 +28,42 @@ ROLES = {
 
 def certify(session: Session, say: Say) -> list[str]:
     """Print the certificate."""
-    from calib.procedure.report import dynamics_section, figures
+    from calib.procedure.report import dynamics_section, figures, geometry_section
 
     say("drawing")
-    outside = json.loads(session.path("5-validation/metrics.json").read_text())
-    whole = whole_report(session, outside)
-    drawn = figures.draw(whole)
-    judged = [with_arrival(certificate.geometry_stage(whole, drawn), noticed(session, "3-measured", "validate"))]
-    notes = [f"geometry {outside['verdict']}: {outside['reason']}"]
+    whole = whole_report(session)
+    section = geometry_section.certificate_section(whole, figures.draw(whole))
+    judged = [with_arrival(section, noticed(session, "3-measured", "validate"))]
+    notes = [f"geometry {section.verdict}: {section.reason}"]
     if session.dynamic:
         dynamics = dynamics_section.read(session.path("8-dynamics"))
         exported = read_state(session)["steps"].get("export", {}).get("notes", [])
         folders = session.path("8-dynamics"), session.path("6-excitation")
-        stage = dynamics_section.dynamics_stage(dynamics, *folders, exported)
-        judged.append(with_arrival(stage, noticed(session, "7-recorded", "predict")))
+        section = dynamics_section.dynamics_stage(dynamics, *folders, exported)
+        judged.append(with_arrival(section, noticed(session, "7-recorded", "predict")))
         notes.append(f"dynamics {dynamics.verdict}: {dynamics.reason}")
     told = simulated(session)
-    page = certificate.Page(
+    page = certificate.certificate(
         f"{'Simulated calibration' if told else 'Calibration'} of {session.settings.name}",
         f"{'SIMULATED: ' if told else ''}{session.settings.instrument.name}, {session.settings.created[:10]}",
         setup(session, whole),
         judged,
         listed(session),
     )
-    files.write(session.path("certificate.html"), certificate.render(page))
+    files.write(session.path("certificate.html"), html.render(page))
     return [*notes, "certificate.html", viewer.write_beside(session.folder)]
 
 
-def whole_report(session: Session, outside: dict[str, Any]) -> fit_report.Report:
-    """Return the fit's report with what the step validate found, whose ``metrics.json`` is `outside`."""
-    if outside.get("schema", 1) >= SCHEMA:
+def whole_report(session: Session) -> fit_report.Report:
+    """Return the fit's report with what the step validate found."""
+    outside = read_record(ValidationMetrics, json.loads(session.path("5-validation/metrics.json").read_text()))
+    if outside.schema >= SCHEMA:
         return fit_report.read(session.path("5-validation"))
     found, rows = fit_report.read(session.path("4-fit")), session.path("5-validation/rows.json")
-    sets = json.loads(rows.read_text()) if rows.exists() and outside["validation"] else []
-    warnings = [*found.metrics["warnings"], *outside["warnings"]]
-    return fit_report.with_unseen(found, outside | {"warnings": warnings}, sets)
+    content = json.loads(rows.read_text()) if rows.exists() and outside.validation else []
+    sets = read_record(tuple[RowErrors, ...], content)
+    outside = replace(outside, warnings=(*found.metrics.warnings, *outside.warnings))
+    return fit_report.with_unseen(found, outside, sets)
 
 
 def noticed(session: Session, place: str, unseen: str) -> list[str]:
@@ -73,11 +76,9 @@ def noticed(session: Session, place: str, unseen: str) -> list[str]:
     return [line for line in (*lines, *(note for note in said if names and note.startswith(names))) if line.strip()]
 
 
-def with_arrival(stage: certificate.Stage, lines: list[str]) -> certificate.Stage:
-    """Return a stage with what was noticed when its files came."""
-    if not lines:
-        return stage
-    return replace(stage, blocks=[*stage.blocks, certificate.Text("What was noticed when the files came", lines)])
+def with_arrival(section: Section, lines: list[str]) -> Section:
+    """Return a section with what was noticed when its files came."""
+    return replace(section, blocks=[*section.blocks, Text("What was noticed when the files came", lines)])
 
 
 def simulated(session: Session) -> list[tuple[str, str]]:
@@ -101,7 +102,7 @@ def setup(session: Session, found: fit_report.Report) -> list[tuple[str, str]]:
         ("session made", settings.created.replace("T", " ")),
         ("measurements", dated([*fitted[0], *fitted[1]])),
         ("pose plan", session_plan(session)),
-        ("model", found.metrics["model"]),
+        ("model", found.metrics.model),
         ("tolerance", certificate.tolerance(settings.fit.tolerance_mm)),
         *dynamic_setup(session),
         ("seed", str(settings.seed)),

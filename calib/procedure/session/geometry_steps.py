@@ -21,10 +21,12 @@ from calib.procedure.kinematic_stage import fit as fitting
 from calib.procedure.kinematic_stage import folder as outputs
 from calib.procedure.kinematic_stage import inputs, proof
 from calib.procedure.kinematic_stage import robot_file as installation_file
+from calib.procedure.kinematic_stage.metrics import ValidationMetrics
 from calib.procedure.report import fit_certificate, fit_report
 from calib.procedure.session import arrival
 from calib.procedure.session.folder import Session
 from calib.procedure.session.outcome import mark_failed
+from calib.records import read_record
 from calib.robot import calibrated
 from calib.robot.chain import Chain
 
@@ -196,12 +198,10 @@ def validate(session: Session, say: Say) -> list[str]:
     """Hold the fitted robot against poses it has not seen, and judge, as `calib fit` does with validation files."""
     chain, unseen = chain_of(session), measured_files(session)[1]
     folder, found, notes = session.path("5-validation"), fit_report.read(session.path("4-fit")), []
-    metrics: dict[str, Any] = {
-        "validation": {},
-        **{key: found.metrics[key] for key in ("verdict", "reason", "warnings")},
-    }
     if not session.settings.poses.validation and not unseen:
-        _write_validation(folder, found, {"validation": {}, **metrics}, [])
+        own = found.metrics
+        content = {"validation": {}, "verdict": own.verdict, "reason": own.reason, "warnings": list(own.warnings)}
+        _write_validation(folder, found, content, [])
         return ["no validation asked for: judged by cross-validation only"]
     plan = planned(session, chain, "validation")
     for path in unseen:
@@ -213,16 +213,16 @@ def validate(session: Session, say: Say) -> list[str]:
     metrics |= {"verdict": result.verdict.level, "reason": result.verdict.reason, "warnings": list(result.warnings)}
     proof.write_errors(folder / "errors.csv", given.chain, result.validation)
     sets = [fit_report.rows_of(name, each, each.proves) for name, each in result.validation.items()]
-    files.write_json(folder / "rows.json", sets)
+    files.write_json(folder / "rows.json", [asdict(each) for each in sets])
     _write_validation(folder, found, metrics, sets)
-    fresh = [words for words in result.warnings if words not in found.metrics["warnings"]]
+    fresh = [words for words in result.warnings if words not in found.metrics.warnings]
     return [*notes, f"verdict {result.verdict.level}: {result.verdict.reason}", *fresh]
 
 
 def _write_validation(
-    folder: Path, found: fit_report.Report, metrics: dict[str, Any], sets: list[dict[str, Any]]
+    folder: Path, found: fit_report.Report, metrics: dict[str, Any], sets: list[fit_report.RowErrors]
 ) -> None:
-    files.write_json(folder / "report.json", asdict(fit_report.with_unseen(found, metrics, sets)))
+    fit_report.write(fit_report.with_unseen(found, read_record(ValidationMetrics, metrics), sets), folder)
     files.write_json(folder / "metrics.json", metrics | {"schema": SCHEMA})
 
 
@@ -230,7 +230,7 @@ def assessed(session: Session, given: inputs.Inputs, found: fit_report.Report) -
     """Return the assessment of the session's fit, read from its folder, on its own rows and on unseen ones."""
     options, wanted, place = options_of(session), session.settings.fit, session.path("4-fit")
     settings = combine(FitSettings(), loss=wanted.loss, loss_scale=options.loss_scale)
-    chosen = combine(settings, loss=found.metrics.get("loss", wanted.loss))
+    chosen = combine(settings, loss=found.metrics.loss or wanted.loss)
     torques = [fitting.gravity_of(given.chain, block) for block in given.fit]
     nominal = polish_frames(fitting.install(given.chain, given.fit, given.known), given.fit, chosen, torques).cell
     return fitting.assess(

@@ -15,7 +15,7 @@ from datetime import datetime
 from typing import Any
 
 from calib.errors import SessionError
-from calib.procedure.report import page
+from calib.procedure.report import certificate
 from calib.procedure.session import dynamics_steps, geometry_steps
 from calib.procedure.session.folder import EXPORT, Session, fingerprint, read_state, write_state
 from calib.procedure.session.step_list import STEPS, SessionStep
@@ -184,7 +184,7 @@ def _run(session: Session, step: SessionStep, say: Say, progress: Say, command: 
         "seconds": round(time.perf_counter() - started, 2),
         "command": command,
         "seed": session.settings.seed,
-        "toolkit": page.versions(),
+        "toolkit": certificate.versions(),
         "inputs": inputs,
         "outputs": {str(path.relative_to(session.folder)): fingerprint(path) for path in produced},
         "notes": notes,

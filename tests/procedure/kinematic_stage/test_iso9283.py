@@ -15,7 +15,9 @@ from calib.data.poses.measurements import PoseMeasurements
 from calib.geometry.checks import repeatability
 from calib.geometry.installation import Installation, see
 from calib.procedure.kinematic_stage import inputs
-from calib.procedure.report.page import iso9283_tables
+from calib.procedure.kinematic_stage.metrics import FitMetrics
+from calib.procedure.report.geometry_section import iso9283_tables
+from calib.records import read_record
 from calib.robot.load import load
 from calib.simulation.cells.cell import SimulatedInstrument, measure
 from calib.simulation.cells.virtual_cells import perturbed_cell
@@ -133,7 +135,7 @@ def test_the_fit_states_them_beside_its_own_errors(files, capsys):
     noise = 0.02 * (1.596 + 3 * 0.673)
     assert iso["repeatability_mm"]["mean"] == pytest.approx(noise, rel=0.2)
     assert iso["accuracy_mm"]["calibrated"]["mean"] < 0.3 * iso["accuracy_mm"]["nominal"]["mean"]
-    (table,) = iso9283_tables(found)
+    (table,) = iso9283_tables(read_record(FitMetrics, found))
     assert len(table.rows) == 5 and "100 and more" in table.note
 
 

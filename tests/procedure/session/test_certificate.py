@@ -15,8 +15,7 @@ from matplotlib.figure import Figure
 from sessions import go_on
 
 from calib.errors import CalibError
-from calib.procedure.report import figures, fit_report, geometry_figures, style
-from calib.procedure.report import page as certificate
+from calib.procedure.report import figures, fit_certificate, fit_report, geometry_figures, html, style
 from calib.procedure.session.folder import Session
 
 
@@ -56,7 +55,7 @@ def test_it_says_what_a_professional_signs(page: str, finished_folder: Path) -> 
     found.feed(page)
     text = " ".join(" ".join(found.text).split())
     metrics = json.loads((finished_folder / "5-validation/metrics.json").read_text())
-    assert certificate.WORDS[metrics["verdict"]] in text and metrics["reason"][1:] in text
+    assert html.WORDS[metrics["verdict"]] in text and metrics["reason"][1:] in text
     rms = metrics["validation"]["validation.csv"]["calibrated"]["position_mm"]["rms"]
     assert f"{rms:.3f}" in text
     for words in ("lwr4plus", "optical CMM", "60 µm", "seed", "numpy", "3-measured/measured.csv", "Limitations"):
@@ -95,15 +94,15 @@ def test_ids_of_figures_do_not_meet(page: str) -> None:
 def test_numbers_of_the_report_are_those_of_the_fit(finished_folder: Path) -> None:
     found = fit_report.read(finished_folder / "4-fit")
     metrics = json.loads((finished_folder / "4-fit/metrics.json").read_text())
-    errors = 1e3 * np.array(found.sets[0]["calibrated"]["position"])
+    errors = 1e3 * np.array(found.sets[0].calibrated["position"])
     assert np.sqrt(np.mean(errors**2)) == pytest.approx(metrics["fit"]["calibrated"]["position_mm"]["rms"], rel=1e-5)
-    assert len(found.sets[0]["q"]) == len(found.sets[0]["points"]) == len(errors)
+    assert len(found.sets[0].q) == len(found.sets[0].points) == len(errors)
     assert found.noise["position"] == pytest.approx(60e-6 * np.sqrt(3))
 
 
 def test_hostile_names_do_not_become_markup(finished_folder: Path) -> None:
     found = replace(fit_report.read(finished_folder / "4-fit"), robot="<script>alert(1)</script>")
-    written = certificate.render(certificate.of_fit(found, {}))
+    written = html.render(fit_certificate.of_fit(found, {}))
     assert "<script>" not in written and "&lt;script&gt;" in written
 
 
@@ -159,6 +158,6 @@ def test_a_figure_as_svg_is_the_same_twice() -> None:
 
 def test_what_the_data_do_not_give_is_left_out(finished_folder: Path) -> None:
     found = fit_report.read(finished_folder / "4-fit")
-    bare = [{key: value for key, value in found.sets[0].items() if key not in ("q", "points")}]
-    drawn = figures.draw(replace(found, sets=bare, singular_values=[]))
+    bare = (replace(found.sets[0], q=(), points=()),)
+    drawn = figures.draw(replace(found, sets=bare, singular_values=()))
     assert "joints" not in drawn and "singular_values" not in drawn and "position" in drawn

@@ -1,0 +1,152 @@
+"""What ``metrics.json`` of a fit holds, as values: errors of both arms, the ladder, outliers, the verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class ErrorStatistics:
+    """Sizes of errors in mm or deg."""
+
+    mean: float
+    rms: float
+    p95: float
+    max: float
+
+
+@dataclass(frozen=True)
+class ArmErrors:
+    """Errors of one arm by nature; None where nothing of the kind was measured."""
+
+    position_mm: ErrorStatistics | None = None
+    orientation_deg: ErrorStatistics | None = None
+    distance_mm: ErrorStatistics | None = None
+
+    @property
+    def main(self) -> ErrorStatistics | None:
+        """What is judged by: positions, or distances where there are no positions [mm]."""
+        return self.position_mm or self.distance_mm
+
+
+@dataclass(frozen=True)
+class MeanAndMax:
+    """Of some sizes."""
+
+    mean: float
+    max: float
+
+
+@dataclass(frozen=True)
+class BothArms:
+    """The same of the nominal and of the calibrated arm."""
+
+    nominal: MeanAndMax
+    calibrated: MeanAndMax
+
+
+@dataclass(frozen=True)
+class RepeatedPose:
+    """One pose measured several times: its rows, AP of both arms per axis, RP, vAP; mm and deg."""
+
+    rows: tuple[int, ...]
+    repeatability_mm: float
+    nominal_mm: tuple[float, ...]
+    calibrated_mm: tuple[float, ...]
+    repeatability_deg: tuple[float, ...] = ()
+    multidirectional_mm: float | None = None
+
+
+@dataclass(frozen=True)
+class RepeatedPoses:
+    """Accuracy and repeatability of poses that were measured several times (`iso9283`)."""
+
+    poses: int
+    cycles: tuple[int, int]
+    repeatability_mm: MeanAndMax
+    accuracy_mm: BothArms
+    each: tuple[RepeatedPose, ...] = ()
+
+
+@dataclass(frozen=True)
+class ComparedRows:
+    """Both arms on one set of rows.
+
+    Attributes:
+        poses: how many robot poses.
+        frames: whose base and tool placement was used, in words.
+        nominal, calibrated: their errors.
+        urdf_alone: those of the calibrated geometry without joint corrections.
+        pair_distance_mm: arm → errors of the distances between pairs of positions.
+        iso9283: of repeated poses.
+        unseen: False where rows are none that the fit had not seen.
+        parameters: how many were fitted, on the fit's own rows.
+    """
+
+    poses: int
+    frames: str
+    nominal: ArmErrors
+    calibrated: ArmErrors
+    urdf_alone: ArmErrors | None = None
+    pair_distance_mm: Mapping[str, ErrorStatistics] = field(default_factory=dict)
+    iso9283: RepeatedPoses | None = None
+    unseen: bool = True
+    parameters: int = 0
+
+
+@dataclass(frozen=True)
+class LadderStep:
+    """One model tried, with its error on rows left out."""
+
+    model: str
+    parameters: int
+    cross_validated_mm: float | None
+    kept: bool
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class OutlierRow:
+    """A row that does not fit, in robust standard deviations and in mm or deg."""
+
+    file: str
+    row: int
+    nature: str
+    sigmas: float
+    size_mm: float | None = None
+    size_deg: float | None = None
+
+
+@dataclass(frozen=True)
+class ValidationMetrics:
+    """What holding a fit against unseen rows came to: their errors, the verdict, what to know."""
+
+    validation: Mapping[str, ComparedRows]
+    verdict: str
+    reason: str
+    warnings: tuple[str, ...]
+    schema: int = 1
+
+
+@dataclass(frozen=True)
+class FitMetrics:
+    """The content of ``metrics.json``; see `calib.procedure.kinematic_stage.folder`."""
+
+    fit: ComparedRows
+    validation: Mapping[str, ComparedRows]
+    model: str
+    ladder: tuple[LadderStep, ...]
+    seed: int
+    verdict: str
+    reason: str
+    tolerance_mm: float | None
+    warnings: tuple[str, ...]
+    not_identifiable: tuple[str, ...]
+    outliers: tuple[OutlierRow, ...]
+    loss: str = ""
+
+    @property
+    def proofs(self) -> dict[str, ComparedRows]:
+        """Sets of rows that the fit has not seen, by name."""
+        return {name: rows for name, rows in self.validation.items() if rows.unseen}

@@ -1,0 +1,80 @@
+"""The certificate: a first sheet to be filed, the sections it sums up, and what every certificate says besides."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Sequence
+from datetime import datetime
+from importlib import metadata
+
+from calib.procedure.report.page import Page, Section, Table, Text
+
+EDITED = "edited by hand"
+SHORT = 12  # hexadecimal digits of a SHA-256 on the first sheet
+LISTED = 8  # files on the first sheet
+LONG = 96  # letters of a line of the setup on the first sheet
+CONVENTIONS = (
+    "Units: m, rad, s, kg, N·m in all files unless a header names another; this page prints mm, deg and mrad.",
+    "Modified Denavit-Hartenberg rows (Khalil and Kleinfinger): Rot_x(alpha) Trans_x(d) Trans_z(r) Rot_z(theta + q).",
+    "Quaternions are x y z w; roll-pitch-yaw is R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF.",
+    "A station is the pose of the arm's base in the instrument's frame, a tool that of the target in the tip's frame.",
+    "Nominal errors are those of the nominal arm with station and tool fitted on the same rows, so that arms are "
+    "compared and not installations.",
+    "rms is the root mean square of the error vector's length over poses, not per axis; ± is its standard error: what "
+    "another set of as many poses would change.",
+)
+LIMITATIONS = (
+    "Sigmas state what the measurements' noise leaves open under the chosen model; they do not cover effects that no "
+    "parameter of the model holds (see the residual plots for trends).",
+    "The figures hold for the region, payload and temperature of the measured poses.",
+)
+
+
+def certificate(
+    title: str,
+    subtitle: str,
+    setup: Sequence[tuple[str, str]],
+    sections: Sequence[Section],
+    files: Sequence[tuple[str, str, str, str]] = (),
+    now: datetime | None = None,
+) -> Page:
+    """Return the page of a certificate.
+
+    Args:
+        setup: label and value of what was calibrated, with what, when, by which command; shortened on the first sheet.
+        sections: what was judged.
+        files: name, role, bytes, SHA-256 of what it rests on; those of the first sheet come first.
+        now: when it is made; this moment by default.
+    """
+    behind = [*sections, Section("Setup", [Table("", ("what", "value"), [*setup])])]
+    if files:
+        listed = Table("", ("file", "what it is", "bytes", "SHA-256"), files, numbers=(2,))
+        behind.append(Section("Files", [listed]))
+    behind.append(
+        Section("Limitations and conventions", [Text("Limitations", LIMITATIONS), Text("Conventions", CONVENTIONS)])
+    )
+    marks = [(name, role, digest[:SHORT]) for name, role, _, digest in files[:LISTED]]
+    if len(files) > LISTED:
+        marks.append((f"and {len(files) - LISTED} more, see Files", "", ""))
+    when = (now or datetime.now().astimezone()).strftime("%Y-%m-%d %H:%M %Z").strip()
+    issued = f"{when}, armature-calib {metadata.version('armature-calib')}"
+    return Page(title, subtitle, issued, [(label, shortened(value)) for label, value in setup], behind, marks)
+
+
+def shortened(text: str, most: int = LONG) -> str:
+    """Return a text cut at a word, with an ellipsis, where it is longer than `most` letters."""
+    return text if len(text) <= most else f"{text[: most - 1].rsplit(' ', 1)[0]} …"
+
+
+def tolerance(millimetres: float | None) -> str:
+    """Return what a verdict of pass means, in words."""
+    if not millimetres:
+        return "none was given: pass means better than the nominal robot on unseen poses, or nothing to gain"
+    return f"{millimetres:g} mm rms on unseen poses"
+
+
+def versions() -> str:
+    """Return the toolkit's version and those of what its numbers depend on."""
+    names = ("armature-calib", "numpy", "scipy")
+    known = ", ".join(f"{name} {metadata.version(name)}" for name in names)
+    return f"{known}, Python {platform.python_version()}"

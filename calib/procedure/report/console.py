@@ -1,0 +1,49 @@
+"""The values of `page` for rich to print: the same tables and sentences that a certificate holds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from rich import box
+from rich.console import RenderableType
+from rich.markup import escape
+from rich.table import Table as RichTable
+
+from calib.procedure.report.page import Block, Section, Table, Text
+
+COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
+
+
+def rendered(blocks: Iterable[Block]) -> Iterator[RenderableType]:
+    """Yield each block as rich prints it; pictures are left out."""
+    for block in blocks:
+        if isinstance(block, Table):
+            yield rich_table(block)
+        elif isinstance(block, Text):
+            label = f"[yellow]{escape(block.label)}[/]: " if block.label else ""
+            yield from (f"{label}{escape(line)}" for line in block.lines)
+
+
+def rich_table(table: Table) -> RichTable:
+    """Return a table of `page` as rich's."""
+    result = RichTable(
+        title=escape(table.title), title_justify="left", caption=escape(table.note) or None, caption_justify="left",
+        box=box.HEAVY_HEAD,
+    )  # fmt: skip
+    numbers = set(table.numbers)
+    for k, name in enumerate(table.header):
+        result.add_column(escape(name), justify="right" if k in numbers else "left")
+    for number, row in enumerate(table.rows):
+        if len(row) == 1 and len(table.header) > 1:
+            result.add_section()
+            result.add_row(f"[bold]{escape(row[0])}[/]")
+        else:
+            result.add_row(*map(escape, row), style="bold" if number in table.strong else "")
+    return result
+
+
+def section(shown: Section) -> Iterator[RenderableType]:
+    """Yield the blocks of a section, and its verdict with the reason."""
+    yield from rendered(shown.blocks)
+    if shown.verdict:
+        yield f"verdict: [bold {COLOURS[shown.verdict]}]{shown.verdict}[/]: {escape(shown.reason)}"

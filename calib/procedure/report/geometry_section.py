@@ -1,0 +1,280 @@
+"""The geometry in a report: what the console says of a fit and what stands on its certificate, from the same values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from calib.geometry.accuracy import rms_sigma
+from calib.procedure.kinematic_stage import iso9283
+from calib.procedure.kinematic_stage.inputs import Inputs
+from calib.procedure.kinematic_stage.metrics import ComparedRows, ErrorStatistics, FitMetrics, OutlierRow, RepeatedPose
+from calib.procedure.report.fit_report import Report
+from calib.procedure.report.page import Block, KeyFigure, Picture, Pictures, Section, Table, Text
+
+if TYPE_CHECKING:
+    from calib.procedure.report.figures import Drawn
+
+KINDS = {
+    "position_mm": ("position", "mm"),
+    "orientation_deg": ("orientation", "deg"),
+    "distance_mm": ("distance", "mm"),
+}
+ARMS = {"nominal": "nominal", "calibrated": "calibrated", "urdf_alone": "its URDF alone"}
+MOST_ROWS = 60  # parameters beyond which joint corrections are not listed
+MOST_POSES = 30  # repeated poses that are listed
+MOST_OUTLIERS = 20
+FEW = 8  # outliers named in a sentence
+ISO_HEADER = (
+    "pose", "cycles", "AP nominal [mm]", "AP calibrated [mm]", "x, y, z of it [mm]", "RP [mm]", "RP a, b, c [deg]",
+    "vAP [mm]",
+)  # fmt: skip
+ISO_NOTE = (
+    "After ISO 9283: AP is the barycentre of a pose's cycles minus the command (what the arm's model says of these "
+    "joints; station and tool as fitted), RP the mean distance from the barycentre plus three standard deviations, vAP "
+    "the largest distance between barycentres approached from different directions. The norm asks for 5 poses of 30 "
+    "cycles. Five poses are too few to state an accuracy: makers judge it by 100 and more, once each, as the errors on "
+    "unseen poses do; repeated poses state the repeatability, below which no calibration can get."
+)
+ALONE_NOTE = (
+    "A URDF cannot hold the joint corrections of the chosen model: robot.urdf is the best geometry without them, and "
+    "its errors stand beside; robot_for_corrections.urdf with joint_corrections.csv has those of the calibrated arm."
+)
+
+
+def read_blocks(inputs: Inputs) -> list[Block]:
+    """Return robot and measurements as they were read, in sentences."""
+    chain = inputs.chain
+    lines = [f"robot {chain.name}: {chain.n} joints, {chain.base} to {chain.tip}"]
+    for block in inputs.fit:
+        tools = f", {len(block.tool_names)} targets" if len(block.tool_names) > 1 else ""
+        ignored = f"; ignored: {', '.join(block.ignored)}" if block.ignored else ""
+        sigma = "stated" if block.sigma is not None else "estimated"
+        lines.append(f"{Path(block.file).name}: {len(block)} rows of kind {block.kind}{tools}, sigmas {sigma}{ignored}")
+    for name, unseen in inputs.unseen.items():
+        role = "held out" if unseen.held_out else "validation"
+        lines.append(f"{name}: {len(unseen.block)} rows of kind {unseen.block.kind} unseen ({role})")
+    return [Text("What was read", lines)]
+
+
+def outcome_section(metrics: FitMetrics) -> Section:
+    """Return what a fit came to as the console says it: ladder, errors, repeated poses, what to know, verdict."""
+    blocks: list[Block] = [ladder_table(metrics), error_table(metrics)]
+    blocks += [Text("", repeated_sentences(metrics)), Text("", metrics.not_identifiable, "identifiability")]
+    blocks += [Text("", metrics.warnings, "note"), Text("", outlier_sentences(metrics), "outliers")]
+    return Section("Geometry", blocks, metrics.verdict, metrics.reason)
+
+
+def certificate_section(report: Report, drawn: Mapping[str, Drawn]) -> Section:
+    """Return the section of a certificate: errors, ladder, parameters, identifiability, figures, outliers.
+
+    Args:
+        drawn: figures by name, see `calib.procedure.report.figures.draw`; those that are not there are left out.
+    """
+    metrics = report.metrics
+    blocks: list[Block] = [error_table(metrics), *iso9283_tables(metrics)]
+    blocks.append(_pictures("Before and after", drawn, ("position", "orientation", "distance")))
+    blocks.append(_pictures("What remains", drawn, ("joints", "map")))
+    if any(step.cross_validated_mm is not None for step in metrics.ladder):
+        blocks += [ladder_table(metrics), _pictures("", drawn, ("ladder",))]
+    blocks.append(Text("What the poses can tell", identifiability(report)))
+    blocks.append(_pictures("Parameters", drawn, ("parameters", "singular_values", "correlations")))
+    blocks.append(parameter_table(report))
+    if metrics.outliers:
+        blocks.append(outlier_table(metrics))
+    blocks.append(Text("Notes", metrics.warnings))
+    return Section("Geometry", blocks, metrics.verdict, metrics.reason, key_figures(report))
+
+
+def key_figures(report: Report) -> list[KeyFigure]:
+    """Return the errors that the verdict rests on, before and after: of the worst unseen rows, else of the fit's."""
+    metrics, proofs = report.metrics, report.metrics.proofs
+    name, proof = max(proofs.items(), key=lambda item: _main_rms(item[1]), default=("fit", metrics.fit))
+    own = next((rows for rows in report.sets if rows.name == name), None)
+    basis = f"{proof.poses} {'unseen' if proofs else 'fitted'} poses"
+    result = []
+    for key, (label, unit) in KINDS.items():
+        before, after = (_errors(proof, arm, key) for arm in ("nominal", "calibrated"))
+        if before is None or after is None:
+            continue
+        factor = 1e3 if unit == "mm" else float(np.degrees(1.0))
+        sizes = None if own is None else own.calibrated.get(label)
+        sigma = np.nan if sizes is None else factor * rms_sigma(np.array(sizes))
+        spread = f"± {sigma:.2g} {unit}" if np.isfinite(sigma) else ""
+        judged = metrics.tolerance_mm and before is proof.nominal.main
+        allowed = f"{metrics.tolerance_mm:g} mm" if judged else ""
+        result.append(
+            KeyFigure(f"{label}, rms", _size(before.rms, unit), _size(after.rms, unit), spread, basis, allowed)
+        )
+        result.append(KeyFigure(f"{label}, largest", _size(before.max, unit), _size(after.max, unit), "", basis))
+    return result
+
+
+def _main_rms(rows: ComparedRows) -> float:
+    return rows.calibrated.main.rms if rows.calibrated.main else 0.0
+
+
+def _size(value: float, unit: str) -> str:
+    return f"{value:.3g} {unit}"
+
+
+def _errors(rows: ComparedRows, arm: str, key: str) -> ErrorStatistics | None:
+    found = getattr(rows, arm)
+    return None if found is None else getattr(found, key)
+
+
+def error_table(metrics: FitMetrics) -> Table:
+    """Return errors of both arms, fitted and unseen: mean, rms, 95 % quantile and maximum."""
+    sets = [(f"fitted: {metrics.fit.poses} poses", metrics.fit)]
+    for name, found in metrics.validation.items():
+        sets.append((f"{'unseen' if found.unseen else 'NOT unseen'}: {name}, {found.poses} poses", found))
+    rows: list[Sequence[str]] = []
+    strong = set()
+    for label, found in sets:
+        rows.append((label,))
+        for words, arm, numbers in _error_lines(found):
+            if arm == "calibrated":
+                strong.add(len(rows))
+            cells = [f"{size:.4f}" for size in (numbers.mean, numbers.rms, numbers.p95, numbers.max)]
+            rows.append((words if arm == "nominal" else "", ARMS[arm], *cells))
+    notes = ["Distances of pairs do not depend on where instrument and tool are placed."]
+    notes += [ALONE_NOTE] * any(found.urdf_alone for _, found in sets)
+    header = ("error", "arm", "mean", "rms", "95 %", "max")
+    return Table(
+        "Errors of the nominal and the calibrated arm", header, rows, " ".join(notes), frozenset(strong), range(2, 6)
+    )
+
+
+def _error_lines(found: ComparedRows) -> Iterator[tuple[str, str, ErrorStatistics]]:
+    for key, (words, unit) in KINDS.items():
+        for arm in ARMS:
+            if (numbers := _errors(found, arm, key)) is not None:
+                yield f"{words} [{unit}]", arm, numbers
+    for arm in ARMS:
+        if arm in found.pair_distance_mm:
+            yield "distance of pairs [mm]", arm, found.pair_distance_mm[arm]
+
+
+def ladder_table(metrics: FitMetrics) -> Table:
+    """Return the models tried with their error on rows left out."""
+    rows, strong = [], set()
+    for step in metrics.ladder:
+        error = step.cross_validated_mm
+        if step.kept:
+            strong.add(len(rows))
+        rows.append((step.model, str(step.parameters), "" if error is None else f"{error:.4f}", step.note))
+    header = ("model", "parameters", "cross-validated rms [mm]", "remark")
+    return Table("Ladder of models", header, rows, f"Chosen: {metrics.model}.", frozenset(strong), (1, 2))
+
+
+def parameter_table(report: Report) -> Table:
+    """Return the fitted parameters; of many joint corrections only the arm and the frames are printed."""
+    shown = [row for row in report.parameters if len(report.parameters) <= MOST_ROWS or row.group != "deflection"]
+    rows = []
+    for row in shown:
+        factor, printed = {"m": (1e3, "mm"), "rad": (1e3, "mrad")}.get(row.unit, (1.0, row.unit))
+        digits = ".3f" if factor > 1 else ".4g"
+        numbers = [f"{factor * number:{digits}}" for number in (row.nominal, row.value)]
+        change = f"{factor * (row.value - row.nominal):+{digits}}"
+        rows.append((row.name, printed, *numbers, change, f"{factor * row.sigma:.2g}", relative_sigma(row.rsd)))
+    left = len(report.parameters) - len(shown)
+    note = f"{left} joint corrections stand in joint_corrections.csv." if left else ""
+    if report.kept:
+        note = f"Not fitted, kept at their nominal values: {', '.join(report.kept)}. {note}"
+    header = ("parameter", "unit", "nominal", "calibrated", "change", "σ", "RSD")
+    return Table("Fitted parameters", header, rows, note.strip(), numbers=range(2, 7))
+
+
+def relative_sigma(percent: float | None) -> str:
+    """Return an RSD [%] with two digits; empty where it says nothing."""
+    return "" if percent is None or percent > 999 else f"{percent:.0f} %" if percent >= 10 else f"{percent:.2g} %"
+
+
+def outlier_sentences(metrics: FitMetrics) -> list[str]:
+    """Return in a sentence how many rows do not fit, and the worst of them; none where all fit."""
+    if not metrics.outliers:
+        return []
+    count = len({(each.file, each.row) for each in metrics.outliers})
+    worst = "; ".join(map(_outlier_words, metrics.outliers[:FEW]))
+    more = "; ..." if len(metrics.outliers) > FEW else ""
+    how = "kept in the fit" if metrics.loss in ("", "none") else f"weighed down by the {metrics.loss} loss"
+    return [f"{count} rows beyond 4 robust sigma, {how}: {worst}{more}"]
+
+
+def _outlier_words(each: OutlierRow) -> str:
+    return f"{Path(each.file).name} row {each.row} ({_outlier_size(each)}, {each.sigmas:.1f} sigma)"
+
+
+def _outlier_size(each: OutlierRow) -> str:
+    return f"{each.size_mm:.3g} mm" if each.size_deg is None else f"{each.size_deg:.3g} deg"
+
+
+def outlier_table(metrics: FitMetrics) -> Table:
+    """Return the rows that do not fit, worst first."""
+    found = metrics.outliers
+    rows = [
+        (Path(each.file).name, str(each.row), each.nature, _outlier_size(each), f"{each.sigmas:.1f}")
+        for each in found[:MOST_OUTLIERS]
+    ]
+    note = "Rows beyond 4 robust sigmas. They were kept in the fit; a robust loss, where used, weighed them down."
+    if len(found) > MOST_OUTLIERS:
+        note += f" {len(found) - MOST_OUTLIERS} more in metrics.json."
+    header = ("file", "row", "residual", "size", "robust sigmas")
+    return Table("Rows that do not fit", header, rows, note, numbers=(1, 3, 4))
+
+
+def identifiability(report: Report) -> list[str]:
+    """Return what the poses can and cannot tell, in sentences."""
+    values, rank, lines = report.singular_values, report.rank, []
+    unclear, fitted = report.metrics.not_identifiable, report.metrics.fit.parameters
+    if values and not unclear:
+        lines.append(f"All {len(values)} candidate parameters can be told apart.")
+    if values and fitted < rank:
+        lines.append(
+            f"{fitted} of them are fitted: the others are told less exactly than an arm of this kind may be off, so "
+            "they keep their nominal values."
+        )
+    lines += [f"{line[0].upper()}{line[1:]}" for line in unclear]
+    strong = [f"{pair.first} with {pair.second} ({pair.correlation:+.2f})" for pair in report.correlations[:8]]
+    if strong:
+        lines.append(f"Told apart only weakly (correlation above 0.9): {', '.join(strong)}.")
+    else:
+        lines.append("No two parameters correlate by more than 0.9.")
+    return lines
+
+
+def _pictures(title: str, drawn: Mapping[str, Drawn], names: Sequence[str]) -> Pictures:
+    from calib.procedure.report.style import svg
+
+    found = [(name, drawn[name]) for name in names if name in drawn]
+    return Pictures(title, [Picture(svg(one.figure, name), one.caption, one.wide) for name, one in found])
+
+
+def repeated_sentences(metrics: FitMetrics) -> list[str]:
+    """Return for each set of rows with repeated poses what they tell."""
+    sets = {"fitted": metrics.fit, **metrics.validation}
+    return [f"{name}: {iso9283.sentence(found.iso9283)}" for name, found in sets.items() if found.iso9283]
+
+
+def iso9283_tables(metrics: FitMetrics) -> list[Table]:
+    """Return accuracy and repeatability after ISO 9283, one table for each set of rows in which poses were repeated."""
+    result = []
+    for name, found in {"fitted": metrics.fit, **metrics.validation}.items():
+        if iso := found.iso9283:
+            rows = [_iso_row(number, each) for number, each in enumerate(iso.each[:MOST_POSES], 1)]
+            if len(iso.each) > MOST_POSES:
+                rows.append(("…", f"{len(iso.each) - MOST_POSES} more in metrics.json", *[""] * 6))
+            title = f"Accuracy and repeatability, {name} ({iso9283.sentence(iso)})"
+            result.append(Table(title, ISO_HEADER, rows, ISO_NOTE, numbers=range(1, 8)))
+    return result
+
+
+def _iso_row(number: int, each: RepeatedPose) -> tuple[str, ...]:
+    sizes = [f"{float(np.linalg.norm(offset)):.3f}" for offset in (each.nominal_mm, each.calibrated_mm)]
+    axes = ", ".join(f"{value:+.3f}" for value in each.calibrated_mm)
+    turns = ", ".join(f"{value:.4f}" for value in each.repeatability_deg)
+    varied = "" if each.multidirectional_mm is None else f"{each.multidirectional_mm:.3f}"
+    return (str(number), str(len(each.rows)), *sizes, axes, f"{each.repeatability_mm:.3f}", turns, varied)

@@ -1,0 +1,20 @@
+"""A `page.Page` as HTML: one file without any outside reference, for the screen and for paper."""
+
+from __future__ import annotations
+
+from importlib import resources
+
+import jinja2
+
+from calib.procedure.report.page import Page
+
+WORDS = {"pass": "PASS", "marginal": "MARGINAL", "fail": "FAIL"}
+
+
+def render(page: Page) -> str:
+    """Return the page as HTML."""
+    here = resources.files("calib.procedure.report")
+    source = here.joinpath("certificate.html").read_text(encoding="utf-8")
+    style = here.joinpath("certificate.css").read_text(encoding="utf-8")
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    return environment.from_string(source).render(page=page, style=style, words=WORDS)

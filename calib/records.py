@@ -1,0 +1,71 @@
+"""JSON and tables as frozen dataclasses: checked once, where they are read, and attributes from there on."""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Mapping
+from dataclasses import MISSING, fields, is_dataclass
+from functools import cache
+from numbers import Real
+from typing import Any, SupportsIndex, TypeVar, Union, get_args, get_origin, get_type_hints
+
+T = TypeVar("T")
+
+
+def read_record(kind: type[T], content: Any, place: str = "") -> T:
+    """Return plain JSON `content` as a value of the dataclass `kind`, fields of fields included.
+
+    Keys that `kind` does not name are left out, so that a newer version may write more; a field with a default may be
+    missing. Annotations may be dataclasses, named tuples (arrays in JSON), ``tuple[X, ...]``, ``Mapping[str, X]``,
+    ``X | None`` and plain types.
+
+    Args:
+        place: what `content` is, for messages.
+
+    Raises:
+        ValueError: where something else stands there, or nothing.
+    """
+    return _value(kind, content, place)
+
+
+@cache
+def _hints(kind: type) -> dict[str, Any]:
+    return get_type_hints(kind)
+
+
+def _value(kind: Any, content: Any, place: str) -> Any:
+    if kind is Any:
+        return content
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin in (Union, types.UnionType):
+        wanted = [one for one in inner if one is not type(None)]
+        return None if content is None else _value(wanted[0], content, place)
+    if origin is tuple and isinstance(content, list | tuple):
+        kinds = [inner[0]] * len(content) if inner[-1] is Ellipsis else inner
+        if len(kinds) != len(content):
+            raise ValueError(f"{place or 'the list'}: {len(content)} values where {len(kinds)} belong")
+        return tuple(_value(one, each, f"{place}[{k}]") for k, (one, each) in enumerate(zip(kinds, content)))
+    if origin is not None and issubclass(origin, Mapping) and isinstance(content, Mapping):
+        return {name: _value(inner[1], each, f"{place}.{name}".lstrip(".")) for name, each in content.items()}
+    if hasattr(kind, "_fields") and isinstance(content, list | tuple):  # a NamedTuple: an array in JSON
+        return kind(*_value(tuple[tuple(_hints(kind).values())], content, place))
+    if is_dataclass(kind) and isinstance(content, Mapping):
+        return _record(kind, content, place)
+    if kind is float and isinstance(content, Real) and not isinstance(content, bool):
+        return float(content)
+    if kind is int and isinstance(content, SupportsIndex) and not isinstance(content, bool):
+        return int(content)
+    if not isinstance(kind, type) or not isinstance(content, kind):
+        raise ValueError(f"{place or 'the content'}: {content!r:.60} where {getattr(kind, '__name__', kind)} belongs")
+    return content
+
+
+def _record(kind: Any, content: Mapping[str, Any], place: str) -> Any:
+    hints, given = _hints(kind), {}
+    for field in fields(kind):
+        where = f"{place}.{field.name}".lstrip(".")
+        if field.name in content:
+            given[field.name] = _value(hints[field.name], content[field.name], where)
+        elif field.default is MISSING and field.default_factory is MISSING:
+            raise ValueError(f"{where} is missing")
+    return kind(**given)
