@@ -37,7 +37,7 @@ class Base:
     """Base parameters of a model.
 
     Attributes:
-        kind: of the model's rows, see `calib.dynamics.idim.KINDS`.
+        rows: name of the model's torque rows.
         standard: names of the p parameters of the model.
         standard_units: their units.
         split: the kept and dropped columns, K = ``split.coefficients``, singular values and their gap.
@@ -46,7 +46,7 @@ class Base:
         lost: (p - b,) the same as a torque: rms over the samples' rows per unit of the parameter [N m or N per unit].
     """
 
-    kind: str
+    rows: str
     standard: tuple[str, ...]
     standard_units: tuple[str, ...]
     split: ColumnSplit
@@ -157,7 +157,7 @@ def random_samples(
     upper: np.ndarray | None = None,
 ) -> States:
     """Draw states: q uniform within its limits (default ±π), v and a uniform within ±3 per s and ±3 per s²."""
-    rng, n = np.random.default_rng(seed), model.bodies.n
+    rng, n = np.random.default_rng(seed), model.n
     low = np.full(n, -np.pi) if lower is None else lower
     q = rng.uniform(low, np.full(n, np.pi) if upper is None else upper, (count, n))
     v, a, load = rng.uniform(-3.0, 3.0, (3, count, n))
@@ -213,7 +213,7 @@ def preference(model: IdentificationModel) -> np.ndarray:
     first: list[int] = []
     late: list[int] = []
     fixed: list[int] = []
-    for i in range(0 if model.kind == "drive" else bodies.count):
+    for i in range(model.inertial // 10):
         if bodies.kinds[i] == FIXED:
             fixed += range(10 * i, 10 * i + 10)
             continue
@@ -274,7 +274,7 @@ def _load_cases(model: IdentificationModel, loads: Loads | None) -> Loads:
     """Return the load cases: all payloads and none, where the model has payloads."""
     if loads is not None:
         return loads
-    return (None, ()) if model.kind != "drive" and np.any(model.bodies.kinds == FIXED) else (None,)
+    return (None, ()) if model.inertial and np.any(model.bodies.kinds == FIXED) else (None,)
 
 
 def _updated(triangle: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -311,9 +311,11 @@ def _describe(model: IdentificationModel, split: ColumnSplit, factor: np.ndarray
     rest = np.linalg.norm(factor[:, split.dropped] - factor[:, split.kept] @ split.coefficients, axis=0)
     rest[silent[split.dropped]] = 0.0
     lost = rest / np.sqrt(samples * model.rows)
-    return Base(model.kind, model.names, model.units, split, frozen(rest / scale[split.dropped]), frozen(lost))
+    return Base(
+        model.torque_rows.name, model.names, model.units, split, frozen(rest / scale[split.dropped]), frozen(lost)
+    )
 
 
 def _require_same(base: Base, model: IdentificationModel) -> None:
-    if (base.kind, base.standard) != (model.kind, model.names):
-        raise CalibError("the base parameters belong to another model: its kind or its parameters' names differ")
+    if (base.rows, base.standard) != (model.torque_rows.name, model.names):
+        raise CalibError("the base parameters belong to another model: its rows or its parameters' names differ")

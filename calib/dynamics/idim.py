@@ -2,12 +2,7 @@
 
     tau = W(q, v, a) · chi,    chi = [standard parameters of every body; drive terms]
 
-With torque sensors in the joints (Kolyubin, Shiriaev, Jubien 2019, section 6.2) four kinds of rows exist:
-
-    motor    tau                 bodies and all drive terms (a robot without such sensors)
-    link     tau_l               Model 1: bodies and link-side terms
-    both     [tau_l; tau]        Model 2: bodies and link-side terms in both, motor-side terms in the second half
-    drive    tau - tau_l         Model 3: motor-side terms alone
+Which torque rows those are, `TorqueRows` says.
 """
 
 from __future__ import annotations
@@ -22,11 +17,9 @@ from calib.dynamics import drives, rigid_body
 from calib.dynamics.bodies import Bodies, bodies_of, with_payload
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.shapes import V0
+from calib.dynamics.torque_rows import BODIES, MOTOR, TorqueRows
 from calib.errors import CalibError
 from calib.robot.chain import Chain
-
-KINDS = ("motor", "link", "both", "drive")
-MODELS = {1: "link", 2: "both", 3: "drive"}  # as the 2019 paper numbers them
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,44 +29,53 @@ class IdentificationModel:
     Attributes:
         bodies: of the robot.
         terms: the drives' terms.
-        kind: one of `KINDS`.
+        torque_rows: which torques it explains.
     """
 
     bodies: Bodies
     terms: tuple[DriveTerm, ...] = ()
-    kind: str = "motor"
+    torque_rows: TorqueRows = MOTOR
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise CalibError(f"model kind '{self.kind}' is none of {', '.join(KINDS)}")
         doubled = sorted({name for name in self.names if self.names.count(name) > 1})
         if doubled:
             raise CalibError(f"parameter '{doubled[0]}' occurs twice; remove one of its terms")
         for one in self.terms:
             for row, motion in one.acts:
-                if not all(0 <= joint < self.bodies.n for joint in (row, *(j for j, _ in motion))):
-                    raise CalibError(f"term '{one.name}' names a joint beyond the robot's {self.bodies.n}")
+                if not all(0 <= joint < self.n for joint in (row, *(j for j, _ in motion))):
+                    raise CalibError(f"term '{one.name}' names a joint beyond the robot's {self.n}")
+
+    @property
+    def n(self) -> int:
+        return self.bodies.n
+
+    @property
+    def inertial(self) -> int:
+        """Number of columns that are bodies' parameters; they come first."""
+        return 10 * self.bodies.count if self.torque_rows.has_bodies else 0
 
     @property
     def names(self) -> tuple[str, ...]:
-        own = tuple(one.name for one in self.columns)
-        return own if self.kind == "drive" else self.bodies.names + own
+        return (*self.bodies.names[: self.inertial], *(one.name for one in self.columns))
 
     @property
     def units(self) -> tuple[str, ...]:
-        own = tuple(one.unit for one in self.columns)
-        return own if self.kind == "drive" else self.bodies.units + own
+        return (*self.bodies.units[: self.inertial], *(one.unit for one in self.columns))
 
     @property
     def columns(self) -> tuple[DriveTerm, ...]:
-        """The terms this kind of rows can see."""
-        hidden = {"link": "motor", "drive": "link"}.get(self.kind)
-        return tuple(one for one in self.terms if one.side != hidden)
+        """The terms that these rows can see."""
+        return tuple(one for one in self.terms if one.side in self.torque_rows.sides)
+
+    @property
+    def sides(self) -> tuple[str, ...]:
+        """(p,) what each column is to `TorqueRows`."""
+        return (*(BODIES,) * self.inertial, *(one.side for one in self.columns))
 
     @property
     def rows(self) -> int:
-        """Torque rows per sample: n, or 2 n where sensors and motors are stacked."""
-        return self.bodies.n * (2 if self.kind == "both" else 1)
+        """Torque rows per sample."""
+        return self.torque_rows.count(self.n)
 
     @property
     def p(self) -> int:
@@ -96,24 +98,16 @@ class IdentificationModel:
             carried: labels of the fixed bodies (payloads) present; None for all. Columns of absent ones are zero.
             states: (s, N), of `friction_states`; None: computed, taking q for one uninterrupted record.
         """
-        q, v, a = (shaped(x, (len(q), self.bodies.n), name) for x, name in ((q, "q"), (v, "v"), (a, "a")))
+        q, v, a = (shaped(x, (len(q), self.n), name) for x, name in ((q, "q"), (v, "v"), (a, "a")))
         loads = None if load is None else shaped(load, q.shape, "load").T
-        n, first = self.bodies.n, 0 if self.kind == "drive" else 10 * self.bodies.count
-        out = np.zeros((self.p, self.rows, len(q)))
-        if first:
-            rigid_body.fill_regressor(self.bodies, q, v, a, out[:first])
+        out = np.zeros((self.p, self.n, len(q)))
+        if self.inertial:
+            rigid_body.fill_regressor(self.bodies, q, v, a, out[: self.inertial])
             self._drop_absent(out, carried)
         motions = [np.ascontiguousarray(x.T) for x in (q, v, a)]
         states = drives.friction_states(self.columns, motions[0]) if states is None else states
-        if self.kind != "both":
-            drives.fill(self.columns, out[first:], [*motions, loads], states)
-            return out.transpose(2, 1, 0)
-        drives.fill(self.columns, out[first:, n:], [*motions, loads], states)
-        out[:first, n:] = out[:first, :n]
-        for k, one in enumerate(self.columns):
-            if one.side == "link":
-                out[first + k, :n] = out[first + k, n:]
-        return out.transpose(2, 1, 0)
+        drives.fill(self.columns, out[self.inertial :], [*motions, loads], states)
+        return self.torque_rows.observe(out.transpose(2, 1, 0), self.sides, q, v)
 
     def regressor_gradient(
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
@@ -123,17 +117,29 @@ class IdentificationModel:
         Args:
             weights: (N, rows, p).
         """
-        n, first = self.bodies.n, 0 if self.kind == "drive" else 10 * self.bodies.count
         weights = shaped(weights, (len(q), self.rows, self.p), "weights of the regressor")
-        if self.kind == "both":
-            linked = [True] * first + [one.side == "link" for one in self.columns]
-            weights = weights[:, n:] + weights[:, :n] * np.array(linked, dtype=float)
+        weights, first = self.torque_rows.fold(weights, self.sides), self.inertial
         out = np.zeros((3, *np.shape(q)))
         if first:
             out[:] = rigid_body.regressor_gradient(self.bodies, q, v, a, weights[:, :, :first])
         motions = [np.ascontiguousarray(np.asarray(x, dtype=float).T) for x in (q, v, a)]
         drives.slopes(self.columns, motions, weights[:, :, first:].transpose(2, 1, 0), [out[0].T, out[1].T, out[2].T])
         return out[0], out[1], out[2]
+
+    def acting(self) -> np.ndarray:
+        """Return which entries of the regressor can differ from 0, (p, rows) bool.
+
+        A body's parameters reach the joints before it, a drive's its own: half of all entries, or less.
+        """
+        if self.torque_rows.projection is not None:
+            return np.ones((self.p, self.rows), dtype=bool)
+        entries = np.zeros((1, self.n, self.p))
+        state = np.random.default_rng(0).uniform(0.5, 1.5, (3, 4, self.n))
+        if self.inertial:  # what is zero at a random state is zero everywhere
+            entries[0, :, : self.inertial] = (rigid_body.regressor(self.bodies, *state) != 0.0).any(axis=0)
+        for k, one in enumerate(self.columns):
+            entries[0, [row for row, _ in one.acts], self.inertial + k] = 1.0
+        return self.torque_rows.observe(entries, self.sides, *state[:2])[0].T != 0.0
 
     def _drop_absent(self, out: np.ndarray, carried: Collection[str] | None) -> None:
         """Zero the columns of fixed bodies that are not carried."""
@@ -151,7 +157,7 @@ def from_chain(
     chain: Chain,
     sets: str | Sequence[str] = "Ia Fv Fc off",
     payload: np.ndarray | None = None,
-    kind: str = "motor",
+    rows: TorqueRows = MOTOR,
     v0: float | Sequence[float] = V0,
 ) -> IdentificationModel:
     """Return the model of a chain with the same drive terms on every joint, or with a set per joint.
@@ -167,7 +173,7 @@ def from_chain(
     bodies = bodies_of(chain)
     bodies = bodies if payload is None else with_payload(bodies, payload)
     linear = [joint.kind == "prismatic" for joint in chain.joints]
-    return IdentificationModel(bodies, drives.standard(each, v0, linear), kind)
+    return IdentificationModel(bodies, drives.standard(each, v0, linear), rows)
 
 
 def friction_states(model: IdentificationModel, q: np.ndarray) -> np.ndarray:

@@ -97,7 +97,7 @@ def of_standard(model: IdentificationModel, values: np.ndarray) -> PathDynamics:
     values = shaped(values, (model.p,), "parameters of the model")
     _require_torques(model)
     rubbing = _is_friction(model)
-    first = 10 * model.bodies.count
+    first = model.inertial
     without = replace(model, terms=tuple(one for one in model.columns if one.shape in AFFINE))
     return PathDynamics(
         without.regressor, values[~rubbing], *_valued(model, values), model.bodies, np.array(values[:first])
@@ -119,25 +119,25 @@ def of_base(model: BaseModel, values: np.ndarray) -> PathDynamics:
         name = model.names[int(mixed.max(axis=1).argmax())]
         raise CalibError(f"base parameter {name} holds friction and other effects: their torques cannot be told apart")
     standard = to_standard(model.base, values)
-    bodies = standard[: 10 * model.model.bodies.count]
+    bodies = standard[: model.model.inertial]
     terms, amounts = _valued(model.model, standard)
     return PathDynamics(model.regressor, np.where(kept, 0.0, values), terms, amounts, model.model.bodies, bodies)
 
 
 def _require_torques(model: IdentificationModel) -> None:
-    if model.kind == "drive":
+    if not model.torque_rows.has_bodies:
         raise CalibError("rows tau - tau_l hold no bodies: no motion to plan; use a model of the torques tau")
 
 
 def _is_friction(model: IdentificationModel) -> np.ndarray:
     """Tell which of the p columns depend on speed."""
-    bodies = np.zeros(10 * model.bodies.count, dtype=bool)
+    bodies = np.zeros(model.inertial, dtype=bool)
     return np.concatenate([bodies, np.array([one.shape not in AFFINE for one in model.columns], dtype=bool)])
 
 
 def _valued(model: IdentificationModel, values: np.ndarray) -> tuple[tuple[DriveTerm, ...], np.ndarray]:
     """Return the drive terms with a value and an exact sign, and the values."""
-    found = [(one, x) for one, x in zip(model.columns, values[10 * model.bodies.count :]) if x]
+    found = [(one, x) for one, x in zip(model.columns, values[model.inertial :]) if x]
     return tuple(_sharp(one) for one, _ in found), np.array([x for _, x in found], dtype=float)
 
 

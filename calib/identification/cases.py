@@ -9,9 +9,8 @@ import numpy as np
 
 from calib.arrays import frozen
 from calib.data.signals.motion import Motion, moving
+from calib.dynamics.torque_rows import MOTOR, TorqueRows
 from calib.errors import MeasurementError, UsageError
-
-FULL = 20  # of a recording's length, the filter of the parallel decimation may eat one part in so many (our choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +24,7 @@ class Case:
         carried: labels of the payloads on board.
         present: (N, rows) which rows may be learnt from: no lost samples, and no slow ones where they are cut.
         noise: (rows,) standard deviation of the targets' samples, as repeats of the motion told it; None: not known.
+        torque_rows: which torques the targets are.
     """
 
     name: str
@@ -33,6 +33,7 @@ class Case:
     carried: tuple[str, ...]
     present: np.ndarray
     noise: np.ndarray | None = None
+    torque_rows: TorqueRows = MOTOR
 
     @property
     def duration(self) -> float:
@@ -43,7 +44,7 @@ class Case:
 def make_case(
     name: str,
     motion: Motion,
-    kind: str = "motor",
+    rows: TorqueRows = MOTOR,
     *,
     gains: np.ndarray | None = None,
     carried: Sequence[str] = (),
@@ -52,35 +53,27 @@ def make_case(
     """Return the case of a motion.
 
     Args:
-        kind: of the model's rows (`calib.dynamics.idim.KINDS`); ``link``, ``both`` and ``drive`` need joint torque
-            sensors (`Motion.tau_link`).
+        rows: which torques the model explains; all but the motors' need joint torque sensors (`Motion.tau_link`).
         gains: (n,) torque per unit of the effort; None: 1.
         carried: labels of payloads.
         slow: rows of joints slower than this are not learnt from: a share of the peak speed or (n,) speeds; None: all
             are.
     """
     effort = np.array(motion.effort) if gains is None else motion.effort * gains
-    if kind != "motor" and motion.tau_link is None:
+    if rows.sensed and motion.tau_link is None:
         raise MeasurementError(
-            f"rows '{kind}' need torques of sensors behind the gear (columns tau_l1 …, tau_sensor1 …) beside motors'",
+            f"rows '{rows.name}' need torques of sensors behind the gear (columns tau_l1 …, tau_sensor1 …) beside "
+            "motors'",
             motion.file,
         )
-    link = effort if motion.tau_link is None else np.asarray(motion.tau_link)
-    target = {"motor": effort, "link": link, "both": np.hstack([link, effort]), "drive": effort - link}[kind]
+    target = rows.target(effort, motion.tau_link, motion.q, motion.v)
     known = np.repeat(motion.weight[:, None] > 0.5, motion.n, axis=1)
     if slow is not None:
         known &= moving(motion, slow)
-    present = np.hstack([known, known]) if kind == "both" else known
     noise = None
-    if motion.effort_variance is not None and kind == "motor":
+    if motion.effort_variance is not None and rows.motors_alone:
         noise = frozen(np.sqrt(motion.effort_variance) * (1.0 if gains is None else np.abs(gains)))
-    return Case(name, motion, frozen(target), tuple(carried), frozen(present, bool), noise)
-
-
-def row_labels(kind: str, n: int) -> tuple[str, ...]:
-    """Return how tables call the torque rows: by the joint's number, sensors' before motors' where both are there."""
-    joints = [str(j + 1) for j in range(n)]
-    return tuple([*(f"l{j}" for j in joints), *(f"m{j}" for j in joints)] if kind == "both" else joints)
+    return Case(name, motion, frozen(target), tuple(carried), frozen(rows.of_joints(known), bool), noise, rows)
 
 
 def case_names(paths: Sequence[str]) -> tuple[str, ...]:

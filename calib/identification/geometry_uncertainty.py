@@ -35,6 +35,7 @@ from calib.data.signals.decimation import Decimator, decimate, kept, spread
 from calib.dynamics import base as bases
 from calib.dynamics import rigid_body
 from calib.dynamics.bodies import Bodies
+from calib.dynamics.torque_rows import BODIES
 from calib.identification.cases import Case
 from calib.identification.identify import Identification, common_decimator
 from calib.identification.prediction import carried_columns
@@ -149,7 +150,7 @@ def sensitivity(
     say = progress or (lambda words: None)
     how = estimator(found)
     p, count = len(how.pull), len(chain.elements) + len(TILTS)
-    if found.dynamics.model.kind == "drive":  # no bodies: rows that no geometry reaches
+    if not found.dynamics.model.torque_rows.has_bodies:  # no bodies: rows that no geometry reaches
         return np.zeros((p, count)), np.zeros(count), np.zeros(count)
     moved = neighbours(found, chain)
     decimator = common_decimator(cases, found.settings)
@@ -227,12 +228,11 @@ def _differences(
         residual: (M, rows) R⁻¹ (y - W φ) of the rows that the samples in `span` make.
     """
     model, motion, b = found.dynamics.model, case.motion, found.base.b
-    bodies = 10 * model.bodies.count
+    bodies = model.inertial
     onboard = carried_columns(model, case.carried)
     parameters = bases.to_standard(found.base, found.fitted.estimate.values[:b])[:bodies] * onboard
     q, v, a = (np.asarray(x[span]) for x in (motion.q, motion.v, motion.a))
-    times = model.rows // model.bodies.n
-    felt = spread(residual, decimator, len(q)).reshape(len(q), times, -1).sum(axis=1)
+    felt = model.torque_rows.fold(spread(residual, decimator, len(q))[:, :, None], (BODIES,))[:, :, 0]
     change = np.empty((len(moved), model.bodies.n, len(q)))
     pulled = np.zeros((bodies, len(moved)))
     for start in range(0, len(q), BLOCK):
@@ -244,11 +244,11 @@ def _differences(
                 torque = (parameters @ regressor).reshape(model.bodies.n, -1)
                 change[k, :, part] = torque if sign > 0 else (change[k, :, part] - torque) / (2.0 * STEP)
                 pulled[:, k] += sign / (2.0 * STEP) * (regressor @ weights)
-    thinned = decimate(change.transpose(2, 1, 0), decimator)
+    rows = model.torque_rows.observe(change.transpose(2, 1, 0), (BODIES,) * len(moved), q, v)
     inertial = found.base.kept < bodies
     result = np.zeros((b, len(moved)))
     result[inertial] = (pulled * onboard[:, None])[found.base.kept[inertial]]
-    return np.tile(thinned, (1, times, 1)), result
+    return decimate(rows, decimator), result
 
 
 def _rms(values: np.ndarray) -> np.ndarray:

@@ -108,7 +108,7 @@ def identify(
     std, tau, values = first_fit(rows, noise)
     first = Dynamics(model, bases.to_standard(base, values))
     friction = "standard" if settings.friction == "auto" and _all_poor(cases) else settings.friction
-    loaded = settings.kind == "motor" and friction not in ("standard", "ripple")
+    loaded = settings.torque_rows.motors_alone and friction not in ("standard", "ripple")
     loads = [transmitted(first, case) if loaded else None for case in cases]
     prior = _prior(chain, model, base, rows, cases, std, tau, settings)
     known = None if prior is None else prior.rows
@@ -117,7 +117,11 @@ def identify(
         cases, rows, loads, decimator, std, tau, np.array(per_joint(settings.v0, n, "v0")),
         np.array([joint.kind == "prismatic" for joint in chain.joints]), known,
     )  # fmt: skip
-    climbed = select_friction(ground, friction, progress) if settings.kind == "motor" else FrictionSelection((), (), ())
+    climbed = (
+        select_friction(ground, friction, progress)
+        if settings.torque_rows.motors_alone
+        else FrictionSelection((), (), ())
+    )
     say("estimate")
     full = [
         extend(part, climbed.terms, observe_terms(climbed.terms, case, decimator, load))
@@ -134,7 +138,7 @@ def identify(
     values = fitted.estimate.values
     standard = np.concatenate([bases.to_standard(base, values[: base.b]), values[base.b :]])
     ripples: list[Ripple] = []
-    if settings.kind == "motor" and friction in ("auto", "ripple"):
+    if settings.torque_rows.motors_alone and friction in ("auto", "ripple"):
         say("ripple")
         so_far = Dynamics(richer, standard)
         ripples = find_all(cases, [case.target - predict(so_far, case) for case in cases])
@@ -205,9 +209,10 @@ def repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> np
     """
     if settings.weights == "residuals":
         return None
-    if settings.method != "wls" or settings.kind != "motor":
+    if settings.method != "wls" or not settings.torque_rows.motors_alone:
         raise UsageError(
-            f'weights = "repeats" goes with method wls and rows motor, found {settings.method} and {settings.kind}'
+            f'weights = "repeats" goes with method wls and rows motor, found {settings.method} and '
+            f"{settings.torque_rows.name}"
         )
     for case in cases:
         if case.noise is None:
@@ -248,7 +253,7 @@ def _prior(
     std: np.ndarray, tau: np.ndarray, settings: IdentificationSettings,
 ) -> Prior | None:  # fmt: skip
     """Return the prior, where it is asked for or the motion is too poor to do without."""
-    if settings.prior == "none" or settings.method != "wls" or settings.kind == "drive":
+    if settings.prior == "none" or settings.method != "wls" or not settings.torque_rows.has_bodies:
         return None
     data = pool(triangulate(rows), rows[0].target.shape[1])
     normalised = condition_numbers(data.factors.reshape(-1, data.parameters + 1)[:, :-1])[1]

@@ -76,8 +76,8 @@ from calib.data.recordings.recording_options import RecordingOptions
 from calib.data.signals.decimation import KINDS as DECIMATORS
 from calib.data.signals.motion import FilterOptions
 from calib.dynamics.drives import DriveTerm, term
-from calib.dynamics.idim import KINDS
 from calib.dynamics.shapes import SHAPES
+from calib.dynamics.torque_rows import ROWS, TorqueRows
 from calib.errors import CalibError, UsageError
 from calib.identification.friction.friction_ladder import NAMES
 from calib.identification.loop.loop_settings import parse_loop
@@ -128,7 +128,11 @@ class IdentifyOptions:
     def for_file(self, path: str | Path) -> FileSettings:
         """Return the settings of the recording at `path`, whose torques are those the model's rows explain."""
         found = values.own_table(self.files, path) or self.every
-        return replace(found, recording=replace(found.recording, wanted=self.settings.kind))
+        return replace(found, recording=_for_rows(found.recording, self.settings.torque_rows))
+
+
+def _for_rows(recording: RecordingOptions, rows: TorqueRows) -> RecordingOptions:
+    return replace(recording, rows=rows.name, motors=rows.driven, sensors=rows.sensed)
 
 
 def read_options(path: str | Path | None = None) -> IdentifyOptions:
@@ -311,6 +315,10 @@ def _as_tuple(value: Any, place: str) -> tuple[float, ...]:
     return found if isinstance(found, tuple) else (found,)
 
 
+def _torque_rows(value: Any, place: str) -> TorqueRows:
+    return ROWS[values.one_of(*ROWS)(value, place)]
+
+
 def _gravity(value: Any, place: str) -> tuple[float, ...]:
     found = _numbers(value, place)
     if len(found) != 3:
@@ -318,14 +326,14 @@ def _gravity(value: Any, place: str) -> tuple[float, ...]:
     return found
 
 
-_FIELD = {"drives": "sets", "rows": "kind"}
+_FIELD = {"drives": "sets", "rows": "torque_rows"}
 _SETTINGS: dict[str, Callable[[Any, str], Any]] = {
     "friction": values.one_of(*NAMES),
     "method": values.one_of(*METHODS),
     "weights": values.one_of(*WEIGHTS),
     "drives": _text_or_texts,
     "v0": _as_tuple,
-    "rows": values.one_of(*KINDS),
+    "rows": _torque_rows,
     "gravity": _gravity,
     "essential": values.one_of(*RULES),
     "ratio": values.positive(),

@@ -42,6 +42,7 @@ from calib.dynamics.base import Base, expressions
 from calib.dynamics.bodies import bodies_of, with_gravity, with_payload
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.torque_rows import torque_rows
 from calib.errors import RobotError, UsageError
 from calib.identification.prediction import Dynamics
 from calib.robot import description
@@ -123,11 +124,11 @@ def read_covariance(folder: Path) -> tuple[tuple[str, ...], np.ndarray] | None:
 def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, Any]:
     """Return the model as what JSON can hold; `unit` is that of its torques."""
     model = dynamics.model
-    bodies = 10 * model.bodies.count if model.kind != "drive" else 0
+    bodies = model.inertial
     payloads = [label for label, coordinate in zip(model.bodies.labels, model.bodies.coordinates) if coordinate < 0]
     return {
         "robot": "robot.toml",
-        "kind": model.kind,
+        "kind": model.torque_rows.name,
         "unit": unit,
         "gravity": model.bodies.gravity.tolist(),
         "payloads": payloads,
@@ -176,11 +177,11 @@ def from_table(chain: Chain, table: Mapping[str, Any]) -> Dynamics:
     for label in table.get("payloads", ()):
         bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1)
     terms = tuple(_term(entry) for entry in table["terms"])
-    model = IdentificationModel(bodies, terms, table.get("kind", "motor"))
+    model = IdentificationModel(bodies, terms, torque_rows(table.get("kind", "motor")))
     own = table["bodies"]
-    standard = [] if model.kind == "drive" else [float(own[name]) for name in bodies.names]
+    standard = [float(own[name]) for name in bodies.names[: model.inertial]]
     values = np.array([*standard, *(float(entry["value"]) for entry in table["terms"])])
-    if len(values) != model.p or (model.kind != "drive" and len(own) != len(standard)):
+    if len(values) != model.p or len(own) != len(standard):
         raise ValueError(f"{len(values)} values for {model.p} parameters")
     return Dynamics(model, values)
 

@@ -11,6 +11,7 @@ from calib.arrays import frozen
 from calib.dynamics.bodies import FIXED
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.rigid_body import inverse_dynamics
+from calib.dynamics.torque_rows import BODIES
 from calib.identification.cases import Case
 from calib.identification.rows import BLOCK, term_columns
 
@@ -34,24 +35,23 @@ class Dynamics:
 
 def predict(dynamics: Dynamics, case: Case) -> np.ndarray:
     """Return the torques of all rows at the full rate (N, rows) [N m or N]: W(q, v, a) · values, without W."""
-    model, n = dynamics.model, case.motion.n
-    result = np.zeros((len(case.motion), model.rows))
-    first, load = 0, None
-    if model.kind != "drive":
-        first, load = 10 * model.bodies.count, transmitted(dynamics, case)
-        result[:, :n] = result[:, -n:] = load
-    for one, value in zip(model.columns, dynamics.values[first:]):
+    model, motion = dynamics.model, case.motion
+    load = transmitted(dynamics, case) if model.inertial else None
+    parts = {BODIES: np.zeros(motion.q.shape) if load is None else load}
+    for one, value in zip(model.columns, dynamics.values[model.inertial :]):
+        own = parts.setdefault(one.side, np.zeros(motion.q.shape))
         for row, values in term_columns(one, case, load):
-            result[:, model.rows - n + row] += value * values
-            if model.kind == "both" and one.side == "link":
-                result[:, row] += value * values
+            own[:, row] += value * values
+    result = np.zeros((len(motion), model.rows))
+    for side, own in parts.items():
+        result += model.torque_rows.observe(own[:, :, None], (side,), motion.q, motion.v)[:, :, 0]
     return result
 
 
 def transmitted(dynamics: Dynamics, case: Case) -> np.ndarray:
     """Return the torques (N, n) the gears pass on to the bodies, by the model: what load-dependent friction feels."""
     model, motion = dynamics.model, case.motion
-    bodies = np.array(dynamics.values[: 10 * model.bodies.count]) * carried_columns(model, case.carried)
+    bodies = np.array(dynamics.values[: model.inertial]) * carried_columns(model, case.carried)
     result = np.empty(motion.q.shape)
     for start in range(0, len(motion), BLOCK):
         part = slice(start, start + BLOCK)

@@ -79,7 +79,7 @@ def find_prior(
     weight = 1.0 / (std * np.sqrt(inflation))
     factor = retriangulate((data.factors * weight[:, None, None]).reshape(-1, data.parameters + 1))
     mean, covariance, source = _shape(chain, model, base, data, wanted)
-    drives = 10 * model.bodies.count
+    drives = model.inertial
     inertial = np.array([k < drives for k in base.kept])
     both = np.outer(inertial, inertial)
     scales = [f for f in SCALES if source != "cad" or f <= MOST]
@@ -98,7 +98,7 @@ def _shape(
     chain: Chain, model: IdentificationModel, base: Base, data: Triangles, wanted: str
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """Return mean, covariance at f = 1, and where they come from."""
-    bodies = 10 * model.bodies.count
+    bodies = model.inertial
     squares = np.sum(data.factors**2, axis=(0, 1))
     size = np.sqrt(squares[-1] / np.maximum(squares[:-1], 1e-12 * squares[:-1].max()))  # would explain all of y
     known = chain.inertias is not None and np.any(chain.inertias[:, 9] > 0.0)

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from calib.data.signals.decimation import Decimator, decimate, decimate_blocks, kept
-from calib.dynamics import drives, rigid_body
+from calib.dynamics import drives
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.estimation.triangles import Triangles, absorb, empty, retriangulate
@@ -50,21 +50,19 @@ def observe(
         load: (N, n) transmitted torques at the full rate, where a term needs them.
     """
     motion = case.motion
-    single = replace(model, kind="motor") if model.kind == "both" else model
-    column, row = _live(single, columns)
-    matrix = np.zeros((len(kept(motion.segment, decimator)), single.rows, len(columns)))
+    column, row = _live(model, columns)
+    source = model.torque_rows.repeated(motion.n)  # rows that repeat others are copied, not filtered anew
+    own, again = source[row] == row, source[row] != row
+    matrix = np.zeros((len(kept(motion.segment, decimator)), model.rows, len(columns)))
     states = segmented_states(model.columns, case)
     step, place = max(1, BLOCK // decimator.factor) * decimator.factor, 0
     for start, stop in segments(motion.segment):
         spans = [slice(i, min(i + step, stop)) for i in range(start, stop, step)]
-        blocks = (_block(single, columns[column], row, case, part, load, states) for part in spans)
+        blocks = (_block(model, columns[column[own]], row[own], case, part, load, states) for part in spans)
         for part in decimate_blocks(blocks, decimator):
-            matrix[place : place + part.shape[1], row, column] = part.T
+            matrix[place : place + part.shape[1], row[own], column[own]] = part.T
             place += part.shape[1]
-    if model.kind == "both":  # what the sensors see, the motors see as well
-        hidden = {one.name for one in model.columns if one.side == "motor"}
-        seen = np.array([model.names[k] not in hidden for k in columns], dtype=float)
-        matrix = np.concatenate([matrix * seen, matrix], axis=1)
+    matrix[:, row[again], column[again]] = matrix[:, source[row[again]], column[again]]
     names, units = model.names, model.units
     return _rows([names[k] for k in columns], [units[k] for k in columns], matrix, case, decimator)
 
@@ -164,14 +162,7 @@ def _live(model: IdentificationModel, columns: np.ndarray) -> tuple[np.ndarray, 
 
     A body's parameters reach the joints before it, a drive's its own: half of all entries, or less.
     """
-    first = 0 if model.kind == "drive" else 10 * model.bodies.count
-    entries = np.zeros((model.p, model.rows), dtype=bool)
-    if first:  # what is zero at a random state is zero everywhere
-        state = np.random.default_rng(0).uniform(0.5, 1.5, (3, 4, model.bodies.n))
-        entries[:first] = (rigid_body.regressor(model.bodies, *state) != 0.0).any(axis=0).T
-    for k, one in enumerate(model.columns):
-        entries[first + k, [row for row, _ in one.acts]] = True
-    column, row = np.nonzero(entries[columns])
+    column, row = np.nonzero(model.acting()[columns])
     return column, row
 
 

@@ -13,6 +13,7 @@ from calib.dynamics.bodies import bodies_of, with_gravity, with_payload
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.shapes import V0
+from calib.dynamics.torque_rows import MOTOR, TorqueRows
 from calib.errors import UsageError
 from calib.identification.loop.loop_settings import LoopSettings
 from calib.robot.chain import Chain
@@ -21,13 +22,6 @@ T = TypeVar("T")
 RULES = ("none", "rsd", "f", "both")
 PRIORS = ("auto", "none", "cad")
 WEIGHTS = ("residuals", "repeats")
-DRIVES = {
-    "motor": "Ia Fv Fc off",
-    "link": "Fvl Fcl offl",
-    "both": "Ia Fvl Fcl offl Fvm Fcm offm",
-    "drive": "Ia Fvm Fcm offm",
-}
-"""Drive terms of a joint by the kind of rows, where none are stated: those of Kolyubin, Shiriaev & Jubien (2019)."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +45,9 @@ class IdentificationSettings:
     """The choices of an identification; the defaults suit a serial arm with motor torques.
 
     Attributes:
-        sets: names of the standard drive terms, one text per joint, or one for all; none: `DRIVES` of the kind.
+        sets: names of the standard drive terms, one text per joint, or one for all; none: those of the rows.
         v0: smoothing of the Coulomb sign [rad/s or m/s], one per joint, or one for all.
-        kind: of the rows, `calib.dynamics.idim.KINDS`.
+        torque_rows: which torques are explained.
         couplings, terms: what a joint-by-joint model lacks.
         friction: ``auto``, ``standard`` or a rung (`calib.identification.friction.friction_ladder`).
         method: see `calib.identification.methods.least_squares`.
@@ -74,7 +68,7 @@ class IdentificationSettings:
 
     sets: tuple[str, ...] = ()
     v0: tuple[float, ...] = (V0,)
-    kind: str = "motor"
+    torque_rows: TorqueRows = MOTOR
     couplings: tuple[Coupling, ...] = ()
     terms: tuple[DriveTerm, ...] = ()
     friction: str = "auto"
@@ -104,13 +98,13 @@ def make_model(chain: Chain, settings: IdentificationSettings) -> Identification
         bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1)
     _check_joints(chain.n, settings)
     linear = [joint.kind == "prismatic" for joint in chain.joints]
-    sets = per_joint(settings.sets or (DRIVES[settings.kind],), chain.n, "drives")
+    sets = per_joint(settings.sets or (settings.torque_rows.drives,), chain.n, "drives")
     v0 = per_joint(settings.v0, chain.n, "v0")
     own = list(drives.standard(sets, v0, linear))
     for coupling in settings.couplings:
         own += drives.coupled(*coupling.joints, v0=v0[coupling.joints[1]], label=coupling.label or None)
     own += [replace(one, linear=linear[one.acts[0][0]]) if one.acts else one for one in settings.terms]
-    return IdentificationModel(bodies, tuple(own), settings.kind)
+    return IdentificationModel(bodies, tuple(own), settings.torque_rows)
 
 
 def _check_joints(n: int, settings: IdentificationSettings) -> None:

@@ -43,7 +43,7 @@ class Uncertainty:
             q, v, a = (np.ascontiguousarray(x[part]) for x in (sampled.q, sampled.v, sampled.a))
             load = None
             if with_load(model):
-                bodies = np.array(self.dynamics.values[: 10 * model.bodies.count])
+                bodies = np.array(self.dynamics.values[: model.inertial])
                 load = inverse_dynamics(model.bodies, bodies, q, v, a)
             W = model.regressor(q, v, a, load, self.carried)[:, -n:][:, :, self.columns]
             variance = np.einsum("Nib,bc,Nic->Ni", W, self.covariance, W, optimize=True)

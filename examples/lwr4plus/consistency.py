@@ -29,6 +29,7 @@ from calib.data.recordings.recording import Recording
 from calib.data.signals.decimation import decimate
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics.bodies import standard_parameters
+from calib.dynamics.torque_rows import torque_rows
 from calib.errors import TaskLost
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit
@@ -103,7 +104,7 @@ def world(setup: Setup, kind: str, seed: int) -> World:
     """Return the truth of a setup; the arm's CAD inertias are the true ones."""
     cell = lwr4plus_cell(setup.instrument, hidden=0.0)
     settings = IdentificationSettings(
-        kind=kind, sets=(SETS[kind],), friction="standard", essential="none", prior="none",
+        torque_rows=torque_rows(kind), sets=(SETS[kind],), friction="standard", essential="none", prior="none",
         payloads={PAYLOAD: Payload()},
     )  # fmt: skip
     motion, true = reference(seed), cell.truth.chain
@@ -120,7 +121,7 @@ def true_torques(
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return the true standard parameters, and the torques without and with the payload (N, n)."""
     known, model = known_robots.truth("lwr4plus"), make_model(true, settings)
-    drives = [drive_values(known)[name] for name in model.names[10 * model.bodies.count :]]
+    drives = [drive_values(known)[name] for name in model.names[model.inertial :]]
     values = np.concatenate([standard_parameters(true), known["payload"]["inertia"], drives])
     loads = ((), (PAYLOAD,))
     return values, [model.regressor(motion.q, motion.v, motion.a, carried=load) @ values for load in loads]
@@ -149,7 +150,7 @@ def cases_of(
         q = motion.q + sigma_q * rng.normal(size=tau.shape)
         names = tuple(f"joint{j + 1}" for j in range(tau.shape[1]))
         recording = Recording(motion.t, q, tau, "torque", names, tau_link=tau if kind == "link" else None)
-        result.append(make_case(name, make_motion(recording, FILTERS), kind, carried=load))
+        result.append(make_case(name, make_motion(recording, FILTERS), torque_rows(kind), carried=load))
     return result
 
 
@@ -162,7 +163,7 @@ def calibrate(given: World, seed: list[int]) -> CalibratedChain:
 def once(given: World, seed: list[int]) -> np.ndarray:
     """Calibrate geometry and dynamics: errors, σ_torque and σ_geometry of the base parameters (3, b)."""
     robot = calibrate(given, seed)
-    cases = cases_of(given.motion, given.clean, given.settings.kind, given.noise, [*seed, 2], 1e-5)
+    cases = cases_of(given.motion, given.clean, given.settings.torque_rows.name, given.noise, [*seed, 2], 1e-5)
     found = identify(robot, cases, given.settings)
     carried = geometry_uncertainty.propagate(found, robot, cases)
     off = found.fitted.estimate.values - given.base
@@ -239,7 +240,7 @@ def unseen(given: World, seed: int) -> list[Case]:
     """Return another motion's cases, torques without noise."""
     motion, true = reference(seed + 1001), given.cell.truth.chain
     _, clean = true_torques(true, given.settings, motion)
-    return cases_of(motion, clean, given.settings.kind, np.zeros(true.n), 0)
+    return cases_of(motion, clean, given.settings.torque_rows.name, np.zeros(true.n), 0)
 
 
 def judged(given: World, found: Identification, chain: Chain, cases: list[Case], other: list[Case]) -> dict[str, Any]:

@@ -30,7 +30,8 @@ from calib.dynamics import base as bases
 from calib.dynamics import drives
 from calib.dynamics.base import Base
 from calib.dynamics.bodies import bodies_of, standard_parameters, with_gravity, with_payload
-from calib.dynamics.idim import MODELS, IdentificationModel
+from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.torque_rows import BOTH, LINK, MODELS, MOTOR, TorqueRows
 from calib.estimation.essential import Elimination, Rule, eliminate
 from calib.estimation.linear import LinearFit, settled_std, wls
 from calib.estimation.triangles import Triangles, absorb, empty
@@ -69,7 +70,7 @@ class Data:
     empty: Recording
     loaded: Recording
 
-    def cases(self, kind: str) -> list[Case]:
+    def cases(self, kind: TorqueRows) -> list[Case]:
         motions = [make_motion(part, FILTERS) for part in (self.empty, self.loaded)]
         return [
             make_case("empty", motions[0], kind, carried=()),
@@ -77,7 +78,7 @@ class Data:
         ]
 
 
-def model(chain: Chain, kind: str, gravity: np.ndarray | None = None) -> IdentificationModel:
+def model(chain: Chain, kind: TorqueRows, gravity: np.ndarray | None = None) -> IdentificationModel:
     """Return the study's model: seven links and a payload, seven drive terms each; the payload's move nothing."""
     bodies = with_payload(
         bodies_of(chain), pose(position=np.array([0.0, 0.0, known_robots.truth("lwr4plus")["payload"]["r"]]))
@@ -88,7 +89,7 @@ def model(chain: Chain, kind: str, gravity: np.ndarray | None = None) -> Identif
 
 
 def true_parameters(chain: Chain) -> np.ndarray:
-    """Return the standard parameters (136,) of the simulated arm, in the order of `model` of kind ``both``."""
+    """Return the standard parameters (136,) of the simulated arm, in the order of `model` of both rows."""
     known = known_robots.truth("lwr4plus")
     sided = [known["drives"][name][joint] for joint in range(chain.n) for name in known_robots.SIDED]
     return np.concatenate([standard_parameters(chain), known["payload"]["inertia"], sided, np.zeros(7)])
@@ -96,13 +97,13 @@ def true_parameters(chain: Chain) -> np.ndarray:
 
 def counts(chain: Chain) -> dict[str, int]:
     """Return the numbers of base parameters of the models and their variants, on the CAD geometry."""
-    both = model(chain, "both")
-    tilted = model(chain, "both", 9.81 * np.array([0.3, 0.2, -np.sqrt(1 - 0.13)]))
+    both = model(chain, BOTH)
+    tilted = model(chain, BOTH, 9.81 * np.array([0.3, 0.2, -np.sqrt(1 - 0.13)]))
     whole = bases.find(both)
     found = {f"Model {number}": bases.find(model(chain, kind)).b for number, kind in MODELS.items()}
     found |= {
         "one load case": bases.find(both, loads=[None]).b,
-        "motor torque only": bases.find(model(chain, "motor")).b,
+        "motor torque only": bases.find(model(chain, MOTOR)).b,
         "tilted": bases.find(tilted).b,
         "standard": both.p,
         "without effect": len(whole.without_effect),
@@ -113,7 +114,7 @@ def counts(chain: Chain) -> dict[str, int]:
 
 def choose_motion(chain: Chain, quick: bool, seed: int) -> Reference:
     """Return the best of a few random motions by the condition number of Model 2's base columns at unit norm."""
-    both = model(chain, "both")
+    both = model(chain, BOTH)
     kept = bases.find(both).kept
 
     def condition(reference: Reference) -> float:
@@ -138,12 +139,12 @@ def record(chain: Chain, reference: Reference, seed: list[int]) -> Data:
 
 def _record(chain: Chain, reference: Reference, loaded: bool, seed: list[int]) -> Recording:
     noise, values = known_robots.truth("lwr4plus")["noise"], true_parameters(chain)
-    whole = model(chain, "motor")
+    whole = model(chain, MOTOR)
     if not loaded:
         values[10 * chain.n : 10 * (chain.n + 1)] = 0.0
     plant = Plant(whole.bodies, whole.terms, values)
     run = simulate(plant, controller(plant, reference), reference, Sensing(noise["sigma_q"]), seed)
-    link = model(chain, "link")
+    link = model(chain, LINK)
     shared = np.array([name in link.names for name in whole.names])
     tau_l = np.einsum("kij,j->ki", link.regressor(run.q, run.v, run.a), values[shared])
     rng = np.random.default_rng([*seed, 2])
@@ -172,7 +173,7 @@ class Fit:
     rules: dict[str, int]
 
 
-def identify(chain: Chain, nominal: Chain, kind: str, data: Data) -> Fit:
+def identify(chain: Chain, nominal: Chain, kind: TorqueRows, data: Data) -> Fit:
     """Estimate base and essential parameters: columns chosen on the nominal chain, regrouped on the one given."""
     own = model(chain, kind)
     base = bases.regroup(bases.find(model(nominal, kind)), own)
@@ -206,7 +207,7 @@ def values_of(found: Fit) -> np.ndarray:
 def computed_torque(found: Fit, data: Data) -> dict[str, Any]:
     """Return errors of the torque below 2 Hz on other motion, rows of sensors and motors by joint [N m], [%]."""
     result: dict[str, Any] = {}
-    for case in data.cases(found.model.kind):
+    for case in data.cases(found.model.torque_rows):
         rows = observe(found.model, found.base.kept, case, case.motion.decimator)
         error = rows.target - rows.matrix @ values_of(found)
         n = found.model.bodies.n
@@ -226,7 +227,7 @@ def computed_torque(found: Fit, data: Data) -> dict[str, Any]:
 
 def tracking(chain: Chain, fits: dict[str, Fit], reference: Reference) -> dict[str, list[float]]:
     """Return rms tracking errors [mrad] of the true loaded arm, fed forward by nothing and by each estimate."""
-    whole = model(chain, "motor")
+    whole = model(chain, MOTOR)
     robot = Plant(whole.bodies, whole.terms, true_parameters(chain))
     bare = replace(controller(robot, reference), ahead=None)
     result = {"feedback alone": tracking_error(robot, None, bare, reference)}
@@ -290,7 +291,7 @@ def run(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
             "base": found.base.b, "essential": found.rules,
             "condition": found.fit.condition_normalised, "error_in_sigma": errors_in_sigma(found, _truth(found)),
         }  # fmt: skip
-    fits = {name: identify(chain, nominal, "both", data)
+    fits = {name: identify(chain, nominal, BOTH, data)
             for name, chain in (("cad", nominal), ("calibrated", calibrated))}  # fmt: skip
     best = fits["calibrated"]
     metrics |= {
@@ -311,7 +312,7 @@ def run(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
 def _truth(found: Fit) -> np.ndarray:
     """Return the true base parameters of a model."""
     chain = replace(lwr4plus.arm(lwr4plus.table_2()[1]), inertias=lwr4plus.nominal_chain().inertias)
-    known = dict(zip(model(chain, "both").names, true_parameters(chain)))
+    known = dict(zip(model(chain, BOTH).names, true_parameters(chain)))
     return found.base.transform @ np.array([known[name] for name in found.model.names])
 
 

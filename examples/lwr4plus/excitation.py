@@ -33,7 +33,8 @@ from calib import files
 from calib.dynamics import base, drives
 from calib.dynamics.base import BaseModel
 from calib.dynamics.bodies import bodies_of, standard_parameters
-from calib.dynamics.idim import MODELS, IdentificationModel
+from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.torque_rows import BOTH, MODELS, MOTOR, TorqueRows
 from calib.procedure.excitation.limits import Points
 from calib.procedure.report.style import save
 from calib.robot.chain import Chain
@@ -50,7 +51,7 @@ from trajectories.places import Workspace
 HARMONICS, RATE, SEEDS = 5, 20.0, 20
 NOISE = {"link": 0.003, "motor": 0.015}  # of the torque limits
 STRIBECK, SLOW = 0.3, 0.05  # share of Fc at most, and speed [rad/s]
-KINDS = {"Model 1": MODELS[1], "Model 3": MODELS[3], "motor torques": "motor"}  # Model 2 is the study itself
+KINDS = {"Model 1": MODELS[1], "Model 3": MODELS[3], "motor torques": MOTOR}  # Model 2 is the study itself
 TOLD = 30.0  # RSD [%] up to which a motion tells a parameter
 
 
@@ -70,12 +71,12 @@ def geometry(name: str) -> Chain:
 
 
 @cache
-def plant(where: str, kind: str) -> Plant:
+def plant(where: str, kind: TorqueRows) -> Plant:
     """Return the arm's model; its columns are chosen on the CAD geometry, and regrouped on its own."""
     known, chain = known_robots.truth("lwr4plus"), geometry(where)
     values = np.column_stack([known["drives"][key] for key in known_robots.SIDED])
     names = " ".join(known_robots.SIDED)
-    if kind == "motor":
+    if kind.motors_alone:
         total = [known["drives"][key] for key in ("Ia", "Fv", "Fc")]
         values = np.column_stack([*total, np.add(known["drives"]["offl"], known["drives"]["offm"])])
         names = "Ia Fv Fc off"
@@ -83,22 +84,21 @@ def plant(where: str, kind: str) -> Plant:
     nominal = IdentificationModel(bodies_of(geometry("CAD")), models[0].terms, kind)
     found = base.regroup(base.find(nominal), models[0])
     amounts = dict(zip([f"{key}{j + 1}" for j in range(7) for key in names.split()], values.ravel()))
-    bodies = np.zeros(0) if kind == "drive" else standard_parameters(chain)
+    bodies = standard_parameters(chain) if kind.has_bodies else np.zeros(0)
     own = np.concatenate([bodies, [amounts[one.name] for one in models[0].columns]])
     effort = np.array([joint.effort for joint in chain.joints])
-    noise = {"link": ["link"], "both": ["link", "motor"], "motor": ["motor"], "drive": ["motor"]}[kind]
-    sigma = np.concatenate([NOISE[one] * effort for one in noise])
+    sigma = np.concatenate([NOISE["motor" if block.motor else "link"] * effort for block in kind.blocks])
     return Plant(BaseModel(models[0], found), BaseModel(models[1], found), found.transform @ own, sigma)
 
 
 def torque(where: str, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-    motor = plant(where, "motor")
+    motor = plant(where, MOTOR)
     return motor.sharp.regressor(q, v, a) @ motor.values
 
 
-def problem(where: str, kind: str, period: float, which: str, harmonics: int) -> ExcitationProblem:
+def problem(where: str, kind: TorqueRows, period: float, which: str, harmonics: int) -> ExcitationProblem:
     """Return the design problem of trajectory A, B or D."""
-    chain, own, motor = geometry(where), plant(where, kind), plant(where, "motor")
+    chain, own, motor = geometry(where), plant(where, kind), plant(where, MOTOR)
     velocity, effort = (np.array([getattr(joint, key) for joint in chain.joints]) for key in ("velocity", "effort"))
     tool = Points(chain, (0,), np.zeros((1, 3)))
     limits = (
@@ -117,7 +117,7 @@ def problem(where: str, kind: str, period: float, which: str, harmonics: int) ->
 
 
 def designed(
-    where: str, kind: str, period: float, which: str, starts: int, seed: int, evaluations: int,
+    where: str, kind: TorqueRows, period: float, which: str, starts: int, seed: int, evaluations: int,
     harmonics: int = HARMONICS,
 ) -> SampledMotion:  # fmt: skip
     """Return a designed motion, verified between its samples."""
@@ -127,7 +127,7 @@ def designed(
     return dense_motion(spot.family, found.x, np.arange(0.0, period, 1.0 / RATE))
 
 
-def judged(where: str, kind: str, motion: SampledMotion) -> dict[str, Any]:
+def judged(where: str, kind: TorqueRows, motion: SampledMotion) -> dict[str, Any]:
     """Return what a motion tells: condition numbers, torque shares, RSD and its two factors, errors over seeds."""
     own = plant(where, kind)
     Y = own.sharp.regressor(motion.q, motion.v, motion.a)
@@ -158,13 +158,13 @@ def _stribeck(where: str, own: Plant, motion: SampledMotion, rng: np.random.Gene
     amount = rng.uniform(0.0, STRIBECK, 7) * np.array(known_robots.truth("lwr4plus")["drives"]["Fc"])
     bump = amount * np.exp(-((motion.v / SLOW) ** 2)) * np.tanh(motion.v / 0.01)
     result = np.zeros((len(own.sigma), len(motion)))
-    if own.smooth.model.kind != "link":
+    if own.smooth.model.torque_rows.with_motors:
         result[-7:] = bump.T
     return result
 
 
 def baselines(
-    where: str, kind: str, period: float, seed: int, draws: int
+    where: str, kind: TorqueRows, period: float, seed: int, draws: int
 ) -> dict[str, tuple[SampledMotion, dict[str, Any]]]:
     """Return per kind of moves the draw whose σ are in the middle of all."""
     found = {}
@@ -196,7 +196,7 @@ def summarised(rows: dict[str, dict[str, Any]], against: str) -> None:
         row["median_error"] = {key: float(np.median(np.array(x)[told])) for key, x in row["error"].items()}
 
 
-def estimates(motions: dict[str, SampledMotion], kind: str = "both") -> dict[str, Any]:
+def estimates(motions: dict[str, SampledMotion], kind: TorqueRows = BOTH) -> dict[str, Any]:
     """Identify the calibrated arm from each motion with CAD and with calibrated geometry: relative errors [%]."""
     truth, rows = plant("ID", kind), dict[str, Any]()
     for name, motion in motions.items():
@@ -216,7 +216,7 @@ def estimates(motions: dict[str, SampledMotion], kind: str = "both") -> dict[str
 
 
 def study(full: bool, seed: int) -> tuple[dict[str, Any], dict[str, SampledMotion]]:
-    kind, period = ("both", 25.0) if full else ("motor", 25.0)
+    kind, period = (BOTH, 25.0) if full else (MOTOR, 25.0)
     starts, evaluations, draws = (3, 450, 5) if full else (1, 120, 3)
     motions = dict[str, SampledMotion]()
     plans = [("A", "cond", HARMONICS), ("B", "goals", HARMONICS), ("D", "log det", HARMONICS)]
@@ -229,7 +229,12 @@ def study(full: bool, seed: int) -> tuple[dict[str, Any], dict[str, SampledMotio
     rows = {name: judged("CAD", kind, motion) for name, motion in motions.items()}
     rows |= {name: row for name, (_, row) in plain.items()}
     summarised(rows, "trapezoidal moves")
-    found: dict[str, Any] = {"kind": kind, "period": period, "columns": len(plant("CAD", kind).values), "motions": rows}
+    found: dict[str, Any] = {
+        "kind": kind.name,
+        "period": period,
+        "columns": len(plant("CAD", kind).values),
+        "motions": rows,
+    }
     random = next(iter(plain.values()))[0]
     found["estimates"] = estimates({"random path": random, "optimised": motions["B, goals"]}, kind)
     if full:
@@ -242,19 +247,19 @@ def swept(seed: int, motions: dict[str, SampledMotion]) -> dict[str, Any]:
     periods, models, places = dict[str, Any](), dict[str, Any](), dict[str, Any]()
     for period in (10.0, 15.0, 20.0, 30.0):
         for which in "AB":
-            row = judged("CAD", "both", designed("CAD", "both", period, which, 1, seed, 300))
+            row = judged("CAD", BOTH, designed("CAD", BOTH, period, which, 1, seed, 300))
             periods[f"{which}, {period:g} s"] = _short(row)
             print(f"{which}, {period:g} s: {_short(row)}", flush=True)
     for name, kind in KINDS.items():
-        for which in "A" if kind in ("link", "drive") else "AB":  # slacks are of motor torques
+        for which in "A" if not kind.with_motors else "AB":  # slacks are of motor torques
             row = judged("CAD", kind, designed("CAD", kind, 25.0, which, 1, seed, 300))
             models[f"{name}, {which}"] = _short(row) | {"columns": len(row["rsd"])}
             print(f"{name}, {which}: {models[f'{name}, {which}']}", flush=True)
     for which, name in (("A", "A, cond"), ("B", "B, goals")):
-        own = designed("ID", "both", 25.0, which, 1, seed, 300)
+        own = designed("ID", BOTH, 25.0, which, 1, seed, 300)
         motions[f"{name}, planned on ID"] = own
         for planned, motion in (("CAD", motions[name]), ("ID", own)):
-            places[f"{which} planned on {planned}, judged on ID"] = _short(judged("ID", "both", motion))
+            places[f"{which} planned on {planned}, judged on ID"] = _short(judged("ID", BOTH, motion))
     return {"periods": periods, "models": models, "geometries": places}
 
 

@@ -16,6 +16,7 @@ from calib.data.recordings.recording_files import read_recording
 from calib.data.signals.motion import make_motion
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.rigid_body import inverse_dynamics
+from calib.dynamics.torque_rows import BOTH
 from calib.identification.cases import make_case
 from calib.identification.identify import identify
 from calib.identification.prediction import predict
@@ -26,7 +27,7 @@ from calib.simulation.loop.references import random_fourier
 
 CHAIN = load("lwr4plus")
 N, RATE, SECONDS = 7, 1000.0, 60.0
-MODEL_2 = IdentificationSettings(kind="both", sets=("Ia Fvm Fcm offm Fvl Fcl",), friction="standard", prior="none")
+MODEL_2 = IdentificationSettings(torque_rows=BOTH, sets=("Ia Fvm Fcm offm Fvl Fcl",), friction="standard", prior="none")
 
 
 def write(folder: Path, seed: int) -> tuple[Path, Path]:
@@ -57,7 +58,7 @@ def logs(tmp_path_factory):
 
 
 def identified(train: Path, other: Path):
-    cases = [make_case(path.name, make_motion(read_recording(path)), "both") for path in (train, other)]
+    cases = [make_case(path.name, make_motion(read_recording(path)), BOTH) for path in (train, other)]
     found = identify(CHAIN, cases[:1], MODEL_2)
     return found, [score(case, predict(found.dynamics, case)) for case in cases]
 

@@ -9,7 +9,8 @@ from differences import check
 
 from calib.dynamics import base, drives, friction, model, rigid_body
 from calib.dynamics.bodies import bodies_of, standard_parameters, with_gravity, with_payload
-from calib.dynamics.idim import MODELS, IdentificationModel, from_chain
+from calib.dynamics.idim import IdentificationModel, from_chain
+from calib.dynamics.torque_rows import BOTH, DRIVE, LINK, MODELS, MOTOR
 from calib.errors import CalibError
 from calib.robot.load import load
 from calib.simulation.cells import lwr4plus
@@ -18,22 +19,22 @@ SENSED = "Ia Fvl Fcl offl Fvm Fcm offm"
 
 
 @cache
-def arm(kind, tilted=False):
+def arm(rows, tilted=False):
     """The study's model: seven joints with torque sensors, payload as body 8, its drive parameters counted too."""
     chain = load("lwr4plus")
     bodies = with_payload(bodies_of(chain), chain.tail)
     bodies = with_gravity(bodies, np.array([1.0, 2.0, -9.5])) if tilted else bodies
-    return IdentificationModel(bodies, drives.standard([SENSED] * 7) + drives.without_effect("8"), kind)
+    return IdentificationModel(bodies, drives.standard([SENSED] * 7) + drives.without_effect("8"), rows)
 
 
 @cache
-def found(kind):
-    return base.find(arm(kind))
+def found(rows):
+    return base.find(arm(rows))
 
 
 def test_counts_of_model_2():
     """136 standard, 18 without effect, 16 regrouped, 102 base (Kolyubin, Shiriaev, Jubien 2019, section 6.2)."""
-    result = found("both")
+    result = found(BOTH)
     assert (len(result.standard), len(result.without_effect), len(result.regrouped), result.b) == (136, 18, 16, 102)
     assert result.split.gap > 1e9
     silent = "XX1 XY1 XZ1 YY1 YZ1 MX1 MY1 MZ1 M1 M2 MZ2 Ia8 Fvl8 Fcl8 offl8 Fvm8 Fcm8 offm8"
@@ -42,19 +43,19 @@ def test_counts_of_model_2():
     assert set(result.regrouped) == {"YY2", *late}
 
 
-@pytest.mark.parametrize(("kind", "count"), [("link", 74), ("both", 102), ("drive", 28), ("motor", 79)])
-def test_counts_of_models_1_2_3_and_of_motor_torques_alone(kind, count):
-    assert found(kind).b == count
-    assert MODELS == {1: "link", 2: "both", 3: "drive"}
+@pytest.mark.parametrize(("rows", "count"), [(LINK, 74), (BOTH, 102), (DRIVE, 28), (MOTOR, 79)])
+def test_counts_of_models_1_2_3_and_of_motor_torques_alone(rows, count):
+    assert found(rows).b == count
+    assert MODELS == {1: LINK, 2: BOTH, 3: DRIVE}
 
 
 @pytest.mark.parametrize("case", [None, ()])
 def test_one_load_case_leaves_the_payload_in_the_links(case):
-    assert base.find(arm("both"), loads=(case,)).b == 92
+    assert base.find(arm(BOTH), loads=(case,)).b == 92
 
 
 def test_tilted_gravity_adds_two():
-    result = base.find(arm("both", tilted=True))
+    result = base.find(arm(BOTH, tilted=True))
     assert result.b == 104
     assert {"MX1", "MY1"} <= {name.rstrip("R") for name in result.names}
 
@@ -105,7 +106,7 @@ FORMULAS = {
 
 def test_regrouping_of_the_lwr():
     """The formulas that symbolic elimination gives (Khalil & Kleinfinger 1987), every coefficient of all 102 rows."""
-    result = found("both")
+    result = found(BOTH)
     wanted = np.zeros((result.b, 136))
     for row, k in enumerate(result.kept):
         wanted[row, k] = 1.0
@@ -117,9 +118,9 @@ def test_regrouping_of_the_lwr():
     assert {name[:-1] for name in result.names if name.endswith("R")} == set(FORMULAS)
 
 
-@pytest.mark.parametrize("kind", ["motor", "both"])
-def test_base_parameters_predict_what_the_standard_ones_do(kind):
-    full, result = arm(kind), found(kind)
+@pytest.mark.parametrize("rows", [MOTOR, BOTH])
+def test_base_parameters_predict_what_the_standard_ones_do(rows):
+    full, result = arm(rows), found(rows)
     chi = np.random.default_rng(0).normal(size=full.p)
     q, v, a = states(7)
     wanted = full.regressor(q, v, a) @ chi
@@ -142,7 +143,7 @@ def test_inertia_matrix_survives_the_regrouping():
 
 
 def test_gradient_through_the_base_columns():
-    reduced = base.BaseModel(arm("both"), found("both"))
+    reduced = base.BaseModel(arm(BOTH), found(BOTH))
     rng = np.random.default_rng(1)
     x, weights = rng.normal(size=21), rng.normal(size=(1, 14, 102))
     smooth = np.array(["Fc" not in name for name in reduced.names])  # tanh(100 v) is too steep for differences
@@ -259,6 +260,6 @@ def test_richer_friction_has_columns_of_its_own():
 
 def test_base_of_another_model_is_refused():
     with pytest.raises(CalibError, match="another model"):
-        base.BaseModel(arm("motor"), found("both"))
+        base.BaseModel(arm(MOTOR), found(BOTH))
     with pytest.raises(CalibError, match="another model"):
-        base.regroup(found("both"), arm("motor"))
+        base.regroup(found(BOTH), arm(MOTOR))

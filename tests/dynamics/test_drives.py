@@ -8,6 +8,7 @@ from differences import check
 from calib.dynamics import drives, friction
 from calib.dynamics.bodies import bodies_of
 from calib.dynamics.idim import IdentificationModel, friction_states, from_chain, stacked, with_load, with_terms
+from calib.dynamics.torque_rows import BOTH, DRIVE, LINK, MOTOR, torque_rows
 from calib.errors import CalibError
 from calib.robot.load import load
 
@@ -58,11 +59,11 @@ def test_coupled_wrist():
     assert added[4, 5] == added[5, 4] == 7.0 and added[2, 2] == 3.0
 
 
-@pytest.mark.parametrize("kind", ["motor", "both", "drive", "link"])
-def test_gradient_of_the_model(kind):
+@pytest.mark.parametrize("rows", [MOTOR, BOTH, DRIVE, LINK], ids=lambda rows: rows.name)
+def test_gradient_of_the_model(rows):
     chain = motley()
     terms = drives.standard(["Ia Fvl Fcl offl Fvm Fcm offm"] * 5, v0=0.5)
-    model = IdentificationModel(bodies_of(chain), terms, kind)
+    model = IdentificationModel(bodies_of(chain), terms, rows)
     rng = np.random.default_rng(1)
     x, weights = rng.normal(size=15), rng.normal(size=(1, model.rows, model.p))
 
@@ -165,7 +166,7 @@ def test_stacking_copies_nothing():
         (lambda: drives.DriveTerm("F", "one", (), side="left"), "neither 'link' nor 'motor'"),
         (lambda: IdentificationModel(bodies_of(TX40), drives.standard(["Ia"]) * 2), "'Ia1' occurs twice"),
         (lambda: IdentificationModel(bodies_of(TX40), drives.standard(["Ia"] * 7)), "'Ia7' names a joint beyond"),
-        (lambda: IdentificationModel(bodies_of(TX40), (), "torque"), "kind 'torque' is none of"),
+        (lambda: torque_rows("torque"), "kind 'torque' is none of"),
     ],
 )
 def test_bad_terms_are_named(make, message):

@@ -12,6 +12,7 @@ from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel, with_terms
 from calib.dynamics.model import model as pinocchio_model
 from calib.dynamics.path_dynamics import of_base, of_standard
+from calib.dynamics.torque_rows import BOTH, DRIVE, MOTOR
 from calib.errors import CalibError
 from calib.robot.load import load
 
@@ -85,14 +86,14 @@ def test_motor_torques_are_the_last_rows_of_a_model_with_joint_torque_sensors():
     terms = drives.standard(["Ia Fvl Fcl Fvm Fcm"] * 7)
     values = np.concatenate([standard_parameters(chain), np.tile([0.5, 1.0, 2.0, 3.0, 4.0], 7)])
     q, v, a = arms.states(7, 5)
-    one = of_standard(IdentificationModel(bodies_of(chain), terms, "motor"), values)
-    two = of_standard(IdentificationModel(bodies_of(chain), terms, "both"), values)
+    one = of_standard(IdentificationModel(bodies_of(chain), terms, MOTOR), values)
+    two = of_standard(IdentificationModel(bodies_of(chain), terms, BOTH), values)
     np.testing.assert_allclose(two.torque(q, v, a), one.torque(q, v, a), atol=1e-12)
 
 
 def test_rows_without_bodies_and_values_that_are_no_numbers_are_refused():
     model, values = driven(load("lwr4plus"))
     with pytest.raises(CalibError, match="no bodies"):
-        of_standard(IdentificationModel(model.bodies, model.terms, "drive"), values[70:])
+        of_standard(IdentificationModel(model.bodies, model.terms, DRIVE), values[70:])
     with pytest.raises(CalibError, match="not finite"):
         of_standard(model, np.where(np.arange(model.p) == 3, np.nan, values))

@@ -14,6 +14,7 @@ from calib import cli
 from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of, with_payload
 from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.torque_rows import torque_rows
 
 SIDED = {
     "Ia": (0.5, 0.4, 0.1), "Fvl": (1.2, 0.5, 0.2), "Fcl": (1.0, 1.5, 0.3), "offl": (0.1, -0.1, 0.05),
@@ -24,7 +25,7 @@ NOISE = {"tau_l": 0.05, "tau_m": 0.2}
 
 def model(kind: str) -> IdentificationModel:
     bodies = with_payload(bodies_of(planted.arm()), np.asarray(planted.arm().tail), "tool", on=planted.N - 1)
-    return IdentificationModel(bodies, drives.standard([" ".join(SIDED)] * planted.N), kind)
+    return IdentificationModel(bodies, drives.standard([" ".join(SIDED)] * planted.N), torque_rows(kind))
 
 
 def truth() -> dict[str, float]:

@@ -72,8 +72,9 @@ class RecordingOptions:
         rate: sampling rate of a file without stamps [Hz].
         topic: of a ROS bag with several topics of joint states.
         use_range: follow the file's own `use_range` where the path has no cut.
-        wanted: which torques are to be explained, ``motor``, ``link``, ``both`` or ``drive`` (motor less link): where
-            it is not the motor's alone and no column is called a torque or current, tau_motor is the effort.
+        rows: what the torques to be explained are called, for messages.
+        motors, sensors: whether they need the motors' torques, those of sensors behind the gears: where they need
+            these and no column is called a torque or current, tau_motor is the effort.
     """
 
     kind: str = ""
@@ -82,7 +83,9 @@ class RecordingOptions:
     rate: float | None = None
     topic: str = ""
     use_range: bool = True
-    wanted: str = "motor"
+    rows: str = "motor"
+    motors: bool = True
+    sensors: bool = False
 
     def __post_init__(self) -> None:
         if self.kind not in ("", "torque", "current"):
@@ -128,8 +131,8 @@ def one_effort(
         wanted = ", ".join(SYNONYMS["q"])
         raise MeasurementError(f"has no joint positions ({wanted}); found: {', '.join(members)}", path)
     kinds = [kind for kind in ("torque", "current") if kind in found]
-    if not kinds and options.wanted != "motor":
-        kinds = _two_torques(found, options.wanted, members, path)
+    if not kinds and options.sensors:
+        kinds = _two_torques(found, options, members, path)
     if not kinds and "tau_link" in found:
         found["torque"] = found.pop("tau_link")
         kinds = ["torque"]
@@ -142,14 +145,12 @@ def one_effort(
     return {ours: theirs for ours, theirs in found.items() if ours not in ("torque", "current") or ours == kind}
 
 
-def _two_torques(found: dict[str, str], wanted: str, members: tuple[str, ...], path: Path) -> list[str]:
+def _two_torques(found: dict[str, str], options: RecordingOptions, members: tuple[str, ...], path: Path) -> list[str]:
     """Put the motors' torque (or, where the sensors' alone are wanted, theirs) among `found` as the effort."""
     own = "tau_motor" if "tau_motor" in found else "tau_link"
-    if "tau_link" not in found or (wanted != "link" and own == "tau_link"):
-        message = f"rows '{wanted}' need " + (
-            "torques of sensors" if wanted == "link" else "two torques, of motors and"
-        )
-        message += " behind the gear" if wanted == "link" else " of sensors behind the gear"
+    if "tau_link" not in found or (options.motors and own == "tau_link"):
+        what = "two torques, of motors and of sensors" if options.motors else "torques of sensors"
+        message = f"rows '{options.rows}' need {what} behind the gear"
         wanted_names = f"{', '.join(SYNONYMS['tau_motor'])}; {', '.join(SYNONYMS['tau_link'])}"
         raise MeasurementError(f"{message} ({wanted_names}); found: {', '.join(members)}", path)
     found["torque"] = found[own]

@@ -28,7 +28,7 @@ def drive_table(dynamics: Dynamics) -> Drives:
     """Return the drive terms of an identified model by joint, those of motor and link side added."""
     model = dynamics.model
     values, left = np.zeros((model.bodies.n, 4)), []
-    for one, value in zip(model.columns, dynamics.values[10 * model.bodies.count :]):
+    for one, value in zip(model.columns, dynamics.values[model.inertial :]):
         if not one.acts or value == 0.0:
             continue
         row, motion = one.acts[0]

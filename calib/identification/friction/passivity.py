@@ -21,7 +21,7 @@ def dissipated(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
     Joints that do not move have zero.
     """
     model = dynamics.model
-    n, first = model.bodies.n, 0 if model.kind == "drive" else 10 * model.bodies.count
+    n, first = model.n, model.inertial
     terms = [
         (one, value)
         for one, value in zip(model.columns, dynamics.values[first:])

@@ -61,8 +61,10 @@ def require_loop(settings: IdentificationSettings) -> IdentificationSettings:
             "method 'iv' simulates the closed loop: state its controller in the options file, [loop] controller = … "
             "(calib formats identify-options), and log or state the reference; from q and torque alone use wls or irls"
         )
-    if settings.kind != "motor":
-        raise UsageError(f"method 'iv' explains motor torques; rows = '{settings.kind}' needs ols, wls, irls or tls")
+    if not settings.torque_rows.motors_alone:
+        raise UsageError(
+            f"method 'iv' explains motor torques; rows = '{settings.torque_rows.name}' needs ols, wls, irls or tls"
+        )
     if settings.friction not in ("auto", "standard"):
         raise UsageError(
             f"method 'iv' simulates standard friction only, not friction = '{settings.friction}'; use wls, whose "
@@ -83,7 +85,7 @@ def try_loop(
     if loop is None:
         return LoopTest()
     try:
-        if settings.kind != "motor":
+        if not settings.torque_rows.motors_alone:
             raise UsageError("instruments from simulation are for motor torques alone")
         loops = close_loops(chain, model.bodies, cases, decimator, loop)
         start = per_joint(loop, "inertia", chain.n) if loop.inertia else None

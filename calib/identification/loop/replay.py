@@ -100,8 +100,8 @@ def replay(
         CalibError: where the rows are not the motors', or the loop is unstable.
     """
     model, n = dynamics.model, chain.n
-    if model.kind not in ("motor", "both"):
-        raise CalibError(f"rows '{model.kind}' do not hold all of the motors' torque")
+    if not model.torque_rows.with_motors:
+        raise CalibError(f"rows '{model.torque_rows.name}' do not hold all of the motors' torque")
     part = _stretch(case)
     motion = case.motion
     robot, left_out = _robot(dynamics, case)
@@ -117,7 +117,7 @@ def replay(
     measured = controlled(np.asarray(case.target))
     ahead: dict[str, np.ndarray | None] = {FEEDBACK: None}
     if chain.inertias is not None:
-        values = np.zeros(10 * model.bodies.count)
+        values = np.zeros(model.inertial)
         own = standard_parameters(chain)
         values[: len(own)] = own
         ahead[CAD] = feed_forward(Plant(model.bodies, (), values), reference)
@@ -137,7 +137,7 @@ def _stretch(case: Case) -> slice:
 def _robot(dynamics: Dynamics, case: Case) -> tuple[Plant, tuple[str, ...]]:
     """Return the model as a robot, with what the case carries, and the names of terms that cannot be simulated."""
     model = dynamics.model
-    bodies = 10 * model.bodies.count
+    bodies = model.inertial
     kept = [k for k, one in enumerate(model.columns) if one.shape in SIMULATED]
     terms = tuple(replace(model.columns[k], side="motor") for k in kept)
     values = dynamics.values[:bodies] * carried_columns(model, case.carried)
@@ -160,18 +160,18 @@ def _possible(robot: Plant, reference: Reference) -> tuple[Plant, np.ndarray]:
 
     The least eigenvalue of its inertia matrix along the reference, scaled by the joints' own, is brought to `MARGIN`.
     """
-    tree, bodies = robot.bodies, 10 * robot.bodies.count
-    inertia = mass_matrix(tree, robot.parameters[:bodies], np.ascontiguousarray(reference.q[::50]))
-    inertia = inertia + added_inertia(robot.terms, robot.parameters[bodies:], tree.n)
+    bodies, first = robot.bodies, robot.inertial
+    inertia = mass_matrix(bodies, robot.parameters[:first], np.ascontiguousarray(reference.q[::50]))
+    inertia = inertia + added_inertia(robot.terms, robot.parameters[first:], bodies.n)
     size = np.maximum(np.abs(np.einsum("kii->i", inertia)) / len(inertia), LEAST)
     least = float(np.linalg.eigvalsh(inertia / np.sqrt(np.outer(size, size)))[:, 0].min())
     added = max(0.0, MARGIN - least) * size
-    softer = tuple(_softer(one, value, size, reference) for one, value in zip(robot.terms, robot.parameters[bodies:]))
+    softer = tuple(_softer(one, value, size, reference) for one, value in zip(robot.terms, robot.parameters[first:]))
     robot = replace(robot, terms=softer)
     if not added.any():
         return robot, added
-    extra = tuple(replace(one, name=f"added {one.name}") for one in standard(["Ia"] * tree.n))
-    return Plant(tree, (*robot.terms, *extra), np.concatenate([robot.parameters, added])), added
+    extra = tuple(replace(one, name=f"added {one.name}") for one in standard(["Ia"] * bodies.n))
+    return Plant(bodies, (*robot.terms, *extra), np.concatenate([robot.parameters, added])), added
 
 
 def _softer(one: DriveTerm, value: float, size: np.ndarray, reference: Reference) -> DriveTerm:

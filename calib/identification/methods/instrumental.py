@@ -157,7 +157,7 @@ def identify_instrumental(
     """Estimate base parameters with instruments from simulation.
 
     Args:
-        model: rows of kind ``motor``.
+        model: of motor torques.
         base: its base columns.
         cases: recordings, each with the loop it came from.
         decimator: the parallel filter of W, Z and y.
@@ -175,7 +175,7 @@ def identify_instrumental(
     """
     if method not in METHODS:
         raise UsageError(f"method '{method}' is none of {', '.join(METHODS)}")
-    if model.kind != "motor" or not cases:
+    if not model.torque_rows.motors_alone or not cases:
         raise UsageError("instruments from simulation need motor torques, and a recording with its reference")
     task = _task(model, base, cases, decimator, method, columns, positive)
     ordinary = _ordinary(task.observed)

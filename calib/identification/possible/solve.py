@@ -111,7 +111,7 @@ def find_consistent(told: Information, weight: float | None = None) -> Consisten
     from scipy.stats import chi2
 
     model = told.dynamics.model
-    if model.kind == "drive":
+    if not model.torque_rows.has_bodies:
         raise UsageError("the model holds drives alone (kind 'drive'): there are no bodies to make consistent")
     allowed = float(np.sqrt(chi2.ppf(0.95, told.b)))
     choices = [(references, make_problem(told, references)) for references in find_prior_bodies(told.chain, model)]

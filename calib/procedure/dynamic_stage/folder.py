@@ -13,7 +13,7 @@ from calib import files
 from calib.dynamics.base import expressions
 from calib.errors import UsageError
 from calib.folders import check_folder, write_staged
-from calib.identification.cases import Case, row_labels
+from calib.identification.cases import Case
 from calib.identification.gains import DriveGains
 from calib.identification.methods.least_squares import ASSUMES
 from calib.identification.model_file import in_unit, to_table
@@ -164,7 +164,7 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
         "counts": {"without_effect": len(found.base.without_effect), "regrouped": len(found.base.regrouped)},
         "unit": outcome.inputs.unit,
         "drive_gains": gain_table(outcome.inputs.gains, outcome.inputs.unit),
-        "rows": list(row_labels(found.settings.kind, outcome.inputs.chain.n)),
+        "rows": list(found.settings.torque_rows.numbered(outcome.inputs.chain.n)),
         "condition_number": {"raw": _finite(found.condition[0]), "normalised": _finite(found.condition[1])},
         "friction": found.friction.chosen,
         "switched_off": list(switched_off(found.names, found.base.b, found.fitted.estimate.sigma)),

@@ -16,7 +16,7 @@ from calib.data.signals.persistency import ExcitationReport, repeats, report_exc
 from calib.data.signals.reference_files import with_reference
 from calib.data.signals.resampling import Resampled
 from calib.errors import UsageError
-from calib.identification.cases import Case, case_names, make_case, row_labels
+from calib.identification.cases import Case, case_names, make_case
 from calib.identification.friction.passivity import driven
 from calib.identification.gains import DriveGains
 from calib.identification.geometry_uncertainty import GeometryUncertainty, propagate
@@ -239,7 +239,7 @@ def assess(
     fit = {case.name: scores[case.name] for case in inputs.cases}
     validation = {case.name: scores[case.name] for case in inputs.unseen}
     proofs = {name: one for name, one in validation.items() if name not in repeated}
-    labels = row_labels(inputs.options.settings.kind, inputs.chain.n)
+    labels = inputs.options.settings.torque_rows.numbered(inputs.chain.n)
     verdict = with_prior(judge(fit, proofs, repeated, excitation, wrong, labels), rests)
     told = *warnings(inputs.cases, inputs.unseen, validation, repeated, excitation, inputs.chain), *said
     return Assessment(
@@ -287,7 +287,7 @@ def read_case(path: str, name: str, motion: Motion, options: IdentifyOptions, fo
     own = file_settings(options, path)
     slow = (options.slow if options.slow is not None else 0.01) if options.cut_slow else None
     return make_case(
-        name, motion, options.settings.kind, gains=found.for_motion(motion, own), carried=own.payload, slow=slow
+        name, motion, options.settings.torque_rows, gains=found.for_motion(motion, own), carried=own.payload, slow=slow
     )  # fmt: skip
 
 

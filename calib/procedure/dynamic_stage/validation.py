@@ -60,14 +60,14 @@ def write(held: Held, folder: Path) -> None:
 
 def report(held: Held) -> dict[str, Any]:
     """Return scores, verdict and curves as JSON holds them."""
-    chain, kind, found = held.inputs.chain, held.inputs.options.settings.kind, held.result
+    chain, rows, found = held.inputs.chain, held.inputs.options.settings.torque_rows, held.result
     return {
         "schema": SCHEMA,
         "verdict": found.verdict.level,
         "reason": found.verdict.reason,
         "warnings": list(found.warnings),
-        "rows": row_names(chain.joint_names, kind),
-        "units": ["N" if joint.kind == "prismatic" else "N m" for joint in chain.joints] * (2 if kind == "both" else 1),
+        "rows": list(rows.titles(chain.joint_names)),
+        "units": list(rows.units([joint.kind == "prismatic" for joint in chain.joints])),
         "fit": {name: score_table(one) for name, one in found.fit.items()},
         "validation": {
             name: score_table(one) | {"evidence": name not in found.repeated} for name, one in found.validation.items()
@@ -81,13 +81,6 @@ def report(held: Held) -> dict[str, Any]:
             for name, one in (found.validation or found.fit).items()
         },
     }
-
-
-def row_names(joints: tuple[str, ...], kind: str) -> list[str]:
-    """Return what the torque rows are called."""
-    sensors = [f"{name} sensor" for name in joints]
-    motors = [f"{name} motor" for name in joints]
-    return {"both": sensors + motors, "link": sensors}.get(kind, list(joints))
 
 
 def _curves(case: Case, predicted: np.ndarray) -> dict[str, Any]:

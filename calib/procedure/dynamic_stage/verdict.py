@@ -80,7 +80,7 @@ def judge(
         repeated: validation files that repeat the training motion.
         excitation: of the training files.
         driven: joints, from 0, see `calib.identification.friction.passivity`.
-        rows: what the torque rows are called, see `calib.identification.cases.row_labels`; default 1, 2, ...
+        rows: what the torque rows are called, see `calib.dynamics.torque_rows.TorqueRows.numbered`; default 1, 2, ...
     """
     if driven:
         named = ", ".join(str(joint + 1) for joint in driven)
@@ -266,7 +266,7 @@ def _coulomb_shift(cases: Sequence[Case], found: Identification) -> list[str]:
 
     Where a joint's friction is richer, they are modelled, not cut.
     """
-    if found.settings.kind != "motor":
+    if not found.settings.torque_rows.motors_alone:
         return []
     richer = {joint for one in found.friction.terms for joint, _ in one.acts}
     index = {j: found.names.index(f"Fc{j + 1}") for j in range(cases[0].motion.n) if f"Fc{j + 1}" in found.names}

@@ -74,7 +74,7 @@ def _identified(chain: Chain, folder: Path) -> ExcitedModel:
     table = read_table(folder)
     try:
         found = from_table(chain, table)
-        if found.model.kind == "drive":
+        if not found.model.torque_rows.has_bodies:
             raise ValueError("rows 'drive' tell nothing of the bodies")
     except (KeyError, TypeError, ValueError, IndexError) as error:
         theirs = description.read(folder / "robot.toml")
@@ -84,7 +84,7 @@ def _identified(chain: Chain, folder: Path) -> ExcitedModel:
         raise UsageError(f"{folder}/dynamics.json does not fit robot '{chain.name}': {error!r}") from error
     bodies = with_gravity(bodies_of(chain), np.asarray(found.model.bodies.gravity))
     numbers = found.values[: 10 * bodies.count]
-    terms = list(zip(found.model.columns, found.values[10 * found.model.bodies.count :]))
+    terms = list(zip(found.model.columns, found.values[found.model.inertial :]))
     kept = [(one, value) for one, value in terms if one.form.slopes is not None]
     left = [one.name for one, _ in terms if one.form.slopes is None]
     values = np.array([*numbers, *(value for _, value in kept)])

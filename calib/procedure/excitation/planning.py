@@ -221,10 +221,10 @@ def _identified(chain: Chain, folder: Path, payloads: Sequence[str]) -> tuple[Pa
     known = [label for label, coordinate in zip(model.bodies.labels, model.bodies.coordinates) if coordinate < 0]
     if unknown := sorted(set(payloads) - set(known)):
         raise UsageError(f"{folder}: no payload '{unknown[0]}' was identified; it knows {', '.join(known) or 'none'}")
-    if model.kind == "drive":
+    if not model.torque_rows.has_bodies:
         return of_standard(model, dynamics.values), None  # which says why that cannot be
     values = np.array(dynamics.values)
-    values[: 10 * model.bodies.count] *= carried_columns(model, payloads)
+    values[: model.inertial] *= carried_columns(model, payloads)
     return of_standard(model, values), read_uncertainty(folder, Dynamics(model, values), payloads)
 
 

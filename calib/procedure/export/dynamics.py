@@ -235,7 +235,7 @@ def parameters(given: Exported) -> dict[str, Any]:
         },
         "dynamics": {
             "gravity": model.bodies.gravity.tolist(),
-            "rows": model.kind,
+            "rows": model.torque_rows.name,
             "base": {**_columns(told.names, told.units, told.values), "covariance": told.covariance.tolist()},
             "standard": {
                 **_columns(model.names, model.units, found.dynamics.values),

@@ -9,7 +9,6 @@ from rich.console import RenderableType
 from rich.markup import escape
 from rich.table import Table
 
-from calib.identification.cases import row_labels
 from calib.identification.methods.least_squares import ASSUMES
 from calib.identification.scores import Score
 from calib.procedure.dynamic_stage import geometry_tables
@@ -93,7 +92,7 @@ def ladder_table(outcome: IdentificationOutcome) -> Table:
 def error_table(outcome: IdentificationOutcome) -> Table:
     """Return the errors of every file, raw and below the band."""
     table = Table("file", "samples", title="100 |tau - predicted| / |tau| [%]", title_justify="left")
-    for name in ("total", *row_labels(outcome.found.settings.kind, outcome.inputs.chain.n)):
+    for name in ("total", *outcome.found.settings.torque_rows.numbered(outcome.inputs.chain.n)):
         table.add_column(name, justify="right")
     for role, scores in (("fitted", outcome.fit), ("unseen", outcome.validation)):
         for name, found in scores.items():

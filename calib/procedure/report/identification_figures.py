@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from calib.identification.cases import Case, row_labels
+from calib.identification.cases import Case
 from calib.identification.scores import Score
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.report import uncertainty_figures
@@ -34,7 +34,7 @@ def torques(case: Case, predicted: np.ndarray, outcome: IdentificationOutcome) -
     t = case.motion.t[::step]
     labels = [
         f"joint {label}\n[{unit}]"
-        for label, unit in zip(row_labels(outcome.found.settings.kind, case.motion.n), _units(outcome, rows))
+        for label, unit in zip(outcome.found.settings.torque_rows.numbered(case.motion.n), _units(outcome, rows))
     ]
     kind = "fitted" if case.name in outcome.fit else "repeat" if case.name in outcome.repeated else "unseen"
     with styled():
@@ -76,7 +76,7 @@ def friction(outcome: IdentificationOutcome) -> Figure:
     """Draw each joint's friction over its velocity: what the rigid model leaves, and the model's terms of velocity."""
     found, case = outcome.found, outcome.inputs.cases[0]
     model, values = found.dynamics.model, found.dynamics.values
-    bodies = 10 * model.bodies.count if model.kind != "drive" else 0
+    bodies = model.inertial
     n, rows = case.motion.n, case.target.shape[1]
     columns = min(n, 4)
     shown = {"velocity", "sign", "one", "speed", "cubic", "root", "stribeck"}

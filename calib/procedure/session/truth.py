@@ -85,11 +85,10 @@ def torques_against_truth(session: Session, cell: Cell, arm: MovingArm, seed: in
     motion = random_fourier(0.8 * lower, 0.8 * upper, 0.8 * speed, SECONDS, RATE, seed=seed)
     states = (motion.q, motion.v, motion.a)
     motor, link = true_torque(arm, *states), link_torque(arm, *states)
-    kind = dynamics.model.kind
-    true = {"both": np.hstack([link, motor]), "link": link}.get(kind, motor)
+    true = dynamics.model.torque_rows.target(motor, link, motion.q, motion.v)
     load = transmitted_along(dynamics, *states)
     predicted = np.einsum("kij,j->ki", dynamics.model.regressor(*states, load, ()), dynamics.values)
-    friction = link - inverse_dynamics(arm.plant.bodies, arm.plant.parameters[: 10 * arm.plant.bodies.count], *states)
+    friction = link - inverse_dynamics(arm.plant.bodies, arm.plant.parameters[: arm.plant.inertial], *states)
     nominal = inverse_dynamics(bodies_of(cell.nominal), standard_parameters(cell.nominal), *states) + friction
     error = predicted - true
     within, count = _parameters(session, dynamics.model, cell, arm)
@@ -105,7 +104,7 @@ def _percent(error: np.ndarray, size: np.ndarray) -> float:
 def transmitted_along(dynamics: Dynamics, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
     """Return what the gears pass on to the bodies by the model, without payloads (N, n): load-dependent friction."""
     model = dynamics.model
-    bodies = dynamics.values[: 10 * model.bodies.count] * carried_columns(model, ())
+    bodies = dynamics.values[: model.inertial] * carried_columns(model, ())
     return inverse_dynamics(model.bodies, bodies, q, v, a)
 
 

@@ -16,6 +16,7 @@ from calib.data.recordings.recording import Recording
 from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.torque_rows import LINK
 from calib.errors import CalibError
 from calib.robot import library
 from calib.robot.chain import Chain, random_joints
@@ -86,7 +87,7 @@ def moving_arm(cell: Cell, robot: str, seed: int = 0) -> MovingArm:
         f"{SIGMA_MOTOR:.1%} (motors) and {SIGMA_LINK:.1%} (sensors) of the limits"
     )
     return MovingArm(
-        chain, plant, IdentificationModel(plant.bodies, plant.terms, "link"),
+        chain, plant, IdentificationModel(plant.bodies, plant.terms, LINK),
         Plant(bodies_of(nominal), tuple(terms), told),
         replace(pd(omega**2 * inertia, 2 * DAMPING * omega * inertia), cutoff=CUTOFF), effort, note,
     )  # fmt: skip

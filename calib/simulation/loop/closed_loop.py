@@ -43,7 +43,7 @@ class Plant:
     parameters: np.ndarray
 
     def __post_init__(self) -> None:
-        size = 10 * self.bodies.count + len(self.terms)
+        size = self.inertial + len(self.terms)
         object.__setattr__(self, "parameters", frozen(shaped(self.parameters, (size,), "parameters of the plant")))
         for one in self.terms:
             if one.shape not in SIMULATED:
@@ -52,6 +52,11 @@ class Plant:
                 raise CalibError(
                     f"term '{one.name}': an exact sign cannot be integrated; give a smoothing v0 of some 0.01 rad/s"
                 )
+
+    @property
+    def inertial(self) -> int:
+        """Number of parameters that are the bodies'; they come first."""
+        return 10 * self.bodies.count
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +172,7 @@ def inertia_diagonal(plant: Plant, q: np.ndarray) -> np.ndarray:
     from calib.dynamics import rigid_body
     from calib.dynamics.drives import added_inertia
 
-    bodies = 10 * plant.bodies.count
+    bodies = plant.inertial
     inertia = rigid_body.mass_matrix(plant.bodies, plant.parameters[:bodies], np.asarray(q, dtype=float))
     added = added_inertia(plant.terms, plant.parameters[bodies:], plant.bodies.n)
     return np.einsum("kii->i", inertia) / len(inertia) + np.diag(added)

@@ -56,7 +56,7 @@ def test_a_recording_named_after_a_payload_carries_it(tmp_path) -> None:
     for name in ("training.csv", "training_loaded.csv"):
         session.path(f"7-recorded/{name}").write_text("t\n")
     found = options_of(session)
-    assert found.settings.payloads["loaded"].mass == 3.28 and found.settings.kind == "both"
+    assert found.settings.payloads["loaded"].mass == 3.28 and found.settings.torque_rows.name == "both"
     assert {name: one.payload for name, one in found.files.items()} == {"training_loaded.csv": ("loaded",)}
 
 

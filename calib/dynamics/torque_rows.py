@@ -1,0 +1,232 @@
+"""Which torque rows a model explains: a linear map of the joints' torques, of regressors and of measured torques alike.
+
+With torque sensors in the joints (Kolyubin, Shiriaev, Jubien 2019, section 6.2) four kinds of rows exist:
+
+    MOTOR   tau             bodies and all drive terms (a robot without such sensors)
+    LINK    tau_l           Model 1: bodies and link-side terms
+    BOTH    [tau_l; tau]    Model 2: bodies and link-side terms in both, motor-side terms in the second half
+    DRIVE   tau - tau_l     Model 3: motor-side terms alone
+
+`projected` makes others of them: torques on the actuated or platform coordinates of a closed chain, Gᵀ tau, or the
+power alone, vᵀ tau (`power`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.errors import CalibError
+
+BODIES = "bodies"  # the side of a column that is a body's parameter
+
+Map = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class JointBlock:
+    """One torque row per joint.
+
+    Attributes:
+        prefix: of the rows' labels.
+        sides: which columns act on them: ``bodies``, drive terms of the ``link`` side, of the ``motor`` side.
+        motor, sensor: the measured torques they are: motor · tau + sensor · tau_l.
+        suffix: of their names, which are a joint's otherwise.
+    """
+
+    prefix: str
+    sides: frozenset[str]
+    motor: float = 0.0
+    sensor: float = 0.0
+    suffix: str = ""
+
+
+@dataclass(frozen=True)
+class Projection:
+    """A linear map on top of joint rows, which may depend on the state.
+
+    Attributes:
+        labels, units: of the rows that it makes.
+        torques: q, v (N, n) of the motion to (N, rows, k): from the k joint rows of a regressor.
+        measured: q, v of the motion to (N, rows, k): from the k measured torques; None: as `torques`.
+    """
+
+    labels: tuple[str, ...]
+    units: tuple[str, ...]
+    torques: Map
+    measured: Map | None = None
+
+
+@dataclass(frozen=True)
+class TorqueRows:
+    """Which torques a model explains, whatever the number of its joints.
+
+    Attributes:
+        name: what options and files call them.
+        blocks: one row per joint each.
+        drives: standard drive terms of a joint that such rows tell apart (`calib.dynamics.drives.standard`).
+        projection: a map of the blocks' rows; None: the blocks themselves.
+    """
+
+    name: str
+    blocks: tuple[JointBlock, ...]
+    drives: str
+    projection: Projection | None = None
+
+    @property
+    def sides(self) -> frozenset[str]:
+        """Which columns any row sees."""
+        return frozenset().union(*(block.sides for block in self.blocks))
+
+    @property
+    def has_bodies(self) -> bool:
+        return BODIES in self.sides
+
+    @property
+    def sensed(self) -> bool:
+        """Whether torques of sensors behind the gears are needed."""
+        return any(block.sensor for block in self.blocks)
+
+    @property
+    def driven(self) -> bool:
+        """Whether the motors' torques are needed."""
+        return any(block.motor for block in self.blocks)
+
+    @property
+    def motors_alone(self) -> bool:
+        """Whether the rows are the motors' torques, joint by joint, and nothing else."""
+        return self.projection is None and self.with_motors and len(self.blocks) == 1
+
+    @property
+    def with_motors(self) -> bool:
+        """Whether the last rows are the motors' whole torques, joint by joint."""
+        last = self.blocks[-1]
+        return self.projection is None and last.motor == 1.0 and last.sensor == 0.0 and BODIES in last.sides
+
+    def count(self, n: int) -> int:
+        """Return the rows per sample of n joints."""
+        return n * len(self.blocks) if self.projection is None else len(self.projection.labels)
+
+    def labels(self, joints: Sequence[str]) -> tuple[str, ...]:
+        """Return how tables call the rows, from labels of the joints."""
+        if self.projection is not None:
+            return self.projection.labels
+        return tuple(block.prefix + joint for block in self.blocks for joint in joints)
+
+    def numbered(self, n: int) -> tuple[str, ...]:
+        """Return the labels with the numbers of n joints."""
+        return self.labels([str(j + 1) for j in range(n)])
+
+    def titles(self, joints: Sequence[str]) -> tuple[str, ...]:
+        """Return the rows' names in full, from the joints' own."""
+        if self.projection is not None:
+            return self.projection.labels
+        return tuple(joint + block.suffix for block in self.blocks for joint in joints)
+
+    def units(self, prismatic: Sequence[bool]) -> tuple[str, ...]:
+        """Return N m or N by row."""
+        if self.projection is not None:
+            return self.projection.units
+        return tuple("N" if linear else "N m" for linear in prismatic) * len(self.blocks)
+
+    def of_joints(self, mask: np.ndarray) -> np.ndarray:
+        """Return for (N, n) flags of the joints those of the rows (N, rows): all joints' where rows mix them."""
+        if self.projection is not None:
+            return np.repeat(mask.all(axis=1)[:, None], len(self.projection.labels), axis=1)
+        return np.tile(mask, (1, len(self.blocks)))
+
+    def observe(self, torques: np.ndarray, sides: Sequence[str], q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Return the rows (N, rows, p) of columns of joint torques (N, n, p), ordered as the columns are.
+
+        Args:
+            torques: regressor of the n joints, or torques themselves as columns.
+            sides: (p,) of the columns: ``bodies``, ``link`` or ``motor``.
+            q, v: (N, n) of the motion.
+        """
+        seen = [np.array([side in block.sides for side in sides], dtype=bool) for block in self.blocks]
+        if len(seen) == 1 and seen[0].all():
+            stacked = torques
+        else:
+            samples, n, p = torques.shape
+            columns = np.zeros((p, len(seen) * n, samples))
+            for k, used in enumerate(seen):
+                columns[used, k * n : (k + 1) * n] = torques.transpose(2, 1, 0)[used]
+            stacked = columns.transpose(2, 1, 0)
+        return stacked if self.projection is None else self.projection.torques(q, v) @ stacked
+
+    def fold(self, weights: np.ndarray, sides: Sequence[str]) -> np.ndarray:
+        """Return the adjoint of `observe`: weights of rows (N, rows, p) as those of joint torques (N, n, p).
+
+        Raises:
+            CalibError: for rows with a projection, whose own dependence on the state it would leave out.
+        """
+        if self.projection is not None:
+            raise CalibError(f"rows '{self.name}' are projected by a map that depends on the state: no slopes")
+        n = weights.shape[1] // len(self.blocks)
+        parts = [
+            weights[:, k * n : (k + 1) * n] * np.array([side in block.sides for side in sides], dtype=float)
+            for k, block in enumerate(self.blocks)
+        ]
+        return np.add.reduce(parts[::-1])
+
+    def target(self, motor: np.ndarray, sensor: np.ndarray | None, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Return what the rows have to explain (N, rows).
+
+        Args:
+            motor: (N, n) the motors' torques.
+            sensor: (N, n) of sensors behind the gears; None where there are none.
+            q, v: (N, n) of the motion.
+        """
+        if sensor is None and self.sensed:
+            raise CalibError(f"rows '{self.name}' need torques of sensors behind the gear")
+        parts = []
+        for block in self.blocks:
+            part = block.motor * motor if block.motor else np.zeros_like(motor)
+            parts.append(part + block.sensor * sensor if sensor is not None and block.sensor else part)
+        stacked = np.hstack(parts)
+        if self.projection is None:
+            return stacked
+        own = self.projection.measured or self.projection.torques
+        return np.einsum("nrk,nk->nr", own(q, v), stacked)
+
+    def repeated(self, n: int) -> np.ndarray:
+        """Return for every row (rows,) the one whose entries it repeats, where it is not zero: itself where none."""
+        rows = np.arange(self.count(n))
+        return rows if self.projection is not None else rows % n + n * (len(self.blocks) - 1)
+
+
+def projected(name: str, projection: Projection, of: TorqueRows | None = None) -> TorqueRows:
+    """Return the rows that a projection makes of others, by default of the motors' torques."""
+    return replace(MOTOR if of is None else of, name=name, projection=projection)
+
+
+def torque_rows(name: str) -> TorqueRows:
+    """Return the rows that options and files call by this name.
+
+    Raises:
+        CalibError: for a name that is none of `ROWS`.
+    """
+    if name not in ROWS:
+        raise CalibError(f"model kind '{name}' is none of {', '.join(ROWS)}")
+    return ROWS[name]
+
+
+_LINK, _MOTOR = frozenset({BODIES, "link"}), frozenset({"motor"})
+MOTOR = TorqueRows("motor", (JointBlock("", _LINK | _MOTOR, motor=1.0),), "Ia Fv Fc off")
+LINK = TorqueRows("link", (JointBlock("", _LINK, sensor=1.0, suffix=" sensor"),), "Fvl Fcl offl")
+BOTH = TorqueRows(
+    "both",
+    (
+        JointBlock("l", _LINK, sensor=1.0, suffix=" sensor"),
+        JointBlock("m", _LINK | _MOTOR, motor=1.0, suffix=" motor"),
+    ),
+    "Ia Fvl Fcl offl Fvm Fcm offm",
+)
+DRIVE = TorqueRows("drive", (JointBlock("", _MOTOR, motor=1.0, sensor=-1.0),), "Ia Fvm Fcm offm")
+ROWS = {one.name: one for one in (MOTOR, LINK, BOTH, DRIVE)}
+MODELS = {1: LINK, 2: BOTH, 3: DRIVE}  # as the 2019 paper numbers them
+
+POWER = projected("power", Projection(("power",), ("W",), lambda q, v: v[:, None, :]))
+"""One row: the power of all torques, vᵀ tau."""
