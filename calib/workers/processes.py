@@ -105,7 +105,7 @@ class Processes:
         if process.ready:
             return Died(f"{self.attempts} processes died of it, the last by {how}")
         self.stillborn += 1
-        if self.stillborn < ATTEMPTS or self.stopping:
+        if self.stillborn < ATTEMPTS * self.count or self.stopping:
             return NotBegun()
         raise CalibError(
             f"worker processes end as they start ({how}): memory ran out, or a script that uses them lacks "
