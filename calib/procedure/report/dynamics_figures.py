@@ -1,106 +1,184 @@
-"""The figures of the dynamics on a certificate, drawn from the plain numbers that a session's folders hold."""
+"""The figures of the dynamics, of an identification's folder and of a certificate: plain arrays in, a `Figure` out."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from calib.procedure.report.style import AFTER, BEFORE, HALF, INK, MARK, QUIET, WIDE, sheet, styled
+from calib.procedure.report.style import (
+    AFTER,
+    BEFORE,
+    HALF,
+    INK,
+    MARK,
+    QUIET,
+    WIDE,
+    legend,
+    log_axis,
+    room,
+    sheet,
+    styled,
+    thinned,
+)
 
 FEW = 8  # torque rows whose figures fit half a page
 
 
-def torques(curves: Mapping[str, Any], rows: Sequence[str], units: Sequence[str]) -> Figure:
-    """Draw measured and predicted torque of every row over time, and what is left."""
-    t, count = np.array(curves["t"]), len(rows)
-    columns = 2 if count > 4 else 1
+def torques(
+    t: np.ndarray, measured: np.ndarray, predicted: np.ndarray, rows: Sequence[str], units: Sequence[str], title: str,
+    errors: Sequence[float | None] = (),
+) -> Figure:  # fmt: skip
+    """Draw measured and predicted torque of every row over time, and what is left.
+
+    Args:
+        t: (N,) [s].
+        measured, predicted: (N, rows) [units].
+        rows, units: names of the torque rows, and their units.
+        title: of the whole.
+        errors: share of each row's torque that is left [%]; none where it is not known.
+    """
+    count = len(rows)
+    columns = 2 if count > FEW else 1
     lines = -(-count // columns)
     with styled():
-        figure, axes = sheet(lines, columns, WIDE, 1.05 * lines + 0.6)
-        for j, axis in enumerate(axes):
-            if j >= count:
-                axis.set_visible(False)
-                continue
-            measured, predicted = (np.array(curves[key][j]) for key in ("measured", "predicted"))
-            axis.plot(t, measured, color=BEFORE, linewidth=1.4, label="measured")
-            axis.plot(t, predicted, color=AFTER, linewidth=0.7, label="predicted")
-            axis.plot(t, measured - predicted, color=QUIET, linewidth=0.5, label="left")
-            axis.set_title(f"{rows[j]} [{units[j]}]", fontsize=7.5)
+        figure, axes = sheet(
+            lines, columns, WIDE, 0.8 + 0.95 * lines, left=0.5, across=0.4, between=0.27, top=0.45, bottom=0.4
+        )
+        for axis in axes[count:]:
+            axis.set_visible(False)
+        for j, axis in enumerate(axes[:count]):
+            rest = measured[:, j] - predicted[:, j]
+            for values, colour, width, label in (
+                (measured[:, j], BEFORE, 1.4, "measured"), (predicted[:, j], AFTER, 0.7, "predicted"),
+                (rest, QUIET, 0.5, "measured - predicted"),
+            ):  # fmt: skip
+                axis.plot(*thinned(t, values), color=colour, linewidth=width, label=label)
+            share = errors[j] if j < len(errors) else None
+            left = "" if share is None or not np.isfinite(share) else f": {share:.3g} % left"
+            axis.set_title(f"{rows[j]} [{units[j]}]{left}", fontsize=7.5, fontweight="normal", pad=3.0)
             axis.tick_params(labelsize=6.5)
+            axis.set_xlim(t[0], t[-1])
             if j + columns < count:
-                axis.set_xticklabels([])
+                axis.tick_params(labelbottom=False)
             else:
                 axis.set_xlabel("time [s]", fontsize=7.5)
-        axes[0].legend(ncols=3, loc="upper right", fontsize=6.5)
+        legend(figure, axes[0], title)
     return figure
 
 
 def errors_by_row(fitted: Sequence[float], unseen: Sequence[float], rows: Sequence[str]) -> Figure:
-    """Draw the relative error of every row, on the training and on unseen motion."""
+    """Draw the relative error of every row [%], on the training and on unseen motion."""
     place = np.arange(len(rows))
+    many = len(rows) > FEW
+    size = 6.5 if many else 7.5
+    worst = int(np.argmax(unseen)) if len(rows) else 0
     with styled():
-        figure, (axis,) = sheet(1, 1, WIDE if len(rows) > FEW else HALF, 2.6)
-        axis.barh(place - 0.19, fitted, 0.36, color=BEFORE, label="training motion")
-        axis.barh(place + 0.19, unseen, 0.36, color=AFTER, label="unseen motion")
-        axis.set_yticks(place, rows, fontsize=6.5 if len(rows) > 8 else 7.5)
-        axis.invert_yaxis()
-        axis.set_xlabel("torque unexplained [%]")
-        axis.legend(fontsize=7)
+        height = 0.95 + 0.21 * len(rows)
+        figure, (axis,) = sheet(1, 1, WIDE if many else HALF, height, left=room(rows, size), top=0.5)
+        for shift, shares, colour, label in (
+            (-0.19, fitted, BEFORE, "training motion"), (0.19, unseen, AFTER, "unseen motion"),
+        ):  # fmt: skip
+            axis.hlines(place + shift, 0.0, shares, colors=colour, linewidth=5.0, label=label)
+        axis.set_yticks(place, rows, fontsize=size)
+        axis.set(xlabel="torque unexplained [%]", ylim=(len(rows) - 0.5, -0.5))
+        axis.set_xlim(left=0.0)
+        axis.grid(axis="x")
+        legend(figure, axis, f"at most {unseen[worst]:.3g} % left" if len(rows) else "")
     return figure
 
 
-def whiteness(values: Sequence[Sequence[float] | None], bounds: Sequence[float | None], rows: Sequence[str]) -> Figure:
-    """Draw the autocorrelation of every row's residual, with the bounds of white noise."""
+def autocorrelations(
+    values: Sequence[Sequence[float] | np.ndarray | None], bounds: Sequence[float | None], rows: Sequence[str],
+    title: str = "", width: float = WIDE,
+) -> Figure:  # fmt: skip
+    """Draw the autocorrelation of every row's residual, with the bounds of white noise.
+
+    Args:
+        values: at lags 1, 2, … of each torque row; None of rows that are too short to say.
+        bounds: of white noise, of each row.
+        rows: names of the torque rows.
+        title: of the whole.
+        width: of the figure [in].
+    """
     shown = [j for j in range(len(rows)) if values[j] is not None]
-    many = len(rows) > FEW
-    columns = min(7 if many else 4, max(1, len(shown)))
+    columns = min(7 if len(shown) > FEW else 4 if width > HALF else 3, max(1, len(shown)))
+    lines = -(-max(1, len(shown)) // columns)
     with styled():
-        figure, axes = sheet(-(-max(1, len(shown)) // columns), columns, WIDE if many else HALF, 2.6)
+        figure, axes = sheet(
+            lines, columns, width, 0.85 + 0.95 * lines, left=0.4, across=0.14, between=0.45, top=0.5, bottom=0.4
+        )
         for axis in axes[len(shown) :]:
             axis.set_visible(False)
-        for j, axis in zip(shown, axes):
-            series, bound = values[j] or (), bounds[j] or 0.0
-            axis.bar(np.arange(1, len(series) + 1), series, color=AFTER, width=0.8)
-            for edge in (-bound, bound):
-                axis.axhline(edge, color=MARK, linewidth=0.6, linestyle="--")
-            axis.set_title(rows[j], fontsize=6.5)
-            axis.set(ylim=(-1, 1), yticks=(-1, 0, 1))
-            axis.tick_params(labelsize=5.5)
+        for k, (j, axis) in enumerate(zip(shown, axes)):
+            series, bound = np.asarray(values[j], dtype=float), bounds[j] or 0.0
+            axis.vlines(np.arange(1, len(series) + 1), 0.0, series, colors=AFTER, linewidth=1.0)
+            axis.hlines([-bound, bound], 0, len(series) + 1, colors=MARK, linewidth=0.7, linestyles="--")
+            axis.set_title(rows[j], fontsize=7, fontweight="normal", pad=3.0)
+            axis.set(ylim=(-1, 1), yticks=(-1, 0, 1), xlim=(0, len(series) + 1))
+            axis.locator_params(axis="x", nbins=3)
+            axis.tick_params(labelsize=6.5, labelleft=k % columns == 0, labelbottom=k + columns >= len(shown))
+            if k + columns >= len(shown):
+                axis.set_xlabel("lag [samples]", fontsize=6.5, labelpad=2.0)
+        legend(figure, None, title)
     return figure
 
 
-def motion(t: np.ndarray, q: np.ndarray, v: np.ndarray, names: Sequence[str], units: Sequence[str]) -> Figure:
-    """Draw the designed positions and speeds of every joint over one period."""
+def friction(
+    velocity: np.ndarray, observed: np.ndarray, curves: Sequence[tuple[np.ndarray, np.ndarray]], rows: Sequence[str],
+    units: Sequence[tuple[str, str]], title: str = "",
+) -> Figure:  # fmt: skip
+    """Draw each joint's friction over its velocity: what the rigid model leaves, and the model's terms of velocity.
+
+    Args:
+        velocity, observed: (N, n), of each joint.
+        curves: velocities and the model's friction there, of each joint.
+        rows: names of the joints.
+        units: of velocity and of friction, of each joint.
+        title: of the whole.
+    """
+    n = len(rows)
+    columns = min(n, 4)
+    lines = -(-n // columns)
+    step = max(1, len(velocity) // (2 * 700))
     with styled():
-        figure, axes = sheet(2, len(names), WIDE, 2.4)
-        for j, name in enumerate(names):
-            for k, (series, unit) in enumerate(((q, units[j]), (v, f"{units[j]}/s"))):
-                axis = axes[k * len(names) + j]
-                axis.plot(t, series[:, j], color=AFTER, linewidth=0.8)
-                axis.axhline(0.0, color=QUIET, linewidth=0.4)
-                axis.tick_params(labelsize=5.5)
-                if k == 0:
-                    axis.set_title(name, fontsize=7)
-                    axis.set_xticklabels([])
-                if j == 0:
-                    axis.set_ylabel(f"{'position' if k == 0 else 'speed'} [{unit}]", fontsize=7)
-        figure.supxlabel("time [s]", fontsize=7.5, color=INK)
+        figure, axes = sheet(lines, columns, WIDE, 0.6 + 1.6 * lines, across=0.5, between=0.62, left=0.55, top=0.5)
+        for axis in axes[n:]:
+            axis.set_visible(False)
+        for j, axis in enumerate(axes[:n]):
+            axis.plot(
+                velocity[::step, j], observed[::step, j], ".", color=BEFORE, markersize=1.5, markeredgewidth=0.0,
+                label="model + residual",
+            )  # fmt: skip
+            axis.plot(*curves[j], color=AFTER, linewidth=1.2, label="model")
+            axis.set_title(rows[j], fontsize=7.5, fontweight="normal", pad=3.0)
+            axis.set_xlabel(f"velocity [{units[j][0]}]", fontsize=7, labelpad=2.0)
+            if j % columns == 0 or units[j] != units[j - 1]:
+                axis.set_ylabel(f"friction [{units[j][1]}]", fontsize=7, labelpad=2.0)
+            axis.tick_params(labelsize=6.5)
+        legend(figure, axes[0], title)
     return figure
 
 
 def significance(names: Sequence[str], values: np.ndarray, sigma: np.ndarray) -> Figure:
-    """Draw how many sigmas each parameter is from zero; below two it is not told."""
-    share = np.abs(values) / np.maximum(sigma, 1e-300)
+    """Draw how many sigmas each parameter is from zero; below two it is not told.
+
+    Args:
+        names: (p,).
+        values, sigma: (p,), in each parameter's unit.
+    """
+    share = np.maximum(np.abs(values) / np.maximum(sigma, 1e-300), 0.1)
+    size = 5.0 if len(names) > 60 else 6.0
     with styled():
-        figure, (axis,) = sheet(1, 1, WIDE, 2.2)
+        margin = room(names, size)
+        figure, (axis,) = sheet(1, 1, WIDE, 1.75 + margin, bottom=margin)
         colours = [AFTER if one > 2 else QUIET for one in share]
-        axis.bar(np.arange(len(names)), np.maximum(share, 0.1), color=colours, width=0.75)
+        thick = min(8.0, 0.75 * 72.0 * (WIDE - 0.62) / (len(names) + 1))
+        axis.vlines(np.arange(len(names)), 0.1, share, colors=colours, linewidth=thick)
         axis.axhline(2.0, color=MARK, linewidth=0.7, linestyle="--")
-        axis.set_yscale("log")
-        axis.set_xticks(np.arange(len(names)), names, rotation=90, fontsize=5 if len(names) > 60 else 6)
-        axis.set_ylabel("|value| / σ")
-        axis.margins(x=0.005)
+        log_axis(axis.yaxis, 0.1, 2.0 * share.max(initial=2.0))
+        axis.set_xticks(np.arange(len(names)), names, rotation=90, fontsize=size)
+        axis.set(ylabel="|value| / σ", xlim=(-0.7, len(names) - 0.3))
+        axis.set_title(f"{int((share > 2).sum())} of {len(names)} parameters differ from zero by two sigmas", color=INK)
     return figure

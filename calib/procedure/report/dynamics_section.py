@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from calib.errors import UsageError
 from calib.procedure.dynamic_stage.validation import SCHEMA
 from calib.procedure.excitation import coefficients
-from calib.procedure.report import dynamics_figures, uncertainty_figures
+from calib.procedure.report import dynamics_figures, motion_figures, uncertainty_figures
 from calib.procedure.report.page import Block, KeyFigure, Picture, Pictures, Section, Table, Text
-from calib.procedure.report.style import svg
+from calib.procedure.report.style import HALF, WIDE, svg
 
 TOLD = 50.0  # RSD [%] from which on a parameter is not told from zero: two sigmas
 DRAWN = 300  # points per curve of the excitation
@@ -70,7 +71,7 @@ def dynamics_stage(found: DynamicReport, folder: Path, excitation: Path, exporte
     """
     blocks: list[Block] = [error_table(found), Pictures("", judged_figures(found))]
     for number, curves in enumerate(found.unseen["curves"]):
-        figure = dynamics_figures.torques(curves, found.unseen["rows"], found.unseen["units"])
+        figure = torques(found, curves)
         seen = "unseen" if found.unseen["validation"] else "fitted"
         words = f"Torques on {curves['name']}, {seen}: measured, predicted, and what is left."
         blocks.append(
@@ -88,6 +89,15 @@ def dynamics_stage(found: DynamicReport, folder: Path, excitation: Path, exporte
     if notes:
         blocks.append(Text("Notes on the dynamics", notes))
     return Section("Dynamics", blocks, found.verdict, found.reason, key_figures(found))
+
+
+def torques(found: DynamicReport, curves: Mapping[str, Any]) -> Figure:
+    """Return the figure of the torques of one recording."""
+    raw = {**found.unseen["fit"], **found.unseen["validation"]}[curves["name"]]["raw"]["relative_error_percent"]
+    t, measured, predicted = (np.array(curves[key], dtype=float).T for key in ("t", "measured", "predicted"))
+    title = f"{curves['name']}: {percent(raw['total'])} of the torque unexplained"
+    rows, units = found.unseen["rows"], found.unseen["units"]
+    return dynamics_figures.torques(t, measured, predicted, rows, units, title, raw["joints"])
 
 
 def proof_of(found: DynamicReport) -> tuple[Mapping[str, Any], str]:
@@ -157,7 +167,8 @@ def judged_figures(found: DynamicReport) -> list[Picture]:
     name = next(iter(found.unseen["autocorrelation"]))
     white = found.unseen["autocorrelation"][name]
     many = len(rows) > dynamics_figures.FEW
-    drawn = dynamics_figures.whiteness(white["values"], white["bound"], rows)
+    width = WIDE if many else HALF
+    drawn = dynamics_figures.autocorrelations(white["values"], white["bound"], rows, "What is left", width)
     return [
         Picture(
             svg(bars, "errors"),
@@ -186,8 +197,9 @@ def planned(excitation: Path) -> list[Block]:
         f"{condition['normalised']:.3g} with unit columns, of {len(setting['columns'])} columns. Every limit was kept, "
         f"at and between {setting['instants_verified']} instants; smallest margins: {margins}."
     )
-    names = [f"joint {j + 1}" for j in range(q.shape[1])]
-    figure = dynamics_figures.motion(t, q, v, names, ["rad"] * len(names))
+    names, none = motion.joint_names, np.full(q.shape[1], np.inf)
+    series = [(values, -none, none, title) for values, title in ((q, "position"), (v, "velocity"))]
+    figure = motion_figures.motion_sheet(t, series, ("rad", "rad/s"), names)
     return [Pictures("Excitation", [Picture(svg(figure, "motion"), words, True)])]
 
 

@@ -11,9 +11,26 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from calib.procedure.report.style import AFTER, BEFORE, HALF, HEAT, INK, MARK, QUIET, WIDE, sheet, styled
+from calib.procedure.report.style import (
+    AFTER,
+    BEFORE,
+    BROWN,
+    HALF,
+    HEAT,
+    INK,
+    MARK,
+    QUIET,
+    WIDE,
+    colour_scale,
+    log_axis,
+    number,
+    room,
+    sheet,
+    styled,
+)
 
 UNITS = {"position": (1e3, "mm"), "orientation": (180.0 / np.pi, "deg"), "distance": (1e3, "mm")}
+PALE = "#c3ccd6"  # of what is not told from zero
 
 
 def error_histogram(
@@ -32,27 +49,33 @@ def error_histogram(
     apart = np.median(two) < np.median(one) / 6.0  # then equal bins would show one bar of the smaller errors
     least = max(min(one.min(), two.min()), 1e-4 * top) * 0.9
     edges = np.geomspace(least, top, 31) if apart else np.linspace(0.0, top, 31)
+    rms = [float(np.sqrt(np.mean(sizes**2))) for sizes in (one, two)]
     with styled():
-        figure, (axes,) = sheet(width=HALF, height=2.4)
-        axes.set_xscale("log" if apart else "linear")
-        axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-        axes.hist(one, edges, color=BEFORE, label="nominal")
-        axes.hist(two, edges, color=AFTER, alpha=0.9, label="calibrated")
-        for sizes, colour, label in ((one, "#a8622a", "nominal"), (two, AFTER, "calibrated")):
-            rms = float(np.sqrt(np.mean(sizes**2)))
-            axes.axvline(rms, color=colour, linewidth=1.0, linestyle="--")
+        figure, (axes,) = sheet(width=HALF, height=2.5, left=0.5)
+        highest = 1
+        for sizes, colour in ((one, BEFORE), (two, AFTER)):
+            counts = np.histogram(sizes, edges)[0]
+            highest = max(highest, int(counts.max()))
+            axes.stairs(counts, edges, fill=True, color=colour, alpha=0.9)
+        for value, colour, label in ((rms[0], BROWN, "nominal"), (rms[1], AFTER, "calibrated")):
+            axes.axvline(value, color=colour, linewidth=1.0, linestyle="--")
+            right = (np.log(value / edges[0]) / np.log(edges[-1] / edges[0]) if apart else value / edges[-1]) > 0.7
             axes.annotate(
-                f"{label}\nrms {rms:.3g}", (rms, 0.98), xycoords=("data", "axes fraction"), xytext=(3, 0),
-                textcoords="offset points", color=colour, va="top", fontsize=7.5,
+                label, (value, 0.98), xycoords=("data", "axes fraction"), xytext=(-3 if right else 3, 0),
+                textcoords="offset points", color=colour, va="top", ha="right" if right else "left", fontsize=7.5,
             )  # fmt: skip
         if noise:
-            axes.axvline(factor * noise, color=QUIET, linewidth=0.9, linestyle=":")
+            axes.axvline(factor * noise, color=INK, linewidth=0.9, linestyle=":")
             axes.annotate(
-                "instrument", (factor * noise, 0.5), xycoords=("data", "axes fraction"), rotation=90, xytext=(2, 0),
-                textcoords="offset points", color=INK, va="center", fontsize=6.5,
+                "instrument", (factor * noise, 0.89), xycoords=("data", "axes fraction"), xytext=(3, 0),
+                textcoords="offset points", color=INK, va="top", fontsize=6.5,
             )  # fmt: skip
-        axes.set(xlabel=f"{nature} error [{unit}]", ylabel="poses", xlim=(edges[0], edges[-1]))
-        axes.margins(y=0.18)
+        if apart:
+            log_axis(axes.xaxis, edges[0], edges[-1])
+        axes.set(xlabel=f"{nature} error [{unit}]", ylabel="poses", ylim=(0.0, 1.2 * highest))
+        if not apart:
+            axes.set_xlim(edges[0], edges[-1])
+        axes.set_title(f"{rms[0]:.3g} {unit} rms before, {rms[1]:.3g} {unit} after")
     return figure
 
 
@@ -75,41 +98,39 @@ def residuals_by_joint(
     """
     factor, unit = UNITS[nature]
     n = q.shape[1]
-    columns = min(4, n)
+    columns = n if n < 4 else 4 if n in (4, 7, 8) else -(-n // 2) if n < 7 else 4
     rows = -(-n // columns)
     slides = prismatic or [False] * n
+    low, high = _decades(factor * np.concatenate([before, after]))
     with styled():
-        figure, axes = sheet(rows, columns, WIDE, 0.4 + 1.35 * rows)
-        for j, plot in enumerate(axes):
-            if j >= n:
-                plot.set_axis_off()
-                continue
+        figure, axes = sheet(rows, columns, WIDE, 0.75 + 1.45 * rows, across=0.15, between=0.55, top=0.42)
+        for plot in axes[n:]:
+            plot.set_axis_off()
+        for j, plot in enumerate(axes[:n]):
             x = q[:, j] if slides[j] else np.rad2deg(q[:, j])
-            plot.scatter(x, factor * before, s=4, color=BEFORE, linewidths=0, alpha=0.8, rasterized=len(q) > 60)
-            plot.scatter(x, factor * after, s=4, color=AFTER, linewidths=0, alpha=0.9, rasterized=len(q) > 60)
-            plot.set_title(f"{joint_names[j]} [{'m' if slides[j] else 'deg'}]", fontsize=7.5, fontweight="normal")
-            plot.set_yscale("log")
-            plot.set_ylim(*_decades(factor * np.concatenate([before, after])))
-            plot.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-            plot.minorticks_off()
+            for sizes, colour in ((before, BEFORE), (after, AFTER)):
+                plot.plot(x, factor * sizes, ".", color=colour, markersize=3.2, markeredgewidth=0.0)
+            plot.set_xlabel(f"{joint_names[j]} [{'m' if slides[j] else 'deg'}]", fontsize=7.5)
+            log_axis(plot.yaxis, low, high, 4)
+            plot.tick_params(labelsize=7)
             plot.grid(axis="y")
             if j % columns:
                 plot.tick_params(labelleft=False)
             else:
-                plot.set_ylabel(f"error [{unit}]")
-        _dots(axes[0])
+                plot.set_ylabel(f"error [{unit}]", fontsize=7.5)
+        _key(axes[0])
     return figure
 
 
-def _dots(plot: Axes) -> None:
-    for height, colour, label in ((0.97, "#a8622a", "nominal"), (0.03, AFTER, "calibrated")):
-        side = "top" if height > 0.5 else "bottom"
-        plot.text(0.03, height, label, color=colour, transform=plot.transAxes, va=side, fontsize=7, fontweight="bold")
+def _key(plot: Axes) -> None:
+    """Name the two colours above the upper left corner."""
+    for place, colour, label in ((0.0, BROWN, "nominal"), (0.42, AFTER, "calibrated")):
+        plot.text(place, 1.05, label, color=colour, transform=plot.transAxes, va="bottom", fontweight="bold")
 
 
 def _decades(sizes: np.ndarray) -> tuple[float, float]:
-    """Return limits that leave out the few smallest sizes, with room above for a label."""
-    return float(max(np.percentile(sizes, 2), 1e-9)) * 0.5, float(max(sizes.max(), 1e-8)) * 2.5
+    """Return limits that leave out the few smallest sizes."""
+    return float(max(np.percentile(sizes, 2), 1e-9)) * 0.5, float(max(sizes.max(), 1e-8)) * 1.3
 
 
 def error_map(points: np.ndarray, sizes: np.ndarray, names: str = "xyz") -> Figure:
@@ -123,19 +144,21 @@ def error_map(points: np.ndarray, sizes: np.ndarray, names: str = "xyz") -> Figu
     order = np.argsort(sizes)
     top = 1e3 * float(np.max(sizes, initial=1e-9))
     with styled():
-        figure, axes = sheet(1, 2, WIDE, 3.1)
+        figure, axes = sheet(1, 2, WIDE, 3.1, across=0.6, right=0.75)
         for plot, (i, j) in zip(axes, ((0, 1), (0, 2))):
-            plot.scatter(
+            drawn = plot.scatter(
                 points[order, i], points[order, j], c=1e3 * sizes[order], cmap=HEAT, vmin=0.0, vmax=top, s=16,
-                edgecolors=QUIET, linewidths=0.25, rasterized=len(points) > 500,
+                edgecolors=QUIET, linewidths=0.25,
             )  # fmt: skip
             plot.plot(0.0, 0.0, marker="+", color=INK, markersize=9)
-            plot.annotate("base", (0.0, 0.0), xytext=(4, 4), textcoords="offset points", fontsize=7)
-            plot.set(xlabel=f"{names[i]} [m]", ylabel=f"{names[j]} [m]", aspect="equal")
-            plot.set_title("from above" if j == 1 else "from the side", fontweight="normal")
+            plot.annotate("base", (0.0, 0.0), (0, -5), textcoords="offset points", ha="center", va="top", fontsize=7)
+            plot.set_aspect("equal", adjustable="datalim")
+            plot.locator_params(nbins=6)
+            plot.set(xlabel=f"{names[i]} [m]", ylabel=f"{names[j]} [m]")
             plot.grid(True)
-            plot.set_axisbelow(True)
-        figure.colorbar(axes[0].collections[0], ax=axes, label="remaining error [mm]", fraction=0.03, pad=0.02)
+        axes[0].set_title(f"from above: at most {top:.3g} mm remain")
+        axes[1].set_title("from the side")
+        colour_scale(figure, axes[1], drawn, "[mm]")
     return figure
 
 
@@ -145,28 +168,34 @@ def parameter_changes(
     """Draw calibrated minus nominal with bars of two sigmas, lengths in mm and angles in mrad side by side.
 
     Args:
-        names, units: (p,); units ``m`` and ``rad``, others are left out.
-        changes, sigmas: (p,).
-        most: parameters per panel, those with the largest change in sigmas first to be kept.
+        names, units: (p,); units are ``m`` or ``rad``, others are left out.
+        changes, sigmas: (p,) [unit].
+        most: parameters per panel, those furthest from nominal by their sigma.
     """
     panels = [[k for k, unit in enumerate(units) if unit == wanted] for wanted in ("m", "rad")]
     panels = [_strongest(panel, changes, sigmas, most) for panel in panels]
     longest = max((len(panel) for panel in panels), default=1)
+    margin = room([names[k] for panel in panels for k in panel], 7.0)
     with styled():
-        figure, axes = sheet(1, 2, WIDE, 0.7 + 0.155 * max(longest, 5))
+        height = 0.75 + 0.155 * max(longest, 5)
+        figure, axes = sheet(1, 2, WIDE, height, left=margin, across=margin + 0.1)
         for plot, panel, unit in zip(axes, panels, ("mm", "mrad")):
+            if not panel:
+                plot.set_axis_off()
+                continue
             y = np.arange(len(panel))[::-1]
             value, spread = 1e3 * changes[panel], 2e3 * sigmas[panel]
             clear = np.abs(value) > spread
+            thick = 0.55 * 72.0 * (height - 0.73) / (len(panel) + 0.2)
             plot.axvline(0.0, color=QUIET, linewidth=0.7)
-            plot.barh(y, value, height=0.55, color=[AFTER if one else "#c3ccd6" for one in clear])
+            plot.hlines(y, 0.0, value, colors=[AFTER if one else PALE for one in clear], linewidth=min(thick, 9.0))
             plot.errorbar(value, y, xerr=spread, fmt="none", ecolor=MARK, elinewidth=0.9, capsize=1.8)
             plot.set_yticks(y, [names[k] for k in panel], fontsize=7)
-            plot.set(xlabel=f"calibrated - nominal [{unit}], bars ±2σ")
+            plot.set(xlabel=f"calibrated - nominal [{unit}], bars ±2σ", ylim=(-0.6, len(panel) - 0.4))
+            plot.set_title(
+                f"{int(clear.sum())} of {len(panel)} {'lengths' if unit == 'mm' else 'angles'} clearly changed"
+            )
             plot.grid(axis="x")
-            plot.set_axisbelow(True)
-            if not panel:
-                plot.set_axis_off()
     return figure
 
 
@@ -188,19 +217,20 @@ def singular_values(values: np.ndarray, rank: int) -> Figure:
     floor = max(values[0] * 1e-17, 1e-17)
     shown = np.maximum(values, floor)
     with styled():
-        figure, (axes,) = sheet(width=HALF, height=2.4)
-        number = np.arange(1, len(values) + 1)
-        axes.semilogy(number[:rank], shown[:rank], "o", color=AFTER, markersize=3)
-        axes.semilogy(number[rank:], shown[rank:], "o", markersize=3, markerfacecolor="white", color=MARK)
+        figure, (axes,) = sheet(width=HALF, height=2.5)
+        count = np.arange(1, len(values) + 1)
+        axes.plot(count[:rank], shown[:rank], "o", color=AFTER, markersize=3)
+        axes.plot(count[rank:], shown[rank:], "o", markersize=3, markerfacecolor="white", color=MARK)
         if 0 < rank < len(values):
             axes.axvspan(rank + 0.1, rank + 0.9, color="#f3e3e1", linewidth=0)
             ratio = shown[rank - 1] / shown[rank]
             axes.annotate(
-                f"gap {ratio:.0e}", (rank + 0.5, np.sqrt(shown[rank - 1] * shown[rank])), xytext=(-6, 0),
+                f"gap {number(ratio)}", (rank + 0.5, np.sqrt(shown[rank - 1] * shown[rank])), xytext=(-6, 0),
                 textcoords="offset points", ha="right", va="center", color=MARK, fontsize=7.5,
             )  # fmt: skip
+        log_axis(axes.yaxis, 0.3 * shown.min(), 3.0 * shown.max())
         axes.set(xlabel="number", ylabel="singular value")
-        axes.set_title(f"{rank} of {len(values)} can be told", fontweight="normal")
+        axes.set_title(f"{rank} of {len(values)} parameters can be told apart")
         axes.grid(axis="y")
     return figure
 
@@ -222,26 +252,27 @@ def ladder(
         noise: rms of the instrument's own error [m].
     """
     errors, x, taken = 1e3 * np.asarray(unseen, dtype=float), np.arange(len(models)), np.flatnonzero(kept)
+    left_out, last = np.setdiff1d(x, taken), taken[-1:]
     with styled():
-        figure, (axes,) = sheet(width=WIDE, height=2.3)
-        axes.plot(x[taken], errors[taken], color=AFTER, linewidth=1.0, zorder=1)
-        for place in x:
-            last, face = place == taken[-1] if len(taken) else False, AFTER if kept[int(place)] else "white"
-            axes.plot(place, errors[place], "o", color=AFTER, markerfacecolor=face, markersize=8 if last else 5)
+        figure, (axes,) = sheet(width=WIDE, height=2.4, bottom=0.62)
+        axes.plot(x[taken], errors[taken], "o-", color=AFTER, linewidth=1.0, markersize=5)
+        axes.plot(x[left_out], errors[left_out], "o", color=AFTER, markerfacecolor="white", markersize=5)
+        axes.plot(x[last], errors[last], "o", color=AFTER, markersize=8)
+        for place, error in zip(x, errors):
             axes.annotate(
-                f"{errors[place]:.3g}", (place, errors[place]), xytext=(0, 8), textcoords="offset points", ha="center",
-                fontsize=7.5, fontweight="bold" if last else "normal",
+                f"{error:.3g}", (place, error), xytext=(0, 8), textcoords="offset points", ha="center", fontsize=7.5,
+                fontweight="bold" if place in last else "normal",
             )  # fmt: skip
         if noise:
-            axes.axhline(1e3 * noise, color=QUIET, linewidth=0.9, linestyle=":")
-            axes.text(-0.45, 1.05e3 * noise, "instrument", color=QUIET, fontsize=6.5, va="bottom")
-        axes.set_yscale("log")
-        axes.set_ylim(0.7 * min(errors.min(), 1e3 * (noise or np.inf)), 2.4 * errors.max())
-        axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-        axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in "25" else "")
+            axes.axhline(1e3 * noise, color=INK, linewidth=0.9, linestyle=":")
+            axes.text(-0.45, 1.05e3 * noise, "instrument", color=INK, fontsize=6.5, va="bottom")
+        log_axis(axes.yaxis, 0.7 * min(errors.min(), 1e3 * (noise or np.inf)), 2.4 * errors.max())
         axes.set_xticks(x, [f"{model}\n{count}" for model, count in zip(models, parameters)], fontsize=7)
         axes.set(ylabel="error on rows left out [mm]", xlabel="model, parameters", xlim=(-0.5, len(models) - 0.5))
-        axes.grid(axis="y", which="both")
+        if len(taken):
+            chosen = str(models[int(taken[-1])]).removeprefix("+ ")
+            axes.set_title(f"{chosen} is where the gain ends: {errors[taken[-1]]:.3g} mm")
+        axes.grid(axis="y")
     return figure
 
 
@@ -253,9 +284,9 @@ def selection_growth(counts: Sequence[int], curves: Mapping[str, Sequence[float]
         curves: method → index at each count; NaN where there is none.
         index: its name.
     """
-    shades = [AFTER, "#a8622a", QUIET, MARK, "#4d7c57"]
+    shades = [AFTER, BROWN, QUIET, MARK, "#4d7c57"]
     with styled():
-        figure, (axes,) = sheet(width=HALF, height=2.4)
+        figure, (axes,) = sheet(width=HALF, height=2.5, right=room(curves, 7.0))
         for (name, values), colour in zip(curves.items(), shades * 3):
             axes.plot(counts, values, color=colour, linewidth=1.4)
             end = int(np.flatnonzero(np.isfinite(values))[-1])
@@ -285,9 +316,11 @@ def correlation_map(names: Sequence[str], correlation: np.ndarray, threshold: fl
     chosen = np.sort(chosen[np.argsort(-off[chosen])][:most])
     block = correlation[np.ix_(chosen, chosen)]
     labels = [str(names[k]) for k in chosen]
+    margin = room(labels, 6.5)
+    side = HALF - margin - 0.72
     with styled():
-        figure, (axes,) = sheet(width=HALF, height=3.2)
-        image = axes.imshow(block, cmap="PuOr", vmin=-1.0, vmax=1.0)
+        figure, (axes,) = sheet(width=HALF, height=side + margin + 0.3, left=margin, bottom=margin, right=0.72, top=0.3)
+        image = axes.imshow(block, cmap="PuOr", vmin=-1.0, vmax=1.0, aspect="auto")
         axes.set_xticks(range(len(labels)), labels, rotation=90, fontsize=6.5)
         axes.set_yticks(range(len(labels)), labels, fontsize=6.5)
         if len(labels) <= 10:
@@ -295,5 +328,8 @@ def correlation_map(names: Sequence[str], correlation: np.ndarray, threshold: fl
                 dark = abs(block[i, j]) > 0.6
                 text = f"{block[i, j]:.2f}"
                 axes.text(j, i, text, ha="center", va="center", fontsize=5.5, color="white" if dark else INK)
-        figure.colorbar(image, ax=axes, label="correlation", fraction=0.046, pad=0.03)
+        colour_scale(figure, axes, image, ticks=(-1.0, -0.5, 0.0, 0.5, 1.0))
+        if len(labels) > 1:
+            strongest = np.abs(block - np.diag(np.diag(block))).max()
+            axes.set_title(f"correlations up to {strongest:.2f}", x=-margin / side)
     return figure

@@ -1,11 +1,16 @@
-"""How every figure looks and is written: one palette that survives a greyscale print, quiet axes, whole files."""
+"""How every figure looks and is drawn: one palette that survives a greyscale print, quiet axes, one drawing of each.
+
+A figure is drawn once, as PNG: the same bytes stand in a folder as a file and on a page as an image. Margins are given
+in inches, since measuring every label to find them takes longer than to draw it; text is never read as mathematics, so
+that a ``$`` in a name is a ``$``.
+"""
 
 from __future__ import annotations
 
 import base64
+import html
 import io
-import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,26 +18,36 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import XAxis, YAxis
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.font_manager import findfont, get_font
+from PIL import Image
 
 from calib import files
 
 BEFORE, AFTER, MARK, QUIET, INK = "#e2a26b", "#17486e", "#b3261e", "#8a8f98", "#22262b"
+BROWN = "#a8622a"  # BEFORE, dark enough for letters
 HEAT = "cividis_r"
-WIDE, HALF = 7.4, 3.6
+WIDE, HALF = 7.4, 3.6  # a page's line and half of it [in]
+DPI = 200  # of print
+COLOURS = 256  # of a PNG with a palette, a third as large as one without
+POINTS = 700  # stretches of a curve, of which each keeps its smallest and its largest value
 STYLE: Any = {
-    "font.family": "sans-serif",
-    "font.sans-serif": ["DejaVu Sans", "Helvetica", "Arial", "sans-serif"],
+    "font.family": "DejaVu Sans",
     "font.size": 8.5,
     "axes.titlesize": 9.0,
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
+    "axes.titley": 1.0,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.edgecolor": QUIET,
     "axes.labelcolor": INK,
     "axes.linewidth": 0.7,
+    "axes.axisbelow": True,
     "text.color": INK,
+    "text.parse_math": False,
     "xtick.color": QUIET,
     "ytick.color": QUIET,
     "xtick.labelcolor": INK,
@@ -40,8 +55,8 @@ STYLE: Any = {
     "grid.color": "#e3e5e8",
     "grid.linewidth": 0.6,
     "legend.frameon": False,
-    "figure.constrained_layout.use": True,
-    "svg.fonttype": "none",
+    "legend.borderpad": 0.0,
+    "legend.borderaxespad": 0.2,
 }
 
 
@@ -52,11 +67,100 @@ def styled() -> Iterator[None]:
         yield
 
 
-def sheet(rows: int = 1, columns: int = 1, width: float = HALF, height: float = 2.5) -> tuple[Figure, list[Axes]]:
-    """Return a figure without a window, and its axes row by row; width and height in inches."""
+def sheet(
+    rows: int = 1, columns: int = 1, width: float = HALF, height: float = 2.5, *, left: float = 0.62,
+    right: float = 0.12, bottom: float = 0.45, top: float = 0.28, across: float = 0.5, between: float = 0.42,
+) -> tuple[Figure, list[Axes]]:  # fmt: skip
+    """Return a figure without a window, and its axes row by row.
+
+    Args:
+        rows, columns: of axes.
+        width, height: of the figure [in].
+        left, right, bottom, top: what is kept free at the edges for labels and titles [in].
+        across, between: what is kept free between columns, and between rows [in].
+    """
     figure = Figure(figsize=(width, height))
-    axes = figure.subplots(rows, columns, squeeze=False)
-    return figure, list(axes.ravel())
+    wide = (width - left - right - (columns - 1) * across) / columns
+    high = (height - top - bottom - (rows - 1) * between) / rows
+    axes = []
+    for i, j in np.ndindex(rows, columns):
+        place = left + j * (wide + across), bottom + (rows - 1 - i) * (high + between)
+        axes.append(figure.add_axes((place[0] / width, place[1] / height, wide / width, high / height)))
+    return figure, axes
+
+
+def room(labels: Iterable[str], size: float) -> float:
+    """Return the margin that the widest of these tick labels needs, printed in points of `size` [in]."""
+    font = get_font(findfont("DejaVu Sans"))
+    font.set_size(size, DPI)
+    widest = 0.0
+    for line in (line for label in labels for line in label.split("\n")):
+        font.set_text(line)
+        widest = max(widest, font.get_width_height()[0] / 64.0)
+    return widest / DPI + 0.15  # and a tick with its distance
+
+
+def colour_scale(figure: Figure, axes: Axes, drawn: Any, title: str = "", **options: Any) -> None:
+    """Draw the scale of colours of what is drawn on these axes at their right, where 0.7 in are free."""
+    width, place = figure.get_figwidth(), axes.get_position()
+    scale = figure.add_axes((place.x1 + 0.1 / width, place.y0, 0.1 / width, place.height))
+    figure.colorbar(drawn, cax=scale, **options)
+    scale.tick_params(labelsize=7)
+    scale.set_title(title, fontsize=7.5, fontweight="normal")
+
+
+def log_axis(axis: XAxis | YAxis, low: float, high: float, most: int = 7) -> None:
+    """Make an axis logarithmic from `low` to `high`, with at most about `most` ticks: 1, 2, 5 or powers of ten."""
+    axes = axis.axes
+    if isinstance(axis, XAxis):
+        axes.set(xscale="log", xlim=(low, high))
+    else:
+        axes.set(yscale="log", ylim=(low, high))
+    powers = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1.0)
+    ticks = (powers[:, None] * ([1.0, 2.0, 5.0] if high < 100.0 * low else [1.0])).ravel()
+    ticks = ticks[(low <= ticks) & (ticks <= high)]
+    ticks = ticks[:: max(1, -(-len(ticks) // most))]
+    axis.set_ticks(ticks, labels=[number(tick) for tick in ticks])
+    axis.set_ticks([], minor=True)
+
+
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def number(value: float) -> str:
+    """Return a tick's number: plain from 0.001 to 10 000, else a power of ten."""
+    if value == 0.0 or 0.99e-3 < abs(value) < 0.99e5:
+        return f"{value:g}"
+    digits, power = f"{value:.0e}".split("e")
+    head = "" if digits == "1" else "-" if digits == "-1" else f"{digits}·"
+    return f"{head}10{str(int(power)).translate(_RAISED)}"
+
+
+def legend(figure: Figure, axes: Axes | None, title: str) -> None:
+    """Write a figure's title in its upper left corner and the legend of `axes` in the right one, where no data are."""
+    width, height = figure.get_size_inches()
+    figure.text(0.1 / width, 1.0 - 0.06 / height, title, va="top", fontsize=9.0, fontweight="bold")
+    if axes is not None:
+        handles, labels = axes.get_legend_handles_labels()
+        place = {"loc": "upper right", "bbox_to_anchor": (1.0 - 0.05 / width, 1.0 - 0.04 / height)}
+        figure.legend(handles, labels, ncols=len(labels), fontsize=7.0, handlelength=1.4, markerscale=4.0, **place)
+
+
+def thinned(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return of a long curve the smallest and the largest value of each of `POINTS` stretches, so that no peak is lost.
+
+    Args:
+        t: (N,) [s].
+        values: (N,).
+    """
+    size = len(t) // POINTS
+    if size < 3:
+        return t, values
+    count = len(t) // size
+    blocks = values[: count * size].reshape(count, size)
+    both = np.sort(np.stack([blocks.argmin(axis=1), blocks.argmax(axis=1)]), axis=0) + size * np.arange(count)
+    kept = np.append(both.T.ravel(), len(t) - 1)
+    return t[kept], values[kept]
 
 
 def motion_units(kinds: Iterable[str]) -> tuple[str, str, str, str]:
@@ -67,57 +171,34 @@ def motion_units(kinds: Iterable[str]) -> tuple[str, str, str, str]:
     return first, f"{first}/s", f"{first}/s²", torque
 
 
-def motion_sheet(
-    times: np.ndarray, rows: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray, str]], units: Sequence[str],
-    names: Sequence[str],
-) -> Figure:  # fmt: skip
-    """Draw series of every joint, a line per joint and a column per series, with their limits dashed.
-
-    Args:
-        times: (N,) [s].
-        rows: values (N, n), lower and upper limit (n,), title.
-        units: of each series.
-        names: of the n joints.
-    """
+def png(figure: Figure, dpi: float = DPI) -> bytes:
+    """Draw a figure and return it as PNG."""
     with styled():
-        figure, axes = sheet(len(names), len(rows), WIDE, 0.85 * len(names) + 0.5)
-        for j, k in np.ndindex(len(names), len(rows)):
-            values, lower, upper, title = rows[k]
-            axis = axes[j * len(rows) + k]
-            axis.plot(times, values[:, j], color=AFTER, linewidth=0.8)
-            for bound in (lower[j], upper[j]):
-                if np.isfinite(bound):
-                    axis.axhline(bound, color=MARK, linewidth=0.6, linestyle="--")
-            if j == 0:
-                axis.set_title(f"{title} [{units[k]}]")
-            if k == 0:
-                axis.set_ylabel(names[j], fontsize=7)
-        for axis in axes[-len(rows) :]:
-            axis.set_xlabel("time [s]")
-    return figure
+        figure.set_dpi(dpi)
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+    colours = Image.fromarray(np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., :3]))
+    image = colours.quantize(COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    palette = np.array(image.getpalette(), dtype=np.uint8)
+    palette[palette > 251] = 255  # the paper is white; the search for a palette misses it by a digit
+    image.putpalette(palette.tolist())
+    buffer = io.BytesIO()
+    image.save(buffer, "png", dpi=(dpi, dpi))
+    return buffer.getvalue()
 
 
-def save(figure: Figure, path: str | Path, dpi: int = 150) -> Path:
-    """Write a figure whole or not at all; the suffix (png, svg, pdf) says the form."""
-    return files.write(path, _bytes(figure, Path(path).suffix.lstrip(".") or "png", dpi))
+def save(figure: Figure, path: str | Path, dpi: float = DPI) -> Path:
+    """Write a figure as PNG, whole or not at all."""
+    return files.write(path, png(figure, dpi))
+
+
+def image(drawn: bytes, words: str) -> str:
+    """Return a PNG as an element of a page that needs no other file; `words` say what it shows."""
+    source = base64.b64encode(drawn).decode()
+    form = "width: 100%; height: auto; display: block"
+    return f'<img style="{form}" alt="{html.escape(words, quote=True)}" src="data:image/png;base64,{source}">'
 
 
 def svg(figure: Figure, name: str) -> str:
-    """Return a figure as an SVG element to stand in a page; `name` keeps its ids apart from those of other figures."""
-    text = _bytes(figure, "svg", 100, name).decode()
-    text = text[text.index("<svg") :]
-    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-    text = re.sub(r'(id="|url\(#|href="#)', rf"\g<1>{name}-", text)
-    return re.sub(r'<svg ([^>]*?)width="[^"]*" height="[^"]*"', r'<svg \1role="img"', text, count=1).strip()
-
-
-def png_uri(figure: Figure, dpi: int = 150) -> str:
-    """Return a figure as a data URI, for pictures with thousands of points."""
-    return "data:image/png;base64," + base64.b64encode(_bytes(figure, "png", dpi)).decode()
-
-
-def _bytes(figure: Figure, form: str, dpi: int, salt: str = "calib") -> bytes:
-    buffer = io.BytesIO()
-    with styled(), matplotlib.rc_context({"svg.hashsalt": salt}):
-        figure.savefig(buffer, format=form, dpi=dpi, metadata={"Date": None} if form == "svg" else None)
-    return buffer.getvalue()
+    """Return a figure as an element of a page."""
+    return image(png(figure), name)

@@ -1,7 +1,7 @@
 """The figures of consistent geometry and dynamics: the estimate on two geometries, and the errors that matter.
 
 Both are drawn from an identification's folder (``geometries.csv``, ``geometry_effects.csv``), so that a certificate
-made later can embed them: ``drawing.svg(found.figure, name)`` of what `from_folder` returns.
+made later shows the same.
 """
 
 from __future__ import annotations
@@ -11,11 +11,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from calib.procedure.dynamic_stage.geometry_tables import EFFECTS, GEOMETRIES, LEAST
 from calib.procedure.report.figures import Drawn
-from calib.procedure.report.style import AFTER, BEFORE, MARK, QUIET, WIDE, save, sheet, styled
+from calib.procedure.report.style import AFTER, BEFORE, MARK, QUIET, WIDE, legend, number, room, save, sheet, styled
 
 TOP = 15  # elements in the ranked figure
 Row = Mapping[str, str]
@@ -58,8 +59,11 @@ def geometries(rows: Sequence[Row]) -> Figure:
     nominal, s_nominal, own, s_own = (np.array([float(row[name]) for row in rows]) for name in columns)
     x = np.arange(len(rows))
     percent = 100.0 / np.abs(own)
+    size = np.divide(nominal - own, s_own, out=np.zeros(len(rows)), where=s_own > 0.0)
+    thick = min(8.0, 0.7 * 72.0 * (WIDE - 0.75) / (len(rows) + 1))
+    margin = room([row["name"] for row in rows], 6.5)
     with styled():
-        figure, (above, below) = sheet(2, 1, WIDE, 4.4)
+        figure, (above, below) = sheet(2, 1, WIDE, 3.7 + margin, bottom=margin, top=0.45, between=0.15)
         for values, sigma, colour, shift, label in (
             (nominal, s_nominal, BEFORE, -0.15, "nominal (CAD) geometry"), (own, s_own, AFTER, 0.15, "calibrated"),
         ):  # fmt: skip
@@ -67,36 +71,50 @@ def geometries(rows: Sequence[Row]) -> Figure:
                 x + shift, percent * (values - own), 2.0 * percent * sigma, fmt="o", color=colour, markersize=2.5,
                 elinewidth=1.0, label=label,
             )  # fmt: skip
-        above.set_yscale("symlog", linthresh=1.0)
+        _symlog(above, 1.0)
         above.axhline(0.0, color=QUIET, linewidth=0.6)
-        above.set(ylabel="from calibrated [%]", title="identified on two geometries")
-        above.legend(ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0), fontsize=7)
-        size = np.divide(nominal - own, s_own, out=np.zeros(len(rows)), where=s_own > 0.0)
-        below.bar(x, size, color=np.where(np.abs(size) > 2.0, MARK, QUIET).tolist(), width=0.7)
-        below.set_yscale("symlog", linthresh=2.0)
-        below.set(ylabel="difference [σ]")
+        above.set_ylabel("from calibrated [%]")
+        below.vlines(x, 0.0, size, colors=np.where(np.abs(size) > 2.0, MARK, QUIET).tolist(), linewidth=thick)
+        _symlog(below, 2.0)
+        below.set_ylabel("difference [σ]")
         for axis in (above, below):
             axis.set_xlim(-0.7, len(rows) - 0.3)
             axis.grid(axis="y")
-            axis.set_axisbelow(True)
         above.set_xticks(x, [])
         below.set_xticks(x, [row["name"] for row in rows], rotation=90, fontsize=6.5)
+        moved = int((np.abs(size) > 2.0).sum())
+        legend(figure, above, f"{moved} of {len(rows)} parameters move by two sigmas with the geometry")
     return figure
+
+
+def _symlog(axes: Axes, linear: float) -> None:
+    """Make the y axis linear up to `linear` from zero, and logarithmic beyond."""
+    axes.set_yscale("symlog", linthresh=linear)
+    low, high = axes.get_ylim()
+    most = max(abs(low), abs(high), linear)
+    powers = linear * 10.0 ** np.arange(0, max(1, int(np.log10(most / linear)) + 1))
+    powers = powers[:: -(-len(powers) // 3)]
+    ticks = [tick for tick in (*-powers[::-1], 0.0, *powers) if low <= tick <= high]
+    axes.set_yticks(ticks, [number(tick) for tick in ticks])
+    axes.set_yticks([], minor=True)
 
 
 def effects(rows: Sequence[Row]) -> Figure:
     """Draw the ranked geometric errors by the largest shift they cause."""
     labels = [f"{row['element']} ({_milli(row)})" for row in rows]
     size = np.array([float(row["shift_sigma"]) for row in rows])
+    places = np.arange(len(rows))[::-1]
+    beside = room([row["parameter"] for row in rows], 6.5)
     with styled():
-        figure, (axis,) = sheet(1, 1, height=0.5 + 0.19 * len(rows))
-        places = np.arange(len(rows))[::-1]
-        axis.barh(places, size, color=np.where(size > LEAST, AFTER, QUIET).tolist(), height=0.7)
+        figure, (axis,) = sheet(height=0.75 + 0.19 * len(rows), left=room(labels, 7.0), right=beside)
+        axis.hlines(places, 0.0, size, colors=np.where(size > LEAST, AFTER, QUIET).tolist(), linewidth=8.0)
         axis.axvline(LEAST, color=MARK, linewidth=0.7, linestyle="--")
         for place, value, row in zip(places, size, rows):
             axis.text(value, place, f" {row['parameter']}", va="center", fontsize=6.5)
         axis.set_yticks(places, labels, fontsize=7)
-        axis.set(xlabel="shift [σ of torque noise]", title="geometric errors that matter")
+        axis.set(xlabel="shift [σ of torque noise]", ylim=(-0.7, len(rows) - 0.3))
+        axis.set_xlim(left=0.0)
+        legend(figure, None, f"{int((size > LEAST).sum())} of these {len(rows)} geometric errors matter")
     return figure
 
 

@@ -14,8 +14,10 @@ from rich.text import Text
 from calib import cli
 from calib.cli.shared import make_console
 from calib.data import values
+from calib.dynamics.torque_rows import MOTOR
 from calib.errors import UsageError
 from calib.identification.loop.replay import CAD, FEEDBACK, FLOOR, IDENTIFIED, Replay
+from calib.identification.scores import TorqueErrors
 from calib.procedure.dynamic_stage import tracking
 from calib.procedure.dynamic_stage.tracking import Tracking
 from calib.procedure.report import identification_figures
@@ -50,11 +52,13 @@ def test_figures_have_units_at_their_axes():
     one = planted.case("train", 0)
     joints = (replace(planted.arm().joints[0], kind="prismatic"), *planted.arm().joints[1:])
     outcome: Any = SimpleNamespace(
-        fit={"train": None}, repeated={}, found=SimpleNamespace(settings=SimpleNamespace(kind="motor")),
+        fit={"train": SimpleNamespace(raw=TorqueErrors(5.0, np.full(3, 5.0), np.zeros(3), 1))}, validation={},
+        repeated={}, found=SimpleNamespace(settings=SimpleNamespace(torque_rows=MOTOR)),
         inputs=SimpleNamespace(unit="N m", chain=replace(planted.arm(), joints=joints)),
     )  # fmt: skip
     figure = identification_figures.torques(one, np.asarray(one.target), outcome)
-    assert [axis.get_ylabel() for axis in figure.axes] == ["joint 1\n[N]", "joint 2\n[N m]", "joint 3\n[N m]"]
+    units = [f"{joint.name} [{unit}]: 5 % left" for joint, unit in zip(joints, ("N", "N m", "N m"))]
+    assert [axis.get_title(loc="left") for axis in figure.axes] == units
     assert not any(axis.get_legend() for axis in figure.axes), "a legend inside would cover the curve"
     assert motion_units(["revolute"] * 2) == ("rad", "rad/s", "rad/s²", "N m")
     assert motion_units(["revolute", "prismatic"])[3] == "N m, N"
