@@ -15,6 +15,9 @@ from pathlib import Path
 ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
 
 
+LIFE = "300 s"  # of processes whose tests were killed before they could end them
+
+
 class Cluster:
     """A scheduler; processes are killed when the block of `running` ends."""
 
@@ -25,7 +28,7 @@ class Cluster:
             "PYTHONPATH": paths, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": str(failures),
         }  # fmt: skip
         file = folder / "scheduler.json"
-        self.scheduler = self._start("scheduler", "--scheduler-file", str(file), "--port", "0", "--no-show")
+        self.scheduler = self._start("scheduler", "--scheduler-file", str(file), "--port", "0", "--idle-timeout", LIFE)
         for _ in range(600):
             if file.exists() and file.read_text().endswith("}"):
                 break
@@ -42,7 +45,7 @@ class Cluster:
 
     def add(self, count: int) -> None:
         """Start workers of one thread; where one dies, no nanny starts it again."""
-        options = ("--no-nanny", "--nthreads", "1", "--death-timeout", "30")
+        options = ("--no-nanny", "--nthreads", "1", "--death-timeout", "30", "--lifetime", LIFE)
         self.workers += [self._start("worker", self.address, *options) for _ in range(count)]
 
     def close(self) -> None:
