@@ -29,6 +29,7 @@ LARGEST = 8_000_000  # bytes of a file, and below: levels of tables in tables, s
 DEEPEST = 32
 LONGEST = 200
 ENDINGS = ("csv", "npz", "txt", "tsv", "dat", "mcap", "bag", "db3")  # of measured files
+_TAG = "\0"  # begins the names of alternatives, which are no part of a place
 UNKNOWN = "unexpected_keyword_argument"  # as pydantic calls it
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 _BINARY = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv}
@@ -223,7 +224,8 @@ def _no_key(key: str, keys: Collection[str]) -> str:
 def _complaint(errors: list[Any], kind: type, place: str) -> str:
     """Return the first of pydantic's errors in our form; a key that is not known explains one that is missing."""
     first = next((one for one in errors if one["type"] == UNKNOWN), errors[0])
-    loc, name, found, context = first["loc"], first["type"], first["input"], first.get("ctx", {})
+    loc = tuple(part for part in first["loc"] if not (isinstance(part, str) and part.startswith(_TAG)))
+    name, found, context = first["type"], first["input"], first.get("ctx", {})
     table = _type_at(kind, loc[:-1]) if name in (UNKNOWN, "missing") else None
     at = loc if table is None else loc[:-1]
     while (
@@ -245,7 +247,9 @@ def _complaint(errors: list[Any], kind: type, place: str) -> str:
     elif name == "expected":
         words = first["msg"]
     else:
-        words = f"a list of tables, [[{loc[-1]}]]" if name == "tuple_type" else "a table"
+        words = {"tuple_type": f"a list of tables, [[{loc[-1]}]]", "too_short": "at least one number"}.get(
+            name, "a table"
+        )
     return f"{where}: expected {words}, found {shown(found)}"
 
 
@@ -405,6 +409,19 @@ class Whole:
 
 
 @dataclass(frozen=True)
+class Index:
+    """A whole number counted from 1 in the file, from 0 here."""
+
+    most: int = 99
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        from pydantic_core import core_schema as core
+
+        counted = Whole(1, self.most).__get_pydantic_core_schema__(int, handler)
+        return core.no_info_after_validator_function(lambda number: number - 1, counted)
+
+
+@dataclass(frozen=True)
 class OneOf:
     """A text that is one of a few."""
 
@@ -516,6 +533,27 @@ class About:
         return {**handler(schema), "description": self.words}
 
 
+@dataclass(frozen=True)
+class OneOrMany:
+    """A number, or a list of them, which means something else: made a float or a tuple."""
+
+    of: Real
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        from pydantic_core import core_schema as core
+
+        one = self.of.__get_pydantic_core_schema__(float, handler)
+        several = core.tuple_variable_schema(one, min_length=1)
+        return core.tagged_union_schema(
+            {f"{_TAG}one": one, f"{_TAG}several": several},
+            lambda value: f"{_TAG}{'several' if isinstance(value, (list, tuple)) else 'one'}",
+        )
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
+        one = self.of.__get_pydantic_json_schema__(schema, handler)
+        return {"anyOf": [one, {"type": "array", "items": one, "minItems": 1}]}
+
+
 def _label(value: Any) -> str:
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
         raise ValueError(f"expected a text or a number, found {shown(value)}")
@@ -535,6 +573,7 @@ Names = Annotated[tuple[str, ...], Expect("a list of names")]
 Label = Annotated[str, Checked(_label, {"type": ["string", "number"]})]
 Positive = Annotated[float, Real(above=0)]
 NotNegative = Annotated[float, Real(least=0)]
+JointNumber = Annotated[int, Index()]
 Length = Annotated[float, Real(quantity="length")]
 Angle = Annotated[float, Real(quantity="angle")]
 Ratio = Annotated[float, Real(quantity="1")]

@@ -8,7 +8,6 @@ but a comment names the columns (numpy's savetxt), the last comment before the n
 from __future__ import annotations
 
 import csv
-import difflib
 import math
 import re
 from collections.abc import Iterator, Sequence
@@ -20,10 +19,9 @@ from typing import IO
 import numpy as np
 
 from calib.arrays import frozen
-from calib.errors import MeasurementError
+from calib.errors import MeasurementError, suggestion
+from calib.units import ANGLES, LENGTHS
 
-ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180, "°": math.pi / 180, "degrees": math.pi / 180}
-LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "cm": 1e-2, "in": 0.0254}
 _HEADING = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
 _DECIMAL_COMMA = re.compile(r"^[+-]?\d*,\d+([eE][+-]?\d+)?$")
 _CHUNK = 20_000
@@ -57,7 +55,9 @@ class Table:
         """Return the place of column `name`; one that is not there is refused with the nearest one that is."""
         if name not in self.header:
             found = ", ".join(self.header)
-            raise MeasurementError(f"column '{name}' is missing{nearest(name, self.header)}; found: {found}", self.file)
+            raise MeasurementError(
+                f"column '{name}' is missing{suggestion(name, self.header)}; found: {found}", self.file
+            )
         return self.header.index(name)
 
     def texts(self, name: str) -> list[str]:
@@ -144,13 +144,6 @@ def row_width(path: str | Path) -> int:
     lines, _, first = _open(path, False)
     lines.close()
     return len(first)
-
-
-def nearest(name: str, among: Sequence[str]) -> str:
-    """Return `` (did you mean '...'?)`` for the most similar name, or nothing."""
-    lower = {other.lower(): other for other in among}
-    close = difflib.get_close_matches(name.lower(), lower, 1, 0.6)
-    return f" (did you mean '{lower[close[0]]}'?)" if close else ""
 
 
 def _open(path: str | Path, headed: bool) -> tuple[IO[str], str, list[str]]:

@@ -62,46 +62,124 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-import numpy as np
-
-from calib.data import values
-from calib.data.recordings.clock import CLOCKS
+from calib.config import (
+    Checked,
+    Expect,
+    Flag,
+    JointNumber,
+    Name,
+    Names,
+    OneOf,
+    OneOrMany,
+    Positive,
+    Real,
+    Spread,
+    Whole,
+    check_keys,
+    inherited,
+    own_table,
+    parse,
+    read_toml,
+    shown,
+    strict,
+)  # fmt: skip
 from calib.data.recordings.recording import parse_cut
 from calib.data.recordings.recording_options import RecordingOptions
-from calib.data.signals.decimation import KINDS as DECIMATORS
 from calib.data.signals.motion import FilterOptions
 from calib.dynamics.drives import DriveTerm, term
 from calib.dynamics.shapes import SHAPES
 from calib.dynamics.torque_rows import ROWS, TorqueRows
 from calib.errors import CalibError, UsageError
 from calib.identification.friction.friction_ladder import NAMES
-from calib.identification.loop.loop_settings import parse_loop
+from calib.identification.loop.loop_settings import LoopSettings, check_loop
 from calib.identification.methods.least_squares import METHODS
 from calib.identification.settings import PRIORS, RULES, WEIGHTS, Coupling, IdentificationSettings, Payload
 
 
+def _no_zero(value: Any) -> Any:
+    if isinstance(value, list) and any(type(x) in (int, float) and x == 0 for x in value):
+        raise ValueError(f"expected finite numbers, none of them zero, found {shown(value)}")
+    return value
+
+
+Texts = Annotated[tuple[Name, ...], Spread(words="a text, or a list of them")]
+Gains = Annotated[tuple[float, ...], Expect("a list of numbers, finite and none of them zero"), Checked(_no_zero)]
+
+
+@strict
 @dataclass(frozen=True)
 class FileSettings:
     """How one recording is read: reader's options, filters, payload labels, gains, a file for its reference."""
 
     recording: RecordingOptions = field(default_factory=RecordingOptions)
     filter: FilterOptions = field(default_factory=FilterOptions)
-    payload: tuple[str, ...] = ()
-    gains: tuple[float, ...] | None = None
-    reference: str = ""
+    payload: Names = ()
+    gains: Gains | None = None
+    reference: Name = ""
 
 
+@strict
 @dataclass(frozen=True)
 class GainPair:
     """Recordings without and with a payload of known mass, by file name."""
 
-    unloaded: tuple[str, ...]
-    loaded: tuple[str, ...]
+    unloaded: Texts
+    loaded: Texts
+
+
+@strict
+@dataclass(frozen=True)
+class TermTable:
+    """A torque term as the file states it; `joint` from 0."""
+
+    name: Name
+    shape: Annotated[str, OneOf(tuple(SHAPES))]
+    joint: JointNumber
+    settings: Annotated[tuple[Annotated[float, Real(infinite=True)], ...], Spread(words="a list of numbers")] = ()
+    side: Annotated[str, OneOf(("motor", "link"))] = "motor"
+
+
+@strict
+@dataclass(frozen=True)
+class OptionsFile:
+    """The keys of the file; None where it says nothing and the default of `IdentificationSettings` stands."""
+
+    friction: Annotated[str, OneOf(NAMES)] | None = None
+    method: Annotated[str, OneOf(METHODS)] | None = None
+    weights: Annotated[str, OneOf(WEIGHTS)] | None = None
+    drives: Texts | None = None
+    v0: Annotated[tuple[Positive, ...], Spread()] | None = None
+    rows: Annotated[str, OneOf(tuple(ROWS))] | None = None
+    gravity: Annotated[tuple[float, float, float], Expect("three numbers [m/s²]")] | None = None
+    essential: Annotated[str, OneOf(RULES)] | None = None
+    ratio: Positive | None = None
+    level: Annotated[float, Real(above=0, most=1.0)] | None = None
+    keep: Names | None = None
+    drop: Names | None = None
+    prior: Annotated[str, OneOf(PRIORS)] | None = None
+    folds: Annotated[int, Whole(2, 50)] | None = None
+    samples: Annotated[int, Whole(1000, 10_000_000)] | None = None
+    coupling: tuple[Coupling, ...] = ()
+    term: tuple[TermTable, ...] = ()
+    payload: Mapping[str, Payload] = field(default_factory=dict)
+    loop: Annotated[LoopSettings, Checked(check_loop)] | None = None
+    slow: Annotated[float | tuple[float, ...], OneOrMany(Real(above=0))] | None = None
+    cut_slow: Flag = False
+    gain_identification: GainPair | None = None
+    recording: RecordingOptions = field(default_factory=RecordingOptions)
+    filter: FilterOptions = field(default_factory=FilterOptions)
+    gains: Gains | None = None
+    files: Mapping[str, FileSettings] = field(default_factory=dict)
+
+
+_TABLES = ("loop", "slow", "gains", "gain_identification")  # beside the keys of `IdentificationSettings`
+_SETTINGS = [key.name for key in fields(OptionsFile) if key.default is None and key.name not in _TABLES]
+_FIELDS = {"drives": "sets", "rows": "torque_rows"}  # where `IdentificationSettings` calls a key otherwise
 
 
 @dataclass(frozen=True)
@@ -127,7 +205,7 @@ class IdentifyOptions:
 
     def for_file(self, path: str | Path) -> FileSettings:
         """Return the settings of the recording at `path`, whose torques are those the model's rows explain."""
-        found = values.own_table(self.files, path) or self.every
+        found = own_table(self.files, path) or self.every
         return replace(found, recording=_for_rows(found.recording, self.settings.torque_rows))
 
 
@@ -141,216 +219,34 @@ def read_options(path: str | Path | None = None) -> IdentifyOptions:
     Raises:
         UsageError: for a file that is missing or no TOML, an unknown key, or a value that a key cannot have.
     """
-    if path is None:
-        return IdentifyOptions()
-    return parse_options(values.read_toml(path), str(path))
+    return IdentifyOptions() if path is None else parse_options(read_toml(path), str(path))
 
 
 def parse_options(table: Mapping[str, Any], source: str = "options") -> IdentifyOptions:
     """Return the options that a parsed TOML table holds; `source` is for messages."""
-    values.known(table, {*_SETTINGS, *_OWN, *_FILE, *_TABLES}, source)
-    chosen = {_FIELD.get(key, key): _SETTINGS[key](table[key], f"{source}: {key}") for key in table if key in _SETTINGS}
+    own = {key: table[key] for key in ("payload",) if key in table}  # bodies; in [files] their labels: not handed down
+    rest = inherited({key: value for key, value in table.items() if key not in own}, FileSettings)
+    read = parse(OptionsFile, rest | own, source)
+    stated = {_FIELDS.get(key, key): getattr(read, key) for key in _SETTINGS if getattr(read, key) is not None}
+    if read.rows is not None:
+        stated["torque_rows"] = ROWS[read.rows]
     settings = IdentificationSettings(
-        **chosen,
-        couplings=tuple(_coupling(v, f"{source}: coupling") for v in _list(table, "coupling", source)),
-        terms=tuple(_term(v, f"{source}: term") for v in _list(table, "term", source)),
-        payloads=_payloads(table.get("payload", {}), f"{source}: payload"),
-        loop=parse_loop(table["loop"], f"{source}: loop") if "loop" in table else None,
+        **stated, couplings=read.coupling, terms=_terms(read.term, source), payloads=read.payload, loop=read.loop
     )
-    every = _file({key: table[key] for key in table if key in _FILE}, FileSettings(), settings, source)
-    files = {}
-    for name, own in values.table(table.get("files", {}), f"{source}: files").items():
-        place = f'{source}: files."{name}"'
-        if isinstance(own, Mapping) and len(own) == 1 and isinstance(next(iter(own.values())), Mapping):
-            inner = next(iter(own))
-            if inner not in ("filter", "recording"):
-                raise UsageError(f'{place}: the dot needs quotes: [files."{name}.{inner}"]')
-        values.known(values.table(own, place), {*_FILE, "payload", "reference"}, place)
-        files[name] = _file(own, every, settings, place)
-    rest: dict[str, Any] = {key: _OWN[key](table[key], f"{source}: {key}") for key in table if key in _OWN}
-    if "gain_identification" in table:
-        rest["gain_pair"] = _gain_pair(table["gain_identification"], f"{source}: gain_identification")
-    return IdentifyOptions(settings, every, files, source=source, **rest)
+    for name, file in read.files.items():
+        check_keys(dict.fromkeys(file.payload), read.payload, f'{source}: files."{name}".payload')
+    every = FileSettings(read.recording, read.filter, gains=read.gains)
+    return IdentifyOptions(settings, every, read.files, read.slow, read.cut_slow, read.gain_identification, source)
 
 
-def _file(table: Mapping[str, Any], base: FileSettings, settings: IdentificationSettings, place: str) -> FileSettings:
-    result = base
-    if "recording" in table:
-        result = replace(result, recording=_recording(table["recording"], base.recording, f"{place}: recording"))
-    if "filter" in table:
-        result = replace(result, filter=_filter(table["filter"], base.filter, f"{place}: filter"))
-    if "gains" in table:
-        gains = _numbers(table["gains"], f"{place}: gains")
-        if not all(np.isfinite(x) and x != 0.0 for x in gains):
-            raise values.refuse(table["gains"], f"{place}: gains", "finite numbers, none of them zero")
-        result = replace(result, gains=gains)
-    if "reference" in table:
-        result = replace(result, reference=values.text(table["reference"], f"{place}: reference"))
-    if isinstance(table.get("payload"), list):
-        labels = values.names(table["payload"], f"{place}: payload")
-        for label in labels:
-            values.known({label: None}, set(settings.payloads), f"{place}: payload")
-        result = replace(result, payload=labels)
-    return result
-
-
-def _recording(value: Any, base: RecordingOptions, place: str) -> RecordingOptions:
-    parsers: dict[str, Callable[[Any, str], Any]] = {
-        "kind": values.one_of("torque", "current"), "rate": values.positive(), "topic": values.text,
-        "use_range": values.flag, "names": values.texts, "units": values.texts,
-    }  # fmt: skip
-    found = _parsed(value, parsers, place)
-    try:
-        return replace(base, **found)
-    except CalibError as error:
-        raise UsageError(f"{place}: {error}") from error
-
-
-def _filter(value: Any, base: FilterOptions, place: str) -> FilterOptions:
-    parsers: dict[str, Callable[[Any, str], Any]] = {
-        "cutoff": _one_or_many, "order": _whole(1, 12), "band": values.positive(), "dynamics": values.positive(),
-        "borders": values.positive(), "clock": values.one_of("auto", *CLOCKS), "gap": values.positive(),
-        "decimator": values.one_of(*DECIMATORS), "width": _whole(1, 4),
-    }  # fmt: skip
-    return replace(base, **_parsed(value, parsers, place))
-
-
-def _parsed(value: Any, parsers: Mapping[str, Callable[[Any, str], Any]], place: str) -> dict[str, Any]:
-    values.known(values.table(value, place), set(parsers), place)
-    return {key: parsers[key](item, f"{place}.{key}") for key, item in value.items()}
-
-
-def _coupling(value: Any, place: str) -> Coupling:
-    parsers = {"joints": _joints, "label": values.text}
-    found = _parsed(value, parsers, place)
-    if len(found.get("joints", ())) != 2:
-        raise UsageError(f"{place}: expected joints = [first, second]")
-    return Coupling(found["joints"], found.get("label", ""))
-
-
-def _term(value: Any, place: str) -> DriveTerm:
-    parsers = {
-        "name": values.text, "shape": values.one_of(*SHAPES), "joint": _whole(1, 99), "settings": _numbers,
-        "side": values.one_of("motor", "link"),
-    }  # fmt: skip
-    found = _parsed(value, parsers, place)
-    for key in ("name", "shape", "joint"):
-        if key not in found:
-            raise UsageError(f"{place}: there is no '{key}'; a term needs name, shape and joint")
-    try:
-        side = found.get("side", "motor")
-        return term(found["name"], found["shape"], found["joint"] - 1, *found.get("settings", ()), side=side)
-    except CalibError as error:
-        raise UsageError(f"{place}: {error}") from error
-
-
-def _payloads(value: Any, place: str) -> dict[str, Payload]:
-    found = {}
-    for label, own in values.table(value, place).items():
-        parsers = {"mass": values.positive(1e4, "kg"), "com": _numbers}
-        parsed = _parsed(own, parsers, f"{place}.{label}")
-        if "com" in parsed and len(parsed["com"]) != 3:
-            raise values.refuse(own["com"], f"{place}.{label}.com", "three numbers [m]")
-        found[label] = Payload(**parsed)
-    return found
-
-
-def _gain_pair(value: Any, place: str) -> GainPair:
-    found = _parsed(value, {"unloaded": _text_or_texts, "loaded": _text_or_texts}, place)
-    if set(found) != {"unloaded", "loaded"}:
-        raise UsageError(f"{place}: expected unloaded and loaded, a recording (or a list of them) each")
-    return GainPair(**found)
-
-
-def _list(table: Mapping[str, Any], key: str, source: str) -> list[Any]:
-    value = table.get(key, [])
-    if not isinstance(value, list):
-        raise values.refuse(value, f"{source}: {key}", f"a list of tables, [[{key}]]")
-    return value
-
-
-def _joints(value: Any, place: str) -> tuple[int, ...]:
-    if not isinstance(value, list) or not all(isinstance(k, int) and not isinstance(k, bool) and k > 0 for k in value):
-        raise values.refuse(value, place, "numbers of joints, from 1")
-    return tuple(k - 1 for k in value)
-
-
-def _numbers(value: Any, place: str) -> tuple[float, ...]:
-    if (
-        not isinstance(value, list)
-        or not value
-        or any(isinstance(x, bool) or not isinstance(x, (int, float)) for x in value)
-    ):
-        raise values.refuse(value, place, "a list of numbers")
-    if any(np.isnan(x) for x in value):
-        raise values.refuse(value, place, "numbers, not nan")
-    return tuple(float(x) for x in value)
-
-
-def _one_or_many(value: Any, place: str) -> float | tuple[float, ...]:
-    if not isinstance(value, list):
-        return values.positive()(value, place)
-    return tuple(values.positive()(item, place) for item in value)
-
-
-def _share_or_speeds(value: Any, place: str) -> float | tuple[float, ...]:
-    return _one_or_many(value, place)
-
-
-def _whole(least: int, most: int) -> Callable[[Any, str], int]:
-    def parse(value: Any, place: str) -> int:
-        if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-            raise values.refuse(value, place, f"a whole number from {least} to {most}")
-        return value
-
-    return parse
-
-
-def _text_or_texts(value: Any, place: str) -> tuple[str, ...]:
-    return values.names(value, place) if isinstance(value, list) else (values.text(value, place),)
-
-
-def _as_tuple(value: Any, place: str) -> tuple[float, ...]:
-    found = _one_or_many(value, place)
-    return found if isinstance(found, tuple) else (found,)
-
-
-def _torque_rows(value: Any, place: str) -> TorqueRows:
-    return ROWS[values.one_of(*ROWS)(value, place)]
-
-
-def _gravity(value: Any, place: str) -> tuple[float, ...]:
-    found = _numbers(value, place)
-    if len(found) != 3:
-        raise values.refuse(value, place, "three numbers [m/s²]")
-    return found
-
-
-_FIELD = {"drives": "sets", "rows": "torque_rows"}
-_SETTINGS: dict[str, Callable[[Any, str], Any]] = {
-    "friction": values.one_of(*NAMES),
-    "method": values.one_of(*METHODS),
-    "weights": values.one_of(*WEIGHTS),
-    "drives": _text_or_texts,
-    "v0": _as_tuple,
-    "rows": _torque_rows,
-    "gravity": _gravity,
-    "essential": values.one_of(*RULES),
-    "ratio": values.positive(),
-    "level": values.positive(1.0),
-    "keep": values.names,
-    "drop": values.names,
-    "prior": values.one_of(*PRIORS),
-    "folds": _whole(2, 50),
-    "samples": _whole(1000, 10_000_000),
-}
-_OWN: dict[str, Callable[[Any, str], Any]] = {
-    "slow": _share_or_speeds,
-    "cut_slow": values.flag,
-}
-_FILE = ("recording", "filter", "gains")
-_TABLES = ("coupling", "term", "payload", "files", "gain_identification", "loop")
-assert {_FIELD.get(key, key) for key in _SETTINGS} <= {f.name for f in fields(IdentificationSettings)}
+def _terms(tables: tuple[TermTable, ...], source: str) -> tuple[DriveTerm, ...]:
+    result = []
+    for number, one in enumerate(tables, 1):
+        try:
+            result.append(term(one.name, one.shape, one.joint, *one.settings, side=one.side))
+        except CalibError as error:
+            raise UsageError(f"{source}: [[term]] number {number}: {error}") from error
+    return tuple(result)
 
 
 def file_settings(options: IdentifyOptions, path: str) -> FileSettings:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
 import numpy as np
 
+from calib.config import Expect, JointNumber, Real, Text, strict
 from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of, with_gravity, with_payload
 from calib.dynamics.drives import DriveTerm
@@ -24,20 +25,22 @@ PRIORS = ("auto", "none", "cad")
 WEIGHTS = ("residuals", "repeats")
 
 
+@strict
 @dataclass(frozen=True)
 class Coupling:
     """A gear whose motor turns with the sum of two joints (from 0), see `calib.dynamics.drives.coupled`."""
 
-    joints: tuple[int, int]
-    label: str = ""
+    joints: Annotated[tuple[JointNumber, JointNumber], Expect("two numbers of joints, counted from 1")]
+    label: Text = ""
 
 
+@strict
 @dataclass(frozen=True)
 class Payload:
     """A body at the flange: its known mass [kg] (None: not known), known centre of mass in the tip's frame [m]."""
 
-    mass: float | None = None
-    com: tuple[float, float, float] | None = None
+    mass: Annotated[float, Real(above=0, most=1e4, unit="kg")] | None = None
+    com: Annotated[tuple[float, float, float], Expect("three numbers [m]")] | None = None
 
 
 @dataclass(frozen=True)

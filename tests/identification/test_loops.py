@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import fields
 from functools import cache
 from pathlib import Path
 
@@ -162,7 +163,7 @@ def test_what_cannot_be_simulated_is_refused(robot, tmp_path, capsys, log_as, lo
 
 
 def test_every_key_of_the_loop_is_documented_and_read():
-    for key in loop_settings._PARSERS:
+    for key in (field.name for field in fields(loop_settings.LoopSettings)):
         assert f"{key} =" in loop_settings.__doc__ or f" {key} " in loop_settings.__doc__, key
     found = identify_options.parse_options(
         {"loop": {"controller": "cascade", "position": 40, "velocity": [9.0, 5.0, 1.0], "reset": 0.1, "delay": 2}}

@@ -6,10 +6,10 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from calib.data.csv_table import Table, nearest
+from calib.data.csv_table import Table
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.measurements import KINDS
-from calib.errors import MeasurementError
+from calib.errors import MeasurementError, suggestion
 
 SUFFIXES = ("", "_meas", "_measured")
 POSITION = ("x", "y", "z")
@@ -115,7 +115,7 @@ def check_names(table: Table, options: FileOptions, joints: Sequence[str]) -> No
     ours = (*OURS, *joints, *(f"q{i + 1}" for i in range(len(joints))))
     for name, theirs in options.columns.items():
         if name not in ours and not _TARGET.fullmatch(name):
-            message = f"the options map a column '{name}', which is none of ours{nearest(name, ours)}"
+            message = f"the options map a column '{name}', which is none of ours{suggestion(name, ours)}"
             raise MeasurementError(f"{message}; ours are {', '.join(ours)}", table.file, column=theirs)
         table.index(theirs)
     for name in (*options.groups, *options.where):
@@ -123,7 +123,7 @@ def check_names(table: Table, options: FileOptions, joints: Sequence[str]) -> No
     for name, unit in options.units.items():
         if name not in (*ours, *UNIT_GROUPS, *table.header) and not _TARGET.fullmatch(name):
             message = f"the options give a unit {unit} for '{name}', which is no column"
-            raise MeasurementError(message + nearest(name, (*ours, *UNIT_GROUPS)), table.file, column=name)
+            raise MeasurementError(message + suggestion(name, (*ours, *UNIT_GROUPS)), table.file, column=name)
 
 
 def find_joints(table: Table, options: FileOptions, joints: Sequence[str]) -> tuple[str, ...]:
@@ -142,7 +142,9 @@ def find_joints(table: Table, options: FileOptions, joints: Sequence[str]) -> tu
         if any(name in table for name in form):
             missing = next(name for name, there in zip(form, found) if not there)
             have = ", ".join(name for name in found if name)
-            message = f"missing{nearest(missing, table.header)}: the robot has {n} joints, the header has only {have}"
+            message = (
+                f"missing{suggestion(missing, table.header)}: the robot has {n} joints, the header has only {have}"
+            )
             raise MeasurementError(message, table.file, column=missing)
     message = f"no joint columns: expected q1 to q{n}, or {', '.join(joints)}; found {', '.join(table.header)}"
     raise MeasurementError(f"{message}. Map them in the options' [columns]", table.file)
@@ -208,7 +210,7 @@ def _family(table: Table, options: FileOptions, names: Sequence[str], mark: str 
         if any(found) and not missing:
             missing = next(name for name, there in zip(wanted, found) if not there)
     if missing:
-        message = f"missing{nearest(missing, table.header)}: {', '.join(name + mark for name in names)} go together"
+        message = f"missing{suggestion(missing, table.header)}: {', '.join(name + mark for name in names)} go together"
         raise MeasurementError(message, table.file, column=missing)
     return ()
 

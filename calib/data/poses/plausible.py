@@ -7,9 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calib.data.csv_table import ANGLES, Table
+from calib.data.csv_table import Table
 from calib.data.poses.fit_options import FileOptions
 from calib.errors import MeasurementError
+from calib.units import ANGLES
 
 TURN = 2.1 * math.pi  # a joint value beyond this needs limits that allow it [rad]; our choice, as all of these
 FAR = 50.0  # no instrument measures a robot from further away [m]

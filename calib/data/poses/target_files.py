@@ -38,13 +38,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.arrays import frozen
-from calib.data.csv_table import ANGLES, LENGTHS, Table, nearest, read_table
+from calib.data.csv_table import Table, read_table
 from calib.data.poses import plausible
 from calib.data.poses.columns import MATRIX, POSITION, QUATERNION, find_joints
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.plausible import Limits
 from calib.data.poses.pose_files import read_joints
-from calib.errors import MeasurementError
+from calib.errors import MeasurementError, suggestion
+from calib.units import ANGLES, LENGTHS
 
 SUFFIXES = ("", "_target")
 MOSTLY = 0.5  # of all rows outside the limits: it is the file, not the row (our choice)
@@ -133,7 +134,7 @@ def _family(table: Table, names: Sequence[str]) -> tuple[str, ...]:
             return tuple(wanted)
         if any(there):
             missing = wanted[there.index(False)]
-            message = f"missing{nearest(missing, table.header)}: {', '.join(wanted)} go together"
+            message = f"missing{suggestion(missing, table.header)}: {', '.join(wanted)} go together"
             raise MeasurementError(message, table.file, column=missing)
     return ()
 

@@ -16,11 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from calib.data.csv_table import nearest
 from calib.data.recordings.archives import Ends
 from calib.data.recordings.recording import Joints, Recording, cut
 from calib.data.recordings.recording_options import RecordingOptions
-from calib.errors import MeasurementError
+from calib.errors import MeasurementError, suggestion
 
 JOINT_STATE = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
 
@@ -55,7 +54,7 @@ def _connections(reader: Any, options: RecordingOptions, path: Path) -> list[Any
         known = ", ".join(sorted(found))
         message = f"there are joint states on {known}: say which (topic = '...')"
         if options.topic:
-            message = f"has no joint states on '{topic}'{nearest(topic, sorted(found))}; found: {known}"
+            message = f"has no joint states on '{topic}'{suggestion(topic, sorted(found))}; found: {known}"
         raise MeasurementError(message, path)
     return [c for c in reader.connections if c.topic == topic and c.msgtype in JOINT_STATE]
 
@@ -102,7 +101,9 @@ def _refuse_joints(names: Sequence[str], seen: Sequence[tuple[str, ...]], path: 
         raise MeasurementError("its topic of joint states has no messages", path)
     known = sorted({name for own in seen for name in own})
     missing = [name for name in names if name not in known]
-    what = f"no joint '{missing[0]}'{nearest(missing[0], known)}" if missing else "no message with all joints at once"
+    what = (
+        f"no joint '{missing[0]}'{suggestion(missing[0], known)}" if missing else "no message with all joints at once"
+    )
     raise MeasurementError(f"has {what}; found: {', '.join(known)}", path)
 
 

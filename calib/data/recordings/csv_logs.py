@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.data.csv_table import Table, nearest, read_table
+from calib.data.csv_table import Table, read_table
 from calib.data.recordings.archives import Ends
 from calib.data.recordings.recording import Joints, Recording, cut, named
 from calib.data.recordings.recording_options import SYNONYMS, RecordingOptions, one_effort, scale
-from calib.errors import MeasurementError, UsageError
+from calib.errors import MeasurementError, UsageError, suggestion
 
 _NUMBERED = re.compile(r"^(?P<stem>.*?)[_\s.]?(?P<number>\d+)$")
 
@@ -96,7 +96,7 @@ def _find(table: Table, options: RecordingOptions, joints: Sequence[str]) -> dic
         if places := next((places for stem in stems if (places := _family(table, stem, joints, ours == "t"))), None):
             found[ours] = places
         elif ours in options.names:
-            message = f"no column begins with '{options.names[ours]}'{nearest(options.names[ours], table.header)}"
+            message = f"no column begins with '{options.names[ours]}'{suggestion(options.names[ours], table.header)}"
             raise MeasurementError(f"{message}; found: {', '.join(table.header)}", table.file)
     return found
 

@@ -26,12 +26,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated, Any
 
-import numpy as np
-
-from calib.data.csv_table import nearest
+from calib.config import Checked, Flag, Hidden, Name, OneOf, Positive, Text, shown, strict
 from calib.data.recordings.recording import Joints, named
-from calib.errors import MeasurementError, UsageError
+from calib.errors import MeasurementError, UsageError, suggestion
+from calib.units import CURRENTS, EFFORTS, POSITIONS, TIMES, VELOCITIES
 
 SYNONYMS: Mapping[str, tuple[str, ...]] = {
     "t": ("t", "time", "times", "timestamp", "timestamps", "stamp"),
@@ -51,16 +51,30 @@ SYNONYMS: Mapping[str, tuple[str, ...]] = {
 RATES = ("frequency", "rate", "sample_rate", "fs")
 OWN = ("joint_names", "drive_gain", "use_range")
 SCALES = {
-    "t": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9},
-    "q": {"rad": 1.0, "m": 1.0, "deg": np.pi / 180, "°": np.pi / 180, "mrad": 1e-3, "mm": 1e-3},
-    "v": {"rad/s": 1.0, "m/s": 1.0, "deg/s": np.pi / 180, "°/s": np.pi / 180, "mm/s": 1e-3, "rpm": np.pi / 30},
-    "torque": {"nm": 1.0, "n·m": 1.0, "n.m": 1.0, "n*m": 1.0, "n m": 1.0, "n": 1.0, "mnm": 1e-3, "knm": 1e3},
-    "current": {"a": 1.0, "ma": 1e-3},
-}
-SCALES |= {name: SCALES["torque"] for name in ("tau_link", "tau_motor", "tau_ff")}
-SCALES |= {name: SCALES["q"] for name in ("q_link", "q_ref")}
+    "t": TIMES, "q": POSITIONS, "v": VELOCITIES, "torque": EFFORTS, "current": CURRENTS, "tau_link": EFFORTS,
+    "tau_motor": EFFORTS, "tau_ff": EFFORTS, "q_link": POSITIONS, "q_ref": POSITIONS,
+}  # fmt: skip
 
 
+def _ours(names: Any) -> Any:
+    """Refuse a name that is none of ours."""
+    for name in names if isinstance(names, Mapping) else ():
+        if name not in SYNONYMS:
+            raise ValueError(
+                f"'{name}' is none of our names{suggestion(name, SYNONYMS)}; ours are {', '.join(SYNONYMS)}"
+            )
+    return names
+
+
+def _known(units: Any) -> Any:
+    """Refuse a unit that its series cannot have."""
+    for name, unit in _ours(units).items() if isinstance(units, Mapping) else ():
+        if unit and (not isinstance(unit, str) or unit.lower() not in SCALES[name]):
+            raise ValueError(f"unit {shown(unit)} of {name} is none of {', '.join(SCALES[name])}")
+    return units
+
+
+@strict
 @dataclass(frozen=True)
 class RecordingOptions:
     """How a recording is to be read; the defaults leave everything to the file.
@@ -77,35 +91,33 @@ class RecordingOptions:
             these and no column is called a torque or current, tau_motor is the effort.
     """
 
-    kind: str = ""
-    names: Mapping[str, str] = field(default_factory=dict)
-    units: Mapping[str, str] = field(default_factory=dict)
-    rate: float | None = None
-    topic: str = ""
-    use_range: bool = True
-    rows: str = "motor"
-    motors: bool = True
-    sensors: bool = False
+    kind: Annotated[str, OneOf(("torque", "current"))] = ""
+    names: Annotated[Mapping[str, Name], Checked(_ours)] = field(default_factory=dict)
+    units: Annotated[Mapping[str, Text], Checked(_known)] = field(default_factory=dict)
+    rate: Positive | None = None
+    topic: Name = ""
+    use_range: Flag = True
+    rows: Annotated[str, Hidden()] = "motor"
+    motors: Annotated[bool, Hidden()] = True
+    sensors: Annotated[bool, Hidden()] = False
 
     def __post_init__(self) -> None:
         if self.kind not in ("", "torque", "current"):
             raise UsageError(f"kind: expected 'torque' or 'current', found '{self.kind}'")
-        for name in (*self.names, *self.units):
-            if name not in SYNONYMS:
-                ours = ", ".join(SYNONYMS)
-                raise UsageError(f"'{name}' is none of our names{nearest(name, tuple(SYNONYMS))}; ours are {ours}")
-        for name, unit in self.units.items():
-            scale(name, unit)
+        try:
+            _ours(self.names)
+            _known(self.units)
+        except ValueError as wrong:
+            raise UsageError(str(wrong)) from None
 
 
 def scale(name: str, unit: str) -> float:
     """Return the factor from `unit` to SI for one of our names; "" is SI."""
-    if not unit:
-        return 1.0
-    known = SCALES[name]
-    if unit.lower() not in known:
-        raise UsageError(f"unit '{unit}' of {name} is none of {', '.join(known)}")
-    return known[unit.lower()]
+    try:
+        _known({name: unit})
+    except ValueError as wrong:
+        raise UsageError(str(wrong)) from None
+    return SCALES[name][unit.lower()] if unit else 1.0
 
 
 def find_names(members: tuple[str, ...], options: RecordingOptions, path: Path) -> dict[str, str]:
@@ -115,7 +127,7 @@ def find_names(members: tuple[str, ...], options: RecordingOptions, path: Path) 
     for ours, synonyms in SYNONYMS.items():
         if ours in options.names:
             if options.names[ours] not in members:
-                message = f"there is no '{options.names[ours]}'{nearest(options.names[ours], members)}"
+                message = f"there is no '{options.names[ours]}'{suggestion(options.names[ours], members)}"
                 raise MeasurementError(f"{message}; found: {', '.join(members)}", path)
             found[ours] = options.names[ours]
         elif name := next((plain[synonym] for synonym in synonyms if synonym in plain), ""):
@@ -168,6 +180,6 @@ def joint_order(names: list[str], joints: Joints | None, n: int, path: str | Pat
         return list(range(n)), named(known, n)
     missing = [name for name in joints.names if name not in names]
     if missing:
-        message = f"has no joint '{missing[0]}'{nearest(missing[0], names)}; found: {', '.join(names)}"
+        message = f"has no joint '{missing[0]}'{suggestion(missing[0], names)}; found: {', '.join(names)}"
         raise MeasurementError(message, path)
     return [names.index(name) for name in joints.names], joints.names

@@ -9,12 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
 from calib.arrays import frozen
+from calib.config import OneOf, OneOrMany, Positive, Real, Whole, strict
+from calib.data.recordings.clock import CLOCKS
 from calib.data.recordings.recording import Recording, read_only
 from calib.data.signals.bandwidth import USABLE, Cutoffs, check_cutoff, propose_cutoffs
+from calib.data.signals.decimation import KINDS as DECIMATORS
 from calib.data.signals.decimation import Decimator, decimate, design_decimator, factor_for, kept, too_short
 from calib.data.signals.filtering import ORDER, border, curvature, low_pass, slope
 from calib.data.signals.resampling import GAP, Resampled, SamplingReport, resample
@@ -24,6 +28,7 @@ SLOW = 0.01  # of a joint's peak speed: below it stands, for friction (the TX40'
 CREEP = 1e-3  # no joint moves below this [rad/s or m/s]
 
 
+@strict
 @dataclass(frozen=True)
 class FilterOptions:
     """How a recording becomes a motion; None: from the data, by Gautier's rules (`calib.data.signals.bandwidth`).
@@ -39,15 +44,15 @@ class FilterOptions:
         decimator: ``kaiser`` or ``chebyshev``.
     """
 
-    cutoff: float | tuple[float, ...] | None = None
-    order: int = ORDER
-    band: float | None = None
-    dynamics: float | None = None
-    width: int = 4
-    clock: str = "auto"
-    gap: float = GAP
-    borders: float | None = None
-    decimator: str = "kaiser"
+    cutoff: Annotated[float | tuple[float, ...], OneOrMany(Real(above=0))] | None = None
+    order: Annotated[int, Whole(1, 12)] = ORDER
+    band: Positive | None = None
+    dynamics: Positive | None = None
+    width: Annotated[int, Whole(1, 4)] = 4
+    clock: Annotated[str, OneOf(("auto", *CLOCKS))] = "auto"
+    gap: Positive = GAP
+    borders: Positive | None = None
+    decimator: Annotated[str, OneOf(DECIMATORS)] = "kaiser"
 
 
 @dataclass(frozen=True, eq=False)

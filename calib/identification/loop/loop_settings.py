@@ -33,13 +33,13 @@ recording, relative to the options file.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from calib.data import values
+from calib.config import Flag, Name, Names, OneOf, Positive, Real, Spread, Whole, strict
 from calib.errors import UsageError
 from calib.simulation.loop.controllers import Controller, cascade, pd
 
@@ -50,55 +50,62 @@ NEEDED = {"pd": ("kp", "kd"), "cascade": ("position", "velocity"), "identify": (
 OWNED = {"pd": ("kp", "kd", "ki"), "cascade": ("position", "velocity", "reset"), "identify": ("band", "integral")}
 
 
+GAIN = "a number above 0, or a list with one per joint"
+OTHER = "a number not below 0, or a list with one per joint"
+Gains = Annotated[tuple[Annotated[float, Real(above=0, words=GAIN)], ...], Spread(words=GAIN)]
+Gains0 = Annotated[tuple[Annotated[float, Real(least=0, words=OTHER)], ...], Spread(words=OTHER)]
+Bounds = Annotated[tuple[Annotated[float, Real(above=0, infinite=True, words=GAIN)], ...], Spread(words=GAIN)]
+
+
+@strict
 @dataclass(frozen=True)
 class LoopSettings:
     """What is known of the loop; the module says what each key means. Tuples hold one value, or one per joint."""
 
-    controller: str
-    kp: tuple[float, ...] = ()
-    kd: tuple[float, ...] = ()
-    ki: tuple[float, ...] = (0.0,)
-    position: tuple[float, ...] = ()
-    velocity: tuple[float, ...] = ()
-    reset: tuple[float, ...] = (np.inf,)
-    share: float = 1.0
-    rate: float | None = None
-    delay: int = 0
-    limit: tuple[float, ...] = (np.inf,)
-    windup: tuple[float, ...] = (np.inf,)
-    velocity_cutoff: float | None = None
-    feedforward: str = "none"
-    reference: str = "recording"
-    design: tuple[float, ...] = ()
-    inertia: tuple[float, ...] = ()
-    instruments: str = "iv"
-    positive: tuple[str, ...] = ()
-    band: float = 20.0
-    integral: bool = False
+    controller: Annotated[str, OneOf(CONTROLLERS)]
+    kp: Gains = ()
+    kd: Gains0 = ()
+    ki: Gains0 = (0.0,)
+    position: Gains = ()
+    velocity: Gains = ()
+    reset: Bounds = (np.inf,)
+    share: Annotated[float, Real(above=0, most=1.0)] = 1.0
+    rate: Annotated[float, Real(above=0, most=1e5, unit="Hz")] | None = None
+    delay: Annotated[int, Whole(0, 100, " of control periods,")] = 0
+    limit: Bounds = (np.inf,)
+    windup: Bounds = (np.inf,)
+    velocity_cutoff: Positive | None = None
+    feedforward: Annotated[str, OneOf(AHEAD)] = "none"
+    reference: Name = "recording"
+    design: Gains = ()
+    inertia: Gains = ()
+    instruments: Annotated[str, OneOf(INSTRUMENTS)] = "iv"
+    positive: Names = ()
+    band: Positive = 20.0
+    integral: Flag = False
 
 
-def parse_loop(table: Any, place: str) -> LoopSettings:
-    """Return the loop that a parsed TOML table states.
+def check_loop(table: Any) -> Any:
+    """Return the parsed table [loop] as it is, its gains held against its controller.
 
     Raises:
-        UsageError: for an unknown key, a value that cannot be, or gains that do not go with the controller.
+        ValueError: for no controller, gains that belong to another one, or gains that are missing.
     """
-    found = dict(values.table(table, place))
-    values.known(found, set(_PARSERS), place)
-    found = {key: _PARSERS[key](value, f"{place}.{key}") for key, value in found.items()}
-    kind = found.get("controller", "")
-    if not kind:
-        raise UsageError(f"{place}: there is no 'controller'; expected one of {', '.join(CONTROLLERS)}")
+    kind = table.get("controller") if isinstance(table, Mapping) else ""
+    if kind is None:
+        raise ValueError(f"there is no 'controller'; expected one of {', '.join(CONTROLLERS)}")
+    if not isinstance(kind, str) or kind not in OWNED:
+        return table
     for other, keys in OWNED.items():
-        wrong = [key for key in keys if key in found and other != kind and key not in OWNED[kind]]
+        wrong = [key for key in keys if key in table and key not in OWNED[kind]]
         if wrong:
-            raise UsageError(f"{place}.{wrong[0]}: belongs to controller '{other}', found controller '{kind}'")
+            raise ValueError(f"'{wrong[0]}' belongs to controller '{other}', found controller '{kind}'")
     for key in NEEDED[kind]:
-        if key not in found:
-            raise UsageError(f"{place}: controller '{kind}' needs {' and '.join(NEEDED[kind])}; there is no '{key}'")
-    if kind != "pd" and kind != "cascade" and found.get("share", 1.0) != 1.0:
-        raise UsageError(f"{place}.share: a controller that is identified sees the whole velocity of the reference")
-    return LoopSettings(**found)
+        if key not in table:
+            raise ValueError(f"controller '{kind}' needs {' and '.join(NEEDED[kind])}; there is no '{key}'")
+    if kind == "identify" and table.get("share", 1.0) != 1.0:
+        raise ValueError("share: a controller that is identified sees the whole velocity of the reference")
+    return table
 
 
 def stated_controller(loop: LoopSettings, n: int) -> Controller:
@@ -129,52 +136,3 @@ def per_joint(loop: LoopSettings, key: str, n: int) -> np.ndarray:
     if len(found) not in (1, n):
         raise UsageError(f"[loop] {key}: {len(found)} values for {n} joints; give one, or one per joint")
     return np.broadcast_to(np.array(found, dtype=float), (n,)).copy()
-
-
-def _numbers(least: float = 0.0) -> Callable[[Any, str], tuple[float, ...]]:
-    def parse(value: Any, place: str) -> tuple[float, ...]:
-        found = value if isinstance(value, list) else [value]
-        fine = all(isinstance(x, (int, float)) and not isinstance(x, bool) and x >= least for x in found)
-        if not found or not fine or any(np.isnan(x) for x in found):
-            raise values.refuse(value, place, "a number not below 0, or a list with one per joint")
-        return tuple(float(x) for x in found)
-
-    return parse
-
-
-def _above_zero(value: Any, place: str) -> tuple[float, ...]:
-    found = _numbers()(value, place)
-    if min(found) <= 0.0:
-        raise values.refuse(value, place, "numbers above 0")
-    return found
-
-
-def _periods(value: Any, place: str) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 100:
-        raise values.refuse(value, place, "a whole number of control periods, 0 to 100")
-    return value
-
-
-_PARSERS: Mapping[str, Callable[[Any, str], Any]] = {
-    "controller": values.one_of(*CONTROLLERS),
-    "kp": _above_zero,
-    "kd": _numbers(),
-    "ki": _numbers(),
-    "position": _above_zero,
-    "velocity": _above_zero,
-    "reset": _above_zero,
-    "share": values.positive(1.0),
-    "rate": values.positive(1e5, "Hz"),
-    "delay": _periods,
-    "limit": _above_zero,
-    "windup": _above_zero,
-    "velocity_cutoff": values.positive(),
-    "feedforward": values.one_of(*AHEAD),
-    "reference": values.text,
-    "design": _above_zero,
-    "inertia": _above_zero,
-    "instruments": values.one_of(*INSTRUMENTS),
-    "positive": values.names,
-    "band": values.positive(),
-    "integral": values.flag,
-}

@@ -15,7 +15,7 @@ from calib.data.signals.motion import FilterOptions, Motion, make_motion, sample
 from calib.data.signals.persistency import ExcitationReport, repeats, report_excitation
 from calib.data.signals.reference_files import with_reference
 from calib.data.signals.resampling import Resampled
-from calib.errors import UsageError
+from calib.errors import UsageError, suggestion
 from calib.identification.cases import Case, case_names, make_case
 from calib.identification.friction.passivity import driven
 from calib.identification.gains import DriveGains
@@ -356,7 +356,7 @@ def referred(motion: Motion, path: str, chain: Chain, options: IdentifyOptions) 
 
 def check_files(options: IdentifyOptions, paths: Sequence[str]) -> None:
     """Refuse a [files] table that names none of the recordings."""
-    from calib.data.csv_table import nearest
+
     from calib.data.recordings.recording import parse_cut
 
     plain = [Path(parse_cut(str(path))[0]) for path in paths]
@@ -364,5 +364,5 @@ def check_files(options: IdentifyOptions, paths: Sequence[str]) -> None:
         wanted = Path(name).parts
         if not any(path.parts[-len(wanted) :] == wanted for path in plain):
             shown = [path.name for path in plain]
-            message = f'{options.source}: files."{name}" is none of the recordings{nearest(name, shown)}'
+            message = f'{options.source}: files."{name}" is none of the recordings{suggestion(name, shown)}'
             raise UsageError(f"{message}: {', '.join(shown)}")

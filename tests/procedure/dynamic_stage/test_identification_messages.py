@@ -13,7 +13,7 @@ from rich.text import Text
 
 from calib import cli
 from calib.cli.shared import make_console
-from calib.data import values
+from calib.config import check_keys
 from calib.dynamics.torque_rows import MOTOR
 from calib.errors import UsageError
 from calib.identification.loop.replay import CAD, FEEDBACK, FLOOR, IDENTIFIED, Replay
@@ -66,4 +66,4 @@ def test_figures_have_units_at_their_axes():
 
 def test_no_keys_to_choose_from_is_said():
     with pytest.raises(UsageError, match="; there are none"):
-        values.known({"tool": None}, set(), "files.payload")
+        check_keys({"tool": None}, set(), "files.payload")
