@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from calib import files
 from calib.errors import RobotError, UsageError
+from calib.procedure.kinematic_stage.folder import FitFolder
 from calib.robot import calibrated
 from calib.robot.calibrated import CalibratedChain, nominal_of
 from calib.robot.chain import AXES, Chain, random_joints
@@ -33,7 +33,7 @@ def read(folder: Path) -> CalibratedChain:
     Raises:
         UsageError: where it is none, or does not say what it was calibrated from.
     """
-    if not (folder / "robot.toml").is_file():
+    if not FitFolder(folder).robot.is_file():
         raise UsageError(f"{folder} holds no robot.toml; give the folder that `calib fit --out` has written")
     robot = calibrated.read(folder)
     if robot.nominal is None:
@@ -47,20 +47,18 @@ def without_corrections(folder: Path) -> str:
     Empty where the fit has none, or does not say it.
     """
     try:
-        metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
-        unseen = next(iter(metrics["validation"].items()), None)
-        where, found = (
-            (f"on {unseen[0]}, unseen" if unseen else "on the fitted poses"),
-            (unseen or ("", metrics["fit"]))[1],
-        )
-        kind = "position_mm" if found["urdf_alone"]["position_mm"] else "distance_mm"
-        bare, after, before = (found[arm][kind]["rms"] for arm in ("urdf_alone", "calibrated", "nominal"))
-    except (OSError, ValueError, KeyError, TypeError):  # a fit by an earlier version says nothing of it
+        metrics = FitFolder(folder).metrics()
+    except UsageError:  # a fit by an earlier version says nothing of it
         return ""
-    worse = "; THAT IS WORSE THAN THE NOMINAL ARM" if bare > before else ""
+    unseen = next(iter(metrics.validation.items()), None)
+    where, found = (f"on {unseen[0]}, unseen", unseen[1]) if unseen else ("on the fitted poses", metrics.fit)
+    bare, after, before = (arm and arm.main for arm in (found.urdf_alone, found.calibrated, found.nominal))
+    if not (bare and after and before):
+        return ""
+    worse = "; THAT IS WORSE THAN THE NOMINAL ARM" if bare.rms > before.rms else ""
     return (
-        f"{where}, the URDF alone leaves {bare:.3f} mm rms, with its corrections {after:.3f} mm (nominal arm "
-        f"{before:.3f} mm){worse}"
+        f"{where}, the URDF alone leaves {bare.rms:.3f} mm rms, with its corrections {after.rms:.3f} mm (nominal arm "
+        f"{before.rms:.3f} mm){worse}"
     )
 
 

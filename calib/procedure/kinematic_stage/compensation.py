@@ -19,7 +19,6 @@ calibrated robot for ``base``; for the other two with its own best placement of 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,6 +33,7 @@ from calib.geometry.inverse import Goal
 from calib.geometry.parameters import layout
 from calib.geometry.spread import pose_sigmas
 from calib.procedure.kinematic_stage import robot_file
+from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.kinematic_stage.tables import read_covariance
 from calib.robot.chain import Chain, sampling_limits
 from calib.robot.deflection import Deflection
@@ -101,30 +101,17 @@ def read(folder: str | Path) -> Fitted:
     Raises:
         UsageError: where it is none, or lacks something.
     """
-    folder = Path(folder)
-    proof = folder / "5-validation" / "metrics.json"
-    if not (folder / "robot.toml").is_file() and (folder / "4-fit" / "robot.toml").is_file():
-        folder = folder / "4-fit"
-    if not (folder / "robot.toml").is_file():
-        raise UsageError(f"{folder} holds no robot.toml; give the folder that `calib fit --out` has written")
-    cell, nominal = robot_file.read(folder), robot_file.nominal(folder)
-    free, covariance = read_covariance(folder, cell)
-    unseen, fitted = _stated_errors(folder / "metrics.json", proof if proof.is_file() else folder / "metrics.json")
-    return Fitted(folder, cell, nominal, free, covariance, unseen, fitted)
-
-
-def _stated_errors(fit: Path, proof: Path) -> tuple[float | None, float | None]:
-    """Return the calibrated arm's rms errors on unseen and on fitted poses [m], from the metrics of fit and proof."""
-    try:
-        fitted, proved = (json.loads(path.read_text(encoding="utf-8")) for path in (fit, proof))
-        unseen = [_rms(found["calibrated"]) for found in proved["validation"].values()]
-        return (max(unseen) if unseen else None), _rms(fitted["fit"]["calibrated"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UsageError(f"{fit.parent}: its metrics cannot be read ({error}); fit again") from error
-
-
-def _rms(found: dict) -> float:
-    return 1e-3 * float((found["position_mm"] or found["distance_mm"])["rms"])
+    session, fit = Path(folder), FitFolder(Path(folder))
+    inside, proof = FitFolder(session / IN_SESSION), ValidationFolder(session / VALIDATED)
+    fit = inside if inside.robot.is_file() and not fit.robot.is_file() else fit
+    if not fit.robot.is_file():
+        raise UsageError(f"{fit.path} holds no robot.toml; give the folder that `calib fit --out` has written")
+    cell, nominal = robot_file.read(fit.path), robot_file.nominal(fit.path)
+    free, covariance = read_covariance(fit.path, cell)
+    own = fit.metrics()
+    judged = proof.metrics() if proof.judged.is_file() else own
+    rms = [1e-3 * one.calibrated.main.rms for one in (own.fit, *judged.validation.values()) if one.calibrated.main]
+    return Fitted(fit.path, cell, nominal, free, covariance, max(rms[1:], default=None), rms[0] if rms else None)
 
 
 def placements(fitted: Fitted, frame: str = "base", tool: str = "flange") -> tuple[Installation, Installation]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -23,24 +22,21 @@ from calib.geometry.observation import has_instrument
 from calib.geometry.parameters import layout
 from calib.geometry.result import GeometricFit, calibrated_chain
 from calib.geometry.weighing import Settings, combine
-from calib.procedure.kinematic_stage.inputs import Inputs
-from calib.procedure.kinematic_stage.outliers import Outlier, named_outliers, plateau, remains
-from calib.procedure.kinematic_stage.proof import doubtful
-from calib.procedure.kinematic_stage.validation import (
+from calib.procedure.kinematic_stage.comparison import (
     Comparison,
-    compare,
-    compare_unseen,
-    urdf_alone,
-    without_corrections,
+    gravity_of,
 )
-from calib.procedure.kinematic_stage.verdict import OWN_FRAMES, Verdict, judge
+from calib.procedure.kinematic_stage.inputs import Inputs
+from calib.procedure.kinematic_stage.metrics import Findings
+from calib.procedure.kinematic_stage.outliers import Outlier, named_outliers, plateau, remains
+from calib.procedure.kinematic_stage.validation import Arms, Assessment, assess
+from calib.procedure.kinematic_stage.verdict import Verdict
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
 from calib.robot.deflection import Deflection
 
 Progress = Callable[[str], None]
 MOVED = 3.0  # nominal errors fall by this factor when each file gets a station of its own: it was moved (our choice)
-ELSEWHERE = 20.0  # nominal errors this many times the fit's: the instrument must have stood elsewhere (our choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,29 +47,23 @@ class Outcome:
         inputs: what it worked on.
         climb: the rungs, the chosen model, and the fits of the nominal and the calibrated arm.
         rigid: the best fit without joint corrections: the geometry that a URDF holds and dynamics is identified on.
-        fit: the two arms on the fit rows.
-        validation: the two arms on unseen rows, by file name.
         outliers: rows of the fit that do not fit, worst first.
         unclear: what the data cannot tell, in words.
-        warnings: what a user should know.
-        verdict: pass, marginal or fail, with its reason.
+        findings: what the fit says of itself.
+        assessment: both arms on fitted and on unseen rows, and the verdict.
         seed: that reproduces it.
         tolerance: largest rms on unseen poses that is good enough [m]; None where none was given.
-        said: those warnings that the fit alone gives, whatever the unseen rows are.
     """
 
     inputs: Inputs
     climb: Climb
     rigid: GeometricFit
-    fit: Comparison
-    validation: Mapping[str, Comparison]
     outliers: Sequence[Outlier]
     unclear: tuple[str, ...]
-    warnings: tuple[str, ...]
-    verdict: Verdict
+    findings: Findings
+    assessment: Assessment
     seed: int = 0
     tolerance: float | None = None
-    said: tuple[str, ...] = ()
 
     @property
     def calibrated(self) -> CalibratedChain:
@@ -81,22 +71,25 @@ class Outcome:
         found = calibrated_chain(self.climb.fit, self.rigid, self.inputs.nominal)
         return replace(found, source=str(self.inputs.source))
 
+    @property
+    def fit(self) -> Comparison:
+        """The two arms on the fit's rows."""
+        return self.assessment.fit
 
-@dataclass(frozen=True, eq=False)
-class Assessment:
-    """Both arms on the same rows, and what that comes to.
+    @property
+    def validation(self) -> Mapping[str, Comparison]:
+        """The two arms on unseen rows, by file name."""
+        return self.assessment.validation
 
-    Attributes:
-        fit: on the fit's rows.
-        validation: on unseen rows, by file name.
-        verdict: pass, marginal or fail, with its reason.
-        warnings: what a user should know, of the inputs, the fit and the unseen rows.
-    """
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a user should know."""
+        return self.assessment.warnings
 
-    fit: Comparison
-    validation: Mapping[str, Comparison]
-    verdict: Verdict
-    warnings: tuple[str, ...]
+    @property
+    def verdict(self) -> Verdict:
+        """Pass, marginal or fail, with its reason."""
+        return self.assessment.verdict
 
 
 def run(
@@ -148,62 +141,27 @@ def run(
     say("comparing on unseen poses")
     rigid = rigid_fit(found, inputs.fit, settings)
     named = named_outliers(found.fit)
-    known = judged(inputs, found, named)
-    unexplained = plateau(found, known["reach"])
-    said = (
-        *moved_between(found.nominal.cell, inputs.fit, settings), *((unexplained,) if unexplained else ()),
-        *diagnose(found.fit),
-    )  # fmt: skip
-    both = found.nominal.cell, found.fit.cell
-    result = assess(*both, rigid.cell.chain, inputs, settings, known, said, asked=asked, tolerance=tolerance, seed=seed)
-    return Outcome(
-        inputs, found, rigid, result.fit, result.validation, named, tuple(explain(found.fit)), result.warnings,
-        result.verdict, seed, tolerance, said,
-    )  # fmt: skip
+    notes = *moved_between(found.nominal.cell, inputs.fit, settings), *diagnose(found.fit)
+    findings = found_of(inputs, found, named, notes)
+    arms = Arms(found.nominal.cell, found.fit.cell, rigid.cell.chain)
+    result = assess(arms, inputs, findings, settings, asked=asked, tolerance=tolerance, seed=seed)
+    return Outcome(inputs, found, rigid, named, tuple(explain(found.fit)), findings, result, seed, tolerance)
 
 
-def assess(
-    nominal: Installation,
-    calibrated: Installation,
-    rigid: Chain,
-    inputs: Inputs,
-    settings: Settings,
-    known: Mapping[str, Any],
-    said: Sequence[str],
-    *,
-    asked: str,
-    tolerance: float | None = None,
-    seed: int = 0,
-) -> Assessment:
-    """Compare both arms on fitted and on unseen rows, and judge: in the command, and of a fit read from its folder.
-
-    Args:
-        nominal, calibrated: installations, frames fitted to the fit's rows.
-        rigid: the best geometry without joint corrections.
-        inputs: the rows.
-        settings: of the fit, as asked for.
-        known: what `judged` says of the fit.
-        said: what the fit says of itself (`Outcome.said`).
-        asked: the model asked for.
-        tolerance: largest rms on unseen poses that is good enough [m].
-        seed: of the pairs whose distances are compared.
-    """
-    torques = [gravity_of(inputs.chain, block) for block in inputs.fit]
-    alone = without_corrections(calibrated, rigid, inputs.fit, settings)
-    fitted = compare(nominal, calibrated, inputs.fit, torques, "fitted on these rows", False, seed, alone=alone)
-    validation = {
-        name: compare_unseen(nominal, calibrated, unseen, lambda b: gravity_of(inputs.chain, b), settings, seed, alone)
-        for name, unseen in inputs.unseen.items()
-    }
-    verdict = judge(fitted, validation, asked=asked, tolerance=tolerance, **known)
-    clause, loud = urdf_alone(fitted, validation)
-    verdict = verdict if not clause else replace(verdict, reason=f"{verdict.reason}; {clause}")
-    blocks = (*inputs.fit, *(unseen.block for unseen in inputs.unseen.values()))
-    warnings = (
-        *loud, *inputs.notes, *(note for block in blocks for note in block.notes), *elsewhere(fitted, validation),
-        *said, *doubtful(validation),
-    )  # fmt: skip
-    return Assessment(fitted, validation, verdict, tuple(dict.fromkeys(warnings)))
+def found_of(inputs: Inputs, found: Climb, named: Sequence[Outlier], notes: Sequence[str]) -> Findings:
+    """Return what a fit says of itself, whatever rows it has not seen; `notes` are those of moved instruments etc."""
+    long = reach(inputs.chain)
+    said = plateau(found, long)
+    return Findings(
+        model=found.chosen,
+        loss=found.loss,
+        cross_validated=cross_validated(found),
+        nominal_cross_validated=next((r.cross_validated for r in found.rungs if r.model == "frames"), None),
+        outlier_share=len({(each.file, each.row) for each in named}) / sum(len(block) for block in inputs.fit),
+        unexplained=said if remains(found, long) else "",
+        reach=long,
+        notes=(*((said,) if said else ()), *notes),
+    )
 
 
 def rigid_fit(found: Climb, measured: Sequence[PoseMeasurements], settings: Settings) -> GeometricFit:
@@ -215,19 +173,6 @@ def rigid_fit(found: Climb, measured: Sequence[PoseMeasurements], settings: Sett
     table = layout(bare)
     every = np.concatenate([table.arm_index, table.frame_index])
     return fit(bare, measured, every, settings=settings, drawn=drawn)
-
-
-def judged(inputs: Inputs, found: Climb, named: Sequence[Outlier]) -> dict[str, Any]:
-    """Return what `judge` of the verdict needs besides errors, the model asked for and a tolerance."""
-    long = reach(inputs.chain)
-    return {
-        "model": found.chosen,
-        "cross_validated": cross_validated(found),
-        "nominal_cross_validated": next((r.cross_validated for r in found.rungs if r.model == "frames"), None),
-        "outlier_share": len({(each.file, each.row) for each in named}) / sum(len(block) for block in inputs.fit),
-        "unexplained": plateau(found, long) if remains(found, long) else "",
-        "reach": long,
-    }
 
 
 def fixed_parameters(start: Installation, options: FitOptions) -> np.ndarray:
@@ -257,31 +202,11 @@ def cross_validated(found: Climb) -> float:
     return [rung.cross_validated for rung in found.rungs if rung.kept][-1]
 
 
-def gravity_of(chain: Chain, block: PoseMeasurements) -> np.ndarray | None:
-    """Return gravity torques (m, n) [N m] of a block; None where the robot's masses are not known."""
-    if chain.inertias is None or sum(element.joint is not None for element in chain.elements) != chain.n:
-        return None
-    from calib.dynamics.gravity import gravity_torques
-
-    return gravity_torques(chain, block.q)
-
-
 def reach(chain: Chain) -> float:
     """Return how long the stretched arm is at most [m]: the sum of its constant offsets."""
     total = sum(abs(e.value) for e in chain.elements if e.axis[0] == "t" and e.joint is None)
     placed = sum(float(np.linalg.norm(e.placement[:3, 3])) for e in chain.elements if e.placement is not None)
     return max(total + placed + float(np.linalg.norm(chain.tail[:3, 3])), 0.1)
-
-
-def elsewhere(fit: Comparison, validation: Mapping[str, Comparison]) -> list[str]:
-    """Name validation files whose errors look like another placement of the instrument, not like an arm's."""
-    usual = float(np.median(fit.errors[0].main)) if len(fit.errors[0].main) else np.inf
-    return [
-        f"{name}: nominal errors of {1e3 * np.median(found.errors[0].main):.3g} mm look like an instrument (or "
-        f"tool) that stood elsewhere; give {OWN_FRAMES}"
-        for name, found in validation.items()
-        if np.median(found.errors[0].main) > ELSEWHERE * usual
-    ]
 
 
 def moved_between(nominal: Installation, blocks: Sequence[PoseMeasurements], settings: Settings) -> list[str]:

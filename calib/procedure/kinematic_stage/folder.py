@@ -1,29 +1,44 @@
-"""The folder of a fit: written whole, beside its place, then moved there."""
+"""The folder of a fit, and that of its validation in a session: what is in them, written and read back.
+
+A fit's folder is written whole, beside its place, then moved there. Nothing else knows what its files are called.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
 from calib import files
 from calib.errors import UsageError
 from calib.folders import check_folder, write_staged
+from calib.geometry.weighing import Settings, combine
 from calib.procedure.kinematic_stage import robot_file
 from calib.procedure.kinematic_stage.fit import Outcome
+from calib.procedure.kinematic_stage.inputs import Inputs
+from calib.procedure.kinematic_stage.metrics import Findings, FitMetrics, ValidationMetrics
 from calib.procedure.kinematic_stage.residual_table import write_residuals
 from calib.procedure.kinematic_stage.tables import HEADER, estimate_table
+from calib.procedure.kinematic_stage.validation import Arms, Assessment, nominal_arm, write_errors
+from calib.records import read_record
 from calib.robot import calibrated
 from calib.robot.calibrated import CorrectedChain
 from calib.robot.formats import urdf_write
 
+T = TypeVar("T")
 OURS = (
     calibrated.ROBOT, "robot.urdf", "robot_for_corrections.urdf",
     "estimate.csv", "covariance.csv", calibrated.COVARIANCE, "residuals.csv", "joint_corrections.csv",
     "joint_corrections.txt", "report.json", "certificate.html", "metrics.json",
 )  # fmt: skip
 """Files of an earlier fit that a new one replaces; besides plots, ``plot_*.png``."""
+
+SCHEMA = 2  # of metrics.json; 1 had no findings, and in a session's 5-validation not the notes of the fit
+IN_SESSION, VALIDATED = "4-fit", "5-validation"  # what these folders are called in a session
 
 CORRECTIONS = """Joint corrections that a URDF cannot hold.
 
@@ -45,6 +60,115 @@ To make the arm stand where the calibrated model says: predict with q + delta(q)
 command a joint position for which that file wants q, send q - delta(q) (one step is enough; delta is small).
 robot.toml holds the same geometry and terms, and `calib.robot.calibrated.read` reads them.
 """
+
+
+@dataclass(frozen=True)
+class FitFolder:
+    """The folder that a fit leaves: where its files are, and what they say."""
+
+    path: Path
+
+    @property
+    def robot(self) -> Path:
+        """The calibrated robot."""
+        return self.path / calibrated.ROBOT
+
+    @property
+    def urdf(self) -> Path:
+        """The best geometry without joint corrections."""
+        return self.path / "robot.urdf"
+
+    @property
+    def report(self) -> Path:
+        """What a certificate is printed from."""
+        return self.path / "report.json"
+
+    @property
+    def residuals(self) -> Path:
+        """A row per measured one."""
+        return self.path / "residuals.csv"
+
+    @property
+    def tables(self) -> tuple[Path, Path]:
+        """The estimate, and its covariance."""
+        return self.path / "estimate.csv", self.path / "covariance.csv"
+
+    def metrics(self) -> FitMetrics:
+        """Read numbers, verdict and findings."""
+        return _record(FitMetrics, self.path / "metrics.json")
+
+    def findings(self) -> Findings:
+        """Read what the fit says of itself; schema 1 keeps it with the report, without the loss."""
+        metrics = self.metrics()
+        if metrics.findings is not None:
+            return metrics.findings
+        return replace(_record(_EarlyReport, self.report).judged, notes=metrics.warnings)
+
+    def arms(self, inputs: Inputs, settings: Settings) -> Arms:
+        """Read both arms; the nominal one's frames are fitted to the fit's rows again."""
+        chosen = combine(settings, loss=self.findings().loss or settings.loss)
+        return Arms(nominal_arm(inputs, chosen), robot_file.read(self.path), calibrated.read(self.path).chain)
+
+
+@dataclass(frozen=True)
+class _EarlyReport:
+    """What ``report.json`` of schema 1 holds of the findings."""
+
+    judged: Findings
+
+
+@dataclass(frozen=True)
+class ValidationFolder:
+    """The folder in a session that holds a fit against unseen rows: where its files are, and what they say."""
+
+    path: Path
+
+    @property
+    def judged(self) -> Path:
+        """Numbers and verdict."""
+        return self.path / "metrics.json"
+
+    @property
+    def errors(self) -> Path:
+        """A row per unseen one."""
+        return self.path / "errors.csv"
+
+    @property
+    def rows(self) -> Path:
+        """Errors of all rows, for figures."""
+        return self.path / "rows.json"
+
+    @property
+    def report(self) -> Path:
+        """What a certificate is printed from."""
+        return self.path / "report.json"
+
+    def write(self, found: Assessment, inputs: Inputs, rows: Sequence[Mapping[str, Any]]) -> ValidationMetrics:
+        """Write errors, rows and, last, the metrics; return these."""
+        write_errors(self.errors, inputs.chain, found.validation)
+        files.write_json(self.rows, rows)
+        files.write_json(self.judged, found.table() | {"schema": SCHEMA})
+        return self.metrics()
+
+    def take_over(self, fit: FitMetrics) -> ValidationMetrics:
+        """Write the fit's own verdict, where no validation was asked for."""
+        found = ValidationMetrics({}, fit.verdict, fit.reason, fit.warnings, SCHEMA)
+        files.write_json(self.judged, asdict(found))
+        return found
+
+    def metrics(self) -> ValidationMetrics:
+        """Read numbers and verdict; of schema 1 the warnings are without the fit's."""
+        return _record(ValidationMetrics, self.judged)
+
+
+def _record(kind: type[T], path: Path) -> T:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if isinstance(content, Mapping) and content.get("schema", 1) > SCHEMA:
+            raise UsageError(f"{path}: schema {content['schema']} of a later version, this one reads up to {SCHEMA}")
+        return read_record(kind, content)
+    except (OSError, ValueError, TypeError) as error:
+        raise UsageError(f"{path} cannot be read ({error}); fit again") from error
 
 
 def check_target(out: Path, source: Path | None = None) -> None:
@@ -93,10 +217,10 @@ def _write_all(outcome: Outcome, folder: Path) -> None:
 def metrics(outcome: Outcome) -> dict[str, object]:
     """Return the content of ``metrics.json``."""
     return {
+        "schema": SCHEMA,
         "fit": {"parameters": len(outcome.climb.fit.free), **outcome.fit.table()},
-        "validation": {name: comparison.table() for name, comparison in outcome.validation.items()},
+        "validation": outcome.assessment.table()["validation"],
         "model": outcome.climb.chosen,
-        "loss": outcome.climb.loss,
         "ladder": [
             {
                 "model": rung.model,
@@ -125,6 +249,7 @@ def metrics(outcome: Outcome) -> dict[str, object]:
             }
             for each in outcome.outliers
         ],
+        "findings": asdict(outcome.findings),
     }
 
 

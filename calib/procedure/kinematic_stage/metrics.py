@@ -119,6 +119,31 @@ class OutlierRow:
 
 
 @dataclass(frozen=True)
+class Findings:
+    """What a fit says of itself and a verdict needs beside the errors on rows; kept in the fit's folder.
+
+    Attributes:
+        model: the one chosen.
+        cross_validated, nominal_cross_validated: errors of the chosen model and of the nominal arm on rows left out
+            [m]; None where they were not computed.
+        outlier_share: of the fit's rows.
+        unexplained: that no rigid geometry explains the measurements, in words, where that decides; else empty.
+        reach: of the arm [m].
+        loss: that was used; empty where it is not known.
+        notes: what a user should know of the fit, whatever the unseen rows are.
+    """
+
+    model: str
+    cross_validated: float | None
+    nominal_cross_validated: float | None
+    outlier_share: float
+    unexplained: str
+    reach: float
+    loss: str = ""
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class ValidationMetrics:
     """What holding a fit against unseen rows came to: their errors, the verdict, what to know."""
 
@@ -144,7 +169,8 @@ class FitMetrics:
     warnings: tuple[str, ...]
     not_identifiable: tuple[str, ...]
     outliers: tuple[OutlierRow, ...]
-    loss: str = ""
+    findings: Findings | None = None
+    schema: int = 1
 
     @property
     def proofs(self) -> dict[str, ComparedRows]:

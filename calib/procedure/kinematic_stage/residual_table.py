@@ -10,8 +10,8 @@ from calib import files
 from calib.data.poses.measurements import PoseMeasurements
 from calib.geometry.accuracy import NATURE
 from calib.geometry.observation import observe, prepare
+from calib.procedure.kinematic_stage.comparison import Comparison
 from calib.procedure.kinematic_stage.fit import Outcome
-from calib.procedure.kinematic_stage.validation import Comparison
 
 _NONE = np.array([], dtype=int)
 COMPONENTS = {

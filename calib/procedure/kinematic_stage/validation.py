@@ -1,145 +1,130 @@
-"""The nominal arm beside the calibrated one, on the same rows."""
+"""Both arms on rows that were fitted and on rows that were not, and what that comes to: one assessment for all who ask.
+
+`assess` is called by a fit that was just made and by one read back from its folder; they get the same answer.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from calib import files
 from calib.data.poses.measurements import PoseMeasurements
-from calib.geometry.accuracy import Errors, errors, pair_errors, statistics, summary
+from calib.geometry.accuracy import Errors
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation
+from calib.geometry.observation import predict, prepare
 from calib.geometry.weighing import Settings
-from calib.procedure.kinematic_stage import iso9283
-from calib.procedure.kinematic_stage.inputs import Unseen, pose_count
+from calib.procedure.kinematic_stage.comparison import (
+    Comparison,
+    compare,
+    compare_unseen,
+    gravity_of,
+    without_corrections,
+)
+from calib.procedure.kinematic_stage.inputs import Inputs
+from calib.procedure.kinematic_stage.metrics import Findings
+from calib.procedure.kinematic_stage.verdict import OWN_FRAMES, Verdict, judge
 from calib.robot.chain import Chain
-from calib.robot.deflection import Deflection
+from calib.transforms import invert
 
-Torques = list[np.ndarray | None]
+ELSEWHERE = 20.0  # nominal errors this many times the fit's: the instrument must have stood elsewhere (our choice)
+GROSS = 8.0  # our choice
+PLACES = tuple(
+    f"{name} [{unit}]"
+    for head, unit in (("", "m"), ("to_nominal_", "mm"), ("to_calibrated_", "mm"))
+    for name in (f"{head}x", f"{head}y", f"{head}z")
+)
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
-    """The two arms on the same rows.
+class Arms:
+    """The nominal and the calibrated installation, frames fitted to the fit's rows, and the best rigid geometry."""
+
+    nominal: Installation
+    calibrated: Installation
+    rigid: Chain
+
+
+@dataclass(frozen=True, eq=False)
+class Assessment:
+    """Both arms on the same rows, and what that comes to.
 
     Attributes:
-        blocks: the rows.
-        torques: gravity torques (m, n) per block, or None [N m].
-        cells: nominal and calibrated installation that predict them.
-        errors: of each.
-        pairs: errors of the distances between pairs of positions, of each [m].
-        poses: how many robot poses.
-        frames: whose base and tool placement was used, in words.
-        proves: False where the rows were fitted on.
-        alone: errors of the calibrated robot as a URDF holds it, without corrections and with frames fitted for it
-            on the same rows as theirs; None where that is all there is.
-        shares_frames: True where another file's base and tool placement was used.
-        repeated: what poses that were measured several times say (`calib.procedure.kinematic_stage.iso9283`); None
-            without any.
+        fit: on the fit's rows.
+        validation: on unseen rows, by file name.
+        verdict: pass, marginal or fail, with its reason.
+        warnings: what a user should know, of the inputs, the fit and the unseen rows.
     """
 
-    blocks: tuple[PoseMeasurements, ...]
-    torques: Torques
-    cells: tuple[Installation, Installation]
-    errors: tuple[Errors, Errors]
-    pairs: tuple[np.ndarray, np.ndarray]
-    poses: int
-    frames: str
-    proves: bool = True
-    alone: Errors | None = None
-    shares_frames: bool = False
-    repeated: Mapping[str, Any] | None = None
+    fit: Comparison
+    validation: Mapping[str, Comparison]
+    verdict: Verdict
+    warnings: tuple[str, ...]
 
-    def table(self) -> dict[str, object]:
-        """Return the comparison as ``metrics.json`` holds it."""
-        arms = ("nominal", "calibrated")
-        result: dict[str, object] = {"poses": self.poses, "frames": self.frames, "unseen": self.proves}
-        result |= {arm: summary(found) for arm, found in zip(arms, self.errors)}
-        if self.alone is not None:
-            result["urdf_alone"] = summary(self.alone)
-        if len(self.pairs[0]):
-            result["pair_distance_mm"] = {arm: statistics(sizes, 1e3) for arm, sizes in zip(arms, self.pairs)}
-        if self.repeated is not None:
-            result["iso9283"] = self.repeated
-        return result
+    def table(self) -> dict[str, Any]:
+        """Return the unseen rows, the verdict and the warnings as ``metrics.json`` holds them."""
+        return {
+            "validation": {name: comparison.table() for name, comparison in self.validation.items()},
+            "verdict": self.verdict.level,
+            "reason": self.verdict.reason,
+            "warnings": list(self.warnings),
+        }
 
 
-def compare(
-    nominal: Installation,
-    calibrated: Installation,
-    blocks: Sequence[PoseMeasurements],
-    torques: Torques,
-    frames: str,
-    proves: bool = True,
-    seed: int = 0,
-    *,
-    alone: Installation | None = None,
-    shares_frames: bool = False,
-) -> Comparison:
-    """Return both arms' errors on some rows, and those of the calibrated geometry `alone` (`without_corrections`)."""
-    cells = nominal, calibrated
-    one, two = (errors(cell, blocks, torques) for cell in cells)
-    first, second = (pair_errors(cell, blocks, torques, seed=seed) for cell in cells)
-    rigid = None if alone is None else errors(alone, blocks)
-    return Comparison(
-        tuple(blocks), torques, cells, (one, two), (first, second), pose_count(blocks), frames, proves, rigid,
-        shares_frames, iso9283.table(cells, blocks, torques),
-    )  # fmt: skip
-
-
-def compare_unseen(
-    nominal: Installation,
-    calibrated: Installation,
-    unseen: Unseen,
-    torque_of: Callable[[PoseMeasurements], np.ndarray | None],
+def assess(
+    arms: Arms,
+    inputs: Inputs,
+    findings: Findings,
     settings: Settings,
+    *,
+    asked: str,
+    tolerance: float | None = None,
     seed: int = 0,
-    alone: Installation | None = None,
-) -> Comparison:
-    """Return both arms' errors on unseen rows, their frames refitted where the rows have frames of their own."""
-    block = unseen.block
-    torques = [torque_of(block)]
-    if unseen.own_frames:
-        nominal, calibrated = (place(cell, block, torques, settings) for cell in (nominal, calibrated))
-        alone = None if alone is None else place(alone, block, torques, settings)
-        words = "base and tool placement refitted on these rows"
-    elif unseen.held_out:
-        words = "those of the fit"
-    else:
-        words = (
-            f"those of the fit, station '{block.station}'" if block.kind in ("pose", "position") else "tool of the fit"
-        )
-    shares = not (unseen.own_frames or unseen.held_out)
-    return compare(
-        nominal, calibrated, [block], torques, words, not unseen.seen, seed, alone=alone, shares_frames=shares
-    )
-
-
-def place(cell: Installation, block: PoseMeasurements, torques: Torques, settings: Settings) -> Installation:
-    """Return an arm, deflections included, with base and tool placement fitted on a block and nothing else."""
-    start = replace(install(cell.chain, [block], cell.known), deflection=cell.deflection)
-    return polish_frames(start, [block], settings, torques).cell
-
-
-def without_corrections(
-    cell: Installation, rigid: Chain, blocks: Sequence[PoseMeasurements], settings: Settings
-) -> Installation | None:
-    """Return the arm as a URDF holds it, base and tool placement fitted for it; None where `cell` has no corrections.
+) -> Assessment:
+    """Compare both arms on fitted and on unseen rows, and judge.
 
     Args:
-        cell: the calibrated installation.
-        rigid: the best geometry without corrections; that inside `cell` is good only together with them.
-        blocks: the fit's rows.
-        settings: of the fit.
+        arms: what is compared.
+        inputs: the rows.
+        findings: what the fit says of itself.
+        settings: of the fit, as asked for.
+        asked: the model asked for.
+        tolerance: largest rms on unseen poses that is good enough [m].
+        seed: of the pairs whose distances are compared.
     """
-    if not (cell.deflection.terms or cell.known.terms):
-        return None
-    bare = replace(cell, chain=rigid, deflection=Deflection(), known=Deflection())
-    return polish_frames(bare, blocks, settings).cell
+    both = arms.nominal, arms.calibrated
+    torques = [gravity_of(inputs.chain, block) for block in inputs.fit]
+    alone = without_corrections(arms.calibrated, arms.rigid, inputs.fit, settings)
+    fitted = compare(*both, inputs.fit, torques, "fitted on these rows", False, seed, alone=alone)
+    validation = {
+        name: compare_unseen(*both, unseen, lambda b: gravity_of(inputs.chain, b), settings, seed, alone)
+        for name, unseen in inputs.unseen.items()
+    }
+    verdict = judge(
+        fitted, validation, model=findings.model, asked=asked, cross_validated=findings.cross_validated,
+        outlier_share=findings.outlier_share, unexplained=findings.unexplained, tolerance=tolerance,
+        nominal_cross_validated=findings.nominal_cross_validated, reach=findings.reach,
+    )  # fmt: skip
+    clause, loud = urdf_alone(fitted, validation)
+    verdict = verdict if not clause else replace(verdict, reason=f"{verdict.reason}; {clause}")
+    blocks = (*inputs.fit, *(unseen.block for unseen in inputs.unseen.values()))
+    warnings = (
+        *loud, *inputs.notes, *(note for block in blocks for note in block.notes), *elsewhere(fitted, validation),
+        *findings.notes, *doubtful(validation),
+    )  # fmt: skip
+    return Assessment(fitted, validation, verdict, tuple(dict.fromkeys(warnings)))
+
+
+def nominal_arm(inputs: Inputs, settings: Settings) -> Installation:
+    """Return the nominal arm, corrections that came with it included, base and tool placement fitted for it."""
+    torques = [gravity_of(inputs.chain, block) for block in inputs.fit]
+    return polish_frames(install(inputs.chain, inputs.fit, inputs.known), inputs.fit, settings, torques).cell
 
 
 def urdf_alone(fit: Comparison, validation: Mapping[str, Comparison]) -> tuple[str, list[str]]:
@@ -163,6 +148,76 @@ def urdf_alone(fit: Comparison, validation: Mapping[str, Comparison]) -> tuple[s
             )
     there = words[0].removesuffix(f" {next(iter(sets))}") if len(sets) == 1 and proofs and words else ", ".join(words)
     return (f"its URDF alone, without joint_corrections.csv, leaves {there}" if words else ""), warnings
+
+
+def elsewhere(fit: Comparison, validation: Mapping[str, Comparison]) -> list[str]:
+    """Name validation files whose errors look like another placement of the instrument, not like an arm's."""
+    usual = float(np.median(fit.errors[0].main)) if len(fit.errors[0].main) else np.inf
+    return [
+        f"{name}: nominal errors of {1e3 * np.median(found.errors[0].main):.3g} mm look like an instrument (or "
+        f"tool) that stood elsewhere; give {OWN_FRAMES}"
+        for name, found in validation.items()
+        if np.median(found.errors[0].main) > ELSEWHERE * usual
+    ]
+
+
+def doubtful(validation: Mapping[str, Comparison]) -> list[str]:
+    """Name unseen rows whose error is more than `GROSS` times the median: they may be wrong measurements."""
+    result = []
+    for name, each in validation.items():
+        sizes, numbers = each.errors[1].main, [row for block in each.blocks for row in _numbers(block)]
+        far = np.flatnonzero(sizes > GROSS * np.median(sizes)) if len(sizes) == len(numbers) else []
+        if len(far):
+            rows = ", ".join(f"row {numbers[k]} ({1e3 * sizes[k]:.3g} mm)" for k in far[:5])
+            rest = np.delete(sizes, far)
+            without = 1e3 * float(np.sqrt(np.mean(rest**2)))
+            result.append(
+                f"{name}: {rows} far off the median of {1e3 * np.median(sizes):.3g} mm; measured wrongly? They count, "
+                f"for the verdict too; without them the rms is {without:.3f} mm"
+            )
+    return result
+
+
+def write_errors(path: Path, chain: Chain, validation: Mapping[str, Comparison]) -> None:
+    """Write the errors of both arms at every unseen row; where positions were measured, with where and whither.
+
+    Then ``x y z`` is where the target was seen, ``to_nominal`` and ``to_calibrated`` lead from there to where each arm
+    puts it, all in the calibrated arm's base.
+    """
+    rows: list[list[object]] = []
+    for name, each in validation.items():
+        q = np.concatenate([block.q for block in each.blocks])
+        numbers = [row for block in each.blocks for row in _numbers(block)]
+        sizes = [found.main for found in each.errors]
+        if len(sizes[0]) == len(q):
+            places = np.concatenate([_places(each, number) for number in range(len(each.blocks))])
+            rows += [
+                [name, number, *map(float, joints), 1e3 * float(a), 1e3 * float(b), *map(_cell, place)]
+                for number, joints, a, b, place in zip(numbers, q, *sizes, places)
+            ]
+    joints = [f"{joint.name} [{joint.unit}]" for joint in chain.joints]
+    files.write_table(path, ["file", "row", *joints, "nominal [mm]", "calibrated [mm]", *PLACES], rows)
+
+
+def _places(found: Comparison, number: int) -> np.ndarray:
+    """Return seen position [m] and the ways from there to both arms' [mm] of one block (m, 9); NaN without any."""
+    block, torque = found.blocks[number], [found.torques[number]]
+    if block.position is None:
+        return np.full((len(block), 9), np.nan)
+    ready = [prepare(cell, [block], torque)[0] for cell in found.cells]
+    base = invert(found.cells[1].stations[ready[1].station])
+    ways = [1e3 * (predict(cell, one).point.T - block.position) for cell, one in zip(found.cells, ready)]
+    turn = base[:3, :3].T
+    return np.hstack([block.position @ turn + base[:3, 3], *(way @ turn for way in ways)])
+
+
+def _cell(value: float) -> float | None:
+    return None if np.isnan(value) else float(value)
+
+
+def _numbers(block: PoseMeasurements) -> list[int]:
+    assert block.rows is not None
+    return [int(row) for row in block.rows]
 
 
 def _rms(found: Errors) -> float:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from calib import files
 from calib.procedure.kinematic_stage.fit import Outcome
+from calib.procedure.kinematic_stage.folder import FitFolder
 from calib.procedure.report import certificate, figures, fit_report, geometry_section, html
 from calib.procedure.report.fit_report import Report
 from calib.procedure.report.page import Page
@@ -16,7 +17,7 @@ from calib.procedure.report.style import save
 def write(outcome: Outcome, folder: Path) -> None:
     """Write ``report.json``, the figures, and a certificate of the fit alone into a fit's folder."""
     report = fit_report.collect(outcome)
-    fit_report.write(report, folder)
+    fit_report.write(report, FitFolder(folder).report)
     drawn = figures.draw(report)
     for name, figure in drawn.items():
         save(figure.figure, folder / f"plot_{name}.png")

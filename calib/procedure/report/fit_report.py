@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,16 +16,16 @@ from calib.errors import UsageError
 from calib.estimation.estimate import strong_correlations
 from calib.geometry.observation import has_instrument, predict, prepare
 from calib.geometry.parameters import layout
-from calib.procedure.kinematic_stage.fit import Outcome, judged
+from calib.procedure.kinematic_stage.comparison import Comparison
+from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.folder import metrics
 from calib.procedure.kinematic_stage.metrics import FitMetrics, ValidationMetrics
 from calib.procedure.kinematic_stage.tables import estimate_table
-from calib.procedure.kinematic_stage.validation import Comparison
 from calib.records import read_record
 from calib.transforms import invert
 
-SCHEMA = 1
-NAME = "report.json"
+SCHEMA = 2
+READ = (1, SCHEMA)  # 1 kept the findings here, too
 NATURES = ("position", "orientation", "distance")
 
 
@@ -93,8 +93,6 @@ class Report:
         singular_values: of the scaled observation matrix; `rank` of them are kept.
         sets: errors per set of rows.
         noise: what the stated sigmas alone give, rms by nature [m, rad]; None where none were stated.
-        judged: what `calib.procedure.kinematic_stage.verdict.judge` needs besides the errors.
-        said: warnings that the fit alone gives, whatever the unseen rows are.
     """
 
     schema: int
@@ -112,8 +110,6 @@ class Report:
     rank: int
     sets: tuple[RowErrors, ...]
     noise: Mapping[str, float | None]
-    judged: Mapping[str, Any] = field(default_factory=dict)
-    said: tuple[str, ...] = ()
 
 
 def fit_metrics(outcome: Outcome) -> FitMetrics:
@@ -146,8 +142,6 @@ def collect(outcome: Outcome) -> Report:
         rank=len(values) if fit.split is None else fit.split.rank,
         sets=tuple(sets),
         noise=_noise(outcome.fit.blocks),
-        judged=judged(outcome.inputs, outcome.climb, outcome.outliers),
-        said=tuple(outcome.said),
     )
 
 
@@ -207,21 +201,20 @@ def _plain(values: np.ndarray) -> tuple[Any, ...]:
     return tuple(rounded.tolist()) if rounded.ndim == 1 else tuple(map(tuple, rounded.tolist()))
 
 
-def write(report: Report, folder: Path) -> None:
-    """Write ``report.json`` into a folder."""
-    files.write_json(folder / NAME, asdict(report))
+def write(report: Report, path: Path) -> None:
+    """Write a report as JSON."""
+    files.write_json(path, asdict(report))
 
 
-def read(folder: Path) -> Report:
+def read(path: Path) -> Report:
     """Read what `write` has left.
 
     Raises:
         UsageError: where it is missing or made by another version.
     """
-    path = Path(folder) / NAME
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        if content.get("schema") != SCHEMA:
+        if content.get("schema") not in READ:
             raise UsageError(f"{path}: schema {content.get('schema')}, this version reads {SCHEMA}; fit again")
         return read_record(Report, content)
     except (OSError, ValueError) as error:

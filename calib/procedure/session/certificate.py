@@ -9,13 +9,13 @@ from datetime import datetime
 from pathlib import Path
 
 from calib import files
-from calib.procedure.kinematic_stage.metrics import ValidationMetrics
+from calib.procedure.kinematic_stage.folder import SCHEMA
 from calib.procedure.report import certificate, fit_report, html, viewer
 from calib.procedure.report.fit_report import RowErrors
 from calib.procedure.report.page import Section, Text
 from calib.procedure.session.dynamics_steps import recordings
 from calib.procedure.session.folder import MARK, Session, fingerprint, read_state
-from calib.procedure.session.geometry_steps import SCHEMA, measured_files, robot_file
+from calib.procedure.session.geometry_steps import measured_files, robot_file
 from calib.records import read_record
 
 Say = Callable[[str], None]
@@ -56,14 +56,14 @@ def certify(session: Session, say: Say) -> list[str]:
 
 def whole_report(session: Session) -> fit_report.Report:
     """Return the fit's report with what the step validate found."""
-    outside = read_record(ValidationMetrics, json.loads(session.path("5-validation/metrics.json").read_text()))
-    if outside.schema >= SCHEMA:
-        return fit_report.read(session.path("5-validation"))
-    found, rows = fit_report.read(session.path("4-fit")), session.path("5-validation/rows.json")
-    content = json.loads(rows.read_text()) if rows.exists() and outside.validation else []
-    sets = read_record(tuple[RowErrors, ...], content)
-    outside = replace(outside, warnings=(*found.metrics.warnings, *outside.warnings))
-    return fit_report.with_unseen(found, outside, sets)
+    place = session.validation
+    found = place.metrics()
+    if found.schema >= SCHEMA:
+        return fit_report.read(place.report)
+    fit = fit_report.read(session.fit.report)
+    content = json.loads(place.rows.read_text()) if place.rows.exists() and found.validation else []
+    whole = replace(found, warnings=(*fit.metrics.warnings, *found.warnings))
+    return fit_report.with_unseen(fit, whole, read_record(tuple[RowErrors, ...], content))
 
 
 def noticed(session: Session, place: str, unseen: str) -> list[str]:
@@ -149,7 +149,7 @@ def session_plan(session: Session) -> str:
 def listed(session: Session) -> list[tuple[str, str, str, str]]:
     """Return the files the certificate rests on: name, what it is, bytes, SHA-256."""
     wanted = [robot_file(session), *measured_files(session)[0], *measured_files(session)[1]]
-    wanted += [session.path("4-fit/estimate.csv"), session.path("4-fit/covariance.csv")]
+    wanted += session.fit.tables
     if session.dynamic:
         wanted += sorted(session.path("6-excitation").glob("*/trajectory.csv"))
         wanted += [path for paths in recordings(session) for path in paths if path.is_file()]

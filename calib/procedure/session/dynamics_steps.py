@@ -48,7 +48,7 @@ def _is_log(path: Path) -> bool:
 
 def calibrated(session: Session) -> Chain:
     """Return the arm with the session's calibrated geometry."""
-    return load(session.path("4-fit"))
+    return load(session.fit.path)
 
 
 def options_of(session: Session) -> IdentifyOptions:
@@ -82,7 +82,7 @@ def excite(session: Session, say: Say) -> list[str]:
     for name in names:
         first = name == "training"
         designed = design.excite(
-            session.path("4-fit"), limits=limits, period=wanted.period * (1.0 if first else SHORTER),
+            session.fit.path, limits=limits, period=wanted.period * (1.0 if first else SHORTER),
             harmonics=wanted.harmonics, rate=wanted.rate, starts=wanted.starts if first else 1,
             evaluations=wanted.evaluations if first else max(20, wanted.evaluations // 3),
             seed=session.settings.seed + (0 if first else OTHER), repeat=wanted.repeats,
@@ -164,7 +164,7 @@ def identify(session: Session, say: Say) -> list[str]:
 
     cuts = json.loads(session.path("7-recorded/cuts.json").read_text(encoding="utf-8"))
     given = identifying.gather(
-        session.path("4-fit"), cut_paths(recordings(session)[0], cuts), options=options_of(session),
+        session.fit.path, cut_paths(recordings(session)[0], cuts), options=options_of(session),
         seed=session.settings.seed, progress=say,
     )  # fmt: skip
     outcome = identifying.run(given, progress=say)
@@ -191,7 +191,7 @@ def predict(session: Session, say: Say) -> list[str]:
         notes += told
     say("predicting unseen motion")
     given = identifying.gather(
-        session.path("4-fit"), cut_paths(training, cuts), cut_paths(unseen, aside), options=options_of(session),
+        session.fit.path, cut_paths(training, cuts), cut_paths(unseen, aside), options=options_of(session),
         seed=session.settings.seed, progress=say,
     )  # fmt: skip
     held = validation.hold(given, session.path("8-dynamics"), session.settings.dynamics.tolerance_percent)

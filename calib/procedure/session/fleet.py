@@ -113,24 +113,14 @@ def _go_on(folder: Path, say: Callable[[str], None], command: str) -> FleetRow:
             str(folder), WAITS, words=f"{waiting.words} (step {waiting.step.name}); {LOG} says what to bring"
         )
     verdict = verdict_of(session)
-    errors, torque = _figures(session.path("5-validation/metrics.json")), None
+    pairs = [(one.nominal.main, one.calibrated.main) for one in session.validation.metrics().validation.values()]
+    rms = [(before.rms, after.rms) for before, after in pairs if before is not None and after is not None]
+    errors, torque = max(rms, key=lambda pair: pair[1], default=(None, None)), None
     if session.dynamic:
         unseen = json.loads(session.path("8-dynamics/unseen/report.json").read_text(encoding="utf-8"))
         sets = (unseen["validation"] or unseen["fit"]).values()
         torque = max((one["raw"]["relative_error_percent"]["total"] or 0.0 for one in sets), default=None)
     return FleetRow(str(folder), DONE, verdict, "", *errors, torque, code=1 if verdict == "fail" else 0)
-
-
-def _figures(path: Path) -> tuple[float | None, float | None]:
-    """Return rms errors on unseen rows [mm]: nominal and calibrated, of the worst file."""
-    table = json.loads(path.read_text(encoding="utf-8"))["validation"]
-    pairs = []
-    for found in table.values():
-        for key in ("position_mm", "distance_mm"):
-            if found["calibrated"].get(key):
-                pairs.append((found["nominal"][key]["rms"], found["calibrated"][key]["rms"]))
-                break
-    return max(pairs, key=lambda pair: pair[1]) if pairs else (None, None)
 
 
 def line(one: FleetRow) -> str:

@@ -36,6 +36,7 @@ from typing import Any
 from calib import files
 from calib.config import parse
 from calib.errors import CalibError, SessionError
+from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.session.settings import SCHEMA, SessionSettings, check_schema, read_settings, written
 
 FOLDERS = ("1-robot", "2-poses", "3-measured", "4-fit", "5-validation")
@@ -60,6 +61,16 @@ class Session:
     def dynamic(self) -> bool:
         """Whether the dynamics are identified, too."""
         return self.settings.dynamics.wanted
+
+    @property
+    def fit(self) -> FitFolder:
+        """What the geometric fit leaves."""
+        return FitFolder(self.folder / IN_SESSION)
+
+    @property
+    def validation(self) -> ValidationFolder:
+        """What the fit comes to on unseen poses."""
+        return ValidationFolder(self.folder / VALIDATED)
 
     @property
     def export(self) -> str:

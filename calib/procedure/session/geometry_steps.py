@@ -6,7 +6,6 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -14,24 +13,19 @@ from calib import files
 from calib.data.poses.fit_options import FileOptions, FitOptions, read_options
 from calib.data.poses.plans import check_against, read_poses, write_poses
 from calib.errors import RobotError, UsageError
-from calib.geometry.fit import polish_frames
 from calib.geometry.weighing import Settings as FitSettings
 from calib.geometry.weighing import combine
 from calib.procedure.kinematic_stage import fit as fitting
 from calib.procedure.kinematic_stage import folder as outputs
-from calib.procedure.kinematic_stage import inputs, proof
-from calib.procedure.kinematic_stage import robot_file as installation_file
-from calib.procedure.kinematic_stage.metrics import ValidationMetrics
+from calib.procedure.kinematic_stage import inputs
+from calib.procedure.kinematic_stage.validation import assess
 from calib.procedure.report import fit_certificate, fit_report
 from calib.procedure.session import arrival
 from calib.procedure.session.folder import Session
 from calib.procedure.session.outcome import mark_failed
-from calib.records import read_record
-from calib.robot import calibrated
 from calib.robot.chain import Chain
 
 Say = Callable[[str], None]
-SCHEMA = 2  # of 5-validation/metrics.json: from 2 on all warnings are in it, and report.json beside it is the step's
 
 
 def robot_file(session: Session) -> Path:
@@ -183,7 +177,7 @@ def fit(session: Session, say: Say) -> list[str]:
         gathered(session), options_of(session), model=settings.fit.model, loss=settings.fit.loss,
         tolerance=tolerance_of(session), seed=settings.seed, progress=say,
     )  # fmt: skip
-    outputs.write_folder(outcome, session.path("4-fit"), fit_certificate.write)
+    outputs.write_folder(outcome, session.fit.path, fit_certificate.write)
     count = len(outcome.climb.fit.free)
     notes = [f"model {outcome.climb.chosen}, {count} parameters on {outcome.fit.poses} poses", *outcome.warnings]
     if outcome.outliers:
@@ -196,47 +190,27 @@ def fit(session: Session, say: Say) -> list[str]:
 
 def validate(session: Session, say: Say) -> list[str]:
     """Hold the fitted robot against poses it has not seen, and judge, as `calib fit` does with validation files."""
-    chain, unseen = chain_of(session), measured_files(session)[1]
-    folder, found, notes = session.path("5-validation"), fit_report.read(session.path("4-fit")), []
+    chain, unseen, notes = chain_of(session), measured_files(session)[1], []
+    fit, out = session.fit, session.validation
+    before, report = fit.metrics(), fit_report.read(fit.report)
     if not session.settings.poses.validation and not unseen:
-        own = found.metrics
-        content = {"validation": {}, "verdict": own.verdict, "reason": own.reason, "warnings": list(own.warnings)}
-        _write_validation(folder, found, content, [])
+        fit_report.write(fit_report.with_unseen(report, out.take_over(before), []), out.report)
         return ["no validation asked for: judged by cross-validation only"]
     plan = planned(session, chain, "validation")
     for path in unseen:
         notes += check_file(session, chain, path, plan)
     say("comparing on unseen poses")
-    given = gathered(session, unseen)
-    result = assessed(session, given, found)
-    metrics = {"validation": {name: each.table() for name, each in result.validation.items()}}
-    metrics |= {"verdict": result.verdict.level, "reason": result.verdict.reason, "warnings": list(result.warnings)}
-    proof.write_errors(folder / "errors.csv", given.chain, result.validation)
-    sets = [fit_report.rows_of(name, each, each.proves) for name, each in result.validation.items()]
-    files.write_json(folder / "rows.json", [asdict(each) for each in sets])
-    _write_validation(folder, found, metrics, sets)
-    fresh = [words for words in result.warnings if words not in found.metrics.warnings]
-    return [*notes, f"verdict {result.verdict.level}: {result.verdict.reason}", *fresh]
-
-
-def _write_validation(
-    folder: Path, found: fit_report.Report, metrics: dict[str, Any], sets: list[fit_report.RowErrors]
-) -> None:
-    fit_report.write(fit_report.with_unseen(found, read_record(ValidationMetrics, metrics), sets), folder)
-    files.write_json(folder / "metrics.json", metrics | {"schema": SCHEMA})
-
-
-def assessed(session: Session, given: inputs.Inputs, found: fit_report.Report) -> fitting.Assessment:
-    """Return the assessment of the session's fit, read from its folder, on its own rows and on unseen ones."""
-    options, wanted, place = options_of(session), session.settings.fit, session.path("4-fit")
+    given, options, wanted = gathered(session, unseen), options_of(session), session.settings.fit
     settings = combine(FitSettings(), loss=wanted.loss, loss_scale=options.loss_scale)
-    chosen = combine(settings, loss=found.metrics.loss or wanted.loss)
-    torques = [fitting.gravity_of(given.chain, block) for block in given.fit]
-    nominal = polish_frames(fitting.install(given.chain, given.fit, given.known), given.fit, chosen, torques).cell
-    return fitting.assess(
-        nominal, installation_file.read(place), calibrated.read(place).chain, given, settings, found.judged, found.said,
-        asked=wanted.model, tolerance=tolerance_of(session), seed=session.settings.seed,
+    found = assess(
+        fit.arms(given, settings), given, fit.findings(), settings, asked=wanted.model,
+        tolerance=tolerance_of(session), seed=session.settings.seed,
     )  # fmt: skip
+    rows = [fit_report.rows_of(name, each, each.proves) for name, each in found.validation.items()]
+    written = out.write(found, given, [asdict(each) for each in rows])
+    fit_report.write(fit_report.with_unseen(report, written, rows), out.report)
+    fresh = [words for words in found.warnings if words not in before.warnings]
+    return [*notes, f"verdict {found.verdict.level}: {found.verdict.reason}", *fresh]
 
 
 def export(session: Session, say: Say) -> list[str]:
@@ -250,7 +224,7 @@ def _exported(session: Session, out: Path, say: Say) -> list[str]:
     from calib.procedure.export.delivery import deliver
 
     source = robot_file(session)
-    lines = deliver(session.path("4-fit"), source, out)
+    lines = deliver(session.fit.path, source, out)
     if not session.dynamic:
         return lines
     from calib.procedure.export.dynamics import deliver_dynamics

@@ -59,7 +59,7 @@ def _fitted(session: Session) -> list[Path]:
 
 
 def _validated(session: Session) -> list[Path]:
-    fit = [session.path("4-fit") / name for name in ("robot.toml", "report.json")]
+    fit = [session.fit.robot, session.fit.report]
     return [
         *fit,
         session.path("2-poses/validation.csv"),
@@ -70,13 +70,13 @@ def _validated(session: Session) -> list[Path]:
 
 def _excited(session: Session) -> list[Path]:
     name = session.settings.dynamics.limits
-    return [session.path("4-fit/robot.toml"), *([session.path(name)] if name else [])]
+    return [session.fit.robot, *([session.path(name)] if name else [])]
 
 
 def _recorded(session: Session) -> list[Path]:
     plan = session.path("6-excitation/training/trajectory.toml")
     return [
-        session.path("4-fit/robot.toml"),
+        session.fit.robot,
         plan,
         *_reading(session),
         *files_of(dynamics_steps.recordings(session)[0]),
@@ -89,7 +89,7 @@ def _reading(session: Session) -> list[Path]:
 
 
 def _identified(session: Session) -> list[Path]:
-    own = [session.path("4-fit/robot.toml"), session.path("7-recorded/cuts.json"), *_reading(session)]
+    own = [session.fit.robot, session.path("7-recorded/cuts.json"), *_reading(session)]
     return [*own, *files_of(dynamics_steps.recordings(session)[0])]
 
 
@@ -107,7 +107,7 @@ def files_of(paths: list[Path]) -> list[Path]:
 
 
 def _exported(session: Session) -> list[Path]:
-    own = [*_robot(session), session.path("4-fit/robot.toml"), session.path("4-fit/robot.urdf")]
+    own = [*_robot(session), session.fit.robot, session.fit.urdf]
     identified = [session.path(f"8-dynamics/{name}") for name in ("dynamics.json", "estimate.csv", "covariance.csv")]
     judged = [session.path(place) for place in PLACES.values()]  # a failed robot's files say so
     return own + judged[:1] + ([*identified, *judged[1:]] if session.dynamic else [])

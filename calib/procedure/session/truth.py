@@ -41,9 +41,9 @@ def against_truth(session: Session, cell: Cell) -> tuple[float, float, float]:
     true = true_poses(cell, q)
     points = true[:, :3, 3]
     block = PoseMeasurements("pose", q, cell.nominal.joint_names, position=points, quaternion=to_quaternion(true))
-    rigid = calibrated.read(session.path("4-fit")).chain
+    rigid = calibrated.read(session.fit.path).chain
     nominal, alone = (polish_frames(install(chain, [block]), [block]).cell for chain in (cell.nominal, rigid))
-    found = robot_file.read(session.path("4-fit"))
+    found = robot_file.read(session.fit.path)
     before, after, bare = (_rms(arm, q, points) for arm in (nominal, found, alone))
     return before, after, bare
 

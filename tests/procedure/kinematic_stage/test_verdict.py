@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from calib.geometry.accuracy import Errors
-from calib.procedure.kinematic_stage.validation import Comparison, urdf_alone
+from calib.procedure.kinematic_stage.comparison import Comparison
+from calib.procedure.kinematic_stage.validation import urdf_alone
 from calib.procedure.kinematic_stage.verdict import judge
 
 

@@ -94,7 +94,7 @@ def test_every_figure_is_in_the_page_and_says_what_it_shows(page: str) -> None:
 
 
 def test_numbers_of_the_report_are_those_of_the_fit(finished_folder: Path) -> None:
-    found = fit_report.read(finished_folder / "4-fit")
+    found = fit_report.read(finished_folder / "4-fit/report.json")
     metrics = json.loads((finished_folder / "4-fit/metrics.json").read_text())
     errors = 1e3 * np.array(found.sets[0].calibrated["position"])
     assert np.sqrt(np.mean(errors**2)) == pytest.approx(metrics["fit"]["calibrated"]["position_mm"]["rms"], rel=1e-5)
@@ -103,7 +103,7 @@ def test_numbers_of_the_report_are_those_of_the_fit(finished_folder: Path) -> No
 
 
 def test_hostile_names_do_not_become_markup(finished_folder: Path) -> None:
-    found = replace(fit_report.read(finished_folder / "4-fit"), robot="<script>alert(1)</script>")
+    found = replace(fit_report.read(finished_folder / "4-fit/report.json"), robot="<script>alert(1)</script>")
     written = html.render(fit_certificate.of_fit(found, {}))
     assert "<script>" not in written and "&lt;script&gt;" in written
 
@@ -112,7 +112,7 @@ def test_another_versions_report_is_refused(finished_folder: Path, tmp_path: Pat
     content = json.loads((finished_folder / "4-fit/report.json").read_text()) | {"schema": 99}
     (tmp_path / "report.json").write_text(json.dumps(content))
     with pytest.raises(CalibError, match="schema 99"):
-        fit_report.read(tmp_path)
+        fit_report.read(tmp_path / "report.json")
 
 
 def test_before_and_after_differ_in_greyscale() -> None:
@@ -188,7 +188,7 @@ def test_paper_is_white_and_peaks_are_kept() -> None:
 
 
 def test_what_the_data_do_not_give_is_left_out(finished_folder: Path) -> None:
-    found = fit_report.read(finished_folder / "4-fit")
+    found = fit_report.read(finished_folder / "4-fit/report.json")
     bare = (replace(found.sets[0], q=(), points=()),)
     drawn = figures.draw(replace(found, sets=bare, singular_values=()))
     assert "joints" not in drawn and "singular_values" not in drawn and "position" in drawn

@@ -1,0 +1,151 @@
+"""The nominal arm beside the calibrated one, on the same rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from calib.data.poses.measurements import PoseMeasurements
+from calib.geometry.accuracy import Errors, errors, pair_errors, statistics, summary
+from calib.geometry.first_guess import install
+from calib.geometry.fit import polish_frames
+from calib.geometry.installation import Installation
+from calib.geometry.weighing import Settings
+from calib.procedure.kinematic_stage import iso9283
+from calib.procedure.kinematic_stage.inputs import Unseen, pose_count
+from calib.robot.chain import Chain
+from calib.robot.deflection import Deflection
+
+Torques = list[np.ndarray | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """The two arms on the same rows.
+
+    Attributes:
+        blocks: the rows.
+        torques: gravity torques (m, n) per block, or None [N m].
+        cells: nominal and calibrated installation that predict them.
+        errors: of each.
+        pairs: errors of the distances between pairs of positions, of each [m].
+        poses: how many robot poses.
+        frames: whose base and tool placement was used, in words.
+        proves: False where the rows were fitted on.
+        alone: errors of the calibrated robot as a URDF holds it, without corrections and with frames fitted for it
+            on the same rows as theirs; None where that is all there is.
+        shares_frames: True where another file's base and tool placement was used.
+        repeated: what poses that were measured several times say (`calib.procedure.kinematic_stage.iso9283`); None
+            without any.
+    """
+
+    blocks: tuple[PoseMeasurements, ...]
+    torques: Torques
+    cells: tuple[Installation, Installation]
+    errors: tuple[Errors, Errors]
+    pairs: tuple[np.ndarray, np.ndarray]
+    poses: int
+    frames: str
+    proves: bool = True
+    alone: Errors | None = None
+    shares_frames: bool = False
+    repeated: Mapping[str, Any] | None = None
+
+    def table(self) -> dict[str, object]:
+        """Return the comparison as ``metrics.json`` holds it."""
+        arms = ("nominal", "calibrated")
+        result: dict[str, object] = {"poses": self.poses, "frames": self.frames, "unseen": self.proves}
+        result |= {arm: summary(found) for arm, found in zip(arms, self.errors)}
+        if self.alone is not None:
+            result["urdf_alone"] = summary(self.alone)
+        if len(self.pairs[0]):
+            result["pair_distance_mm"] = {arm: statistics(sizes, 1e3) for arm, sizes in zip(arms, self.pairs)}
+        if self.repeated is not None:
+            result["iso9283"] = self.repeated
+        return result
+
+
+def compare(
+    nominal: Installation,
+    calibrated: Installation,
+    blocks: Sequence[PoseMeasurements],
+    torques: Torques,
+    frames: str,
+    proves: bool = True,
+    seed: int = 0,
+    *,
+    alone: Installation | None = None,
+    shares_frames: bool = False,
+) -> Comparison:
+    """Return both arms' errors on some rows, and those of the calibrated geometry `alone` (`without_corrections`)."""
+    cells = nominal, calibrated
+    one, two = (errors(cell, blocks, torques) for cell in cells)
+    first, second = (pair_errors(cell, blocks, torques, seed=seed) for cell in cells)
+    rigid = None if alone is None else errors(alone, blocks)
+    return Comparison(
+        tuple(blocks), torques, cells, (one, two), (first, second), pose_count(blocks), frames, proves, rigid,
+        shares_frames, iso9283.table(cells, blocks, torques),
+    )  # fmt: skip
+
+
+def compare_unseen(
+    nominal: Installation,
+    calibrated: Installation,
+    unseen: Unseen,
+    torque_of: Callable[[PoseMeasurements], np.ndarray | None],
+    settings: Settings,
+    seed: int = 0,
+    alone: Installation | None = None,
+) -> Comparison:
+    """Return both arms' errors on unseen rows, their frames refitted where the rows have frames of their own."""
+    block = unseen.block
+    torques = [torque_of(block)]
+    if unseen.own_frames:
+        nominal, calibrated = (place(cell, block, torques, settings) for cell in (nominal, calibrated))
+        alone = None if alone is None else place(alone, block, torques, settings)
+        words = "base and tool placement refitted on these rows"
+    elif unseen.held_out:
+        words = "those of the fit"
+    else:
+        words = (
+            f"those of the fit, station '{block.station}'" if block.kind in ("pose", "position") else "tool of the fit"
+        )
+    shares = not (unseen.own_frames or unseen.held_out)
+    return compare(
+        nominal, calibrated, [block], torques, words, not unseen.seen, seed, alone=alone, shares_frames=shares
+    )
+
+
+def place(cell: Installation, block: PoseMeasurements, torques: Torques, settings: Settings) -> Installation:
+    """Return an arm, deflections included, with base and tool placement fitted on a block and nothing else."""
+    start = replace(install(cell.chain, [block], cell.known), deflection=cell.deflection)
+    return polish_frames(start, [block], settings, torques).cell
+
+
+def without_corrections(
+    cell: Installation, rigid: Chain, blocks: Sequence[PoseMeasurements], settings: Settings
+) -> Installation | None:
+    """Return the arm as a URDF holds it, base and tool placement fitted for it; None where `cell` has no corrections.
+
+    Args:
+        cell: the calibrated installation.
+        rigid: the best geometry without corrections; that inside `cell` is good only together with them.
+        blocks: the fit's rows.
+        settings: of the fit.
+    """
+    if not (cell.deflection.terms or cell.known.terms):
+        return None
+    bare = replace(cell, chain=rigid, deflection=Deflection(), known=Deflection())
+    return polish_frames(bare, blocks, settings).cell
+
+
+def gravity_of(chain: Chain, block: PoseMeasurements) -> np.ndarray | None:
+    """Return gravity torques (m, n) [N m] of a block; None where the robot's masses are not known."""
+    if chain.inertias is None or sum(element.joint is not None for element in chain.elements) != chain.n:
+        return None
+    from calib.dynamics.gravity import gravity_torques
+
+    return gravity_torques(chain, block.q)
