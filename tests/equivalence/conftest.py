@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import planted_motion as planted
@@ -33,18 +32,18 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="session")
-def plain() -> Any:
+@pytest.fixture
+def plain(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw no figures."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(figures, "draw", lambda report: {})
-        yield
+    monkeypatch.setattr(figures, "draw", lambda report: {})
 
 
 @pytest.fixture(scope="session")
-def fitted(files: Path, plain: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def fitted(files: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished session of geometry."""
     place = tmp_path_factory.mktemp("fitted") / "cell"
     session = session_with(place, files / "robot.toml", "geometry", files / "measured.csv", files / "validation.csv")
-    assert not go_on(session)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(figures, "draw", lambda report: {})
+        assert not go_on(session)
     return place
