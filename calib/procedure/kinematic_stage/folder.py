@@ -95,14 +95,14 @@ class FitFolder:
 
     def metrics(self) -> FitMetrics:
         """Read numbers, verdict and findings."""
-        return _record(FitMetrics, self.path / "metrics.json")
+        return _read(FitMetrics, self.path / "metrics.json")
 
     def findings(self) -> Findings:
         """Read what the fit says of itself; schema 1 keeps it with the report, without the loss."""
         metrics = self.metrics()
         if metrics.findings is not None:
             return metrics.findings
-        return replace(_record(_EarlyReport, self.report).judged, notes=metrics.warnings)
+        return replace(_read(_EarlyReport, self.report).judged, notes=metrics.warnings)
 
     def arms(self, inputs: Inputs, settings: Settings) -> Arms:
         """Read both arms; the nominal one's frames are fitted to the fit's rows again."""
@@ -158,10 +158,10 @@ class ValidationFolder:
 
     def metrics(self) -> ValidationMetrics:
         """Read numbers and verdict; of schema 1 the warnings are without the fit's."""
-        return _record(ValidationMetrics, self.judged)
+        return _read(ValidationMetrics, self.judged)
 
 
-def _record(kind: type[T], path: Path) -> T:
+def _read(kind: type[T], path: Path) -> T:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         if isinstance(content, Mapping) and content.get("schema", 1) > SCHEMA:
