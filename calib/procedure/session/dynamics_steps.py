@@ -13,6 +13,7 @@ from typing import Any
 
 from calib import files
 from calib.data.recordings.recording_files import read_recording
+from calib.dynamics.torque_rows import torque_rows
 from calib.identification.identify_options import FileSettings, IdentifyOptions, file_settings, read_options
 from calib.identification.settings import Payload
 from calib.procedure.dynamic_stage import identify as identifying
@@ -57,8 +58,8 @@ def options_of(session: Session) -> IdentifyOptions:
     options = read_options(session.path(wanted.options) if wanted.options else None)
     settings = options.settings
     if not wanted.options:
-        kind = wanted.torques
-        settings = replace(settings, kind=kind, friction=wanted.friction, method=wanted.method)
+        rows = torque_rows(wanted.torques)
+        settings = replace(settings, torque_rows=rows, friction=wanted.friction, method=wanted.method)
     known = {label: Payload(float(mass)) for label, mass in wanted.payloads.items()}
     settings = replace(settings, payloads={**known, **settings.payloads}, seed=session.settings.seed)
     own = dict(options.files)
