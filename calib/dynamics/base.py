@@ -263,6 +263,11 @@ def expressions(base: Base, digits: int = 5, smallest: float = 1e-4) -> tuple[st
     return tuple(lines)
 
 
+def standard_name(name: str, standard: Collection[str]) -> str:
+    """Return the standard parameter that a base parameter of a file is named after: ``ZZ1R`` stands at ``ZZ1``."""
+    return name[:-1] if name.endswith("R") and name not in standard and name[:-1] in standard else name
+
+
 def to_standard(base: Base, values: np.ndarray) -> np.ndarray:
     """Return standard parameters (p,) with the same torques: base values at the kept ones, zero at the others."""
     result = np.zeros(len(base.standard))

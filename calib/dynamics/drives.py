@@ -60,6 +60,18 @@ class DriveTerm:
         return SHAPES[self.shape]
 
     @property
+    def joint(self) -> int | None:
+        """The one joint whose own motion it answers; None for a coupling."""
+        if len(self.acts) != 1 or self.acts[0][1] != ((self.acts[0][0], 1.0),):
+            return None
+        return self.acts[0][0]
+
+    @property
+    def nonnegative(self) -> bool:
+        """Whether no robot has a parameter below zero; the inertia of a coupling may be."""
+        return self.form.nonnegative and (self.form.dissipative or self.joint is not None)
+
+    @property
     def unit(self) -> str:
         return self.form.unit_linear if self.linear else self.form.unit
 

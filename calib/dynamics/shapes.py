@@ -42,6 +42,10 @@ class Shape:
         unit: of the parameter for a revolute joint, and `unit_linear` for a prismatic one.
         settings: names of the numbers it needs, with units.
         loaded, remembers: whether it needs `Joined.load`, `Joined.state`.
+        dissipative: friction, which takes energy out of the joint where its parameter is above zero.
+        of_velocity: whether it is a function of v alone (a constant is one).
+        nonnegative: whether its parameter is above zero in every robot: inertia, viscous and Coulomb friction.
+        exact: whether its columns are free of the noise of q, v and a: ones, and signs but for reversals.
     """
 
     values: Values
@@ -51,6 +55,10 @@ class Shape:
     settings: tuple[str, ...] = ()
     loaded: bool = False
     remembers: bool = False
+    dissipative: bool = False
+    of_velocity: bool = False
+    nonnegative: bool = False
+    exact: bool = False
 
 
 def smooth_sign(v: np.ndarray, v0: float) -> np.ndarray:
@@ -104,31 +112,49 @@ def _given(array: np.ndarray | None) -> np.ndarray:
 
 VISCOUS, VISCOUS_LINEAR = "N m s/rad", "N s/m"
 SHAPES: dict[str, Shape] = {
-    "acceleration": Shape(lambda m, s: m.a, lambda m, s: (0.0, 0.0, np.ones_like(m.a)), "kg m²", "kg"),
-    "velocity": Shape(lambda m, s: m.v, lambda m, s: (0.0, np.ones_like(m.v), 0.0), VISCOUS, VISCOUS_LINEAR),
-    "one": Shape(lambda m, s: np.ones_like(m.v), lambda m, s: (0.0, 0.0, 0.0), "N m", "N"),
+    "acceleration": Shape(
+        lambda m, s: m.a, lambda m, s: (0.0, 0.0, np.ones_like(m.a)), "kg m²", "kg", nonnegative=True
+    ),
+    "velocity": Shape(
+        lambda m, s: m.v, lambda m, s: (0.0, np.ones_like(m.v), 0.0), VISCOUS, VISCOUS_LINEAR,
+        dissipative=True, of_velocity=True, nonnegative=True,
+    ),
+    "one": Shape(
+        lambda m, s: np.ones_like(m.v), lambda m, s: (0.0, 0.0, 0.0), "N m", "N", of_velocity=True, exact=True
+    ),
     "position": Shape(lambda m, s: m.x, lambda m, s: (np.ones_like(m.x), 0.0, 0.0), "N m/rad", "N/m"),
     "sign": Shape(
-        lambda m, s: smooth_sign(m.v, s[0]), lambda m, s: (0.0, _sign_slope(m.v, s[0]), 0.0), "N m", "N", ("v0",)
+        lambda m, s: smooth_sign(m.v, s[0]), lambda m, s: (0.0, _sign_slope(m.v, s[0]), 0.0), "N m", "N", ("v0",),
+        dissipative=True, of_velocity=True, nonnegative=True, exact=True,
     ),
     "dead": Shape(
-        lambda m, s: np.sign(m.v) * (np.abs(m.v) > s[0]), lambda m, s: (0.0, 0.0, 0.0), "N m", "N", ("v0",)
+        lambda m, s: np.sign(m.v) * (np.abs(m.v) > s[0]), lambda m, s: (0.0, 0.0, 0.0), "N m", "N", ("v0",),
+        dissipative=True,
     ),
     "speed": Shape(
-        lambda m, s: np.abs(m.v), lambda m, s: (0.0, np.sign(m.v), 0.0), VISCOUS, VISCOUS_LINEAR
+        lambda m, s: np.abs(m.v), lambda m, s: (0.0, np.sign(m.v), 0.0), VISCOUS, VISCOUS_LINEAR,
+        dissipative=True, of_velocity=True,
     ),
-    "cubic": Shape(lambda m, s: m.v**3, lambda m, s: (0.0, 3.0 * m.v**2, 0.0), "N m s³/rad³", "N s³/m³"),
+    "cubic": Shape(
+        lambda m, s: m.v**3, lambda m, s: (0.0, 3.0 * m.v**2, 0.0), "N m s³/rad³", "N s³/m³",
+        dissipative=True, of_velocity=True,
+    ),
     "root": Shape(
         lambda m, s: m.v / np.sqrt(np.abs(m.v) + s[0]),
         lambda m, s: (0.0, (0.5 * np.abs(m.v) + s[0]) / (np.abs(m.v) + s[0]) ** 1.5, 0.0),
-        "N m (s/rad)^½", "N (s/m)^½", ("v0",),
+        "N m (s/rad)^½", "N (s/m)^½", ("v0",), dissipative=True, of_velocity=True,
     ),
-    "stribeck": Shape(_stribeck, _stribeck_slopes, "N m", "N", ("vs", "exponent", "v0")),
+    "stribeck": Shape(
+        _stribeck, _stribeck_slopes, "N m", "N", ("vs", "exponent", "v0"), dissipative=True, of_velocity=True
+    ),
     "load": Shape(
-        lambda m, s: np.abs(_given(m.load)) * smooth_sign(m.v, s[0]), None, "", "", ("v0",), loaded=True
+        lambda m, s: np.abs(_given(m.load)) * smooth_sign(m.v, s[0]), None, "", "", ("v0",),
+        loaded=True, dissipative=True,
     ),
-    "load_velocity": Shape(lambda m, s: np.abs(_given(m.load)) * m.v, None, "s/rad", "s/m", loaded=True),
-    "stop": Shape(lambda m, s: _given(m.state), None, "N m", "N", ("width",), remembers=True),
+    "load_velocity": Shape(
+        lambda m, s: np.abs(_given(m.load)) * m.v, None, "s/rad", "s/m", loaded=True, dissipative=True
+    ),
+    "stop": Shape(lambda m, s: _given(m.state), None, "N m", "N", ("width",), remembers=True, dissipative=True),
     "presliding": Shape(
         lambda m, s: _given(m.state) - smooth_sign(m.v, s[1]), None, "N m", "N", ("width", "v0"), remembers=True
     ),

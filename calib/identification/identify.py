@@ -11,6 +11,7 @@ from calib.data.signals.decimation import Decimator, design_decimator
 from calib.data.signals.persistency import report_excitation
 from calib.dynamics import base as bases
 from calib.dynamics.base import Base
+from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel, with_terms
 from calib.errors import MeasurementError, UsageError
 from calib.estimation import instrumental_variables
@@ -74,6 +75,13 @@ class Identification:
         """Names of the estimate's parameters: base ones, then richer friction."""
         return (*self.base.names, *(one.name for one in self.friction.terms))
 
+    @property
+    def terms(self) -> tuple[DriveTerm | None, ...]:
+        """The drive term behind each of the estimate's parameters; None for those of bodies."""
+        model = self.dynamics.model
+        own = (None if k < model.inertial else model.columns[k - model.inertial] for k in self.base.kept)
+        return (*own, *self.friction.terms)
+
 
 def identify(
     robot: Chain | CalibratedChain,
@@ -128,7 +136,7 @@ def identify(
         for part, case, load in zip(rows, cases, loads)
     ]
     plain = replace(settings, method="wls") if settings.method == "iv" else settings
-    fitted, condition = _estimate(full, climbed, plain, prior, noise)
+    fitted, condition = _estimate(full, model, base, climbed, plain, prior, noise)
     if settings.loop is not None:
         say("simulating the closed loop")
     bias = try_loop(chain, model, base, cases, decimator, settings)
@@ -264,6 +272,8 @@ def _prior(
 
 def _estimate(
     rows: Sequence[ObservationRows],
+    model: IdentificationModel,
+    base: Base,
     climbed: FrictionSelection,
     settings: IdentificationSettings,
     prior: Prior | None,
@@ -287,7 +297,10 @@ def _estimate(
     std = fitted.std * np.sqrt(fitted.inflation)
     drawn: LinearFit = ridge(fitted.pooled, mean, covariance, std)
     if prior is not None:
-        drawn = _bounded(drawn, fitted.pooled, std, mean, covariance)
+        drives = np.array([one.nonnegative for one in model.columns], dtype=bool)
+        every = np.concatenate([np.zeros(model.inertial, dtype=bool), drives])
+        nonnegative = np.concatenate([every[base.kept], [one.nonnegative for one in climbed.terms]]).astype(bool)
+        drawn = _bounded(drawn, fitted.pooled, std, mean, covariance, nonnegative)
     return replace(fitted, fit=drawn), condition
 
 
@@ -296,7 +309,10 @@ def _all_poor(cases: Sequence[Case]) -> bool:
     return all(report_excitation(case.motion).poor for case in cases)
 
 
-def _bounded(drawn: LinearFit, data: Triangles, std: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> LinearFit:
+def _bounded(
+    drawn: LinearFit, data: Triangles, std: np.ndarray, mean: np.ndarray, covariance: np.ndarray,
+    nonnegative: np.ndarray,
+) -> LinearFit:  # fmt: skip
     """Return the fit with drive parameters that are not negative; the covariance is that without the bounds."""
     known = np.isfinite(np.diag(covariance))
     unit = np.sqrt(np.diag(covariance)[known])
@@ -304,7 +320,7 @@ def _bounded(drawn: LinearFit, data: Triangles, std: np.ndarray, mean: np.ndarra
     rows = np.zeros((len(unit), data.parameters + 1))
     rows[:, np.flatnonzero(known)] = np.linalg.solve(lower, np.diag(1.0 / unit))
     rows[:, -1] = rows[:, :-1] @ mean
-    values = bounded(retriangulate(np.vstack([combine(data, std), rows])), data.names)
+    values = bounded(retriangulate(np.vstack([combine(data, std), rows])), nonnegative)
     return replace(drawn, estimate=replace(drawn.estimate, values=values))
 
 
@@ -320,16 +336,10 @@ def _essential(
         std, inflation = np.ones(1), np.array([bias.found.inflation])
     return eliminate(
         data, Rule(settings.essential), ratio=settings.ratio, level=settings.level,
-        keep=_base_names(settings.keep, data.names), drop=_base_names(settings.drop, data.names),
+        keep=[bases.standard_name(name, data.names) for name in settings.keep],
+        drop=[bases.standard_name(name, data.names) for name in settings.drop],
         std=std, inflation=inflation,
     )  # fmt: skip
-
-
-def _base_names(chosen: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
-    """Return names of columns; ``ZZ1R``, as the files call what others are regrouped in, is column ``ZZ1``."""
-    return tuple(
-        name[:-1] if name.endswith("R") and name[:-1] in names and name not in names else name for name in chosen
-    )
 
 
 def _require_motion(cases: Sequence[Case]) -> None:

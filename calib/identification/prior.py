@@ -13,8 +13,6 @@ inertia and friction of the drives from being negative.
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,7 +27,6 @@ from calib.errors import UsageError
 from calib.estimation.triangles import Triangles, retriangulate
 from calib.robot.chain import Chain
 
-POSITIVE = re.compile(r"(Ia|Fv|Fc|Fvm|Fcm|Fvl|Fcl)\d+")
 SCALES = tuple(float(10.0 ** (k / 4)) for k in range(-6, 7))  # f from 0.03 to 30
 MOST = 1.0  # largest f of a CAD prior: what no model explains must not pass for a wrong CAD (our choice)
 SPREAD = 0.3  # of a CAD value: standard deviation at f = 1 (our choice)
@@ -122,7 +119,7 @@ def _shape(
         if k >= len(own):  # drives, payloads
             covariance[row, :] = covariance[:, row] = 0.0
             covariance[row, row] = (DRIVES * size[row]) ** 2
-            if base.standard[k].startswith("Ia"):
+            if k >= bodies and model.columns[k - bodies].shape == "acceleration":
                 covariance[row, row] = min(covariance[row, row], (float(own[9::10].sum()) * ROTOR**2) ** 2)
     return mean, covariance, "cad"
 
@@ -138,15 +135,15 @@ def _evidence(factor: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> f
     return float(-np.log(np.diag(lower)).sum() - 0.5 * white @ white)
 
 
-def bounded(factor: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Return argmin ‖R x - z‖² with motor inertias, viscous and Coulomb friction not negative.
+def bounded(factor: np.ndarray, nonnegative: np.ndarray) -> np.ndarray:
+    """Return argmin ‖R x - z‖² with some parameters (motor inertias, viscous and Coulomb friction) not negative.
 
     Args:
         factor: (p + 1, p + 1) triangle of data and prior, whitened.
-        names: (p,).
+        nonnegative: (p,) bool.
     """
-    p = len(names)
-    lower = np.array([0.0 if POSITIVE.fullmatch(name) else -np.inf for name in names])
+    p = len(nonnegative)
+    lower = np.where(nonnegative, 0.0, -np.inf)
     norms = np.linalg.norm(factor[:p, :p], axis=0)
     found = scipy.optimize.lsq_linear(factor[:p, :p] / norms, factor[:p, p], (lower, np.inf), method="bvls")
     return found.x / norms

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.dynamics.idim import IdentificationModel, with_load
+from calib.dynamics.base import standard_name
+from calib.dynamics.idim import with_load
 from calib.dynamics.rigid_body import inverse_dynamics
 from calib.errors import UsageError
 from calib.identification.model_file import read_covariance
@@ -58,13 +59,8 @@ def read_uncertainty(folder: Path, dynamics: Dynamics, carried: Sequence[str]) -
         return None
     names, covariance = found
     try:
-        columns = np.array([_column(dynamics.model, name) for name in names])
+        standard = dynamics.model.names
+        columns = np.array([standard.index(standard_name(name, standard)) for name in names])
     except ValueError as error:
         raise UsageError(f"{folder}/covariance.csv does not fit dynamics.json beside it: {error}") from error
     return Uncertainty(dynamics, tuple(carried), columns, covariance)
-
-
-def _column(model: IdentificationModel, name: str) -> int:
-    """Return the column of a parameter; regrouped ones (ZZ1R) stand at the one they are named after."""
-    names = model.names
-    return names.index(name if name in names else name.removesuffix("R"))

@@ -31,9 +31,8 @@ def drive_table(dynamics: Dynamics) -> Drives:
     for one, value in zip(model.columns, dynamics.values[model.inertial :]):
         if not one.acts or value == 0.0:
             continue
-        row, motion = one.acts[0]
-        if one.shape in PLAIN and len(one.acts) == 1 and motion == ((row, 1.0),):
-            values[row, PLAIN[one.shape]] += value
+        if one.shape in PLAIN and one.joint is not None:
+            values[one.joint, PLAIN[one.shape]] += value
         else:
             left.append(one.name)
     return Drives(values, tuple(left))

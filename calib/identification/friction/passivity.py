@@ -11,7 +11,6 @@ from calib.identification.cases import Case
 from calib.identification.prediction import Dynamics, transmitted
 from calib.identification.rows import term_columns
 
-FRICTION = ("velocity", "sign", "dead", "speed", "cubic", "root", "stribeck", "load", "load_velocity", "stop")
 LEAST = -0.01  # of the energy that a joint moves: noise and what other columns take over stay above (our choice)
 
 
@@ -25,7 +24,7 @@ def dissipated(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
     terms = [
         (one, value)
         for one, value in zip(model.columns, dynamics.values[first:])
-        if one.shape in FRICTION and value != 0.0
+        if one.form.dissipative and value != 0.0
     ]
     taken, moved = np.zeros(n), np.zeros(n)
     for case in cases:

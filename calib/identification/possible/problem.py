@@ -9,7 +9,7 @@ import numpy as np
 from calib.dynamics import pseudo_inertia
 from calib.identification.possible.information import Information
 from calib.identification.possible.prior_bodies import PriorBodies
-from calib.identification.prior import DRIVES, POSITIVE, ROTOR
+from calib.identification.prior import DRIVES, ROTOR
 
 WEAK = 2.0  # γ of payloads: nothing is known of them but the order of size
 
@@ -56,7 +56,7 @@ def make_problem(told: Information, references: PriorBodies) -> BodyCost:
     norms, target = np.linalg.norm(columns, axis=0)[10 * bodies :], np.linalg.norm(told.factor[:, -1])
     seen = norms > 1e-9 * np.linalg.norm(columns, axis=0).max()
     whole = target / np.where(seen, norms, 1.0)  # would explain all of the torque
-    positive = np.array([bool(POSITIVE.fullmatch(one.name)) for one in model.columns], dtype=bool)
+    positive = np.array([one.nonnegative for one in model.columns], dtype=bool)
     sizes = np.where(positive, 0.1 * whole, DRIVES * whole)
     mass = float(references.parameters[:, 9].sum())
     for k, one in enumerate(model.columns):

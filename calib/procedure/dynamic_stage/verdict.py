@@ -252,7 +252,8 @@ def _slow_bias(cases: Sequence[Case], found: Identification) -> list[str]:
         total += (~moving(case.motion) & used).sum(axis=0)
         size += len(case.motion)
     share = total / max(size, 1)
-    slow = [j for j in np.flatnonzero(share > SLOW_SHARE) if f"Fc{j + 1}" in found.names]
+    coulomb = _coulomb(found)
+    slow = [j for j in np.flatnonzero(share > SLOW_SHARE) if j in coulomb]
     if not slow:
         return _coulomb_shift(cases, found)
     shown = ", ".join(f"{100 * share[j]:.0f} % at joint {j + 1}" for j in slow)
@@ -261,20 +262,27 @@ def _slow_bias(cases: Sequence[Case], found: Identification) -> list[str]:
     ]
 
 
+def _coulomb(found: Identification) -> dict[int, int]:
+    """Return by joint where the estimate holds its Coulomb friction, of models of the motors' torques."""
+    if not found.settings.torque_rows.motors_alone:
+        return {}
+    return {one.joint: k for k, one in enumerate(found.terms) if one and one.shape == "sign" and one.joint is not None}
+
+
 def _coulomb_shift(cases: Sequence[Case], found: Identification) -> list[str]:
     """Notice that the few rows near standstill move Coulomb friction by more than its sigma.
 
     Where a joint's friction is richer, they are modelled, not cut.
     """
-    if not found.settings.torque_rows.motors_alone:
+    coulomb = _coulomb(found)
+    if not coulomb:
         return []
     richer = {joint for one in found.friction.terms for joint, _ in one.acts}
-    index = {j: found.names.index(f"Fc{j + 1}") for j in range(cases[0].motion.n) if f"Fc{j + 1}" in found.names}
     estimate = found.fitted.estimate
     shift, sigma, percent = standstill_shift(found, cases), estimate.sigma, 0.01 * np.abs(estimate.values)
     moved = [
-        f"Fc{j + 1} {shift[k] / percent[k]:+.1f} % (sigma {sigma[k] / percent[k]:.1f} %)"
-        for j, k in index.items()
+        f"{found.names[k]} {shift[k] / percent[k]:+.1f} % (sigma {sigma[k] / percent[k]:.1f} %)"
+        for j, k in coulomb.items()
         if j not in richer and abs(shift[k]) > sigma[k] and percent[k] > 0.0
     ]
     if not moved:

@@ -52,10 +52,10 @@ def read_dynamics(chain: Chain, folder: Path | None, sets: str, limits: MotionLi
     terms = drives.standard([sets] * chain.n, V0, linear)
     values, notes = None, []
     if chain.inertias is not None:
-        known = {"Fv": 0, "Fc": 1}
+        known = {"velocity": 0, "sign": 1}
         own = [
-            0.0 if limits.friction is None or one.name[:2] not in known
-            else limits.friction[known[one.name[:2]], one.acts[0][0]]
+            0.0 if limits.friction is None or one.shape not in known
+            else limits.friction[known[one.shape], one.acts[0][0]]
             for one in terms
         ]  # fmt: skip
         values = np.concatenate([standard_parameters(chain), own])

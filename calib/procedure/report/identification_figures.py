@@ -14,8 +14,6 @@ from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.report import dynamics_figures, uncertainty_figures
 from calib.procedure.report.style import save
 
-OF_VELOCITY = {"velocity", "sign", "one", "speed", "cubic", "root", "stribeck"}  # shapes that a curve over v shows
-
 
 def write(outcome: IdentificationOutcome, folder: Path) -> None:
     """Write ``plot_torque_<n>.png`` of every file, ``plot_residuals.png``, ``plot_friction.png`` and more."""
@@ -57,7 +55,7 @@ def friction(outcome: IdentificationOutcome) -> Figure:
     curves, units = [], _units(outcome)[rows - n :]
     observed = observed.copy()
     for j in range(n):
-        own = [one for one in terms if one[0].shape in OF_VELOCITY and one[0].acts == ((j, ((j, 1.0),)),)]
+        own = [one for one in terms if one[0].form.of_velocity and one[0].joint == j]
         grid = np.linspace(v[:, j].min(), v[:, j].max(), 400)
         curve = np.zeros(len(grid))
         for one, value in own:

@@ -113,7 +113,9 @@ def _parameters(session: Session, model: IdentificationModel, cell: Cell, arm: M
     with session.path("8-dynamics/estimate.csv").open(newline="", encoding="utf-8") as file:
         names = csv.DictReader(file)
         rows = [
-            (row["name"].removesuffix("R"), float(row["value"]), float(row["sigma"])) for row in names if row["sigma"]
+            (bases.standard_name(row["name"], model.names), float(row["value"]), float(row["sigma"]))
+            for row in names
+            if row["sigma"]
         ]
     true = true_base(model, cell, arm, session.settings.seed)
     inside = [abs(value - true[name]) < 2 * sigma for name, value, sigma in rows if name in true]
@@ -132,5 +134,5 @@ def true_base(model: IdentificationModel, cell: Cell, arm: MovingArm, seed: int)
     lower, upper = sampling_limits(arm.chain)
     samples = bases.random_samples(bare[0], seed=seed, lower=lower, upper=upper)
     base = bases.regroup(bases.find(bare[0], samples), bare[1], samples)
-    plain = (name.removesuffix("R") for name in base.names)  # what is regrouped on one geometry need not be on another
+    plain = (base.standard[k] for k in base.kept)  # what is regrouped on one geometry need not be on another
     return dict(zip(plain, base.transform @ np.array([known[name] for name in bare[1].names])))

@@ -41,7 +41,7 @@ def plant(name: str, coupled: bool = False, offset: np.ndarray | None = None) ->
         link = known["coupling"]
         first, second = (joint - 1 for joint in link["joints"])
         gear = drives.coupled(first, second, known["drives"]["v0"])
-        place = [one.name for one in terms].index(f"Ia{second + 1}")
+        place = next(k for k, one in enumerate(terms) if one.shape == "acceleration" and one.joint == second)
         # one motor inertia: Iam6 is Ia6, which acts on row 5 by a6 and on row 6 by a5 + a6
         both = ((first, ((second, 1.0),)), (second, ((first, 1.0), (second, 1.0))))
         terms[place] = replace(terms[place], acts=both)
