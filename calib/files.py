@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from calib.errors import CalibError
+from calib.errors import CalibError, UsageError
 
 
 def write(path: str | Path, content: str | bytes) -> Path:
@@ -41,6 +41,27 @@ def write(path: str | Path, content: str | bytes) -> Path:
         reason = error.strerror or str(error)
         raise CalibError(f"cannot write {path}: {reason}; nothing was changed there") from error
     return path
+
+
+def check_not_input(targets: Iterable[Path], inputs: Iterable[str | Path | None]) -> None:
+    """Refuse, before any work is done, to write onto a file or folder that is read.
+
+    Args:
+        targets: to be written.
+        inputs: to be read; names that are no path on the disk (robots of the library), and None, are passed over.
+
+    Raises:
+        UsageError: with the file that is both.
+    """
+    known = [path for path in (Path(one) for one in inputs if one is not None) if path.exists()]
+    for target in targets:
+        if any(same_file(target, path) for path in known):
+            raise UsageError(f"{target} is read, and would be written over; choose another --out")
+
+
+def same_file(one: Path, other: Path) -> bool:
+    """Say whether two paths lead to one place, on file systems that do not tell cases apart, too."""
+    return one.resolve() == other.resolve() or (one.exists() and other.exists() and one.samefile(other))
 
 
 def write_json(path: str | Path, value: Any) -> Path:

@@ -9,7 +9,8 @@ from pathlib import Path
 from calib.data.poses.plans import write_poses
 from calib.procedure.dynamic_stage import folder as identification_outputs
 from calib.procedure.dynamic_stage import identify
-from calib.procedure.excitation import plan_folder, planning
+from calib.procedure.excitation import folder as motion_folder
+from calib.procedure.excitation import planning
 from calib.procedure.report import motion_figures
 from calib.robot.load import load
 from calib.simulation.cells import measured_files
@@ -33,5 +34,5 @@ write_poses(folder / "waypoints.csv", corners, chain.joint_names)
 for words, model in (("the maker's model", None), ("the identified model", folder / "model")):
     planned = planning.plan("tx40", folder / "waypoints.csv", model=model)
     print(f"on {words}: {planned.track.duration:.3f} s")
-plan_folder.write_folder(planned, folder / "motion", motion_figures.write_plan)
+motion_folder.write_plan(planned, folder / "motion", motion_figures.write_plan)
 print(f"motion.csv and trajectory.yaml are in {folder / 'motion'}")

@@ -7,9 +7,11 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.shared import Base, Robot, Seed, Tip, make_console, numbers, progress
+from calib.cli.shared import Base, Robot, Seed, Tip, numbers, progress, say_written
+from calib.procedure.excitation.settings import DEFAULT_DESIGN, DEFAULT_PLAN, ExcitationSettings, PlanSettings
 
 app = typer.Typer()
+DESIGN, PLAN = DEFAULT_DESIGN, DEFAULT_PLAN
 
 
 @app.command()
@@ -22,17 +24,23 @@ def excite(
         list[str] | None, typer.Option(help="raw=35, normalised=6, wrist=0.1, joint6=0.1, coverage=0.1; repeatable")
     ] = None,
     hard: Annotated[list[str] | None, typer.Option(help="a goal that must be met; repeatable")] = None,
-    period: Annotated[float, typer.Option(help="of the motion [s]")] = 20.0,
-    harmonics: Annotated[int, typer.Option(help="frequencies per joint; control points for splines")] = 5,
-    family: Annotated[str, typer.Option(help="fourier or bspline")] = "fourier",
-    drives: Annotated[str, typer.Option(help="terms of each drive to identify, without --model")] = "Fv Fc off",
-    rate: Annotated[float, typer.Option(help="of the controller [Hz]")] = 1000.0,
-    starts: Annotated[int, typer.Option(help="random starts of the search")] = 6,
-    evaluations: Annotated[int, typer.Option(help="most evaluations per start")] = 600,
-    front: Annotated[int, typer.Option(help="motions on the front of condition number and torque; 0 for none")] = 0,
+    period: Annotated[float, typer.Option(help="of the motion [s]")] = DESIGN.period,
+    harmonics: Annotated[
+        int, typer.Option(help="frequencies per joint; control points for splines")
+    ] = DESIGN.harmonics,
+    family: Annotated[str, typer.Option(help="fourier or bspline")] = DESIGN.family,
+    drives: Annotated[str, typer.Option(help="terms of each drive to identify, without --model")] = DESIGN.drives,
+    rate: Annotated[float, typer.Option(help="of the controller [Hz]")] = DESIGN.rate,
+    starts: Annotated[int, typer.Option(help="random starts of the search")] = DESIGN.starts,
+    evaluations: Annotated[int, typer.Option(help="most evaluations per start")] = DESIGN.evaluations,
+    front: Annotated[
+        int, typer.Option(help="motions on the front of condition number and torque; 0 for none")
+    ] = DESIGN.front,
     start: Annotated[str | None, typer.Option(help="joint values with commas: an approach from there")] = None,
-    repeat: Annotated[int, typer.Option(help="periods to run one after the other")] = 1,
-    slower: Annotated[float, typer.Option(help="factor of a slow rehearsal, written beside the motion")] = 1.0,
+    repeat: Annotated[int, typer.Option(help="periods to run one after the other")] = DESIGN.repeat,
+    slower: Annotated[
+        float, typer.Option(help="factor of a slow rehearsal, written beside the motion")
+    ] = DESIGN.slower,
     existing: Annotated[
         list[str] | None, typer.Option(help="a recording, or an earlier --out, that counts already; repeatable")
     ] = None,
@@ -42,31 +50,27 @@ def excite(
     workers: Annotated[str, typer.Option(help="local processes, or the address of a Dask scheduler")] = "1",
     base: Base = None,
     tip: Tip = None,
-    seed: Seed = 0,
+    seed: Seed = DESIGN.seed,
 ) -> None:
     """Design a motion that excites the dynamics of ROBOT within its limits."""
     from calib import workers as work
-    from calib.procedure.excitation import design, design_folder
+    from calib.procedure.excitation import design, folder
     from calib.procedure.report import motion_figures
 
-    design_folder.check_target(out)
-    stands = None if start is None else numbers(start, start.count(",") + 1, "--start")
+    settings = ExcitationSettings(
+        goals=tuple(goal or ()), hard=tuple(hard or ()), period=period, harmonics=harmonics, family=family,
+        drives=drives, rate=rate, starts=starts, evaluations=evaluations, seed=seed, front=front,
+        start=_stands(start), repeat=repeat, slower=slower, existing=tuple(existing or ()), lock=tuple(lock or ()),
+    )  # fmt: skip
+    folder.check_design_target(out, [robot, model, limits, *settings.existing])
     lost = []
     with work.workers(workers) as crew, progress() as say:
         designed = design.excite(
-            robot, model=model, limits=limits, goals=goal or [], hard=hard or [], period=period, harmonics=harmonics,
-            family=family, drives_=drives, rate=rate, starts=starts, evaluations=evaluations, front=front, start=stands,
-            repeat=repeat, slower=slower, existing=existing or [], lock=lock or [], base=base, tip=tip, seed=seed,
-            map=crew.map_without(lost), progress=say,
-        )  # fmt: skip
+            robot, settings, model=model, limits=limits, base=base, tip=tip, map=crew.map_without(lost), progress=say
+        )
         say("writing")
-        design_folder.write_folder(designed, out, motion_figures.write_design)
-    console = make_console()
-    for line in design_folder.lines(designed):
-        console.print(line, soft_wrap=True, markup=False)
-    for note in lost:
-        console.print(f"note: {note}", soft_wrap=True, markup=False)
-    console.print(f"written to {out}", soft_wrap=True, markup=False)
+        folder.write_design(designed, out, motion_figures.write_design)
+    say_written([*folder.design_lines(designed), *(f"note: {note}" for note in lost)], out)
 
 
 @app.command()
@@ -79,13 +83,10 @@ def recall(
     """Find a designed motion in a log, and average its periods to a recording for calib identify."""
     from calib.procedure.excitation import recall as excitation_recall
 
-    excitation_recall.check_target(out)
+    excitation_recall.check_target(out, folder, log)
     found = excitation_recall.find(folder, log, skip)
     excitation_recall.write(found, out)
-    console = make_console()
-    for line in excitation_recall.lines(found):
-        console.print(line, soft_wrap=True, markup=False)
-    console.print(f"written to {out}", soft_wrap=True, markup=False)
+    say_written(excitation_recall.lines(found), out)
 
 
 @app.command()
@@ -99,30 +100,32 @@ def plan(
     drives: Annotated[Path | None, typer.Option(help="TOML: [drives] Ia, Fv, Fc, off, without --model")] = None,
     line: Annotated[
         bool, typer.Option("--line", help="the tool runs straight between waypoints, resting there")
-    ] = False,
-    rate: Annotated[float, typer.Option(help="of the controller [Hz]")] = 1000.0,
-    shorten: Annotated[int, typer.Option(help="timings to spend on a faster shape between waypoints")] = 0,
-    stray: Annotated[float, typer.Option(help="how far that may leave the spline, per joint [rad or m]")] = 0.0,
+    ] = PLAN.lines,
+    rate: Annotated[float, typer.Option(help="of the controller [Hz]")] = PLAN.rate,
+    shorten: Annotated[int, typer.Option(help="timings to spend on a faster shape between waypoints")] = PLAN.shorten,
+    stray: Annotated[float, typer.Option(help="how far that may leave the spline, per joint [rad or m]")] = PLAN.stray,
     start: Annotated[str | None, typer.Option(help="joint values with commas: an approach from there")] = None,
-    slower: Annotated[float, typer.Option(help="factor of a slow rehearsal, written beside the motion")] = 1.0,
+    slower: Annotated[float, typer.Option(help="factor of a slow rehearsal, written beside the motion")] = PLAN.slower,
     base: Base = None,
     tip: Tip = None,
 ) -> None:
     """Plan the fastest motion of ROBOT through waypoints, within its speeds and torques."""
-    from calib.procedure.excitation import plan_folder, planning
+    from calib.procedure.excitation import folder, planning
     from calib.procedure.report import motion_figures
 
-    plan_folder.check_target(out)
-    stands = None if start is None else numbers(start, start.count(",") + 1, "--start")
+    settings = PlanSettings(
+        payloads=tuple(payload or ()), lines=line, rate=rate, shorten=shorten, stray=stray, start=_stands(start),
+        slower=slower,
+    )  # fmt: skip
+    folder.check_plan_target(out, [robot, waypoints, model, limits, drives])
     with progress() as say:
         planned = planning.plan(
-            robot, waypoints, model=model, payloads=payload or [], limits=limits, drives_file=drives, lines=line,
-            rate=rate, evaluations=shorten, stray=stray, start=stands, slower=slower, base=base, tip=tip,
-            progress=say,
-        )  # fmt: skip
+            robot, waypoints, settings, model=model, limits=limits, drives=drives, base=base, tip=tip, progress=say
+        )
         say("writing")
-        plan_folder.write_folder(planned, out, motion_figures.write_plan)
-    console = make_console()
-    for words in plan_folder.lines(planned):
-        console.print(words, soft_wrap=True, markup=False)
-    console.print(f"written to {out}", soft_wrap=True, markup=False)
+        folder.write_plan(planned, out, motion_figures.write_plan)
+    say_written(folder.plan_lines(planned), out)
+
+
+def _stands(start: str | None) -> tuple[float, ...] | None:
+    return None if start is None else tuple(numbers(start, start.count(",") + 1, "--start"))

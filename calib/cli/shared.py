@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -25,6 +26,13 @@ def make_console(**options: Any) -> Any:
     if not stream.isatty() and "COLUMNS" not in os.environ:
         options.setdefault("width", PIPED)  # rich takes 80, and cuts the files' names
     return Console(highlight=False, **options)
+
+
+def say_written(lines: Iterable[str], out: Path) -> None:
+    """Print lines as they are, and where the results lie."""
+    console = make_console()
+    for words in (*lines, f"written to {out}"):
+        console.print(words, soft_wrap=True, markup=False)
 
 
 @contextmanager

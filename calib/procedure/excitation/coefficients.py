@@ -1,4 +1,4 @@
-"""``trajectory.toml``, the coefficients of an exciting motion, read back.
+"""``trajectory.toml``, the coefficients of an exciting motion.
 
 ::
 
@@ -21,6 +21,7 @@ from __future__ import annotations
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -34,7 +35,7 @@ NAME = "trajectory.toml"
 
 @dataclass(frozen=True, eq=False)
 class Periodic:
-    """A motion read back.
+    """A periodic motion by its coefficients: eq. 23 of Kolyubin et al. 2019, or control points.
 
     Attributes:
         joint_names: n names.
@@ -59,6 +60,22 @@ class Periodic:
         x = family.variables(self.coefficients)
         q, v, a = (family.evaluate(x, times, order) for order in range(3))
         return q, v, a
+
+
+def table(motion: Periodic, robot: str) -> dict[str, Any]:
+    """Return the content of ``trajectory.toml`` of a robot's motion."""
+    fourier = motion.kind == "fourier"
+    head: dict[str, Any] = {
+        "robot": robot, "family": motion.kind, "period": motion.period, "rate": motion.rate, "repeat": motion.repeat,
+        "note": "q(t) = q0 + sum_k a_k sin(k w t) + b_k cos(k w t), w = 2 pi / period; rad, m, s" if fourier
+        else "periodic spline, uniform knots over the period; rad, m, s",
+    }  # fmt: skip
+    joints = []
+    for name, c in zip(motion.joint_names, motion.coefficients):
+        half = len(c) // 2
+        own = {"q0": c[0], "a": c[1 : 1 + half], "b": c[1 + half :]} if fourier else {"points": c}
+        joints.append({"name": name, **own})
+    return head | ({} if fourier else {"degree": motion.degree}) | {"joint": joints}
 
 
 def read(folder: Path) -> Periodic:

@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from calib.data.poses.fit_options import FitOptions
 from calib.errors import UsageError
-from calib.procedure.excitation.goals import SCALINGS, objective_of, read_goals, scaled, with_conditions
-from calib.procedure.excitation.limits import MotionLimits, read_motion_limits
-from calib.procedure.excitation.locked_joints import IdentifiableColumns, read_held, told
-from calib.procedure.excitation.model import ExcitedModel, read_dynamics
+from calib.procedure.excitation.goals import SCALINGS, NamedGoal, read_goals, torque_slack, wrist
+from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel, read_inputs
+from calib.procedure.excitation.limits import MotionLimits
 from calib.procedure.excitation.playback import Playback, check_playback, play
-from calib.procedure.excitation.prior_motions import Existing, read_existing
-from calib.procedure.kinematic_stage.inputs import load_robot
-from calib.robot.chain import Chain
-from trajectories.basis import Family, aligned_period
+from calib.procedure.excitation.settings import DEFAULT_DESIGN, ExcitationSettings
+from trajectories.basis import Family
 from trajectories.bspline import bspline_family
 from trajectories.constraints import MotionConstraint, TorqueLimit
 from trajectories.design.objectives import Excitation, TorqueSlack, condition_numbers
@@ -35,6 +30,7 @@ from trajectories.fourier import fourier_family
 GUARD = 0.2  # share of the torque limits kept free where no friction is known (our choice)
 INSTANTS = 1000  # over the period, at which condition numbers are reported
 Progress = Callable[[str], None]
+Search = Callable[..., SearchResult]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,23 +38,18 @@ class Designed:
     """An exciting motion with its proof.
 
     Attributes:
-        chain, dynamics, limits, family: what it was made for.
-        problem: that was solved last.
+        inputs, settings: what it was designed for.
+        problem: that was solved last, with the family of motions.
         found: the motion; `proof`: its margins, checked independently.
         condition: raw and normalised, of `INSTANTS` samples over the period with the model's own Coulomb sign.
         goals: name, goal, weight and what was reached.
         front: trade-offs, where asked for.
         playback: what a controller is to run.
-        held: joints that stay, and their values; `told`: the columns that can be told.
-        existing: what motions before tell; None without any.
-        rate: of the controller [Hz].
         notes: what a user should know.
     """
 
-    chain: Chain
-    dynamics: ExcitedModel
-    limits: MotionLimits
-    family: Family
+    inputs: ExcitationInputs
+    settings: ExcitationSettings
     problem: ExcitationProblem
     found: SearchResult
     proof: Verification
@@ -66,42 +57,32 @@ class Designed:
     goals: tuple[tuple[str, float, float, float], ...]
     front: Front | None
     playback: Playback
-    held: Mapping[int, float]
-    told: IdentifiableColumns
-    existing: Existing | None
-    rate: float
-    kind: str
     notes: tuple[str, ...]
 
     @property
+    def family(self) -> Family:
+        return self.problem.family
+
+    @property
     def period(self) -> float:
+        """Of the motion found [s]."""
         return self.family.period * self.found.factor
+
+    @property
+    def locked(self) -> dict[str, float]:
+        """Where the joints rest that were locked, by name [rad or m]."""
+        last = self.playback.run.q[-1]
+        return {self.inputs.chain.joint_names[j]: float(last[j]) for j in self.inputs.locked}
 
 
 def excite(
     robot: str | Path,
+    settings: ExcitationSettings = DEFAULT_DESIGN,
     *,
     model: Path | None = None,
     limits: Path | None = None,
-    goals: Sequence[str] = (),
-    hard: Sequence[str] = (),
-    period: float = 20.0,
-    harmonics: int = 5,
-    family: str = "fourier",
-    drives_: str = "Fv Fc off",
-    rate: float = 1000.0,
-    samples: int = 200,
-    starts: int = 6,
-    evaluations: int = 600,
-    front: int = 0,
-    start: Sequence[float] | None = None,
-    repeat: int = 1,
-    slower: float = 1.0,
-    existing: Sequence[str] = (),
-    lock: Sequence[str] = (),
     base: str | None = None,
     tip: str | None = None,
-    seed: int = 0,
     map: Callable = map,
     progress: Progress | None = None,
 ) -> Designed:
@@ -112,79 +93,74 @@ def excite(
     they are given themselves.
 
     Args:
-        robot: see `calib.robot.load`.
+        robot, base, tip: see `calib.robot.load`.
+        settings: see `calib.procedure.excitation.settings`.
         model: folder of an identification: torques, friction and their uncertainty.
         limits: see `calib.procedure.excitation.limits`.
-        goals, hard: ``raw=35``, ``normalised=6`` (condition numbers), ``wrist=0.1`` or ``joint6=0.1`` (mean torque as a
-            share of the limit, at least), ``coverage=0.1`` (share of time at low and at high speed, either way).
-        period: T0 [s], of the first motion.
-        harmonics: n_f, or control points beside the rest conditions for splines.
-        family: "fourier" or "bspline".
-        drives_: terms of each joint's drive, without a model.
-        rate: the controller's [Hz].
-        samples, starts, evaluations, seed, map: of the search.
-        front: motions on the front between the normalised condition number and the first torque goal.
-        start: (n,) where the robot stands, for an approach; repeat: periods; slower: factor of a rehearsal.
-        existing: recordings, or folders of earlier excitations, that count already; the new motion counts `repeat`
-            times.
-        lock: joints that stay, ``joint4`` or ``joint4=0.5``.
+        map: where the starts of the search run (`calib.workers`).
+        progress: called with words.
 
     Ctrl-C ends the search; the best motion found so far is verified and returned.
     """
     say = progress or (lambda words: None)
-    chain, source = load_robot(robot, None, FitOptions(), base, tip)
-    found_limits = read_motion_limits(limits, chain, source)
-    dynamics = read_dynamics(chain, model, drives_, found_limits)
-    check_playback(repeat, slower, start, chain, found_limits)
-    held = read_held(lock, chain, found_limits.positions)
-    motions = _family(family, harmonics, period, held, chain, found_limits, rate)
-    search, check, notes = _constraints(dynamics, found_limits)
-    before = read_existing(existing, dynamics, chain)
-    columns = told(dynamics, chain, held, None if before is None else before.information)
-    known = None if before is None else before.per_sample(samples, repeat * period)
-    condition = Excitation("cond", sigmas=columns.sigmas, existing=known, columns=columns.columns)
-    problem = ExcitationProblem(
-        motions, dynamics.smooth.regressor, dynamics.smooth.regressor_gradient,
-        tuple((scaled(condition, scaling), 0.5) for scaling in SCALINGS), search, samples=samples,
-    )  # fmt: skip
-    wanted = read_goals([*goals, *hard], dynamics, chain, found_limits, len(goals), condition)
-    run = partial(design, evaluations=evaluations, seed=seed, map=map, report=_reporter(say))
-    found, problem = _searched(problem, wanted, starts, run, say, condition)
+    given = read_inputs(robot, settings, model, limits, base, tip)
+    check_playback(settings, given)
+    problem, checked, notes = excitation_problem(given, settings)
+    condition = condition_objective(given, settings)
+    wanted = read_goals(settings, given, condition)
+    report = lambda done, total, what: say(f"{what} ({done} of {total})")  # noqa: E731
+    search = partial(design, evaluations=settings.evaluations, seed=settings.seed, map=map, report=report)
+    found, problem = _searched(problem, wanted, settings.starts, search, say)
     say("verifying")
-    found, proof = ensured(problem, found, check)
-    trade = None
-    if front and not found.interrupted:
+    found, proof = ensured(problem, found, checked)
+    front = None
+    if settings.front and not found.interrupted:
         with suppress(KeyboardInterrupt):  # the motion is there: what comes besides may be cut short
-            trade = _front(problem, dynamics, chain, found_limits, found, wanted, front, condition, _reporter(say))
-    reached = condition_of(dynamics, motions, found, columns, before, repeat)
-    played = play(motions, found, dynamics, chain, found_limits, rate=rate, start=start, repeat=repeat, slower=slower)
+            front = _front(problem, given, found, wanted, settings.front, report)
+    played = play(problem.family, found, given, settings)
     cut = ("interrupted before any motion met the goals",) if wanted and not problem.goals else ()
-    stays = {j: float(played.run.q[-1, j]) for j in held}
     return Designed(
-        chain, dynamics, found_limits, motions, problem, found, proof, reached, _reached(problem, found), trade,
-        played, stays, columns, before, rate, family,
-        (*found_limits.notes, *dynamics.notes, *notes, *columns.notes, *cut, *played.notes),
+        given, settings, problem, found, proof, condition_of(given, problem.family, found, settings.repeat),
+        _reached(problem, found), front, played,
+        (*given.limits.notes, *given.model.notes, *notes, *given.columns.notes, *cut, *played.notes),
     )  # fmt: skip
+
+
+def excitation_problem(
+    given: ExcitationInputs, settings: ExcitationSettings
+) -> tuple[ExcitationProblem, tuple[MotionConstraint, ...], tuple[str, ...]]:
+    """Return the problem of both condition numbers within the limits, the constraints to verify, and notes."""
+    search, checked, notes = _constraints(given.model, given.limits)
+    condition, smooth = condition_objective(given, settings), given.model.smooth
+    objectives = tuple((replace(condition, scaling=scaling), 0.5) for scaling in SCALINGS)
+    problem = ExcitationProblem(
+        _family(given, settings), smooth.regressor, smooth.regressor_gradient, objectives, search,
+        samples=settings.samples,
+    )  # fmt: skip
+    return problem, checked, notes
+
+
+def condition_objective(given: ExcitationInputs, settings: ExcitationSettings) -> Excitation:
+    """Return the condition number of the columns that can be told, motions before included."""
+    known = None if given.prior is None else given.prior.per_sample(settings.samples, settings.repeat * settings.period)
+    return Excitation("cond", sigmas=given.columns.sigmas, existing=known, columns=given.columns.columns)
 
 
 def _searched(
-    problem: ExcitationProblem,
-    wanted: list[tuple[str, AttainmentGoal]],
-    starts: int,
-    search: Callable[..., SearchResult],
-    say: Progress,
-    condition: Excitation,
+    problem: ExcitationProblem, wanted: list[NamedGoal], starts: int, search: Search, say: Progress
 ) -> tuple[SearchResult, ExcitationProblem]:
     """Search without goals, or for the goals: with a first run that proposes some for the condition numbers."""
     if not wanted:
         return search(problem, starts=starts), problem
-    if set(SCALINGS) & {name for name, _ in wanted}:
-        problem = replace(problem, goals=tuple(goal for _, goal in wanted))
+    goals = tuple(one.goal for one in wanted)
+    if set(SCALINGS) & {one.name for one in wanted}:
+        problem = replace(problem, goals=goals)
         return search(problem, starts=starts), problem
     first = search(problem, starts=starts)
     if first.interrupted:
         return first, problem
-    plain, problem = problem, replace(problem, goals=with_conditions(wanted, first, condition))
+    proposed = [AttainmentGoal(one, float(value)) for (one, _), value in zip(problem.objectives, first.values)]
+    plain, problem = problem, replace(problem, goals=(*goals, *proposed))
     say("goal attainment")
     try:
         found = search(problem, starts=max(1, starts // 3), guesses=(first.x,))
@@ -194,89 +170,33 @@ def _searched(
     return replace(found, evaluations=spent, seconds=seconds), problem
 
 
-def _reporter(say: Progress) -> Callable[[int, int, str], None]:
-    return lambda done, total, what: say(f"{what} ({done} of {total})")
-
-
-def condition_of(
-    dynamics: ExcitedModel,
-    family: Family,
-    found: SearchResult,
-    told: IdentifiableColumns,
-    existing: Existing | None = None,
-    repeat: int = 1,
-) -> dict[str, float]:
+def condition_of(given: ExcitationInputs, family: Family, found: SearchResult, repeat: int = 1) -> dict[str, float]:
     """Return the condition numbers of `INSTANTS` samples over the period, with the model's own Coulomb sign.
 
     With motions before they are those of all motions together; ``alone`` and ``before`` say what each has by itself.
     """
     times = family.period * found.factor / INSTANTS * np.arange(INSTANTS)
-    motion = dense_motion(family, found.x, times, found.factor)
-    Y = dynamics.exact.regressor(motion.q, motion.v, motion.a)
-    alone = condition_numbers(Y, told.sigmas, columns=told.columns)
-    if existing is None:
+    motion, columns = dense_motion(family, found.x, times, found.factor), given.columns
+    Y = given.model.exact.regressor(motion.q, motion.v, motion.a)
+    alone = condition_numbers(Y, columns.sigmas, columns=columns.columns)
+    if given.prior is None:
         return alone
-    known = existing.per_sample(INSTANTS, repeat * family.period * found.factor)
-    both = condition_numbers(Y, told.sigmas, known, told.columns)
-    before = condition_numbers(0.0 * Y, None, known, told.columns)
+    known = given.prior.per_sample(INSTANTS, repeat * family.period * found.factor)
+    both = condition_numbers(Y, columns.sigmas, known, columns.columns)
+    before = condition_numbers(0.0 * Y, None, known, columns.columns)
     return both | {f"{key}_alone": alone[key] for key in alone} | {f"{key}_before": before[key] for key in before}
 
 
-def metrics(designed: Designed) -> dict[str, Any]:
-    """Return the content of ``metrics.json``."""
-    found = designed.found
-    return {
-        "condition_number": designed.condition,
-        "objective": found.merit,
-        "feasible": designed.proof.feasible,
-        "margins": {
-            name: {
-                "margin": one.margin, "unit": one.unit, "at": one.label, "time": one.time, "share": one.share,
-                "allowance": one.allowance, "proved": one.proved,
-            }
-            for name, one in designed.proof.worst.items()
-        },
-        "seconds": found.seconds,
-        "evaluations": found.evaluations,
-        "feasible_evaluations": found.feasible,
-        "history": list(found.history),
-        "goals": {name: {"goal": goal, "weight": w, "reached": value} for name, goal, w, value in designed.goals},
-        "setting": {
-            "robot": designed.chain.name, "family": designed.kind, "period": designed.period,
-            "harmonics": list(getattr(designed.family, "harmonics", getattr(designed.family, "counts", ()))),
-            "columns": list(designed.told.names), "samples": designed.problem.samples,
-            "samples_reported": INSTANTS, "instants_verified": designed.proof.instants, "rate": designed.rate,
-            "interrupted": found.interrupted,
-            "held": {designed.chain.joint_names[j]: value for j, value in designed.held.items()},
-        },
-        "existing": None if designed.existing is None
-        else {"names": list(designed.existing.names), "seconds": designed.existing.seconds},
-        "playback": {
-            "repeat": designed.playback.repeat, "seconds": designed.playback.run.duration,
-            "approach": None if designed.playback.approach is None else designed.playback.approach.duration,
-            "rehearsal": None if designed.playback.rehearsal is None else designed.playback.rehearsal.duration,
-        },
-        "notes": list(designed.notes),
-    }  # fmt: skip
-
-
-def _family(
-    kind: str,
-    harmonics: int,
-    period: float,
-    held: Mapping[int, float | None],
-    chain: Chain,
-    limits: MotionLimits,
-    rate: float,
-) -> Family:
-    values = {j: value for j, value in held.items() if value is not None}
-    if kind == "fourier":
-        counts = [0 if j in held else harmonics for j in range(chain.n)]
-        return fourier_family(counts, period, held=values, resonance=limits.resonance, rate=rate)
-    if kind == "bspline":
-        counts = [1 if j in held else harmonics for j in range(chain.n)]
-        return bspline_family(counts, period, held=values, rate=rate)
-    raise UsageError(f"family '{kind}' is none of fourier, bspline")
+def _family(given: ExcitationInputs, settings: ExcitationSettings) -> Family:
+    fixed = {j: value for j, value in given.locked.items() if value is not None}
+    counts = [settings.harmonics] * given.chain.n
+    if settings.family == "fourier":
+        counts = [0 if j in given.locked else count for j, count in enumerate(counts)]
+        return fourier_family(counts, settings.period, held=fixed, resonance=given.limits.resonance, rate=settings.rate)
+    if settings.family == "bspline":
+        counts = [1 if j in given.locked else count for j, count in enumerate(counts)]
+        return bspline_family(counts, settings.period, held=fixed, rate=settings.rate)
+    raise UsageError(f"family '{settings.family}' is none of fourier, bspline")
 
 
 def _constraints(
@@ -307,28 +227,20 @@ def _reached(problem: ExcitationProblem, found: SearchResult) -> tuple[tuple[str
 
 def _front(
     problem: ExcitationProblem,
-    dynamics: ExcitedModel,
-    chain: Chain,
-    limits: MotionLimits,
+    given: ExcitationInputs,
     found: SearchResult,
-    wanted: list[tuple[str, AttainmentGoal]],
+    wanted: list[NamedGoal],
     count: int,
-    condition: Excitation,
     report: Callable[[int, int, str], None],
 ) -> Front:
     """Sweep the first torque goal (default: the wrist) between what this motion has and what it can reach alone."""
-    slack = next((goal.objective for _, goal in wanted if isinstance(goal.objective, TorqueSlack)), None)
-    if slack is None:
-        slack = objective_of("wrist", 0.5, dynamics, chain, limits, "wrist", condition)[0]
+    goals = (one.goal.objective for one in wanted)
+    slack = next((one for one in goals if isinstance(one, TorqueSlack)), None)
+    slack = slack or torque_slack(wrist(given.chain.n), given, "--front")
     motion = problem.basis().motion(found.x)
     begin = slack.evaluate(motion, problem.regressor(motion.q, motion.v, motion.a)).value
-    (end, alone), *_ = proposed_goals(
-        replace(problem, goals=()), [slack], starts=1, evaluations=150, guesses=(found.x,)
-    )
+    bare = replace(problem, goals=())
+    (end, alone), *_ = proposed_goals(bare, [slack], starts=1, evaluations=150, guesses=(found.x,))
     levels = np.linspace(begin, end, count + 1)[:-1].tolist() if end < begin else [begin]
-    return sweep(problem, scaled(condition, "normalised"), slack, levels, found.x, alone.x, report=report)
-
-
-def periods(designed: Designed) -> int:
-    """Return how many samples of the controller one period holds."""
-    return aligned_period(designed.period, designed.rate)
+    normalised = problem.objectives[SCALINGS.index("normalised")][0]
+    return sweep(problem, normalised, slack, levels, found.x, alone.x, report=report)

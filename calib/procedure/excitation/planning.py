@@ -10,16 +10,17 @@ from pathlib import Path
 import numpy as np
 
 from calib.data.poses.fit_options import FitOptions
-from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of, standard_parameters
+from calib.dynamics.drives import standard
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.path_dynamics import PathDynamics, of_standard
 from calib.errors import RobotError, UsageError
 from calib.identification.model_file import read_dynamics, refuse_currents
 from calib.identification.prediction import Dynamics, carried_columns
 from calib.identification.torque_uncertainty import Uncertainty, read_uncertainty
-from calib.procedure.excitation.approach import approach_to
 from calib.procedure.excitation.limits import MotionLimits, read_motion_limits
+from calib.procedure.excitation.playback import approach_to, check_slower
+from calib.procedure.excitation.settings import DEFAULT_PLAN, PlanSettings
 from calib.procedure.excitation.waypoints import read_waypoints
 from calib.procedure.kinematic_stage.inputs import load_robot
 from calib.robot.chain import Chain
@@ -78,69 +79,78 @@ class Planned:
 def plan(
     robot: str | Path,
     waypoints: Path,
+    settings: PlanSettings = DEFAULT_PLAN,
     *,
     model: Path | None = None,
-    payloads: Sequence[str] = (),
     limits: Path | None = None,
-    drives_file: Path | None = None,
-    lines: bool = False,
-    rate: float = 1000.0,
-    evaluations: int = 0,
-    stray: float = 0.0,
-    start: Sequence[float] | None = None,
-    slower: float = 1.0,
+    drives: Path | None = None,
     base: str | None = None,
     tip: str | None = None,
     progress: Progress | None = None,
 ) -> Planned:
-    """Plan the fastest motion through the waypoints of a file.
+    """Plan the fastest motion of a robot through the waypoints of a file.
 
     Args:
-        robot: see `calib.robot.load`.
+        robot, base, tip: see `calib.robot.load`.
+        waypoints: see `calib.procedure.excitation.waypoints`.
+        settings: see `calib.procedure.excitation.settings`.
         model: folder of an identification; its geometry is planned with, the limits are the robot's.
-        payloads: labels of identified payloads on board.
-        limits: see `calib.procedure.excitation.limits`; drives_file: see `read_drives`.
-        lines: the tool runs straight from waypoint to waypoint, and rests at each.
-        rate: of the controller [Hz].
-        evaluations, stray: of the outer loop, see `trajectories.timing.shape`; 0 evaluations for none.
-        start: (n,) where the robot stands now, for an approach.
-        slower: factor of a rehearsal; 1 for none.
+        limits: see `calib.procedure.excitation.limits`; drives: see `read_drives`.
+        progress: called with words.
+
+    Raises:
+        UsageError: for waypoints that cannot be reached, and limits that cannot be kept.
     """
     say = progress or (lambda words: None)
-    _check(rate, evaluations, lines, slower)
+    _check(settings)
     chain, source = load_robot(robot, waypoints, FitOptions(), base, tip)
     known = read_motion_limits(limits, chain, source)
-    law, notes, unsure = _law(chain, model, payloads, drives_file, known)
+    law, notes, uncertain = _law(chain, model, settings.payloads, drives, known)
     lower, upper, bounds = _bounds(chain, known, law)
     arm = chain if model is None else read_dynamics(model)[0]
-    points = read_waypoints(waypoints, arm, lower, upper, start)
+    points = read_waypoints(waypoints, arm, lower, upper, settings.start)
     say("the path")
-    paths, deviation = _paths(arm, points, lines)
+    paths, deviation = _paths(arm, points, settings.lines)
     for path in paths:
         check_within(path, lower, upper, points)
     shaped = None
-    if evaluations:
+    if settings.shorten:
         timer = partial(_duration, limits=bounds, law=law, lower=lower, upper=upper, known=known)
         words = lambda done, best: say(f"shaping the path: {best:.4f} s after {done} timings")  # noqa: E731
-        shaped = shorten(points, timer, evaluations, stray, words)
+        shaped = shorten(points, timer, settings.shorten, settings.stray, words)
         paths = [shaped.path]
     margins = np.min([check_within(path, lower, upper) for path in paths], axis=0)
     for path in paths:
         check_places(path, known)
     say("timing")
-    timings = tuple(time_optimal(path, bounds, law, rate=rate) for path in paths)
-    sigma = None
-    if unsure is not None and known.deviations > 0:
-        sigma = np.max([unsure.sigma(one.sampled) for one in timings], axis=0)
-        bounds = _guarded(bounds, known.deviations * sigma, chain)
-        timings = tuple(time_optimal(path, bounds, law, rate=rate) for path in paths)
+    timings, bounds, sigma = _timed(paths, bounds, law, uncertain, known.deviations, chain, settings.rate)
     torque = None if law is None else law.torque
-    motion = joined([track(one.path, one.profile, rate, torque) for one in timings])
-    lead, told = (None, ()) if start is None else approach_to(start, motion.q[0], rate, known, chain)
+    motion = joined([track(one.path, one.profile, settings.rate, torque) for one in timings])
+    lead, remarks = None, ()
+    if settings.start is not None:
+        lead, remarks = approach_to(settings.start, motion.q[0], settings.rate, known, chain)
     return Planned(
         chain, law, bounds, lower, upper, timings, motion, margins, deviation, shaped, lead,
-        slowed(motion, slower) if slower != 1 else None, sigma, (*known.notes, *notes, *told),
+        slowed(motion, settings.slower) if settings.slower != 1 else None, sigma, (*known.notes, *notes, *remarks),
     )  # fmt: skip
+
+
+def _timed(
+    paths: Sequence[JointPath],
+    bounds: TimingLimits,
+    law: PathDynamics | None,
+    uncertain: Uncertainty | None,
+    deviations: float,
+    chain: Chain,
+    rate: float,
+) -> tuple[tuple[Timing, ...], TimingLimits, np.ndarray | None]:
+    """Return the fastest timings, their limits, and the torques' sigmas (n,) for which these were narrowed."""
+    timings = tuple(time_optimal(path, bounds, law, rate=rate) for path in paths)
+    if uncertain is None or not deviations > 0:
+        return timings, bounds, None
+    sigma = np.max([uncertain.sigma(one.sampled) for one in timings], axis=0)
+    bounds = _guarded(bounds, deviations * sigma, chain)
+    return tuple(time_optimal(path, bounds, law, rate=rate) for path in paths), bounds, sigma
 
 
 def read_drives(path: Path, chain: Chain) -> dict[str, np.ndarray]:
@@ -172,15 +182,14 @@ def check_places(path: JointPath, known: MotionLimits) -> None:
             )
 
 
-def _check(rate: float, evaluations: int, lines: bool, slower: float) -> None:
-    if not (np.isfinite(rate) and rate > 0):
-        raise UsageError(f"--rate {rate:g}: expected a number of samples per second above zero")
-    if evaluations < 0:
-        raise UsageError(f"--shorten {evaluations}: expected a number of timings, 0 for none")
-    if evaluations and lines:
+def _check(settings: PlanSettings) -> None:
+    if not (np.isfinite(settings.rate) and settings.rate > 0):
+        raise UsageError(f"--rate {settings.rate:g}: expected a number of samples per second above zero")
+    if settings.shorten < 0:
+        raise UsageError(f"--shorten {settings.shorten}: expected a number of timings, 0 for none")
+    if settings.shorten and settings.lines:
         raise UsageError("--shorten changes the path between waypoints; a straight --line leaves nothing to change")
-    if not (np.isfinite(slower) and slower >= 1):
-        raise UsageError(f"--slower {slower:g}: a rehearsal runs a factor of 1 or more slower")
+    check_slower(settings.slower)
 
 
 def _law(
@@ -202,7 +211,7 @@ def _law(
     except RobotError as error:
         raise UsageError(str(error)) from error
     linear = [joint.kind == "prismatic" for joint in chain.joints]
-    model = IdentificationModel(bodies_of(chain), drives.standard([" ".join(DRIVES)] * chain.n, linear=linear))
+    model = IdentificationModel(bodies_of(chain), standard([" ".join(DRIVES)] * chain.n, linear=linear))
     missing = [what for what, key in (("motor inertia", "Ia"), ("friction", "Fc")) if key not in stated]
     note = (
         f"{' and '.join(missing)} not known (no --model, no --drives): planned without, a real robot needs more torque"

@@ -1,4 +1,7 @@
-"""An exciting motion as it is run: an approach, as many periods as wanted, and a slow rehearsal of it."""
+"""An exciting motion as it is run: an approach, as many periods as wanted, and a slow rehearsal of it.
+
+The approach leads from where a robot stands to where a motion starts: calm, jerk-limited, held against the limits file.
+"""
 
 from __future__ import annotations
 
@@ -9,15 +12,20 @@ import numpy as np
 
 from calib.dynamics.base import BaseModel
 from calib.errors import UsageError
-from calib.procedure.excitation.approach import approach_to, check_start
+from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel
 from calib.procedure.excitation.limits import MotionLimits
-from calib.procedure.excitation.model import ExcitedModel
+from calib.procedure.excitation.settings import ExcitationSettings
 from calib.robot.chain import Chain
-from trajectories.basis import Family
+from trajectories.approach import straight_approach
+from trajectories.basis import Family, SampledMotion
+from trajectories.constraints import BoxLimit, MotionConstraint
 from trajectories.design.search import SearchResult
 from trajectories.design.verify import dense_motion
+from trajectories.places import Clearance
 from trajectories.setpoints import Setpoints, joined, repeated, slowed
 
+ACCELERATION, JERK = 2.0, 20.0  # of an approach, per s and s² times the velocity limit, where nothing else is said
+LEISURE = 1.0  # [rad/s or m/s] an approach is no faster than this (our choice)
 BLOCK = 4000
 
 
@@ -39,50 +47,37 @@ class Playback:
     notes: tuple[str, ...]
 
 
-def check_playback(
-    repeat: int, slower: float, start: Sequence[float] | None, chain: Chain, limits: MotionLimits
-) -> None:
+def check_playback(settings: ExcitationSettings, given: ExcitationInputs) -> None:
     """Refuse, before the search, what could not be played."""
-    if repeat < 1:
-        raise UsageError(f"--repeat {repeat}: expected 1 period or more")
-    if not (np.isfinite(slower) and slower >= 1):
-        raise UsageError(f"--slower {slower:g}: a rehearsal runs a factor of 1 or more slower")
-    if start is not None:
-        check_start(np.asarray(start, dtype=float), chain, limits)
+    if settings.repeat < 1:
+        raise UsageError(f"--repeat {settings.repeat}: expected 1 period or more")
+    check_slower(settings.slower)
+    if settings.start is not None:
+        check_start(np.asarray(settings.start, dtype=float), given.chain, given.limits)
 
 
-def play(
-    family: Family,
-    found: SearchResult,
-    dynamics: ExcitedModel,
-    chain: Chain,
-    limits: MotionLimits,
-    *,
-    rate: float,
-    start: Sequence[float] | None = None,
-    repeat: int = 1,
-    slower: float = 1.0,
-) -> Playback:
-    """Return the tracks of a motion that was found.
+def check_slower(factor: float) -> None:
+    """Refuse a rehearsal that is faster than the motion."""
+    if not (np.isfinite(factor) and factor >= 1):
+        raise UsageError(f"--slower {factor:g}: a rehearsal runs a factor of 1 or more slower")
 
-    Args:
-        rate: of the controller [Hz]; a period holds a whole number of its samples.
-        start: (n,) where the robot stands, for an approach.
-        repeat: periods; slower: factor of the rehearsal, 1 for none.
-    """
+
+def play(family: Family, found: SearchResult, given: ExcitationInputs, settings: ExcitationSettings) -> Playback:
+    """Return the setpoints of a motion that was found: approach, periods and rehearsal, as the settings say."""
+    model, limits, chain = given.model, given.limits, given.chain
     period = family.period * found.factor
-    count = round(period * rate)
+    count = round(period * settings.rate)  # a period holds a whole number of the controller's samples
     motion = dense_motion(family, found.x, np.arange(count + 1) * (period / count), found.factor)
-    once = _with_torque(Setpoints(rate, motion.q, motion.v, motion.a), dynamics)
+    once = _with_torque(Setpoints(settings.rate, motion.q, motion.v, motion.a), model)
     lead, notes = None, ()
-    if start is not None:
-        lead, notes = approach_to(start, once.q[0], rate, limits, chain)
-        lead = _with_torque(lead, dynamics)
+    if settings.start is not None:
+        lead, notes = approach_to(settings.start, once.q[0], settings.rate, limits, chain)
+        lead = _with_torque(lead, model)
     ahead = [] if lead is None else [lead]
-    slow = _with_torque(slowed(joined([*ahead, once]), slower), dynamics) if slower > 1 else None
+    slow = _with_torque(slowed(joined([*ahead, once]), settings.slower), model) if settings.slower > 1 else None
     for name, track in (("approach", lead), ("rehearsal", slow)):
         notes = (*notes, *_torques(name, track, limits, chain))
-    return Playback(joined([*ahead, repeated(once, repeat)]), lead, slow, repeat, notes)
+    return Playback(joined([*ahead, repeated(once, settings.repeat)]), lead, slow, settings.repeat, notes)
 
 
 def _with_torque(track: Setpoints, dynamics: ExcitedModel) -> Setpoints:
@@ -109,3 +104,58 @@ def _torques(name: str, track: Setpoints | None, limits: MotionLimits, chain: Ch
     if share[j] <= 1.0:
         return ()
     return (f"the {name} needs {share[j]:.0%} of the torque limit of {chain.joint_names[j]}: do not run it",)
+
+
+def approach_to(
+    start: Sequence[float], goal: np.ndarray, rate: float, known: MotionLimits, chain: Chain
+) -> tuple[Setpoints, tuple[str, ...]]:
+    """Return the way from a pose to the start of a motion, a straight line in joint space, and what a user should know.
+
+    Velocity, acceleration and jerk come from the limits file, else from the robot and our own choice.
+
+    Args:
+        start: (n,) where the robot stands [rad or m]; goal: (n,).
+
+    Raises:
+        UsageError: for a start beyond the joint limits, or a way too near to something.
+    """
+    here = np.asarray(start, dtype=float)
+    boxes = {one.order: one for one in known.constraints if isinstance(one, BoxLimit)}
+    check_start(here, chain, known)
+    sizes = {order: box.upper for order, box in boxes.items()}
+    free = np.full(chain.n, np.inf)
+    velocity = np.minimum(sizes.get(1, free), LEISURE)
+    acceleration, jerk = (
+        np.where(np.isfinite(sizes.get(order, free)), sizes.get(order, free), factor * velocity)
+        for order, factor in ((2, ACCELERATION), (3, JERK))
+    )
+    found = straight_approach(here, goal, velocity, acceleration, jerk, rate)
+    notes = [_place(one, found) for one in known.constraints if not isinstance(one, BoxLimit)]
+    return found, tuple(note for note in notes if note)
+
+
+def check_start(start: np.ndarray, chain: Chain, known: MotionLimits) -> None:
+    """Refuse a pose (n,) that the robot cannot be in."""
+    limits = known.positions
+    if start.shape != (chain.n,):
+        raise UsageError(f"--start: expected {chain.n} joint values, found {start.size}")
+    for name, value, lower, upper in zip(chain.joint_names, start, limits.lower, limits.upper):
+        if not lower <= value <= upper:
+            raise UsageError(f"--start: {name} at {value:g} is beyond its limits {lower:.4g} to {upper:.4g}")
+
+
+def _place(limit: MotionConstraint, track: Setpoints) -> str:
+    """Return a note where an approach leaves the workspace, which a robot may; refuse one that comes too near."""
+    rows = np.unique(np.linspace(0, len(track) - 1, 500).astype(int))
+    parts = (track.times, track.q, track.v, track.a, np.zeros(track.q.shape))
+    values = limit.values(SampledMotion(*(x[rows] for x in parts)))
+    if values.max() <= 0:
+        return ""
+    k, column = (int(i) for i in np.unravel_index(np.argmax(values), values.shape))
+    words = (
+        f"on the straight way from --start, {limit.name} ({limit.labels[column]}) is broken by "
+        f"{values[k, column]:.3g} {limit.unit} at t = {track.times[rows[k]]:.3g} s"
+    )
+    if isinstance(limit, Clearance):
+        raise UsageError(f"{words}: move the robot to another pose before, or reach the start of the motion by hand")
+    return f"{words}: watch the approach, or start from another pose"

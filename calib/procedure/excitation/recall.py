@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
-from calib.data.recordings.recording import Joints, Recording
+from calib.data.recordings.recording import Joints, Recording, parse_cut
 from calib.data.recordings.recording_files import read_recording
 from calib.data.signals.resampling import resample
 from calib.errors import MeasurementError, UsageError
@@ -28,7 +28,7 @@ HEADERS = {"effort": "tau", "tau_link": "tau_link", "tau_motor": "tau_motor", "q
 
 
 @dataclass(frozen=True, eq=False)
-class Recollection:
+class AveragedMotion:
     """Periods of a motion in a log, averaged.
 
     Attributes:
@@ -49,12 +49,14 @@ class Recollection:
     following: np.ndarray
 
 
-def check_target(out: Path) -> None:
+def check_target(out: Path, folder: Path, log: str) -> None:
+    """Refuse, before any work is done, a name that is not a recording's, or that of the log or the designed motion."""
+    files.check_not_input([out], [folder, folder / coefficients.NAME, log, parse_cut(log)[0]])
     if out.suffix not in SUFFIXES or out.is_dir():
         raise UsageError(f"--out {out}: give a file with the suffix {' or '.join(SUFFIXES)}")
 
 
-def find(folder: Path, log: str, skip: int = 0) -> Recollection:
+def find(folder: Path, log: str, skip: int = 0) -> AveragedMotion:
     """Find the motion of an excitation's folder in a log.
 
     Args:
@@ -77,16 +79,16 @@ def find(folder: Path, log: str, skip: int = 0) -> Recollection:
     except BadInput as error:
         raise MeasurementError(str(error), recording.file) from error
     error = averages["q"].mean - reference
-    return Recollection(
+    return AveragedMotion(
         motion, recording.file, found, averages, recording.kind, rate, np.sqrt(np.mean(error**2, axis=0))
     )
 
 
-def write(recollection: Recollection, out: Path) -> Path:
+def write(averaged: AveragedMotion, out: Path) -> Path:
     """Write one averaged period as a recording: CSV, or an archive with variances."""
-    averages, names = recollection.averages, recollection.motion.joint_names
-    called = HEADERS | {"q": "q", "v": "v", "effort": "tau" if recollection.kind == "torque" else "current"}
-    t = np.arange(recollection.found.period) / recollection.rate
+    averages, names = averaged.averages, averaged.motion.joint_names
+    called = HEADERS | {"q": "q", "v": "v", "effort": "tau" if averaged.kind == "torque" else "current"}
+    t = np.arange(averaged.found.period) / averaged.rate
     if out.suffix == ".csv":
         header = ["t", *(f"{called[name]}{j + 1}" for name in averages for j in range(len(names)))]
         table = np.column_stack([t, *(one.mean for one in averages.values())])
@@ -94,23 +96,23 @@ def write(recollection: Recollection, out: Path) -> Path:
     arrays = {called[name]: one.mean for name, one in averages.items()}
     arrays |= {f"variance_{called[name]}": one.variance for name, one in averages.items()}
     buffer = io.BytesIO()
-    arrays |= {"t": t, "joint_names": np.array(names), "periods": np.array(recollection.found.periods)}
+    arrays |= {"t": t, "joint_names": np.array(names), "periods": np.array(averaged.found.periods)}
     np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
     return files.write(out, buffer.getvalue())
 
 
-def lines(recollection: Recollection) -> list[str]:
+def lines(averaged: AveragedMotion) -> list[str]:
     """Return what a person wants to read."""
-    found, averages = recollection.found, recollection.averages
-    start = found.start / recollection.rate
-    unit = "N m" if recollection.kind == "torque" else "A"
+    found, averages = averaged.found, averaged.averages
+    start = found.start / averaged.rate
+    unit = "N m" if averaged.kind == "torque" else "A"
     result = [
-        f"{found.periods} whole periods of {recollection.motion.period:g} s in {recollection.file}, from {start:.3f} s "
+        f"{found.periods} whole periods of {averaged.motion.period:g} s in {averaged.file}, from {start:.3f} s "
         f"on; each explains {min(found.likeness):.2%} of the motion at least",
         f"{'joint':14} {'off command':>14} {'noise of q':>12} {f'noise of {unit}':>14} {'of the mean':>12}",
     ]
     noise, effort = np.sqrt(averages["q"].pooled), np.sqrt(averages["effort"].pooled)
-    rows = zip(recollection.motion.joint_names, recollection.following, noise, effort)
+    rows = zip(averaged.motion.joint_names, averaged.following, noise, effort)
     for name, following, one, two in rows:
         result.append(f"{name:14} {following:14.3g} {one:12.3g} {two:14.3g} {two / np.sqrt(found.periods):12.3g}")
     return result

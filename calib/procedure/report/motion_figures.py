@@ -96,17 +96,17 @@ def motion_figure(designed: Designed) -> Figure:
     motion = _motion(designed)
     states = zip((motion.q, motion.v, motion.a), (_limits(designed, order) for order in range(3)), TITLES)
     rows = [(values, lower, upper, title) for values, (lower, upper), title in states]
-    values = designed.dynamics.values
+    values = designed.inputs.model.values
     if values is not None:
-        torque = designed.dynamics.exact.regressor(motion.q, motion.v, motion.a) @ values
-        rows.append((torque, -designed.limits.torque, designed.limits.torque, TITLES[3]))
-    units = motion_units(joint.kind for joint in designed.chain.joints)
-    return motion_sheet(motion.times, rows, units, designed.chain.joint_names)
+        torque = designed.inputs.model.exact.regressor(motion.q, motion.v, motion.a) @ values
+        rows.append((torque, -designed.inputs.limits.torque, designed.inputs.limits.torque, TITLES[3]))
+    units = motion_units(joint.kind for joint in designed.inputs.chain.joints)
+    return motion_sheet(motion.times, rows, units, designed.inputs.chain.joint_names)
 
 
 def path_figure(designed: Designed) -> Figure:
     """Draw the tool's path from above and from the side."""
-    tool = sweep(designed.chain, _motion(designed).q).position
+    tool = sweep(designed.inputs.chain, _motion(designed).q).position
     with styled():
         figure, axes = sheet(1, 2, WIDE, 3.4, across=0.6)
         for axis, (i, j), title in (
@@ -156,10 +156,10 @@ def _motion(designed: Designed) -> Any:
 
 def _limits(designed: Designed, order: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the limits (n,) of position, velocity or acceleration; infinite without one."""
-    for limit in designed.limits.constraints:
+    for limit in designed.inputs.limits.constraints:
         if isinstance(limit, BoxLimit) and limit.order == order:
             return limit.lower, limit.upper
-    none = np.full(designed.chain.n, np.inf)
+    none = np.full(designed.inputs.chain.n, np.inf)
     return -none, none
 
 

@@ -74,7 +74,9 @@ def options_of(session: Session) -> IdentifyOptions:
 
 def excite(session: Session, say: Say) -> list[str]:
     """Design the motion to learn from, and another one to validate on."""
-    from calib.procedure.excitation import design, design_folder
+    from calib.procedure.excitation import design
+    from calib.procedure.excitation import folder as motion_folder
+    from calib.procedure.excitation.settings import ExcitationSettings
     from calib.procedure.report import motion_figures
 
     wanted, notes = session.settings.dynamics, []
@@ -82,20 +84,23 @@ def excite(session: Session, say: Say) -> list[str]:
     names = ["training", "validation"] if wanted.validation else ["training"]
     for name in names:
         first = name == "training"
-        designed = design.excite(
-            session.fit.path, limits=limits, period=wanted.period * (1.0 if first else SHORTER),
-            harmonics=wanted.harmonics, rate=wanted.rate, starts=wanted.starts if first else 1,
+        settings = ExcitationSettings(
+            period=wanted.period * (1.0 if first else SHORTER), harmonics=wanted.harmonics, rate=wanted.rate,
+            starts=wanted.starts if first else 1,
             evaluations=wanted.evaluations if first else max(20, wanted.evaluations // 3),
             seed=session.settings.seed + (0 if first else OTHER), repeat=wanted.repeats,
+        )  # fmt: skip
+        designed = design.excite(
+            session.fit.path, settings, limits=limits,
             progress=lambda words, name=name: say(f"{name} motion: {words}"),
         )  # fmt: skip
         if designed.found.interrupted:  # a session is resumed, not gone on with half a search
             raise KeyboardInterrupt
-        design_folder.write_folder(designed, session.path("6-excitation") / name, motion_figures.write_design)
+        motion_folder.write_design(designed, session.path("6-excitation") / name, motion_figures.write_design)
         cond = designed.condition
         notes.append(
             f"{name}: {designed.period:g} s, condition number {cond['raw']:.3g} raw, {cond['normalised']:.3g} "
-            f"normalised, {len(designed.dynamics.exact.names)} columns; every limit is kept"
+            f"normalised, {len(designed.inputs.model.exact.names)} columns; every limit is kept"
         )
         notes += [f"{name}: {note}" for note in designed.notes if first]
     if limits is None:

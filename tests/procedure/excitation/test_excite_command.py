@@ -10,8 +10,8 @@ import subprocess
 import sys
 import time
 import tomllib
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,11 +21,11 @@ from calib.data.recordings.recording_files import read_recording
 from calib.dynamics import base, drives
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
-from calib.procedure.excitation import coefficients, design, design_folder
+from calib.procedure.excitation import coefficients, design
+from calib.procedure.excitation import folder as motion_folder
+from calib.procedure.excitation.inputs import identifiable, read_model, read_prior
 from calib.procedure.excitation.limits import Points, read_motion_limits
-from calib.procedure.excitation.locked_joints import told
-from calib.procedure.excitation.model import read_dynamics
-from calib.procedure.excitation.prior_motions import read_existing
+from calib.procedure.excitation.settings import ExcitationSettings
 from calib.procedure.report import motion_figures
 from calib.robot.kinematics import forward
 from calib.robot.load import load
@@ -48,7 +48,7 @@ Fv = [14.4, 15.3, 6.55, 11.0, 4.29, 2.26, 1.6]
 Fc = [11.9, 11.5, 8.98, 8.35, 8.31, 4.72, 6.04]
 """
 QUICK = ("--starts", 1, "--evaluations", 60, "--period", 16, "--harmonics", 4, "--rate", 100)
-SHORT: Any = {"starts": 1, "evaluations": 45, "period": 16.0, "harmonics": 4, "rate": 100.0, "samples": 120}
+SHORT = ExcitationSettings(starts=1, evaluations=45, period=16.0, harmonics=4, rate=100.0, samples=120)
 
 
 def test_the_motion_keeps_its_limits_and_is_written_for_a_controller(cell, calib):
@@ -109,19 +109,19 @@ def check_playback(q: np.ndarray, stands: np.ndarray, metrics: dict) -> None:
 def earlier(tmp_path_factory) -> Path:
     """Return the folder of a quick excitation, two periods of it."""
     folder = tmp_path_factory.mktemp("excited") / "e"
-    designed = design.excite("lwr4plus", repeat=2, **SHORT)
-    return design_folder.write_folder(designed, folder, motion_figures.write_design)
+    designed = design.excite("lwr4plus", replace(SHORT, repeat=2))
+    return motion_folder.write_design(designed, folder, motion_figures.write_design)
 
 
 def test_motions_before_count(earlier, tmp_path):
     """Designed with what is known, the two motions together tell more than twice the first one would."""
     before = coefficients.read(earlier)
     known = json.loads((earlier / "metrics.json").read_text())["condition_number"]
-    second = design.excite("lwr4plus", existing=[str(earlier)], **SHORT)
+    second = design.excite("lwr4plus", replace(SHORT, existing=(str(earlier),)))
     assert second.condition["raw_before"] == pytest.approx(known["raw"], rel=0.02)
     assert second.condition["raw"] < 0.9 * second.condition["raw_before"]
     # the same from the matrices themselves
-    sharp, period = second.dynamics.exact.regressor, second.period
+    sharp, period = second.inputs.model.exact.regressor, second.period
     times = np.arange(1000) * (period / 1000)
     one = np.sqrt(2) * sharp(*before.orders(times))
     motion = dense_motion(second.family, second.found.x, times)
@@ -130,9 +130,9 @@ def test_motions_before_count(earlier, tmp_path):
     # a recording of the first motion counts as the motion itself, less what the filters' borders eat
     q = np.tile(before.orders(np.arange(1600) / 100)[0], (2, 1))
     np.savez(tmp_path / "log.npz", t=np.arange(len(q)) / 100, q=q, tau=q)
-    found = read_existing([str(tmp_path / "log.npz")], second.dynamics, second.chain)
+    found = read_prior([str(tmp_path / "log.npz")], second.inputs.model, second.inputs.chain)
     assert found is not None
-    ratio = np.diag(found.information) / np.diag(second.existing.information)
+    ratio = np.diag(found.information) / np.diag(second.inputs.prior.information)
     assert 0.9 < np.median(ratio) < 1.02
 
 
@@ -152,12 +152,12 @@ def test_a_held_joint_stays_and_its_columns_are_said(cell, calib):
 
 def test_the_columns_told_with_a_joint_held_are_all_there_are():
     chain = load("lwr4plus")
-    dynamics = read_dynamics(chain, None, "Fv Fc off", read_motion_limits(None, chain))
+    dynamics = read_model(chain, None, "Fv Fc off", read_motion_limits(None, chain))
     rng = np.random.default_rng(3)
     q, v, a = rng.uniform(-2, 2, (3, 400, 7))
     q[:, 3], v[:, 3], a[:, 3] = 0.5, 0.0, 0.0
     W = np.delete(dynamics.exact.regressor(q, v, a), 3, axis=1).reshape(-1, 64)
-    held = told(dynamics, chain, {3: 0.5})
+    held = identifiable(dynamics, chain, {3: 0.5})
     scaled = W / np.maximum(np.linalg.norm(W, axis=0), 1e-12)
     assert len(held.names) == np.linalg.matrix_rank(scaled, 1e-4)
     assert np.linalg.cond(scaled[:, held.columns]) < 200
@@ -307,7 +307,7 @@ def identified(folder: Path, spoil: str = "") -> None:
 def test_an_identified_model_predicts_torques_with_their_uncertainty(tmp_path):
     identified(tmp_path / "m")
     chain = load("lwr4plus")
-    dynamics = read_dynamics(chain, tmp_path / "m", "", read_motion_limits(None, chain))
+    dynamics = read_model(chain, tmp_path / "m", "", read_motion_limits(None, chain))
     assert dynamics.values is not None and dynamics.covariance is not None and dynamics.friction
     assert len(dynamics.values) == len(dynamics.exact.names) == 69  # 43 + 28, less Ia1 and Ia2
     assert np.allclose(dynamics.covariance, 0.01 * np.eye(69))

@@ -14,7 +14,9 @@ from planned import CHAIN, WAYPOINTS, lwr
 from calib import cli, files
 from calib.dynamics import drives
 from calib.dynamics.bodies import STANDARD
-from calib.procedure.excitation import plan_folder, planning
+from calib.procedure.excitation import folder as motion_folder
+from calib.procedure.excitation import planning
+from calib.procedure.excitation.settings import PlanSettings
 from calib.procedure.excitation.waypoints import read_waypoints
 from calib.robot import description
 from calib.robot.kinematics import forward
@@ -91,7 +93,7 @@ def test_an_identified_model_is_planned_with(room, capsys):
 
 def test_model_and_stated_drives_plan_the_same_motion(room):
     one = planning.plan("lwr4plus", room / "way.csv", model=room / "model")
-    two = planning.plan("lwr4plus", room / "way.csv", drives_file=room / "drives.toml")
+    two = planning.plan("lwr4plus", room / "way.csv", drives=room / "drives.toml")
     assert one.track.duration == two.track.duration and "no covariance" in one.notes[1]
     assert "collisions and floor are NOT checked" in one.notes[0]
     bare = planning.plan("lwr4plus", room / "way.csv")
@@ -100,14 +102,14 @@ def test_model_and_stated_drives_plan_the_same_motion(room):
 
 def test_lines_and_shapes(room):
     given = {"model": room / "model", "limits": None}
-    straight = planning.plan("lwr4plus", room / "way.csv", lines=True, **given)
-    table = plan_folder.metrics(straight)
+    straight = planning.plan("lwr4plus", room / "way.csv", PlanSettings(lines=True), **given)
+    table = motion_folder.plan_metrics(straight)
     assert len(table["segments"]) == 2 and table["line_deviation"]["position"] <= 1e-6
     corner = forward(CHAIN, WAYPOINTS[1:2])[0, :3, 3]
     tool = forward(CHAIN, straight.track.q)[:, :3, 3]
     assert np.linalg.norm(tool - corner, axis=1).min() < 1e-4
-    shaped = planning.plan("lwr4plus", room / "way.csv", evaluations=20, stray=0.1, **given)
-    found = plan_folder.metrics(shaped)["shortened"]
+    shaped = planning.plan("lwr4plus", room / "way.csv", PlanSettings(shorten=20, stray=0.1), **given)
+    found = motion_folder.plan_metrics(shaped)["shortened"]
     assert found["after"] <= found["before"] and found["evaluations"] >= 20
 
 
@@ -149,7 +151,7 @@ def test_waypoints_of_the_tool(room, capsys):
         if name != "place":
             np.testing.assert_allclose(found, poses, atol=2e-6)
     assert np.abs(q - WAYPOINTS).max() < 0.2
-    planned = planning.plan("lwr4plus", room / "both.csv", drives_file=room / "drives.toml")
+    planned = planning.plan("lwr4plus", room / "both.csv", drives=room / "drives.toml")
     tool = forward(CHAIN, planned.track.q)[:, :3, 3]
     assert all(np.linalg.norm(tool - place, axis=1).min() < 2e-3 for place in poses[:, :3, 3])
     write_waypoints([[0.2, 0.1, 0.6], [2.0, 0.0, 0.5]], "far.csv", "x,y,z")
@@ -212,7 +214,7 @@ def test_an_uncertain_model_keeps_torque_free(room, capsys):
     files.write_table(
         room / "model" / "covariance.csv", ("name", "Ia2", "ZZ3R"), [("Ia2", 0.04, 0.0), ("ZZ3R", 0.0, 0.0)]
     )
-    sharp = planning.plan("lwr4plus", room / "way.csv", drives_file=room / "drives.toml")
+    sharp = planning.plan("lwr4plus", room / "way.csv", drives=room / "drives.toml")
     careful = planning.plan("lwr4plus", room / "way.csv", model=room / "model")
     assert careful.sigma is not None
     np.testing.assert_allclose(careful.sigma[1], 0.2 * np.abs(sharp.timings[0].sampled.a[:, 1]).max(), rtol=1e-6)
@@ -230,7 +232,7 @@ def test_a_payload_on_board_takes_longer(room):
     load = dict(zip([f"{name}tool" for name in STANDARD], truth("lwr4plus")["payload"]["inertia"]))
     place.write_text(json.dumps(table | {"payloads": ["tool"], "bodies": table["bodies"] | load}))
     free, loaded = (
-        planning.plan("lwr4plus", room / "way.csv", model=room / "model", payloads=on).track.duration
+        planning.plan("lwr4plus", room / "way.csv", PlanSettings(payloads=on), model=room / "model").track.duration
         for on in ((), ("tool",))
     )
     assert free < loaded

@@ -13,8 +13,7 @@ from sessions import edit, go_on
 
 from calib import cli
 from calib.errors import MeasurementError
-from calib.procedure.excitation import design_folder
-from calib.procedure.report import identification_figures
+from calib.procedure.report import identification_figures, motion_figures
 from calib.procedure.session import commands, demo, instructions, steps
 from calib.procedure.session.commands import begin
 from calib.procedure.session.folder import Session, open_session
@@ -39,7 +38,7 @@ def waiting_folder(finished_folder: Path, tmp_path_factory: pytest.TempPathFacto
         lines = [f"{key} = {value}" if line.startswith(f"{key} =") else line for line in path.read_text().splitlines()]
         path.write_text("\n".join(lines) + "\n")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(design_folder, "save", lambda figure, path: path)
+        patch.setattr(motion_figures, "save", lambda figure, path: path)
         waiting = go_on(open_session(folder))
     assert waiting is not None and waiting.step.name == "record"
     return folder

@@ -1,0 +1,285 @@
+"""The folders of designed and planned motions: samples at the controller's rate, ROS messages, metrics and pictures.
+
+Each is written whole, beside its place, then moved there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib import files
+from calib.errors import UsageError
+from calib.folders import check_folder, write_staged
+from calib.procedure.excitation import coefficients
+from calib.procedure.excitation.coefficients import Periodic
+from calib.procedure.excitation.design import INSTANTS, Designed
+from calib.procedure.excitation.planning import Planned
+from calib.robot.tables import dumps
+from trajectories.design.verify import dense_motion
+from trajectories.messages import joint_trajectory, to_json, to_yaml
+from trajectories.setpoints import Setpoints
+from trajectories.timing.time_scaling import ACTIVE
+
+DESIGN = ("metrics.json", "trajectory.csv", coefficients.NAME)
+PLAN = ("metrics.json", "motion.csv", "trajectory.yaml", "trajectory.json")
+"""Files by which an earlier run's folder is known."""
+ALL = (*DESIGN, *PLAN[1:], "run.csv", "front.csv", "approach.csv", "rehearsal.csv")
+"""Files of an earlier run that a new one replaces; besides plots, ``plot_*.png``."""
+MESSAGES = 100.0  # points per second of the ROS message, whose controllers interpolate (our choice)
+UNITS = {"velocity": "rad/s", "acceleration": "rad/s²", "torque": "N m"}
+
+
+def check_design_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
+    """Refuse, before any work is done, a folder that is not for a designed motion, or that holds one of its inputs."""
+    _check(out, DESIGN, "excitation", inputs)
+
+
+def check_plan_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
+    """Refuse, before any work is done, a folder that is not for a planned motion, or that holds one of its inputs."""
+    _check(out, PLAN, "plan", inputs)
+
+
+def _check(out: Path, marks: Sequence[str], what: str, inputs: Sequence[str | Path | None]) -> None:
+    check_folder(out)
+    read = [one for path in inputs if path is not None for one in (path, str(path).rpartition("@")[0] or path)]
+    files.check_not_input([out, *(out / name for name in ALL)], read)
+    present = [name for name in marks if (out / name).exists()]
+    if present and len(present) < len(marks):
+        raise UsageError(f"{out} holds {', '.join(present)} which no earlier {what} left there; choose another")
+
+
+def write_design(designed: Designed, out: Path, draw: Callable[[Designed, Path], None] | None = None) -> Path:
+    """Write the folder of a designed motion; `draw` adds figures.
+
+    Raises:
+        UsageError: where the disk refuses; what stood there stays.
+    """
+
+    def write(folder: Path) -> None:
+        period, played = one_period(designed), designed.playback
+        chain = designed.inputs.chain
+        _write_setpoints(period, folder / "trajectory.csv")
+        files.write(folder / coefficients.NAME, dumps(coefficients.table(periodic(designed), chain.name)))
+        longer = played.approach is not None or played.repeat > 1
+        _write_optional(played.run if longer else None, folder / "run.csv")
+        _write_optional(played.approach, folder / "approach.csv")
+        _write_optional(played.rehearsal, folder / "rehearsal.csv")
+        _write_messages(played.run, chain.joint_names, folder, max(1, round(period.rate / MESSAGES)))
+        if draw is not None:
+            draw(designed, folder)
+        if designed.front is not None and len(designed.front.values):
+            rows = [[*map(float, row), bool(best)] for row, best in zip(designed.front.values, designed.front.best)]
+            files.write_table(folder / "front.csv", [*designed.front.names, "not dominated"], rows)
+        files.write_json(folder / "metrics.json", design_metrics(designed))
+
+    return write_staged(out, ALL, write)
+
+
+def write_plan(planned: Planned, out: Path, draw: Callable[[Planned, Path], None] | None = None) -> Path:
+    """Write the folder of a planned motion; `draw` adds figures.
+
+    Raises:
+        UsageError: where the disk refuses; what stood there stays.
+    """
+
+    def write(folder: Path) -> None:
+        _write_setpoints(planned.track, folder / "motion.csv")
+        _write_messages(planned.track, planned.chain.joint_names, folder)
+        _write_optional(planned.approach, folder / "approach.csv")
+        _write_optional(planned.rehearsal, folder / "rehearsal.csv")
+        if draw is not None:
+            draw(planned, folder)
+        files.write_json(folder / "metrics.json", plan_metrics(planned))
+
+    return write_staged(out, ALL, write)
+
+
+def _write_setpoints(track: Setpoints, path: Path) -> Path:
+    """Write t, q, v, a and, where known, tau; SI, a row per sample of the controller."""
+    parts = {"q": track.q, "v": track.v, "a": track.a} | ({} if track.tau is None else {"tau": track.tau})
+    header = ["t", *(f"{letter}{j + 1}" for letter in parts for j in range(track.n))]
+    return files.write_table(path, header, np.column_stack([track.times, *parts.values()]).tolist())
+
+
+def _write_optional(track: Setpoints | None, path: Path) -> None:
+    if track is not None:
+        _write_setpoints(track, path)
+
+
+def _write_messages(track: Setpoints, joint_names: Sequence[str], folder: Path, every: int = 1) -> None:
+    """Write ``trajectory.json`` and ``trajectory.yaml`` (trajectory_msgs/JointTrajectory), one sample of `every`."""
+    message = joint_trajectory(track, joint_names, every)
+    files.write(folder / "trajectory.json", to_json(message))
+    files.write(folder / "trajectory.yaml", to_yaml(message))
+
+
+def one_period(designed: Designed) -> Setpoints:
+    """Return one period at the controller's rate, both ends included; without torques."""
+    count = round(designed.period * designed.settings.rate)
+    times = np.arange(count + 1) * (designed.period / count)
+    motion = dense_motion(designed.family, designed.found.x, times, designed.found.factor)
+    return Setpoints(count / designed.period, motion.q, motion.v, motion.a)
+
+
+def periodic(designed: Designed) -> Periodic:
+    """Return the motion by its coefficients."""
+    settings = designed.settings
+    return Periodic(
+        tuple(designed.inputs.chain.joint_names), designed.period, settings.rate, settings.repeat, settings.family,
+        tuple(designed.family.coefficients(designed.found.x)), getattr(designed.family, "degree", 5),
+    )  # fmt: skip
+
+
+def design_metrics(designed: Designed) -> dict[str, Any]:
+    """Return the content of ``metrics.json`` of a designed motion."""
+    found, given, settings, family = designed.found, designed.inputs, designed.settings, designed.family
+    return {
+        "condition_number": designed.condition,
+        "objective": found.merit,
+        "feasible": designed.proof.feasible,
+        "margins": {
+            name: {
+                "margin": one.margin, "unit": one.unit, "at": one.label, "time": one.time, "share": one.share,
+                "allowance": one.allowance, "proved": one.proved,
+            }
+            for name, one in designed.proof.worst.items()
+        },
+        "seconds": found.seconds,
+        "evaluations": found.evaluations,
+        "feasible_evaluations": found.feasible,
+        "history": list(found.history),
+        "goals": {name: {"goal": goal, "weight": w, "reached": value} for name, goal, w, value in designed.goals},
+        "setting": {
+            "robot": given.chain.name, "family": settings.family, "period": designed.period,
+            "harmonics": list(getattr(family, "harmonics", getattr(family, "counts", ()))),
+            "columns": list(given.columns.names), "samples": designed.problem.samples,
+            "samples_reported": INSTANTS, "instants_verified": designed.proof.instants, "rate": settings.rate,
+            "interrupted": found.interrupted, "held": designed.locked,
+        },
+        "existing": None if given.prior is None else {"names": list(given.prior.names), "seconds": given.prior.seconds},
+        "playback": {
+            "repeat": designed.playback.repeat, "seconds": designed.playback.run.duration,
+            "approach": _seconds(designed.playback.approach), "rehearsal": _seconds(designed.playback.rehearsal),
+        },
+        "notes": list(designed.notes),
+    }  # fmt: skip
+
+
+def _seconds(track: Setpoints | None) -> float | None:
+    return None if track is None else track.duration
+
+
+def design_lines(designed: Designed) -> list[str]:
+    """Return what a person wants to read at the end."""
+    found, cond = designed.found, designed.condition
+    columns = len(designed.inputs.columns.names)
+    result = [
+        *(["interrupted: this is the best motion found until then"] if found.interrupted else []),
+        f"condition number of {columns} columns: {cond['raw']:.4g} raw, {cond['normalised']:.4g} normalised "
+        f"({designed.settings.family}, period {designed.period:g} s)",
+        *_together(designed),
+        *(f"goal {name}: {value:.4g} (asked: {goal:.4g})" for name, goal, _, value in designed.goals),
+        f"{found.evaluations} evaluations, {found.feasible:.0%} of them feasible, {found.seconds:.1f} s",
+        f"every limit is kept, at {designed.proof.instants} instants and between them; smallest margins:",
+    ]
+    for name, one in designed.proof.worst.items():
+        how = "bound" if one.proved else "estimate"
+        result.append(
+            f"  {name:12} {one.margin:.4g} {one.unit} ({one.label}, t = {one.time:.2f} s; between instants: {how})"
+        )
+    played = designed.playback
+    parts = ["the approach"] if played.approach is not None else []
+    parts.append(f"{played.repeat} period{'s' if played.repeat > 1 else ''}")
+    result.append(f"to run: {' and '.join(parts)}, {played.run.duration:.1f} s")
+    return result + [f"note: {note}" for note in designed.notes]
+
+
+def _together(designed: Designed) -> list[str]:
+    """Return what motions before have, and this one alone."""
+    prior, cond = designed.inputs.prior, designed.condition
+    if prior is None:
+        return []
+    return [
+        f"together with {', '.join(prior.names)} ({prior.seconds:.1f} s), which alone has "
+        f"{cond['raw_before']:.4g} raw, {cond['normalised_before']:.4g} normalised; this motion alone "
+        f"{cond['raw_alone']:.4g} and {cond['normalised_alone']:.4g}"
+    ]
+
+
+def plan_metrics(planned: Planned) -> dict[str, Any]:
+    """Return the content of ``metrics.json``."""
+    used = {name: np.concatenate([one.used[name] for one in planned.timings]) for name in planned.timings[0].used}
+    seconds = np.array([one.duration for one in planned.timings])
+    shaped = planned.shaped
+    return {
+        "feasible": True,
+        "duration": planned.track.duration,
+        "margins": {"position": _nearest(planned)} | {name: _margin(planned, name, x) for name, x in used.items()},
+        "active_share": float(seconds @ [one.active_share for one in planned.timings] / seconds.sum()),
+        "active_within": ACTIVE,
+        "iterations": sum(one.iterations for one in planned.timings),
+        "tightened": max(one.tightened for one in planned.timings),
+        "history": [list(one.history) for one in planned.timings],
+        "segments": seconds.tolist(),
+        "rate": planned.track.rate,
+        "samples": len(planned.track),
+        "samples_verified": sum(len(one.sampled.s) for one in planned.timings),
+        "line_deviation": None
+        if planned.deviation is None
+        else {"position": float(planned.deviation[0]), "orientation": float(planned.deviation[1])},
+        "shortened": None
+        if shaped is None
+        else {
+            "before": shaped.before, "after": shaped.after, "evaluations": shaped.evaluations,
+            "refused": shaped.refused, "parameters": shaped.phi.tolist(),
+        },
+        "torque_sigma": None if planned.sigma is None else planned.sigma.tolist(),
+        "torque_limits": [float(x) if np.isfinite(x) else None for x in planned.limits.torque],
+        "approach": _seconds(planned.approach),
+        "notes": list(planned.notes),
+    }  # fmt: skip
+
+
+def plan_lines(planned: Planned) -> list[str]:
+    """Return what a person wants to read at the end."""
+    found = plan_metrics(planned)
+    words = [
+        f"{found['duration']:.3f} s at {found['rate']:g} Hz; some limit is within {ACTIVE:.0%} of being reached for "
+        f"{found['active_share']:.1%} of the time, none is crossed at {found['samples_verified']} instants",
+        "smallest margins:",
+    ]
+    for name, one in found["margins"].items():
+        words.append(f"  {name:12} {one['margin']:.4g} {one['unit']} ({one['at']})")
+    if planned.sigma is not None:
+        free = ", ".join(f"{x:.3g}" for x in planned.sigma)
+        words.append(f"limits of torque narrowed for the model's uncertainty, one sigma of each joint: {free} N m")
+    if planned.shaped is not None:
+        words.append(f"the path's own shape: {planned.shaped.before:.3f} s before, {planned.shaped.after:.3f} s after")
+    if planned.deviation is not None:
+        words.append(f"the tool keeps its lines to {1e6 * planned.deviation[0]:.2g} µm")
+    return words + [f"note: {note}" for note in planned.notes]
+
+
+def _margin(planned: Planned, name: str, used: np.ndarray) -> dict[str, Any]:
+    size = getattr(planned.limits, name)
+    share = 1.0 - used.max(axis=0)
+    j = int(np.argmin(share))
+    joint = planned.chain.joints[j]
+    unit = UNITS[name] if joint.kind == "revolute" else UNITS[name].replace("rad", "m").replace("N m", "N")
+    return {
+        "margin": float(share[j] * size[j]), "unit": unit, "at": joint.name, "share": float(share[j]),
+        "joints": share.tolist(),
+    }  # fmt: skip
+
+
+def _nearest(planned: Planned) -> dict[str, Any]:
+    j = int(np.argmin(planned.margins))
+    joint = planned.chain.joints[j]
+    return {
+        "margin": float(planned.margins[j]), "unit": joint.unit, "at": joint.name,
+        "share": float(planned.margins[j] / (planned.upper[j] - planned.lower[j])), "joints": planned.margins.tolist(),
+    }  # fmt: skip

@@ -1,0 +1,298 @@
+"""What an excitation starts from: a robot's model and limits, joints that rest, and motions that count already."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from calib.data.poses.fit_options import FitOptions
+from calib.dynamics import base as base_parameters
+from calib.dynamics import drives
+from calib.dynamics.base import BaseModel
+from calib.dynamics.bodies import bodies_of, standard_parameters, with_gravity
+from calib.dynamics.drives import DriveTerm
+from calib.dynamics.identifiability import columns_at_rest, information
+from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.shapes import V0
+from calib.errors import UsageError
+from calib.identification.identify_options import FileSettings
+from calib.identification.model_file import from_table, read_covariance, read_table, refuse_currents
+from calib.procedure.dynamic_stage.identify import read_motion
+from calib.procedure.excitation import coefficients
+from calib.procedure.excitation.limits import MotionLimits, read_motion_limits
+from calib.procedure.excitation.settings import ExcitationSettings
+from calib.procedure.kinematic_stage.inputs import load_robot
+from calib.robot import description
+from calib.robot.chain import Chain, sampling_limits
+from trajectories.constraints import BoxLimit
+
+SMOOTH = 0.05  # [rad/s or m/s] of the Coulomb sign while searching; the figures reported have the model's own
+
+
+@dataclass(frozen=True, eq=False)
+class ExcitedModel:
+    """A model to excite, and the best there is to predict torques with.
+
+    Attributes:
+        smooth: base model with the Coulomb sign smoothed for the search; `exact` with the model's own smoothing.
+        values: (b,) base parameters; None where neither a model nor inertias are known.
+        covariance: (b, b) or None.
+        friction: whether friction is among the values.
+        notes: what a user should know.
+    """
+
+    smooth: BaseModel
+    exact: BaseModel
+    values: np.ndarray | None
+    covariance: np.ndarray | None
+    friction: bool
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiableColumns:
+    """The columns that a motion can tell apart.
+
+    Attributes:
+        columns: (c,) of the model's; None: all of them.
+        sigmas: (n,) infinite for torque rows that are left out; None: all rows count.
+        names: of the columns; notes: what a user should know.
+    """
+
+    columns: np.ndarray | None
+    sigmas: np.ndarray | None
+    names: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class PriorMotions:
+    """Motions that were recorded, or designed, before.
+
+    Attributes:
+        names: of the files or folders.
+        seconds: of motion.
+        information: (b, b) ∫ ωᵀω dt, of the design's columns.
+    """
+
+    names: tuple[str, ...]
+    seconds: float
+    information: np.ndarray
+
+    def per_sample(self, count: int, duration: float) -> np.ndarray:
+        """Return the information in units of one of `count` samples that stand for `duration` seconds of new motion."""
+        return self.information * (count / duration)
+
+
+@dataclass(frozen=True, eq=False)
+class ExcitationInputs:
+    """The robot an excitation is designed for.
+
+    Attributes:
+        chain, limits, model: the arm, what it must keep, and the dynamics to excite.
+        locked: joints that rest, and where; None: where the search likes it.
+        columns: that the motion can tell apart.
+        prior: motions that count already; None without any.
+    """
+
+    chain: Chain
+    limits: MotionLimits
+    model: ExcitedModel
+    locked: Mapping[int, float | None]
+    columns: IdentifiableColumns
+    prior: PriorMotions | None
+
+
+def read_inputs(
+    robot: str | Path,
+    settings: ExcitationSettings,
+    model: Path | None = None,
+    limits: Path | None = None,
+    base: str | None = None,
+    tip: str | None = None,
+) -> ExcitationInputs:
+    """Read robot, limits, model and earlier motions of an excitation.
+
+    Args:
+        robot, base, tip: see `calib.robot.load`.
+        model: folder of an identification: torques, friction and their uncertainty.
+        limits: see `calib.procedure.excitation.limits`.
+
+    Raises:
+        UsageError, MeasurementError: for a file that is none, or belongs to another robot.
+    """
+    chain, source = load_robot(robot, None, FitOptions(), base, tip)
+    known = read_motion_limits(limits, chain, source)
+    dynamics = read_model(chain, model, settings.drives, known)
+    locked = read_locked(settings.lock, chain, known.positions)
+    prior = read_prior(settings.existing, dynamics, chain)
+    return ExcitationInputs(chain, known, dynamics, locked, identifiable(dynamics, chain, locked, prior), prior)
+
+
+def read_model(chain: Chain, folder: Path | None, sets: str, limits: MotionLimits) -> ExcitedModel:
+    """Return the model to excite: of an identification's folder, or the robot's own inertias and stated friction."""
+    if folder is not None:
+        return _identified(chain, folder)
+    linear = [joint.kind == "prismatic" for joint in chain.joints]
+    terms = drives.standard([sets] * chain.n, V0, linear)
+    values, notes = None, []
+    if chain.inertias is not None:
+        known = {"velocity": 0, "sign": 1}
+        own = [
+            0.0 if limits.friction is None or one.shape not in known
+            else limits.friction[known[one.shape], one.acts[0][0]]
+            for one in terms
+        ]  # fmt: skip
+        values = np.concatenate([standard_parameters(chain), own])
+    else:
+        notes.append("the robot's masses are not known: torques are not limited")
+    friction = limits.friction is not None
+    if values is not None and not friction:
+        notes.append("friction is not known (no --model, no [friction]): torques are predicted without it")
+    model = IdentificationModel(bodies_of(chain), terms)
+    return _dynamics(model, values, None, friction, tuple(notes))
+
+
+def _identified(chain: Chain, folder: Path) -> ExcitedModel:
+    """Return the model of an identification's folder without its payloads, and the covariance of its columns."""
+    refuse_currents(folder, "an excitation within torque limits")
+    table = read_table(folder)
+    try:
+        found = from_table(chain, table)
+        if not found.model.torque_rows.has_bodies:
+            raise ValueError("rows 'drive' tell nothing of the bodies")
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        theirs = description.read(folder / "robot.toml")
+        if theirs.n != chain.n:
+            message = f"{folder} is of a robot with {theirs.n} joints ({theirs.name}), {chain.name} has {chain.n}"
+            raise UsageError(message) from error
+        raise UsageError(f"{folder}/dynamics.json does not fit robot '{chain.name}': {error!r}") from error
+    bodies = with_gravity(bodies_of(chain), np.asarray(found.model.bodies.gravity))
+    numbers = found.values[: 10 * bodies.count]
+    terms = list(zip(found.model.columns, found.values[found.model.inertial :]))
+    kept = [(one, value) for one, value in terms if one.form.slopes is not None]
+    left = [one.name for one, _ in terms if one.form.slopes is None]
+    values = np.array([*numbers, *(value for _, value in kept)])
+    if not np.isfinite(values).all():
+        names = [*bodies.names, *(one.name for one, _ in kept)]
+        raise UsageError(f"{folder}: parameter {names[int(np.argmin(np.isfinite(values)))]} of the model is not finite")
+    notes = [f"terms without slopes are left out of the predicted torque: {', '.join(left)}"] if left else []
+    model = IdentificationModel(bodies, tuple(one for one, _ in kept))
+    made = _dynamics(model, values, None, any(one.shape == "sign" for one, _ in kept), ())
+    covariance = _covariance(folder, made.exact.names)
+    if covariance is None:
+        notes.append(f"{folder}/covariance.csv does not fit the design's columns: the torque has no margin from it")
+    return replace(made, covariance=covariance, notes=tuple(notes))
+
+
+def _dynamics(
+    model: IdentificationModel, values: np.ndarray | None, covariance: np.ndarray | None, friction: bool, notes: tuple
+) -> ExcitedModel:
+    smooth = replace(model, terms=tuple(_smoothed(one) for one in model.terms))
+    found = base_parameters.find(model)
+    chosen = None if values is None else found.transform @ values
+    return ExcitedModel(BaseModel(smooth, found), BaseModel(model, found), chosen, covariance, friction, notes)
+
+
+def _smoothed(one: DriveTerm) -> DriveTerm:
+    return replace(one, settings=(max(SMOOTH, one.settings[0]),)) if one.shape == "sign" else one
+
+
+def _covariance(folder: Path, names: Sequence[str]) -> np.ndarray | None:
+    """Return the covariance of the named columns; None where the file has others."""
+    found = read_covariance(folder)
+    if found is None or not set(names) <= set(found[0]):
+        return None
+    index = [found[0].index(name) for name in names]
+    return found[1][np.ix_(index, index)]
+
+
+def read_locked(texts: Sequence[str], chain: Chain, limits: BoxLimit) -> dict[int, float | None]:
+    """Return the joints that rest: at the value said (``joint4=0.5``, rad or m), or where the search likes it (None).
+
+    Raises:
+        UsageError: for a joint that is not there, a value beyond its limits, or when none is left to move.
+    """
+    known = {f"{word}{j + 1}": j for word in ("joint", "q") for j in range(chain.n)}
+    known |= {name: j for j, name in enumerate(chain.joint_names)}
+    found: dict[int, float | None] = {}
+    for text in [part.strip() for word in texts for part in word.split(",")]:
+        name, _, amount = (part.strip() for part in text.partition("="))
+        if name not in known:
+            raise UsageError(f"--lock {text}: '{name}' is no joint; there are {', '.join(chain.joint_names)}")
+        j = known[name]
+        try:
+            value = float(amount) if amount else None
+        except ValueError:
+            raise UsageError(f"--lock {text}: '{amount}' is not a number") from None
+        lower, upper = limits.lower[j], limits.upper[j]
+        if value is not None and not lower <= value <= upper:
+            raise UsageError(
+                f"--lock {text}: {chain.joint_names[j]} at {value:g} is beyond its limits {lower:.4g} to {upper:.4g}"
+            )
+        found[j] = value
+    if len(found) == chain.n:
+        raise UsageError("--lock: every joint is locked; nothing is left to move")
+    return found
+
+
+def identifiable(
+    model: ExcitedModel, chain: Chain, locked: Mapping[int, float | None], prior: PriorMotions | None = None
+) -> IdentifiableColumns:
+    """Return which columns of a model a motion with these joints locked, and those before, can tell apart."""
+    names = model.exact.names
+    if not locked:
+        return IdentifiableColumns(None, None, names)
+    known = None if prior is None else prior.information
+    kept = columns_at_rest(model.exact, locked, *sampling_limits(chain), known)
+    sigmas = np.where(np.isin(np.arange(chain.n), list(locked)), np.inf, 1.0)
+    still = ", ".join(chain.joint_names[j] for j in locked)
+    gone = [name for k, name in enumerate(names) if k not in set(kept.tolist())]
+    note = (
+        f"held: {still}; a held joint's torque is stiction in part and is left out; {len(kept)} of {len(names)} "
+        f"columns can be told ({len(gone)} fold into others or vanish: {', '.join(gone[:12])}"
+        f"{', ...' if len(gone) > 12 else ''})"
+    )
+    return IdentifiableColumns(kept, sigmas, tuple(names[k] for k in kept), (note,) if gone else ())
+
+
+def read_prior(paths: Sequence[str], model: ExcitedModel, chain: Chain) -> PriorMotions | None:
+    """Return the information of recordings (``log.npz@0:9.4`` cuts) and folders of `calib excite`; None without any.
+
+    Recordings are filtered and differentiated as `calib identify` does it.
+
+    Raises:
+        UsageError, MeasurementError: for what is neither, or belongs to another robot.
+    """
+    if not paths:
+        return None
+    total, seconds = np.zeros((len(model.exact.names),) * 2), 0.0
+    for text in paths:
+        designed = (Path(text) / coefficients.NAME).exists()
+        q, v, a, rate = _designed(Path(text), chain) if designed else _recorded(text, chain)
+        total += information(model.exact, q, v, a) / rate
+        seconds += len(q) / rate
+    return PriorMotions(tuple(str(path) for path in paths), seconds, total)
+
+
+def _designed(folder: Path, chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Return all periods of a designed motion, at 50 samples a second at least."""
+    found = coefficients.read(folder)
+    if found.joint_names != tuple(chain.joint_names):
+        raise UsageError(
+            f"--existing {folder}: a motion of {', '.join(found.joint_names)}; {chain.name} has "
+            f"{', '.join(chain.joint_names)}"
+        )
+    count = max(1000, round(50 * found.period))
+    q, v, a = found.orders(np.arange(count) * (found.period / count))
+    every = found.repeat
+    return np.tile(q, (every, 1)), np.tile(v, (every, 1)), np.tile(a, (every, 1)), count / found.period
+
+
+def _recorded(text: str, chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    motion = read_motion(text, chain, FileSettings())
+    present = motion.weight > 0.5
+    return motion.q[present], motion.v[present], motion.a[present], motion.rate

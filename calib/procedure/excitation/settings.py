@@ -1,0 +1,77 @@
+"""Settings of designing and planning motions: one default each, for the commands, the guided run and scripts alike."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ExcitationSettings:
+    """How an exciting motion is designed and played.
+
+    Attributes:
+        goals, hard: ``raw=35``, ``normalised=6`` (condition numbers), ``wrist=0.1`` or ``joint6=0.1`` (mean torque as a
+            share of the limit, at least), ``coverage=0.1`` (share of time at low and at high speed, either way); hard
+            ones must be met. Without any the logarithms of both condition numbers are minimised in equal parts.
+        period: T0 of the motion [s].
+        harmonics: frequencies per joint, or control points beside the rest conditions of splines.
+        family: "fourier" or "bspline".
+        drives: terms of each joint's drive, where no identified model has its own.
+        rate: of the controller [Hz].
+        samples: instants over the period at which the search evaluates.
+        starts: random starts of the search; evaluations: most of one start; seed: of the starts.
+        front: motions on the front between the normalised condition number and the first torque goal; 0 for none.
+        start: (n,) where the robot stands [rad or m], for an approach; None for none.
+        repeat: periods to run one after the other.
+        slower: factor of a slow rehearsal, 1 for none.
+        existing: recordings (``log.npz@0:9.4`` cuts), or folders of earlier excitations, that count already; the new
+            motion counts `repeat` times.
+        lock: joints that stay, ``joint4`` or ``joint4=0.5`` [rad or m].
+    """
+
+    goals: tuple[str, ...] = ()
+    hard: tuple[str, ...] = ()
+    period: float = 20.0
+    harmonics: int = 5
+    family: str = "fourier"
+    drives: str = "Fv Fc off"
+    rate: float = 1000.0
+    samples: int = 200
+    starts: int = 6
+    evaluations: int = 600
+    seed: int = 0
+    front: int = 0
+    start: tuple[float, ...] | None = None
+    repeat: int = 1
+    slower: float = 1.0
+    existing: tuple[str, ...] = ()
+    lock: tuple[str, ...] = ()
+
+
+DEFAULT_DESIGN = ExcitationSettings()
+
+
+@dataclass(frozen=True)
+class PlanSettings:
+    """How a motion through waypoints is planned.
+
+    Attributes:
+        payloads: labels of identified payloads on board.
+        lines: the tool runs straight from waypoint to waypoint, and rests at each.
+        rate: of the controller [Hz].
+        shorten: timings to spend on a faster shape between waypoints (`trajectories.timing.shape`); 0 for none.
+        stray: how far that shape may leave the spline, per joint [rad or m].
+        start: (n,) where the robot stands [rad or m], for an approach; None for none.
+        slower: factor of a slow rehearsal, 1 for none.
+    """
+
+    payloads: tuple[str, ...] = ()
+    lines: bool = False
+    rate: float = 1000.0
+    shorten: int = 0
+    stray: float = 0.0
+    start: tuple[float, ...] | None = None
+    slower: float = 1.0
+
+
+DEFAULT_PLAN = PlanSettings()
