@@ -8,6 +8,7 @@ from pathlib import Path
 
 from calib.procedure.dynamic_stage import folder as identification_outputs
 from calib.procedure.dynamic_stage import identify
+from calib.procedure.dynamic_stage.inputs import gather
 from calib.robot.load import load
 from calib.simulation.cells import measured_files
 from calib.simulation.cells.virtual_arm import moving_arm, record
@@ -25,7 +26,7 @@ for name, seed in (("training", 1), ("other", 2)):
     reference = random_fourier(chain.lower, chain.upper, speeds, 10.0, 500.0, acceleration=15.0, seed=seed)
     measured_files.write_log(record(arm, reference, seed), folder / f"{name}.csv")
 
-inputs = identify.gather("tx40", [str(folder / "training.csv")], [str(folder / "other.csv")], friction="standard")
+inputs = gather("tx40", [str(folder / "training.csv")], [str(folder / "other.csv")], friction="standard")
 outcome = identify.run(inputs)
 identification_outputs.write_folder(outcome, folder / "model")
 for name, score in outcome.validation.items():

@@ -9,6 +9,7 @@ from pathlib import Path
 from calib.data.poses.plans import write_poses
 from calib.procedure.dynamic_stage import folder as identification_outputs
 from calib.procedure.dynamic_stage import identify
+from calib.procedure.dynamic_stage.inputs import gather
 from calib.procedure.excitation import folder as motion_folder
 from calib.procedure.excitation import planning
 from calib.procedure.report import motion_figures
@@ -26,7 +27,7 @@ arm, chain = moving_arm(virtual_cell("tx40", 0), "tx40", 0), load("tx40")
 speeds = [0.5 * joint.velocity for joint in chain.joints]
 reference = random_fourier(chain.lower, chain.upper, speeds, 10.0, 500.0, acceleration=15.0, seed=1)
 measured_files.write_log(record(arm, reference, 1), folder / "training.csv")
-inputs = identify.gather("tx40", [str(folder / "training.csv")], friction="standard")
+inputs = gather("tx40", [str(folder / "training.csv")], friction="standard")
 identification_outputs.write_folder(identify.run(inputs), folder / "model")
 
 corners = [[0.0, 0.3, 1.2, 0.0, 0.5, 0.0], [1.2, 0.8, 0.6, 0.5, 0.9, 0.8], [0.4, 0.2, 1.5, -0.5, 0.2, -0.6]]

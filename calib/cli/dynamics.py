@@ -31,14 +31,14 @@ def identify_dynamics(
 ) -> None:
     """Identify the dynamics of ROBOT from recordings, and say how well it predicts other motion."""
     from calib.identification.identify_options import read_options
-    from calib.procedure.dynamic_stage import folder, identify
+    from calib.procedure.dynamic_stage import folder, identify, inputs
     from calib.procedure.report import identification_console, identification_figures
 
     chosen = read_options(options)
     folder.check_target(out)
     console = make_console()
     with progress() as say:
-        found = identify.gather(
+        found = inputs.gather(
             robot, recordings, validate or [], options=chosen, method=method, friction=friction, base=base, tip=tip,
             seed=seed, progress=say,
         )  # fmt: skip

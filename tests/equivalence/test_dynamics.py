@@ -6,6 +6,7 @@ import re
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import planted_motion as planted
@@ -23,7 +24,17 @@ DYNAMICS = {
     "wanted": "true", "plan": "false", "validation": "false", "friction": '"standard"', "period": "4.0",
     "harmonics": "2", "rate": "100.0", "repeats": "1", "starts": "1", "evaluations": "20",
 }  # fmt: skip
-MODEL = ("parameters", "condition_number", "friction", "method", "ladder", "elimination", "geometry", "resting", "unit")
+MODEL = (
+    "parameters",
+    "condition_number",
+    "friction",
+    "method",
+    "ladder",
+    "elimination",
+    "geometry",
+    "findings",
+    "unit",
+)
 
 
 @pytest.fixture(scope="module")
@@ -81,6 +92,14 @@ def standing(training: Series, unseen: Series) -> None:
     unseen["q"] = np.repeat(unseen["q"][:1], len(unseen["q"]), axis=0)
 
 
+def timeless(tracking: dict[str, Any]) -> dict[str, Any]:
+    """Return what tracking came to, without how long its simulation took."""
+    return {
+        name: {key: value for key, value in one.items() if key != "seconds"} if isinstance(one, dict) else one
+        for name, one in tracking.items()
+    }
+
+
 def by_command(session: Session, out: Path) -> Judgement:
     place = session.path("7-recorded")
     refused = command(
@@ -91,6 +110,7 @@ def by_command(session: Session, out: Path) -> Judgement:
         return Judgement(refused=refused)
     found = read(out / "metrics.json")
     numbers = {"fit": found["identification"], **{key: found[key] for key in ("validation", *MODEL)}}
+    numbers["tracking"] = timeless(found["tracking"])
     return Judgement(found["verdict"], found["reason"], numbers, frozenset(found["warnings"]))
 
 
@@ -104,6 +124,7 @@ def by_session(session: Session) -> Judgement:
     assert set(found["warnings"]) <= set(notes)
     own, printed = read(session.path("8-dynamics/metrics.json")), dynamics_section.read(session.path("8-dynamics"))
     numbers = {key: found[key] for key in ("fit", "validation")} | {key: own[key] for key in MODEL}
+    numbers["tracking"] = timeless(found["tracking"])
     assert (printed.verdict, printed.reason) == (found["verdict"], found["reason"])
     return Judgement(found["verdict"], found["reason"], numbers, frozenset(found["warnings"]))
 

@@ -15,6 +15,7 @@ from calib.identification.geometry_uncertainty import propagate
 from calib.identification.identify import identify
 from calib.procedure.dynamic_stage import folder as identified
 from calib.procedure.dynamic_stage import identify as dynamic
+from calib.procedure.dynamic_stage.inputs import gather
 from calib.procedure.kinematic_stage import fit as kinematic
 from calib.procedure.kinematic_stage import folder as fitted
 from calib.procedure.kinematic_stage.inputs import Inputs
@@ -37,12 +38,12 @@ def test_fit_and_identification_in_one_process_equal_the_way_through_files(model
     outcome = geometry(model)
     robot = outcome.calibrated
     log = planted.write(tmp_path, "log.npz", 0)
-    given = dynamic.gather(robot, [str(log)])
+    given = gather(robot, [str(log)])
     found = identify(robot, given.cases, given.options.settings)
     carried = propagate(found, robot, given.cases)
 
     fitted.write_folder(outcome, tmp_path / "fit")
-    through = dynamic.run(dynamic.gather(tmp_path / "fit", [str(log)]))
+    through = dynamic.run(gather(tmp_path / "fit", [str(log)]))
     assert through.carried is not None and robot.covariance is not None
     close = {"rtol": 1e-10, "atol": 0.0}  # tables hold twelve digits
     np.testing.assert_allclose(found.fitted.estimate.values, through.found.fitted.estimate.values, **close)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -16,16 +17,22 @@ from calib.folders import check_folder, write_staged
 from calib.identification.cases import Case
 from calib.identification.gains import DriveGains
 from calib.identification.methods.least_squares import ASSUMES
-from calib.identification.model_file import in_unit, to_table
+from calib.identification.model_file import in_unit, read_dynamics, to_table
 from calib.identification.possible.information import information
+from calib.identification.prediction import Dynamics
 from calib.identification.scores import Score, TorqueErrors
 from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
+from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.loop_tables import loop_table, write_instrumental
 from calib.procedure.dynamic_stage.tracking import tracking_table
-from calib.procedure.dynamic_stage.verdict import resting_parameters
+from calib.procedure.dynamic_stage.validation import Assessment, ModelFindings
+from calib.procedure.dynamic_stage.verdict import Resting
+from calib.records import read_record
 from calib.robot import calibrated
+from calib.simulation.loop.controllers import Controller
 
+T = TypeVar("T")
 OURS = (
     calibrated.ROBOT, "dynamics.json", "estimate.csv", "covariance.csv", "information.csv", "instrumental.csv",
     "metrics.json", "drive_gains.csv",
@@ -33,9 +40,144 @@ OURS = (
     geometry_tables.GEOMETRIES,
 )  # fmt: skip
 """Files of an earlier identification that a new one replaces; besides plots, ``plot_*.png``."""
+UNSEEN = 1  # schema of the report on unseen motion
+POINTS = 400  # samples per curve of the certificate (our choice)
 TORQUE_RATE = 100.0  # of torques_1.csv [Hz]
 OFF = 1e-9  # σ of a friction term below which it is the ridge's floor, not a measurement [N m] (our choice)
 HEADER = ("name", "expression", "unit", "value", "sigma", "rsd", "essential", "sigma_torque", "sigma_geometry")
+
+
+@dataclass(frozen=True)
+class StoredController:
+    """A controller as JSON holds it, see `calib.simulation.loop.controllers.Controller`."""
+
+    kp: tuple[float, ...]
+    kd: tuple[float, ...]
+    ki: tuple[float, ...]
+    share: tuple[float, ...]
+    limit: tuple[float | None, ...]
+    windup: tuple[float | None, ...]
+    delay: int = 0
+    cutoff: float | None = None
+
+    @classmethod
+    def of(cls, controller: Controller | None) -> StoredController | None:
+        """Return what is to be stored; None without a controller, or with torques or a model of its own."""
+        if controller is None or controller.ahead is not None or controller.model is not None:
+            return None
+        gains = (tuple(_finite(x) for x in row) for row in controller.rows)
+        return cls(*gains, controller.delay, controller.cutoff)  # type: ignore[arg-type]
+
+    def controller(self) -> Controller:
+        """Return the controller."""
+        rows = (self.kp, self.kd, self.ki, self.share, self.limit, self.windup)
+        gains = (np.array([np.inf if x is None else x for x in row]) for row in rows)
+        return Controller(*gains, delay=self.delay, cutoff=self.cutoff)
+
+
+@dataclass(frozen=True)
+class StoredFindings:
+    """`ModelFindings` as JSON holds them."""
+
+    rests: Resting
+    notes: tuple[str, ...]
+    controller: StoredController | None = None
+
+
+@dataclass(frozen=True)
+class IdentificationMetrics:
+    """What ``metrics.json`` holds of the verdict; `findings` from version 0.2 on."""
+
+    verdict: str
+    reason: str
+    warnings: tuple[str, ...]
+    findings: StoredFindings | None = None
+
+
+@dataclass(frozen=True)
+class StoredVerdict:
+    """What ``report.json`` of unseen motion says of the verdict."""
+
+    verdict: str
+    reason: str
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class IdentificationFolder:
+    """The folder that an identification leaves: where its files are, and what they say."""
+
+    path: Path
+
+    @property
+    def robot(self) -> Path:
+        """The robot it was identified on."""
+        return self.path / calibrated.ROBOT
+
+    @property
+    def model(self) -> Path:
+        """The model."""
+        return self.path / "dynamics.json"
+
+    @property
+    def numbers(self) -> Path:
+        """Numbers, verdict and findings."""
+        return self.path / "metrics.json"
+
+    @property
+    def tables(self) -> tuple[Path, Path]:
+        """The estimate, and its covariance."""
+        return self.path / "estimate.csv", self.path / "covariance.csv"
+
+    @property
+    def unseen(self) -> UnseenFolder:
+        """What the model comes to on motion it has not seen."""
+        return UnseenFolder(self.path / "unseen")
+
+    def dynamics(self) -> Dynamics:
+        """Read the model."""
+        return read_dynamics(self.path)[1]
+
+    def metrics(self) -> IdentificationMetrics:
+        """Read the verdict and the findings."""
+        return _read(IdentificationMetrics, self.numbers)
+
+    def findings(self) -> ModelFindings:
+        """Read what is known of the model; an older folder says it in its warnings alone."""
+        metrics = self.metrics()
+        if metrics.findings is None:
+            return ModelFindings(Resting(), metrics.warnings)
+        known = metrics.findings.controller
+        return ModelFindings(metrics.findings.rests, metrics.findings.notes, known and known.controller())
+
+
+@dataclass(frozen=True)
+class UnseenFolder:
+    """The folder that holds an identified model against motion it has not seen."""
+
+    path: Path
+
+    @property
+    def report(self) -> Path:
+        """Scores, verdict, and curves for the certificate."""
+        return self.path / "report.json"
+
+    def write(self, inputs: IdentificationInputs, found: Assessment) -> None:
+        """Write a table of torques per unseen recording, and the report."""
+        for number, case in enumerate(inputs.unseen, 1):
+            write_torques(case, found.predictions[case.name], self.path / f"torques_{number}.csv")
+        files.write_json(self.report, report(inputs, found))
+
+    def verdict(self) -> StoredVerdict:
+        """Read what was judged."""
+        return _read(StoredVerdict, self.report)
+
+
+def _read(kind: type[T], path: Path) -> T:
+    try:
+        return read_record(kind, json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError) as error:
+        raise UsageError(f"{path} cannot be read ({error}); identify again") from error
 
 
 def check_target(out: Path, source: Path | None = None) -> None:
@@ -196,7 +338,11 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
         "filters": {case.name: filter_table(case.motion) for case in (*outcome.inputs.cases, *outcome.inputs.unseen)},
         "geometry": geometry_tables.metrics(outcome.carried, outcome.geometries),
         "repeated": dict(outcome.repeated),
-        "resting": asdict(resting_parameters(found)),
+        "findings": asdict(
+            StoredFindings(
+                outcome.findings.rests, outcome.findings.notes, StoredController.of(outcome.findings.controller)
+            )
+        ),
         "warnings": list(outcome.warnings),
         "verdict": outcome.verdict.level,
         "reason": outcome.verdict.reason,
@@ -266,3 +412,41 @@ def _finite(value: float) -> float | None:
 
 def _number(value: float | None) -> float | None:
     return None if value is None else float(value)
+
+
+def report(inputs: IdentificationInputs, found: Assessment) -> dict[str, Any]:
+    """Return scores, verdict and curves on unseen motion as JSON holds them."""
+    chain, rows = inputs.chain, inputs.options.settings.torque_rows
+    return {
+        "schema": UNSEEN,
+        "verdict": found.verdict.level,
+        "reason": found.verdict.reason,
+        "warnings": list(found.warnings),
+        "rows": list(rows.titles(chain.joint_names)),
+        "units": list(rows.units([joint.kind == "prismatic" for joint in chain.joints])),
+        "fit": {name: score_table(one) for name, one in found.fit.items()},
+        "validation": {
+            name: score_table(one) | {"evidence": name not in found.repeated} for name, one in found.validation.items()
+        },
+        "curves": [_curves(case, found.predictions[case.name]) for case in (inputs.unseen or inputs.cases)],
+        "tracking": tracking_table(found.tracking),
+        "autocorrelation": {
+            name: {
+                "bound": [None if w is None else w.bound for w in one.whiteness],
+                "values": [None if w is None else [round(float(x), 4) for x in w.acf] for w in one.whiteness],
+            }
+            for name, one in (found.validation or found.fit).items()
+        },
+    }
+
+
+def _curves(case: Case, predicted: np.ndarray) -> dict[str, Any]:
+    """Return measured and predicted torques, thinned for drawing."""
+    picked = np.unique(np.linspace(0, len(case.target) - 1, POINTS).astype(int))
+    plain = lambda x: [[float(f"{value:.5g}") for value in column] for column in np.asarray(x)[picked].T]  # noqa: E731
+    return {
+        "name": case.name,
+        "t": [round(float(t), 4) for t in case.motion.t[picked]],
+        "measured": plain(case.target),
+        "predicted": plain(predicted),
+    }

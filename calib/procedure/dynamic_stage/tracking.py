@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,12 +11,13 @@ from rich.markup import escape
 from rich.table import Table
 
 from calib.errors import CalibError
-from calib.identification.cases import Case
-from calib.identification.identify import Identification
 from calib.identification.loop.loop_settings import stated_controller
 from calib.identification.loop.replay import CAD, DAMPING, FEEDBACK, FLOOR, FREQUENCY, IDENTIFIED, Replay, replay
+from calib.identification.prediction import Dynamics
+from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.loop_tables import controller_table
 from calib.robot.chain import Chain
+from calib.simulation.loop.controllers import Controller
 
 MOST = 3  # recordings that are replayed
 KEYS = {FEEDBACK: "feedback", CAD: "cad", IDENTIFIED: "model", FLOOR: "floor"}
@@ -38,21 +39,28 @@ class Tracking:
 
 
 def track(
-    chain: Chain, found: Identification, cases: Sequence[Case], unseen: Sequence[Case],
-    predictions: Mapping[str, np.ndarray], unit: str,
-) -> Tracking:  # fmt: skip
-    """Replay unseen recordings (or, without any, one of the fit's own); see `calib.identification.loop.replay`."""
-    chosen = list(unseen)[:MOST] or list(cases)[:1]
-    loop = found.settings.loop if unit == "N m" else None
-    read = None if loop is None or found.bias.loops is None else found.bias.loops.controller
+    inputs: IdentificationInputs,
+    dynamics: Dynamics,
+    predictions: Mapping[str, np.ndarray],
+    controller: Controller | None = None,
+) -> Tracking:
+    """Replay unseen recordings (or, without any, one of the fit's own); see `calib.identification.loop.replay`.
+
+    Args:
+        predictions: case name → torques by the model.
+        controller: that was identified, where the loop's is not stated.
+    """
+    chain, chosen = inputs.chain, list(inputs.unseen)[:MOST] or list(inputs.cases)[:1]
+    loop = inputs.options.settings.loop if inputs.unit == "N m" else None
+    read = None if loop is None else controller
     try:
         if loop is not None and loop.controller != "identify":
             read = stated_controller(loop, chain.n)
         rate = None if read is None or loop is None else loop.rate
-        replays = tuple(replay(chain, found.dynamics, case, predictions[case.name], read, rate) for case in chosen)
+        replays = tuple(replay(chain, dynamics, case, predictions[case.name], read, rate) for case in chosen)
     except CalibError as error:
-        return Tracking(unseen=bool(unseen), failure=str(error))
-    return Tracking(replays, bool(unseen))
+        return Tracking(unseen=bool(inputs.unseen), failure=str(error))
+    return Tracking(replays, bool(inputs.unseen))
 
 
 def tracking_lines(tracking: Tracking, chain: Chain) -> Iterator[Table | str]:

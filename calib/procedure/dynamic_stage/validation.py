@@ -1,95 +1,125 @@
-"""An identified model held against recordings it has not seen, and judged; what the certificate needs of it."""
+"""A model beside recordings, and what that comes to: one assessment for all who ask.
+
+`assess` is called of a model that was just identified and of one read back from its folder; they get the same answer.
+"""
 
 from __future__ import annotations
 
-import json
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib import files
-from calib.errors import UsageError
-from calib.identification.cases import Case
-from calib.identification.model_file import read_dynamics
-from calib.procedure.dynamic_stage.folder import score_table, write_torques
-from calib.procedure.dynamic_stage.identify import Assessment, IdentificationInputs, assess
-from calib.procedure.dynamic_stage.verdict import Resting
+from calib.data.signals.persistency import ExcitationReport, repeats, report_excitation
+from calib.identification.friction.passivity import driven
+from calib.identification.prediction import Dynamics, predict
+from calib.identification.scores import Score, score
+from calib.procedure.dynamic_stage.gains import relative_warnings
+from calib.procedure.dynamic_stage.inputs import IdentificationInputs, Progress
+from calib.procedure.dynamic_stage.tracking import Tracking, track
+from calib.procedure.dynamic_stage.verdict import (
+    Resting,
+    judge,
+    warnings,
+    with_prior,
+)
+from calib.procedure.kinematic_stage.verdict import Verdict
+from calib.simulation.loop.controllers import Controller
 
-SCHEMA = 1
-POINTS = 400  # samples per curve of the certificate (our choice)
+REPEAT = 0.5  # share of states met in training from which on a validation file proves nothing (our choice)
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
-    """A model on unseen motion: the recordings, and what it comes to on them."""
+class ModelFindings:
+    """What an identification says of its model and a verdict needs beside the recordings; kept in its folder.
 
-    inputs: IdentificationInputs
-    result: Assessment
+    Attributes:
+        rests: its parameters that rest on a prior.
+        notes: what a user should know of the model, whatever the unseen recordings are.
+        controller: that was stated or identified; None without any.
+    """
+
+    rests: Resting
+    notes: tuple[str, ...] = ()
+    controller: Controller | None = None
 
 
-def hold(inputs: IdentificationInputs, folder: Path, tolerance: float = 0.0) -> Held:
-    """Predict every recording by the model that an identification left in `folder`, and judge.
+@dataclass(frozen=True, eq=False)
+class Assessment:
+    """A model beside the recordings, and what that comes to.
+
+    Attributes:
+        fit, validation: case name → its score.
+        predictions: case name → predicted torques (N, rows) at the full rate.
+        repeated: validation case → share of its states that the training motion has been in, where it is no proof.
+        excitation: case name → what the motion can tell.
+        verdict: as of `calib.procedure.dynamic_stage.verdict`.
+        warnings: what a user should know of the recordings, and of the model.
+        tracking: with the model fed forward.
+    """
+
+    fit: Mapping[str, Score]
+    validation: Mapping[str, Score]
+    predictions: Mapping[str, np.ndarray]
+    repeated: Mapping[str, float]
+    excitation: Mapping[str, ExcitationReport]
+    verdict: Verdict
+    warnings: tuple[str, ...]
+    tracking: Tracking
+
+
+def assess(
+    inputs: IdentificationInputs,
+    dynamics: Dynamics,
+    findings: ModelFindings,
+    wrong: Sequence[int] | None = None,
+    tolerance: float = 0.0,
+    progress: Progress | None = None,
+) -> Assessment:
+    """Predict every recording and judge: in the command, and of a model read from its folder.
 
     Args:
         inputs: recordings to learn from (for the model's own error) and unseen ones.
+        dynamics: the model.
+        findings: what is known of it.
+        wrong: joints that friction drives, where that is known already (`friction.passivity.driven`).
         tolerance: largest error of the torque on unseen motion that is good enough [%]; 0: none.
-
-    Raises:
-        RobotError: where the folder holds no model.
-        UsageError: where its ``metrics.json`` is missing or damaged.
     """
-    _, dynamics = read_dynamics(folder)
-    try:
-        metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
-        known = metrics.get("resting", {})  # an older version does not say it: its warnings do
-        rests = Resting(tuple(known.get("names", ())), known.get("of", 0), known.get("source", ""))
-        said = metrics["warnings"]
-    except (OSError, ValueError, KeyError) as error:
-        raise UsageError(f"{folder}/metrics.json: {error!r}; identify again") from error
-    return Held(inputs, assess(inputs, dynamics, rests, said, tolerance=tolerance))
+    say = progress or (lambda words: None)
+    wrong = driven(dynamics, inputs.cases) if wrong is None else wrong
+    predictions, scores = {}, {}
+    for case in (*inputs.cases, *inputs.unseen):
+        say(f"predicting {case.name}")
+        predictions[case.name] = predict(dynamics, case)
+        scores[case.name] = score(case, predictions[case.name], inputs.options.slow)
+    say("judging")
+    shares = {case.name: max(repeats(own.motion, case.motion) for own in inputs.cases) for case in inputs.unseen}
+    repeated = {name: share for name, share in shares.items() if share >= REPEAT}
+    excitation = {case.name: report_excitation(case.motion) for case in inputs.cases}
+    fit = {case.name: scores[case.name] for case in inputs.cases}
+    validation = {case.name: scores[case.name] for case in inputs.unseen}
+    proofs = {name: one for name, one in validation.items() if name not in repeated}
+    labels = inputs.options.settings.torque_rows.numbered(inputs.chain.n)
+    verdict = with_prior(judge(fit, proofs, repeated, excitation, wrong, labels), findings.rests)
+    say("tracking with the model fed forward")
+    amperes = relative_warnings(inputs.unit)
+    tracking = (
+        Tracking(unseen=bool(inputs.unseen), failure=amperes[0]) if amperes
+        else track(inputs, dynamics, predictions, findings.controller)
+    )  # fmt: skip
+    told = (
+        *amperes, *warnings(inputs.cases, inputs.unseen, validation, repeated, excitation, inputs.chain),
+        *findings.notes,
+    )  # fmt: skip
+    return Assessment(
+        fit, validation, predictions, repeated, excitation, tolerated(verdict, proofs, tolerance),
+        tuple(dict.fromkeys(told)), tracking,
+    )  # fmt: skip
 
 
-def write(held: Held, folder: Path) -> None:
-    """Write ``report.json`` (scores, verdict, curves for the certificate) and a table of unseen torques per file."""
-    for number, case in enumerate(held.inputs.unseen, 1):
-        write_torques(case, held.result.predictions[case.name], folder / f"torques_{number}.csv")
-    files.write_json(folder / "report.json", report(held))
-
-
-def report(held: Held) -> dict[str, Any]:
-    """Return scores, verdict and curves as JSON holds them."""
-    chain, rows, found = held.inputs.chain, held.inputs.options.settings.torque_rows, held.result
-    return {
-        "schema": SCHEMA,
-        "verdict": found.verdict.level,
-        "reason": found.verdict.reason,
-        "warnings": list(found.warnings),
-        "rows": list(rows.titles(chain.joint_names)),
-        "units": list(rows.units([joint.kind == "prismatic" for joint in chain.joints])),
-        "fit": {name: score_table(one) for name, one in found.fit.items()},
-        "validation": {
-            name: score_table(one) | {"evidence": name not in found.repeated} for name, one in found.validation.items()
-        },
-        "curves": [_curves(case, found.predictions[case.name]) for case in (held.inputs.unseen or held.inputs.cases)],
-        "autocorrelation": {
-            name: {
-                "bound": [None if w is None else w.bound for w in one.whiteness],
-                "values": [None if w is None else [round(float(x), 4) for x in w.acf] for w in one.whiteness],
-            }
-            for name, one in (found.validation or found.fit).items()
-        },
-    }
-
-
-def _curves(case: Case, predicted: np.ndarray) -> dict[str, Any]:
-    """Return measured and predicted torques, thinned for drawing."""
-    picked = np.unique(np.linspace(0, len(case.target) - 1, POINTS).astype(int))
-    plain = lambda x: [[float(f"{value:.5g}") for value in column] for column in np.asarray(x)[picked].T]  # noqa: E731
-    return {
-        "name": case.name,
-        "t": [round(float(t), 4) for t in case.motion.t[picked]],
-        "measured": plain(case.target),
-        "predicted": plain(predicted),
-    }
+def tolerated(verdict: Verdict, proofs: Mapping[str, Score], tolerance: float) -> Verdict:
+    """Return the verdict, made to fail where the tolerance [%] is not kept."""
+    worst = max((one.raw.total for one in proofs.values()), default=0.0)
+    if not tolerance or worst <= tolerance:
+        return verdict
+    return replace(verdict, level="fail", reason=f"{verdict.reason}; above the tolerance of {tolerance:g} %")

@@ -20,7 +20,7 @@ from calib.dynamics.shapes import V0
 from calib.errors import UsageError
 from calib.identification.identify_options import FileSettings
 from calib.identification.model_file import from_table, read_covariance, read_table, refuse_currents
-from calib.procedure.dynamic_stage.identify import read_motion
+from calib.procedure.dynamic_stage.inputs import read_motion
 from calib.procedure.excitation import coefficients
 from calib.procedure.excitation.limits import MotionLimits, read_motion_limits
 from calib.procedure.excitation.settings import ExcitationSettings

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calib.errors import UsageError
-from calib.procedure.dynamic_stage.validation import SCHEMA
+from calib.procedure.dynamic_stage.folder import UNSEEN, IdentificationFolder
 from calib.procedure.excitation import coefficients
 from calib.procedure.report import dynamics_figures, motion_figures, uncertainty_figures
 from calib.procedure.report.page import Block, KeyFigure, Picture, Pictures, Section, Table, Text
@@ -50,14 +50,15 @@ def read(folder: Path) -> DynamicReport:
         UsageError: where it is missing or made by another version.
     """
     try:
-        metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
-        unseen = json.loads((folder / "unseen/report.json").read_text(encoding="utf-8"))
-        with (folder / "estimate.csv").open(newline="", encoding="utf-8") as file:
+        place = IdentificationFolder(folder)
+        metrics = json.loads(place.numbers.read_text(encoding="utf-8"))
+        unseen = json.loads(place.unseen.report.read_text(encoding="utf-8"))
+        with place.tables[0].open(newline="", encoding="utf-8") as file:
             estimate = tuple(csv.DictReader(file))
     except (OSError, ValueError) as error:
         raise UsageError(f"{folder}: {error}; identify again: calib redo … identify") from error
-    if unseen.get("schema") != SCHEMA:
-        raise UsageError(f"{folder}/unseen/report.json: schema {unseen.get('schema')}, this version reads {SCHEMA}")
+    if unseen.get("schema") != UNSEEN:
+        raise UsageError(f"{folder}/unseen/report.json: schema {unseen.get('schema')}, this version reads {UNSEEN}")
     return DynamicReport(unseen["verdict"], unseen["reason"], metrics, estimate, unseen)
 
 

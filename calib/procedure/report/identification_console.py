@@ -12,7 +12,8 @@ from rich.table import Table
 from calib.identification.methods.least_squares import ASSUMES
 from calib.identification.scores import Score
 from calib.procedure.dynamic_stage import geometry_tables
-from calib.procedure.dynamic_stage.identify import IdentificationInputs, IdentificationOutcome
+from calib.procedure.dynamic_stage.identify import IdentificationOutcome
+from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.loop_tables import loop_lines
 from calib.procedure.dynamic_stage.tracking import tracking_lines
 from calib.procedure.report.console import COLOURS

@@ -36,9 +36,9 @@ def certify(session: Session, say: Say) -> list[str]:
     judged = [with_arrival(section, noticed(session, "3-measured", "validate"))]
     notes = [f"geometry {section.verdict}: {section.reason}"]
     if session.dynamic:
-        dynamics = dynamics_section.read(session.path("8-dynamics"))
+        dynamics = dynamics_section.read(session.identification.path)
         exported = read_state(session)["steps"].get("export", {}).get("notes", [])
-        folders = session.path("8-dynamics"), session.path("6-excitation")
+        folders = session.identification.path, session.path("6-excitation")
         section = dynamics_section.dynamics_stage(dynamics, *folders, exported)
         judged.append(with_arrival(section, noticed(session, "7-recorded", "predict")))
         notes.append(f"dynamics {dynamics.verdict}: {dynamics.reason}")
@@ -153,7 +153,7 @@ def listed(session: Session) -> list[tuple[str, str, str, str]]:
     if session.dynamic:
         wanted += sorted(session.path("6-excitation").glob("*/trajectory.csv"))
         wanted += [path for paths in recordings(session) for path in paths if path.is_file()]
-        wanted += [session.path(f"8-dynamics/{name}") for name in ("estimate.csv", "covariance.csv", "dynamics.json")]
+        wanted += [*session.identification.tables, session.identification.model]
     wanted += sorted(path for path in session.path(session.export).glob("*") if path.is_file())
     made = {name: mark for step in read_state(session)["steps"].values() for name, mark in step["outputs"].items()}
     rows = []

@@ -17,11 +17,12 @@ from calib.dynamics.torque_rows import torque_rows
 from calib.identification.identify_options import FileSettings, IdentifyOptions, file_settings, read_options
 from calib.identification.settings import Payload
 from calib.procedure.dynamic_stage import identify as identifying
-from calib.procedure.dynamic_stage import validation
+from calib.procedure.dynamic_stage import inputs
+from calib.procedure.dynamic_stage.validation import assess
 from calib.procedure.excitation import coefficients
 from calib.procedure.excitation.coefficients import Periodic
 from calib.procedure.session import motion_check
-from calib.procedure.session.folder import Session, read_state
+from calib.procedure.session.folder import Session
 from calib.robot.chain import Chain
 from calib.robot.load import load
 
@@ -129,7 +130,7 @@ def check_recording(session: Session, path: Path, name: str) -> tuple[list[float
     """
     chain, options = calibrated(session), options_of(session)
     own = file_settings(options, str(path))
-    recording = read_recording(str(path), identifying.joints_of(chain), own.recording)
+    recording = read_recording(str(path), inputs.joints_of(chain), own.recording)
     rate = (len(recording) - 1) / max(recording.duration, 1e-9)
     sensors = ", and sensors behind the gears" if recording.tau_link is not None else ""
     notes = [f"{path.name}: {recording.duration:.1f} s at {rate:.4g} Hz, {recording.kind}s{sensors}"]
@@ -169,13 +170,13 @@ def identify(session: Session, say: Say) -> list[str]:
     from calib.procedure.report import identification_figures
 
     cuts = json.loads(session.path("7-recorded/cuts.json").read_text(encoding="utf-8"))
-    given = identifying.gather(
+    given = inputs.gather(
         session.fit.path, cut_paths(recordings(session)[0], cuts), options=options_of(session),
         seed=session.settings.seed, progress=say,
     )  # fmt: skip
     outcome = identifying.run(given, progress=say)
     say("writing")
-    identification_outputs.write_folder(outcome, session.path("8-dynamics"), identification_figures.write)
+    identification_outputs.write_folder(outcome, session.identification.path, identification_figures.write)
     found = outcome.found
     raw, normalised = found.condition
     own = next(iter(outcome.fit.values()))
@@ -196,12 +197,13 @@ def predict(session: Session, say: Say) -> list[str]:
         aside[path.name], told = check_recording(session, path, "validation")
         notes += told
     say("predicting unseen motion")
-    given = identifying.gather(
+    given = inputs.gather(
         session.fit.path, cut_paths(training, cuts), cut_paths(unseen, aside), options=options_of(session),
         seed=session.settings.seed, progress=say,
     )  # fmt: skip
-    held = validation.hold(given, session.path("8-dynamics"), session.settings.dynamics.tolerance_percent)
-    validation.write(held, session.path("8-dynamics/unseen"))
-    verdict, identified = held.result.verdict, read_state(session)["steps"].get("identify", {}).get("notes", [])
-    fresh = [words for words in held.result.warnings if words not in identified]
-    return [*notes, f"verdict {verdict.level}: {verdict.reason}", *fresh]
+    place, tolerance = session.identification, session.settings.dynamics.tolerance_percent
+    found = assess(given, place.dynamics(), place.findings(), tolerance=tolerance, progress=say)
+    place.unseen.write(given, found)
+    known = place.metrics().warnings
+    fresh = [words for words in found.warnings if words not in known]
+    return [*notes, f"verdict {found.verdict.level}: {found.verdict.reason}", *fresh]

@@ -117,7 +117,7 @@ def _go_on(folder: Path, say: Callable[[str], None], command: str) -> FleetRow:
     rms = [(before.rms, after.rms) for before, after in pairs if before is not None and after is not None]
     errors, torque = max(rms, key=lambda pair: pair[1], default=(None, None)), None
     if session.dynamic:
-        unseen = json.loads(session.path("8-dynamics/unseen/report.json").read_text(encoding="utf-8"))
+        unseen = json.loads(session.identification.unseen.report.read_text(encoding="utf-8"))
         sets = (unseen["validation"] or unseen["fit"]).values()
         torque = max((one["raw"]["relative_error_percent"]["total"] or 0.0 for one in sets), default=None)
     return FleetRow(str(folder), DONE, verdict, "", *errors, torque, code=1 if verdict == "fail" else 0)

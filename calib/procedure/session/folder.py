@@ -36,6 +36,7 @@ from typing import Any
 from calib import files
 from calib.config import parse
 from calib.errors import CalibError, SessionError
+from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.session.settings import SCHEMA, SessionSettings, check_schema, read_settings, written
 
@@ -71,6 +72,11 @@ class Session:
     def validation(self) -> ValidationFolder:
         """What the fit comes to on unseen poses."""
         return ValidationFolder(self.folder / VALIDATED)
+
+    @property
+    def identification(self) -> IdentificationFolder:
+        """What the identification leaves."""
+        return IdentificationFolder(self.folder / "8-dynamics")
 
     @property
     def export(self) -> str:

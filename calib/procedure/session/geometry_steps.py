@@ -233,7 +233,7 @@ def _exported(session: Session, out: Path, say: Say) -> list[str]:
     corrected = (out / "robot_for_corrections.urdf").exists()  # identified on another geometry than robot.urdf's
     place = out / "dynamics" if corrected else out
     try:
-        found = deliver_dynamics(session.path("8-dynamics"), source if source.suffix == ".urdf" else None, place)
+        found = deliver_dynamics(session.identification.path, source if source.suffix == ".urdf" else None, place)
     except (RobotError, UsageError) as error:  # the geometry stands by itself
         return [*lines, f"the dynamics were not exported: {error}"]
     return [

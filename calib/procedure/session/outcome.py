@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 
@@ -10,16 +9,18 @@ from calib import files
 from calib.procedure.session.folder import Session
 
 ORDER = ("pass", "marginal", "fail")
-PLACES = {"geometry": "5-validation/metrics.json", "dynamics": "8-dynamics/unseen/report.json"}
 FIRST = "verdict fail: "  # how a README.txt of ours begins; another's is left alone
 DECLARATION, BOM = b"?>", b"\xef\xbb\xbf"
 
 
 def verdicts(session: Session) -> dict[str, tuple[str, str]]:
     """Return verdict and reason of each stage."""
-    wanted = PLACES if session.dynamic else {"geometry": PLACES["geometry"]}
-    read = {stage: json.loads(session.path(place).read_text(encoding="utf-8")) for stage, place in wanted.items()}
-    return {stage: (found["verdict"], found["reason"]) for stage, found in read.items()}
+    geometry = session.validation.metrics()
+    found = {"geometry": (geometry.verdict, geometry.reason)}
+    if session.dynamic:
+        dynamics = session.identification.unseen.verdict()
+        found["dynamics"] = (dynamics.verdict, dynamics.reason)
+    return found
 
 
 def verdict_of(session: Session) -> str:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from calib.procedure.session import certificate, dynamics_steps, geometry_steps
 from calib.procedure.session.folder import MARK, Session
-from calib.procedure.session.outcome import PLACES
 
 Say = Callable[[str], None]
 
@@ -94,7 +93,8 @@ def _identified(session: Session) -> list[Path]:
 
 
 def _predicted(session: Session) -> list[Path]:
-    own = [session.path(f"8-dynamics/{name}") for name in ("robot.toml", "dynamics.json", "metrics.json")]
+    found = session.identification
+    own = [found.robot, found.model, found.numbers]
     plan = session.path("6-excitation/validation/trajectory.toml")
     training, unseen = dynamics_steps.recordings(session)
     cuts = session.path("7-recorded/cuts.json")
@@ -108,19 +108,18 @@ def files_of(paths: list[Path]) -> list[Path]:
 
 def _exported(session: Session) -> list[Path]:
     own = [*_robot(session), session.fit.robot, session.fit.urdf]
-    identified = [session.path(f"8-dynamics/{name}") for name in ("dynamics.json", "estimate.csv", "covariance.csv")]
-    judged = [session.path(place) for place in PLACES.values()]  # a failed robot's files say so
-    return own + judged[:1] + ([*identified, *judged[1:]] if session.dynamic else [])
+    own.append(session.validation.judged)  # a failed robot's files say so
+    found = session.identification
+    return own + ([found.model, *found.tables, found.unseen.report] if session.dynamic else [])
 
 
 def _certified(session: Session) -> list[Path]:
-    names = ["4-fit/report.json", "5-validation/metrics.json", f"{session.export}/robot.urdf", "2-poses/selection.json"]
-    names.append("3-measured/checked.txt")
+    made = [session.fit.report, session.validation.judged, session.path(f"{session.export}/robot.urdf")]
+    made += [session.path("2-poses/selection.json"), session.path("3-measured/checked.txt")]
     if session.dynamic:
-        names += ["7-recorded/checked.txt"]
-        names += ["8-dynamics/metrics.json", "8-dynamics/estimate.csv", "8-dynamics/unseen/report.json"]
-    marked = [session.path(MARK)] if session.path(MARK).exists() else []
-    return [*(session.path(name) for name in names), *marked]
+        found = session.identification
+        made += [session.path("7-recorded/checked.txt"), found.numbers, found.tables[0], found.unseen.report]
+    return [*made, *([session.path(MARK)] if session.path(MARK).exists() else [])]
 
 
 PLAN = "plan validation period harmonics rate starts evaluations limits"

@@ -79,7 +79,7 @@ class TorqueErrors:
 
 def torques_against_truth(session: Session, cell: Cell, arm: MovingArm, seed: int = 4321) -> TorqueErrors:
     """Compare predicted torques with the noise-free truth along a random motion, and parameters with theirs."""
-    chain, dynamics = read_dynamics(session.path("8-dynamics"))
+    chain, dynamics = read_dynamics(session.identification.path)
     lower, upper = sampling_limits(chain)
     speed = np.array([joint.velocity if np.isfinite(joint.velocity) else 2.0 for joint in chain.joints])
     motion = random_fourier(0.8 * lower, 0.8 * upper, 0.8 * speed, SECONDS, RATE, seed=seed)
@@ -110,7 +110,7 @@ def transmitted_along(dynamics: Dynamics, q: np.ndarray, v: np.ndarray, a: np.nd
 
 def _parameters(session: Session, model: IdentificationModel, cell: Cell, arm: MovingArm) -> tuple[float, int]:
     """Return the share of estimated base parameters whose truth is within two sigmas, and how many there are."""
-    with session.path("8-dynamics/estimate.csv").open(newline="", encoding="utf-8") as file:
+    with session.identification.tables[0].open(newline="", encoding="utf-8") as file:
         names = csv.DictReader(file)
         rows = [
             (bases.standard_name(row["name"], model.names), float(row["value"]), float(row["sigma"]))

@@ -12,7 +12,7 @@ import pytest
 from calib import cli
 from calib.identification.identify_options import parse_options
 from calib.procedure.dynamic_stage.gains import find_gains
-from calib.procedure.dynamic_stage.identify import read_motion
+from calib.procedure.dynamic_stage.inputs import read_motion
 from calib.robot.load import load
 
 
@@ -221,7 +221,7 @@ def test_lwr_full_parameters_hold_where_it_has_not_been(data, tmp_path):
     from calib.dynamics.bodies import standard_parameters
     from calib.identification import prediction
     from calib.identification.possible import information, solve
-    from calib.procedure.dynamic_stage import identify as identifying
+    from calib.procedure.dynamic_stage.inputs import gather
 
     folder = data / "kuka_lwr4plus_iit"
     log = folder / "measurements_1.npz"
@@ -231,7 +231,7 @@ def test_lwr_full_parameters_hold_where_it_has_not_been(data, tmp_path):
     data_alone = information.read(tmp_path / "drawn")
     found = solve.find_consistent(data_alone)
     assert data_alone.rests_on_prior and (found.margins > 0.0).all()
-    inputs = identifying.gather(arguments[0], [str(arguments[1])], [str(arguments[3])])
+    inputs = gather(arguments[0], [str(arguments[1])], [str(arguments[3])])
     case = inputs.unseen[0]
 
     def error(dynamics: prediction.Dynamics) -> float:

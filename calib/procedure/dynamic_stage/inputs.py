@@ -1,0 +1,213 @@
+"""What an identification works on: the robot, the recordings to learn from, and those it must not see."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from calib.data.recordings.recording import Joints, Recording
+from calib.data.recordings.recording_files import read_recording
+from calib.data.signals.decimation import SHARE
+from calib.data.signals.motion import FilterOptions, Motion, make_motion, sample
+from calib.data.signals.reference_files import with_reference
+from calib.data.signals.resampling import Resampled
+from calib.errors import UsageError, suggestion
+from calib.identification.cases import Case, case_names, make_case
+from calib.identification.gains import DriveGains
+from calib.identification.identify_options import FileSettings, IdentifyOptions, file_settings
+from calib.identification.settings import IdentificationSettings
+from calib.procedure.dynamic_stage.gains import FoundGains, find_gains
+from calib.procedure.kinematic_stage.inputs import joint_kinds
+from calib.robot.calibrated import CalibratedChain, without_corrections
+from calib.robot.chain import Chain
+from calib.robot.load import load_calibrated, resolve
+
+LOST = 0.05  # of a recording may fall to the windows of the parallel decimation (our choice)
+QUIET = 0.02  # noise of the accelerations that is no matter, of their rms (our choice)
+WINDOW = 18  # samples per decimation factor that one window needs
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class IdentificationInputs:
+    """A robot and its recordings.
+
+    Attributes:
+        robot: as a geometric fit has left it, or as it was described; joint corrections left out.
+        source: the file it came from.
+        cases: recordings to learn from.
+        unseen: recordings to be predicted.
+        options: the options file's content, the command's choices put in.
+        notes: what a user should know about how the files were understood.
+        unit: of the torques.
+        gains: drive gains that were identified; None where none were.
+    """
+
+    robot: CalibratedChain
+    source: Path
+    cases: tuple[Case, ...]
+    unseen: tuple[Case, ...]
+    options: IdentifyOptions
+    notes: tuple[str, ...] = ()
+    unit: str = "N m"
+    gains: DriveGains | None = None
+
+    @property
+    def chain(self) -> Chain:
+        """The arm that is identified."""
+        return self.robot.chain
+
+
+def gather(
+    robot: str | Path | CalibratedChain,
+    recordings: Sequence[str],
+    validate: Sequence[str] = (),
+    *,
+    options: IdentifyOptions | None = None,
+    method: str | None = None,
+    friction: str | None = None,
+    base: str | None = None,
+    tip: str | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> IdentificationInputs:
+    """Read the robot and all recordings, and make motions of them.
+
+    Args:
+        robot: see `calib.robot.load`; or as a geometric fit returns it.
+        recordings, validate: paths, each with a cut if wanted (``log.npz@0:9.4``).
+        options: the options file's content.
+        method, friction: in place of the options'.
+        base, tip: links of a URDF.
+        seed: for everything random.
+    """
+    say = progress or (lambda words: None)
+    options = with_choices(options or IdentifyOptions(), method, friction, seed)
+    if not recordings:
+        raise UsageError("no recording given")
+    check_files(options, [*recordings, *validate])
+    known = robot if isinstance(robot, CalibratedChain) else load_calibrated(robot, base, tip)
+    source = Path(known.source or known.chain.name) if isinstance(robot, CalibratedChain) else resolve(robot)
+    chain = known.chain
+    paths = [*map(str, recordings), *map(str, validate)]
+    names = case_names(paths)
+    motions: list[Motion] = []
+    for name, path in zip(names, paths):
+        say(f"reading {name}")
+        like = motions[0] if len(motions) >= len(recordings) else None
+        motion = read_motion(path, chain, file_settings(options, path), like)
+        motions.append(referred(motion, path, chain, options) if len(motions) < len(recordings) else motion)
+    notes = [f"{name}: {note}" for name, motion in zip(names, motions) for note in motion.notes]
+    count = len(recordings)
+    found = find_gains(chain, options, dict(zip(paths, motions)), paths[:count], say)
+    options = found.options
+    cases = [read_case(path, name, motion, options, found) for name, path, motion in zip(names, paths, motions)]
+    return IdentificationInputs(
+        without_corrections(known), source, tuple(cases[:count]), tuple(cases[count:]), options,
+        (*notes, *found.notes), found.unit, found.found,
+    )  # fmt: skip
+
+
+def with_choices(options: IdentifyOptions, method: str | None, friction: str | None, seed: int) -> IdentifyOptions:
+    """Return the options with the command's choices in them, held against what exists."""
+    from calib.identification.friction.friction_ladder import NAMES
+    from calib.identification.methods.least_squares import METHODS
+
+    settings: IdentificationSettings = replace(options.settings, seed=seed)
+    for value, allowed, key in ((method, METHODS, "method"), (friction, NAMES, "friction")):
+        if value is None:
+            continue
+        if value not in allowed:
+            raise UsageError(f"--{key} {value}: expected {', '.join(allowed)}")
+        settings = replace(settings, **{key: value})
+    return replace(options, settings=settings)
+
+
+def read_case(path: str, name: str, motion: Motion, options: IdentifyOptions, found: FoundGains) -> Case:
+    """Return the case of one recording; payload and gains as the options, or the gain identification, say."""
+    own = file_settings(options, path)
+    slow = (options.slow if options.slow is not None else 0.01) if options.cut_slow else None
+    return make_case(
+        name, motion, options.settings.torque_rows, gains=found.for_motion(motion, own), carried=own.payload, slow=slow
+    )  # fmt: skip
+
+
+def read_motion(path: str, chain: Chain, own: FileSettings, like: Motion | None = None) -> Motion:
+    """Return the motion of a recording, held against the robot's joints and limits.
+
+    Args:
+        like: a motion whose identification band it is judged in, where the options state none; how far its own
+            positions need filtering, it says itself.
+    """
+    recording = read_recording(path, joints_of(chain), own.recording)
+    sampled = sample(recording, own.filter)
+    if like is not None and own.filter.band is None and like.band * np.median(np.diff(recording.t)) < 0.4:
+        banded = replace(own.filter, band=like.band * (1.0 - 1e-9))
+        motion = make_motion(recording, banded, sampled)
+        return motion if own.filter.cutoff is not None else _sharper(recording, motion, banded, sampled)
+    motion = make_motion(recording, own.filter, sampled)
+    if own.filter.cutoff is None:
+        motion = _sharper(recording, motion, own.filter, sampled)
+    widest = LOST * len(motion) / WINDOW  # decimation factor
+    if own.filter.band is not None or motion.decimator.factor <= max(widest, 1.0):
+        return motion
+    band = SHARE * motion.rate / (2 * max(1, int(widest)))
+    cutoff = tuple(float(f) for f in motion.cutoff)
+    wider = make_motion(recording, replace(own.filter, band=min(band, 0.45 * motion.rate), cutoff=cutoff), sampled)
+    note = f"f_p = {wider.band:.3g} Hz instead: a short recording must not lose its ends to the decimation's window"
+    return replace(wider, notes=(*motion.notes, note))
+
+
+def joints_of(chain: Chain) -> Joints:
+    """Return what a recording is held against."""
+    return Joints(
+        chain.joint_names, tuple(joint_kinds(chain)), chain.lower, chain.upper,
+        np.array([joint.velocity for joint in chain.joints]), np.array([joint.effort for joint in chain.joints]),
+    )  # fmt: skip
+
+
+def _sharper(recording: Recording, motion: Motion, options: FilterOptions, sampled: Resampled) -> Motion:
+    """Return the motion with a higher f_q, where the encoders are quiet enough: f_q ≥ 5 f_dyn is a least value.
+
+    White noise of the positions, σ_q, makes σ_a = σ_q (2π)² sqrt(2 f_q⁵ / (5 f_s)) in the accelerations; f_q is
+    doubled where that stays below `QUIET` of every moving joint's rms acceleration (our choice).
+    """
+    size = np.sqrt(np.mean(motion.a**2, axis=0))
+    moves = np.ptp(motion.q, axis=0) > 1e-3
+    cutoff = float(motion.cutoff.max())
+    f = 2.0 * cutoff
+    noise = motion.cutoffs.noise * (2 * np.pi) ** 2 * np.sqrt(2 * f**5 / (5 * motion.rate))
+    if f > 0.4 * motion.rate or not moves.any() or not (noise < QUIET * size)[moves].all():
+        return motion
+    borders = 2.0 / cutoff if options.borders is None else options.borders  # no samples that the wider band would add
+    sharper = make_motion(recording, replace(options, cutoff=f, borders=borders), sampled)
+    note = f"f_q = {f:.3g} Hz instead: the positions are quiet enough"
+    return replace(sharper, notes=(*motion.notes, note), cutoffs=motion.cutoffs)
+
+
+def referred(motion: Motion, path: str, chain: Chain, options: IdentifyOptions) -> Motion:
+    """Return the motion with the reference of a file of its own, where the options name one."""
+    own, loop = file_settings(options, path), options.settings.loop
+    named = own.reference or (loop.reference if loop is not None and loop.reference != "recording" else "")
+    if not named or loop is None:
+        return motion
+    beside = Path(options.source).parent / named
+    return with_reference(motion, beside if beside.exists() else Path(named), Joints(chain.joint_names), own.recording)
+
+
+def check_files(options: IdentifyOptions, paths: Sequence[str]) -> None:
+    """Refuse a [files] table that names none of the recordings."""
+
+    from calib.data.recordings.recording import parse_cut
+
+    plain = [Path(parse_cut(str(path))[0]) for path in paths]
+    for name in options.files:
+        wanted = Path(name).parts
+        if not any(path.parts[-len(wanted) :] == wanted for path in plain):
+            shown = [path.name for path in plain]
+            message = f'{options.source}: files."{name}" is none of the recordings{suggestion(name, shown)}'
+            raise UsageError(f"{message}: {', '.join(shown)}")
