@@ -16,7 +16,7 @@ import re
 import reprlib
 import tomllib
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
@@ -468,7 +468,7 @@ class Checked:
     """
 
     read: Callable[[Any], Any]
-    json: Mapping[str, Any] | None = None
+    json: Mapping[str, Any] | None = field(default=None, hash=False)
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         return self.around(handler(source))

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from calib.errors import RobotError
+from calib.errors import RobotError, suggestion
 from calib.robot import calibrated, description, library
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
 from calib.robot.formats import urdf
-from calib.robot.tables import nearest
 
 
 def load(
@@ -68,4 +67,4 @@ def resolve(robot: str | Path) -> Path:
         return library.path(str(robot))
     if path.suffix in (".urdf", ".toml") or len(path.parts) > 1:
         raise RobotError(f"no file {path}; give {known}")
-    raise RobotError(f"no robot '{robot}'{nearest(str(robot), names)}; give {known}")
+    raise RobotError(f"no robot '{robot}'{suggestion(str(robot), names)}; give {known}")

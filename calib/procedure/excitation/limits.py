@@ -27,26 +27,80 @@ and ``[[obstacle]]`` are those of pose selection (`calib.procedure.kinematic_sta
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from calib.errors import RobotError, UsageError
+from calib.config import (
+    Name,
+    NotNegative,
+    Numeric,
+    Real,
+    Spread,
+    Whole,
+    check_keys,
+    number,
+    parse,
+    read_toml,
+    strict,
+)  # fmt: skip
+from calib.errors import UsageError
 from calib.geometry.observability import targets_of
-from calib.procedure.kinematic_stage.pose_limits import Limits, read_limits
+from calib.procedure.kinematic_stage.pose_limits import ConstraintsFile, Limits, Point, limits_of
 from calib.robot.chain import Chain
 from calib.robot.kinematics import element_jacobian, joint_frames, joint_jacobian, sweep
-from calib.robot.tables import check_keys, load, number, vector
 from poses.space import PoseConstraint
 from trajectories.basis import SampledMotion
 from trajectories.constraints import BoxLimit, MotionConstraint, box_limits
 from trajectories.places import Clearance, Workspace
 
+MARGINS = ("margin", "deviations")  # keys of [torque] that are no joint's
 STEP = 1e-6  # [rad or m] of the central differences of collision distances (our choice)
+
+
+@strict
+@dataclass(frozen=True)
+class PointTable:
+    """[[point]], see the module."""
+
+    name: Name
+    joint: Annotated[int, Whole()] = 0
+    xyz: Point = (0.0, 0.0, 0.0)
+
+
+@strict
+@dataclass(frozen=True)
+class FrictionTable:
+    """[friction], see the module."""
+
+    Fv: Annotated[tuple[NotNegative, ...], Spread()] | None = None
+    Fc: Annotated[tuple[NotNegative, ...], Spread()] | None = None
+
+
+@strict
+@dataclass(frozen=True)
+class FrequencyTable:
+    """[frequency], see the module."""
+
+    resonance: Annotated[float, Real(above=0, quantity="frequency")] | None = None
+
+
+@strict
+@dataclass(frozen=True)
+class LimitsFile(ConstraintsFile):
+    """The limits file; values per joint are read by their joint's unit."""
+
+    velocity: Mapping[str, Numeric] = field(default_factory=dict)
+    acceleration: Mapping[str, Numeric] = field(default_factory=dict)
+    jerk: Mapping[str, Numeric] = field(default_factory=dict)
+    torque: Mapping[str, Numeric] = field(default_factory=dict)
+    friction: FrictionTable | None = None
+    point: tuple[PointTable, ...] = ()
+    frequency: FrequencyTable = field(default_factory=FrequencyTable)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,28 +142,27 @@ def read_motion_limits(path: Path | None, chain: Chain, source: Path | None = No
     Raises:
         UsageError: for an unknown key or a value that a key cannot have.
     """
-    cell = targets_of(chain)
-    found = read_limits(path, cell, source)
-    table, where = ({}, "limits") if path is None else (load(path), str(path))
-    try:
-        velocity = _per_joint(table, "velocity", chain, where, np.array([j.velocity for j in chain.joints]))
-        bounds = [_per_joint(table, key, chain, where) for key in ("acceleration", "jerk")]
-        torque = _per_joint(table, "torque", chain, where, np.array([j.effort for j in chain.joints]))
-        own = table.get("torque", {})
-        margin = number(own["margin"], f"{where}, torque.margin") if "margin" in own else None
-        deviations = number(own.get("deviations", 2.0), f"{where}, torque.deviations")
-        points = _points(table, chain, where)
-        friction = _friction(table, chain, where)
-        resonance = _resonance(table, where)
-    except RobotError as error:
-        raise UsageError(str(error)) from error
+    stated = LimitsFile() if path is None else parse(LimitsFile, read_toml(path), str(path))
+    where, own = str(path or "limits"), stated.torque
+    found = limits_of(stated, targets_of(chain), source, where)
+    speeds, efforts = (np.array([getattr(j, key) for j in chain.joints]) for key in ("velocity", "effort"))
+    velocity = _per_joint(stated.velocity, f"{where}: velocity", chain, speeds, ("angular speed", "speed"))
+    acceleration = _per_joint(stated.acceleration, f"{where}: acceleration", chain)
+    jerk = _per_joint(stated.jerk, f"{where}: jerk", chain)
+    amounts = {key: value for key, value in own.items() if key not in MARGINS}
+    torque = _per_joint(amounts, f"{where}: torque", chain, efforts, ("torque", "force"))
+    margin = number(own["margin"], f"{where}: torque.margin") if "margin" in own else None
+    deviations = number(own.get("deviations", 2.0), f"{where}: torque.deviations")
+    points = _points(stated.point, chain, where)
+    friction = _friction(stated.friction, chain, where)
     linear = [joint.kind == "prismatic" for joint in chain.joints]
-    constraints: list[MotionConstraint] = [*box_limits(found.lower, found.upper, velocity, *bounds, linear=linear)]
-    constraints += _places(table, found, points, where)
+    boxes = box_limits(found.lower, found.upper, velocity, acceleration, jerk, linear=linear)
+    constraints: list[MotionConstraint] = [*boxes]
+    constraints += _places(stated, found, points)
     if found.collision is not None:
         constraints.append(_clearance(found))
     notes = found.notes if found.collision is not None else (*found.notes, _unchecked(path))
-    return MotionLimits(tuple(constraints), torque, margin, deviations, friction, resonance, notes)
+    return MotionLimits(tuple(constraints), torque, margin, deviations, friction, stated.frequency.resonance, notes)
 
 
 def _unchecked(path: Path | None) -> str:
@@ -180,19 +233,12 @@ class PoseLimit:
         return result
 
 
-def _places(table: Mapping[str, Any], found: Limits, points: Points, where: str) -> list[MotionConstraint]:
+def _places(stated: LimitsFile, found: Limits, points: Points) -> list[MotionConstraint]:
     """Return the workspace of tip and named points, and what else a pose must keep."""
-    target = table.get("target", {})
-    radius = number(target["axis_distance"], where, "length") if "axis_distance" in target else None
-    lowest, highest = None, None
-    if "height" in target:
-        span = target["height"]
-        lowest, highest = map(float, vector(span, 2, where, "length")) if isinstance(span, list) else (
-            number(span, where, "length"), None
-        )  # fmt: skip
+    radius, (lowest, highest) = stated.target.axis_distance, stated.target.heights
     result: list[MotionConstraint] = []
-    if target.keys() & {"axis_distance", "height"}:
-        names = ("tool", *(entry["name"] for entry in table.get("point", [])))
+    if radius is not None or lowest is not None:
+        names = ("tool", *(one.name for one in stated.point))
         result.append(Workspace(points, points.product, names, radius, lowest, highest))
     others = [one for one in found.constraints if one.name not in ("height", "distance from the axis")]
     still = np.zeros((1, len(found.lower)))
@@ -214,54 +260,43 @@ def _distance_product(collision: Any, q: np.ndarray, G: np.ndarray) -> np.ndarra
     return result
 
 
-def _per_joint(table: Mapping[str, Any], key: str, chain: Chain, where: str, default: np.ndarray | None = None) -> Any:
-    """Return limits (n,) of a table with joints' names, q1 …, ``all`` and ``share``; the default without the table."""
-    own, where = table.get(key, {}), f"{where}, {key}"
+def _per_joint(
+    stated: Mapping[str, Any], where: str, chain: Chain, default: np.ndarray | None = None,
+    quantities: tuple[str, str] = ("", ""),
+) -> Any:  # fmt: skip
+    """Return limits (n,) of a table with joints' names, q1 …, ``all`` and ``share``; the default without the table.
+
+    Args:
+        quantities: of a revolute joint's limit, and of a prismatic one's.
+    """
     numbered = {f"q{j + 1}": j for j in range(chain.n)} | {name: j for j, name in enumerate(chain.joint_names)}
-    check_keys(own, ("all", "share", *(("margin", "deviations") if key == "torque" else ()), *numbered), where)
+    check_keys(stated, ("all", "share", *(MARGINS if "torque" in quantities else ()), *numbered), where)
     bounds = np.full(chain.n, np.inf) if default is None else default.copy()
-    for name in [name for name in own if name == "all" or name in numbered]:
-        rows = range(chain.n) if name == "all" else [numbered[name]]
-        for j in rows:
-            revolute = chain.joints[j].kind == "revolute"
-            units = {"velocity": ("angular speed", "speed"), "torque": ("torque", "force")}.get(key, (None, None))
-            value = number(own[name], f"{where}.{name}", units[0] if revolute else units[1])
+    for name in [name for name in stated if name != "share"]:
+        for j in range(chain.n) if name == "all" else [numbered[name]]:
+            value = number(stated[name], f"{where}.{name}", quantities[chain.joints[j].kind != "revolute"])
             bounds[j] = value if default is None else min(value, bounds[j])
-    share = number(own.get("share", 1.0), f"{where}.share")
+    share = number(stated.get("share", 1.0), f"{where}.share")
     if not 0 < share <= 1:
         raise UsageError(f"{where}.share: expected a share of the limits above 0 and up to 1, found {share:g}")
     bounds = bounds * share
     return None if default is None and not np.isfinite(bounds).any() else bounds
 
 
-def _points(table: Mapping[str, Any], chain: Chain, where: str) -> Points:
-    joints, places = [0], [np.zeros(3)]
-    for k, entry in enumerate(table.get("point", [])):
-        place = f"{where}, [[point]] {k + 1}"
-        check_keys(entry, ("name", "joint", "xyz"), place)
-        joint = entry.get("joint", 0)
-        if "name" not in entry or isinstance(joint, bool) or not isinstance(joint, int) or not 0 <= joint <= chain.n:
-            raise UsageError(f"{place}: needs a name, and a joint from 1 to {chain.n} (0: the tip)")
-        joints.append(joint)
-        places.append(vector(entry.get("xyz", [0.0, 0.0, 0.0]), 3, f"{place}, xyz", "length"))
-    return Points(chain, tuple(joints), np.array(places))
+def _points(stated: Sequence[PointTable], chain: Chain, where: str) -> Points:
+    for k, one in enumerate(stated, 1):
+        if one.joint > chain.n:
+            raise UsageError(f"{where}: [[point]] number {k}.joint: expected a joint from 1 to {chain.n} (0: the tip)")
+    return Points(chain, (0, *(one.joint for one in stated)), np.array([(0.0, 0.0, 0.0), *(one.xyz for one in stated)]))
 
 
-def _friction(table: Mapping[str, Any], chain: Chain, where: str) -> np.ndarray | None:
-    if "friction" not in table:
+def _friction(stated: FrictionTable | None, chain: Chain, where: str) -> np.ndarray | None:
+    if stated is None:
         return None
-    own = table["friction"]
-    check_keys(own, ("Fv", "Fc"), f"{where}, friction")
-    zero = [0.0] * chain.n
-    return np.array([vector(own.get(key, zero), chain.n, f"{where}, friction.{key}") for key in ("Fv", "Fc")])
-
-
-def _resonance(table: Mapping[str, Any], where: str) -> float | None:
-    own = table.get("frequency", {})
-    check_keys(own, ("resonance",), f"{where}, frequency")
-    if "resonance" not in own:
-        return None
-    value = own["resonance"]
-    if isinstance(value, str) and value.strip().endswith("Hz"):
-        return 2 * np.pi * number(value.strip().removesuffix("Hz"), f"{where}, frequency.resonance")
-    return number(value, f"{where}, frequency.resonance", "angular speed")
+    result = []
+    for key in ("Fv", "Fc"):
+        own = getattr(stated, key) or (0.0,) * chain.n
+        if len(own) not in (1, chain.n):
+            raise UsageError(f"{where}: friction.{key}: {len(own)} values for {chain.n} joints")
+        result.append(np.broadcast_to(np.array(own), (chain.n,)))
+    return np.array(result)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
+from calib.config import Expect, numbers, parse, read_toml, strict
 from calib.data.poses.fit_options import FitOptions
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.drives import standard
@@ -25,7 +27,6 @@ from calib.procedure.excitation.waypoints import read_waypoints
 from calib.procedure.kinematic_stage.inputs import load_robot
 from calib.robot.chain import Chain
 from calib.robot.kinematics import element_jacobian, forward, joint_jacobian, sweep
-from calib.robot.tables import check_keys, load, vector
 from trajectories.basis import SampledMotion
 from trajectories.constraints import BoxLimit
 from trajectories.setpoints import Setpoints, joined, slowed
@@ -38,6 +39,28 @@ from trajectories.timing.shape import Shaped, shorten
 from trajectories.timing.time_scaling import Timing, time_optimal
 
 DRIVES = ("Ia", "Fv", "Fc", "off")
+PerJoint = Annotated[tuple[float, ...], Expect("a list of numbers, one per joint")]
+
+
+@strict
+@dataclass(frozen=True)
+class DrivesTable:
+    """[drives]: parameters one per joint (SI, joint side)."""
+
+    Ia: PerJoint | None = None
+    Fv: PerJoint | None = None
+    Fc: PerJoint | None = None
+    off: PerJoint | None = None
+
+
+@strict
+@dataclass(frozen=True)
+class DrivesFile:
+    """The file of ``calib plan --drives``."""
+
+    drives: DrivesTable = field(default_factory=DrivesTable)
+
+
 COARSE = 150  # grid of the outer loop
 Progress = Callable[[str], None]
 
@@ -155,11 +178,9 @@ def _timed(
 
 def read_drives(path: Path, chain: Chain) -> dict[str, np.ndarray]:
     """Read drive parameters from TOML, one per joint: ``[drives]`` with any of Ia, Fv, Fc, off (SI, joint side)."""
-    table = load(path)
-    check_keys(table, ("drives",), str(path))
-    own = table.get("drives", {})
-    check_keys(own, DRIVES, f"{path}, drives")
-    return {key: vector(own[key], chain.n, f"{path}, drives.{key}") for key in own}
+    own = parse(DrivesFile, read_toml(path), str(path)).drives
+    stated = {key: value for key in DRIVES if (value := getattr(own, key)) is not None}
+    return {key: np.array(numbers(value, chain.n, f"{path}: drives.{key}")) for key, value in stated.items()}
 
 
 def check_places(path: JointPath, known: MotionLimits) -> None:

@@ -33,20 +33,125 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
+from calib.config import (
+    Expect,
+    Name,
+    Numeric,
+    OneOf,
+    OneOrMany,
+    Real,
+    check_keys,
+    number,
+    parse,
+    read_toml,
+    strict,
+)  # fmt: skip
 from calib.errors import RobotError, UsageError
 from calib.geometry.installation import Installation
 from calib.geometry.observability import Target, TargetJacobian
 from calib.robot.chain import sampling_limits
-from calib.robot.tables import check_keys, load, number, placement, vector
+from calib.robot.tables import placement
 from poses import constraints
 from poses.space import PoseConstraint
 
 MOTION = ("velocity", "acceleration", "jerk", "torque", "friction", "point", "frequency")  # `motion_limits` reads them
 MARGIN, RADIUS = 0.01, 0.05  # [m], where the file does not tell (our choice)
+
+Metres = Annotated[float, Real(quantity="length")]
+Distance = Annotated[float, Real(least=0, quantity="length")]
+Angle = Annotated[float, Real(quantity="angle")]
+Point = Annotated[tuple[Metres, Metres, Metres], Expect("a list of 3 lengths")]
+Turns = Annotated[tuple[Angle, Angle, Angle], Expect("a list of 3 angles")]
+Rows = Annotated[tuple[tuple[float, float, float, float], ...], Expect("three or four rows of 4 numbers")]
+Span = Annotated[tuple[Numeric, Numeric], Expect("a list of 2 numbers, lower and upper")]
+Size = Annotated[tuple[Annotated[float, Real(above=0, quantity="length")], ...], Expect("lengths above 0")]
+
+
+@strict
+@dataclass(frozen=True)
+class TargetTable:
+    """[target], see the module."""
+
+    height: Annotated[float | tuple[float, ...], OneOrMany(Real(quantity="length"))] | None = None
+    axis_distance: Distance | None = None
+    reach: Annotated[float, Real(above=0, quantity="length")] | None = None
+    facing: Annotated[tuple[float, float, float], Expect("a list of 3 numbers")] = (0.0, 0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        if not np.any(self.facing):
+            raise ValueError("facing: [0, 0, 0] is no direction")
+        if isinstance(self.height, tuple):
+            _rising(self.height, "height")
+
+    @property
+    def heights(self) -> tuple[float | None, float | None]:
+        """The least and the largest height of the target [m]."""
+        return (self.height[0], self.height[1]) if isinstance(self.height, tuple) else (self.height, None)
+
+
+@strict
+@dataclass(frozen=True)
+class PlacedTable:
+    """What stands somewhere: xyz and rpy, or a matrix."""
+
+    xyz: Point | None = None
+    rpy: Turns | None = None
+    matrix: Rows | None = None
+
+    @property
+    def stated(self) -> dict[str, Any]:
+        """The keys that were stated."""
+        return {key: value for key in ("xyz", "rpy", "matrix") if (value := getattr(self, key)) is not None}
+
+
+@strict
+@dataclass(frozen=True)
+class InstrumentTable(PlacedTable):
+    """[instrument], see the module."""
+
+    roll: Span | None = None
+    pitch: Span | None = None
+    sight: Annotated[float, Real(above=0, quantity="angle")] | None = None
+
+    def __post_init__(self) -> None:
+        if self.sight is not None and self.xyz is None and self.matrix is None:
+            raise ValueError("sight needs the place of the instrument, xyz")
+
+
+@strict
+@dataclass(frozen=True)
+class CollisionTable:
+    """[collision], see the module."""
+
+    margin: Distance = MARGIN
+    radius: Annotated[float, Real(above=0, quantity="length")] = RADIUS
+    floor: Metres | None = None
+
+
+@strict
+@dataclass(frozen=True, kw_only=True)
+class ObstacleTable(PlacedTable):
+    """[[obstacle]], see the module."""
+
+    kind: Annotated[str, OneOf(("box", "sphere", "cylinder"))]
+    size: Size
+    name: Name = "obstacle"
+
+
+@strict
+@dataclass(frozen=True)
+class ConstraintsFile:
+    """The constraints file."""
+
+    joints: Mapping[str, Span] = field(default_factory=dict)
+    target: TargetTable = field(default_factory=TargetTable)
+    instrument: InstrumentTable | None = None
+    collision: CollisionTable | None = None
+    obstacle: tuple[ObstacleTable, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,123 +172,110 @@ class Limits:
     clearance: float = MARGIN
 
 
-def read_limits(
-    path: Path | None, cell: Installation, source: Path | None = None, beside: tuple[str, ...] = MOTION
-) -> Limits:
+def read_limits(path: Path | None, cell: Installation, source: Path | None = None) -> Limits:
     """Read the constraints for an arm with its targets.
 
     Args:
-        path: the file; None for the joint limits alone.
+        path: the file; None for the joint limits alone. Tables of motions (`MOTION`) may stand in it.
         cell: the arm, see `calib.geometry.observability.targets_of`.
         source: the robot's file, whose collision shapes are used where it is a URDF.
-        beside: tables of the file that somebody else reads; one file may serve poses and motions.
 
     Raises:
         UsageError: for an unknown key or a value that a key cannot have.
     """
-    lower, upper = sampling_limits(cell.chain)
     if path is None:
-        return Limits(lower, upper)
+        return limits_of(ConstraintsFile(), cell)
+    table = {key: value for key, value in read_toml(path).items() if key not in MOTION}
+    return limits_of(parse(ConstraintsFile, table, str(path)), cell, source, str(path))
+
+
+def limits_of(
+    stated: ConstraintsFile, cell: Installation, source: Path | None = None, where: str = "constraints"
+) -> Limits:
+    """Return the limits that a constraints file states for an arm; see `read_limits`."""
     try:
-        table, where = load(path), str(path)
-        check_keys(table, ("joints", "target", "instrument", "collision", "obstacle", *beside), where)
-        lower, upper = _joints(table.get("joints", {}), cell, where)
-        found = (*_target(table.get("target", {}), cell, where), *_instrument(table, cell, where))
-        if not {"collision", "obstacle"} & set(table):
+        lower, upper = _joints(stated.joints, cell, where)
+        found = (*_target(stated.target, cell), *_instrument(stated, cell, where))
+        if stated.collision is None and not stated.obstacle:
             return Limits(lower, upper, found)
-        model, margin, notes = _collision(table, cell, source, where)
+        model, margin, notes = _collision(stated, cell, source, where)
     except RobotError as error:
         raise UsageError(str(error)) from error
     return Limits(lower, upper, found, partial(model.free, margin=margin), notes, model, margin)
 
 
-def _joints(table: Mapping[str, Any], cell: Installation, where: str) -> tuple[np.ndarray, np.ndarray]:
+def _joints(spans: Mapping[str, Any], cell: Installation, where: str) -> tuple[np.ndarray, np.ndarray]:
     lower, upper = (side.copy() for side in sampling_limits(cell.chain))
     names = cell.chain.joint_names
     numbered = {f"q{j + 1}": j for j in range(len(names))} | {name: j for j, name in enumerate(names)}
-    check_keys(table, tuple(numbered), f"{where}, joints")
-    for name, span in table.items():
-        j = numbered[name]
-        low, high = _span(span, f"{where}, joints.{name}", "length" if cell.chain.joints[j].unit == "m" else "angle")
+    check_keys(spans, tuple(numbered), f"{where}: joints")
+    for name, span in spans.items():
+        j, place = numbered[name], f"{where}: joints.{name}"
+        low, high = _span(span, place, "length" if cell.chain.joints[j].unit == "m" else "angle")
         lower[j], upper[j] = max(lower[j], low), min(upper[j], high)
         if not lower[j] < upper[j]:
-            raise UsageError(f"{where}, joints.{name}: nothing is left between {lower[j]:g} and {upper[j]:g}")
+            raise UsageError(f"{place}: nothing is left between {lower[j]:g} and {upper[j]:g}")
     return lower, upper
 
 
-def _span(value: Any, where: str, quantity: str) -> tuple[float, float]:
-    low, high = vector(value, 2, where, quantity)
-    if not low < high:
-        raise UsageError(f"{where}: {low:g} is not below {high:g}")
-    return float(low), float(high)
+def _span(value: tuple[Any, Any], where: str, quantity: str) -> tuple[float, float]:
+    low, high = (number(side, where, quantity) for side in value)
+    try:
+        _rising((low, high), where)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    return low, high
 
 
-def _target(table: Mapping[str, Any], cell: Installation, where: str) -> list[PoseConstraint]:
-    check_keys(table, ("height", "axis_distance", "reach", "facing"), f"{where}, target")
+def _rising(span: tuple[float, ...], where: str) -> None:
+    if len(span) != 2:
+        raise ValueError(f"{where}: expected a list of 2 numbers, lower and upper, found {len(span)}")
+    if not span[0] < span[1]:
+        raise ValueError(f"{where}: {span[0]:g} is not below {span[1]:g}")
+
+
+def _target(stated: TargetTable, cell: Installation) -> list[PoseConstraint]:
     target, slope, result = Target(cell), TargetJacobian(cell), []
-    if "height" in table:
-        value, place = table["height"], f"{where}, target.height"
-        low, high = (
-            _span(value, place, "length") if isinstance(value, list) else (number(value, place, "length"), np.inf)
-        )
-        result.append(constraints.height(target, low, high, slope))
-    if "axis_distance" in table:
-        least = number(table["axis_distance"], f"{where}, target.axis_distance", "length")
-        result.append(constraints.axis_distance(target, least, slope))
-    if "reach" in table:
-        most = number(table["reach"], f"{where}, target.reach", "length")
-        result.append(constraints.reach(target, most, jacobian=slope))
+    low, high = stated.heights
+    if low is not None:
+        result.append(constraints.height(target, low, np.inf if high is None else high, slope))
+    if stated.axis_distance is not None:
+        result.append(constraints.axis_distance(target, stated.axis_distance, slope))
+    if stated.reach is not None:
+        result.append(constraints.reach(target, stated.reach, jacobian=slope))
     return result
 
 
-def _instrument(tables: Mapping[str, Any], cell: Installation, where: str) -> list[PoseConstraint]:
-    if "instrument" not in tables:
+def _instrument(stated: ConstraintsFile, cell: Installation, where: str) -> list[PoseConstraint]:
+    table, where = stated.instrument, f"{where}: instrument"
+    if table is None:
         return []
-    table, where = tables["instrument"], f"{where}, instrument"
-    check_keys(table, ("xyz", "rpy", "matrix", "roll", "pitch", "sight"), where)
-    stand = placement({key: table[key] for key in ("xyz", "rpy", "matrix") if key in table}, where)
-    result = []
-    if "roll" in table or "pitch" in table:
-        roll = _span(table.get("roll", [-np.pi, np.pi]), f"{where}.roll", "angle")
-        pitch = _span(table.get("pitch", [-np.pi / 2, np.pi / 2]), f"{where}.pitch", "angle")
+    stand, result = placement(table.stated, where), []
+    if table.roll is not None or table.pitch is not None:
+        roll = _span(table.roll or (-np.pi, np.pi), f"{where}.roll", "angle")
+        pitch = _span(table.pitch or (-np.pi / 2, np.pi / 2), f"{where}.pitch", "angle")
         result.append(constraints.orientation(Target(cell), stand[:3, :3], roll, pitch))
-    if "sight" in table:
-        half = number(table["sight"], f"{where}.sight", "angle")
-        facing = vector(tables.get("target", {}).get("facing", [0, 0, 1]), 3, f"{where}, target.facing")
-        result.append(constraints.line_of_sight(Target(cell), stand[:3, 3], facing, half, TargetJacobian(cell)))
+    if table.sight is not None:
+        facing, seen = np.array(stated.target.facing), Target(cell)
+        result.append(constraints.line_of_sight(seen, stand[:3, 3], facing, table.sight, TargetJacobian(cell)))
     return result
 
 
 def _collision(
-    tables: Mapping[str, Any], cell: Installation, source: Path | None, where: str
+    stated: ConstraintsFile, cell: Installation, source: Path | None, where: str
 ) -> tuple[Any, float, tuple[str, ...]]:
     from calib.robot import collision
 
-    table = tables.get("collision", {})
-    check_keys(table, ("margin", "radius", "floor"), f"{where}, collision")
-    value = {key: number(table[key], f"{where}, collision.{key}", "length") for key in table}
+    table, chain, notes = stated.collision or CollisionTable(), cell.chain, ()
     obstacles = [
-        _obstacle(entry, f"{where}, [[obstacle]] {k + 1}") for k, entry in enumerate(tables.get("obstacle", []))
+        collision.Obstacle(one.name, one.kind, one.size, placement(one.stated, f"{where}: [[obstacle]] number {k}"))
+        for k, one in enumerate(stated.obstacle, 1)
     ]
-    margin, radius, floor = value.get("margin", MARGIN), value.get("radius", RADIUS), value.get("floor")
-    chain, notes = cell.chain, ()
     if source is not None and source.suffix == ".urdf" and "<collision" in source.read_text(encoding="utf-8"):
-        model = collision.from_urdf(source, chain.base, chain.tip, floor, obstacles)
+        model = collision.from_urdf(source, chain.base, chain.tip, table.floor, obstacles)
         if model.missing:
             notes = (f"collision meshes not found, left out: {', '.join(model.missing[:3])}",)
     else:
-        model = collision.from_chain(chain, radius, floor, obstacles)
-        notes = (f"no collision shapes in the robot's file: capsules of radius {radius:g} m stand for its links",)
-    return model, margin, notes
-
-
-def _obstacle(entry: Mapping[str, Any], where: str) -> Any:
-    from calib.robot.collision import Obstacle
-
-    check_keys(entry, ("name", "kind", "size", "xyz", "rpy", "matrix"), where)
-    for key in ("kind", "size"):
-        if key not in entry:
-            raise UsageError(f"{where}: '{key}' is missing")
-    stand = placement({key: entry[key] for key in ("xyz", "rpy", "matrix") if key in entry}, where)
-    size = tuple(number(length, f"{where}, size", "length") for length in entry["size"])
-    return Obstacle(str(entry.get("name", "obstacle")), str(entry["kind"]), size, stand)
+        model = collision.from_chain(chain, table.radius, table.floor, obstacles)
+        notes = (f"no collision shapes in the robot's file: capsules of radius {table.radius:g} m stand for its links",)
+    return model, table.margin, notes

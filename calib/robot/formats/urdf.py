@@ -20,12 +20,11 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.errors import RobotError
+from calib.errors import RobotError, suggestion
 from calib.robot.chain import AXES, Chain, Element
 from calib.robot.formats.markup import text
 from calib.robot.formats.urdf_tree import JointTag, Mimic, Tree, transform_body
 from calib.robot.formats.urdf_tree import read as read_tree
-from calib.robot.tables import nearest
 from calib.transforms import invert, pose
 
 _IDENTITY = np.eye(4)
@@ -153,7 +152,7 @@ def drive(tree: Tree, joint: JointTag) -> tuple[str, float, float]:
         ratio *= mimic.multiplier
         name = mimic.leader
         if name in seen or name not in tree.joints:
-            what = "a circle" if name in seen else f"'{name}', which is no joint{nearest(name, tree.joints)}"
+            what = "a circle" if name in seen else f"'{name}', which is no joint{suggestion(name, tree.joints)}"
             raise RobotError(f"{tree.where}, line {joint.node.line}, joint '{joint.name}': it mimics {what}")
         seen.add(name)
         mimic = tree.joints[name].mimic
@@ -187,7 +186,7 @@ def _check_path(tree: Tree, path: list[JointTag], base: str, tip: str, joint_nam
     if joint_names and (absent := [name for name in joint_names if name not in actuated]):
         held = ", ".join(actuated)
         raise RobotError(
-            f"{tree.where}: joint '{absent[0]}' is not between '{base}' and '{tip}'{nearest(absent[0], actuated)} "
+            f"{tree.where}: joint '{absent[0]}' is not between '{base}' and '{tip}'{suggestion(absent[0], actuated)} "
             f"(found there: {held})"
         )
 
@@ -242,7 +241,7 @@ def _last_named(tree: Tree, base: str, joint_names: Sequence[str]) -> str:
     for name in joint_names:
         if name not in tree.joints:
             known = ", ".join(joint.name for joint in tree.joints.values() if joint.actuated)
-            raise RobotError(f"{tree.where}: no joint '{name}'{nearest(name, tree.joints)} (joints: {known})")
+            raise RobotError(f"{tree.where}: no joint '{name}'{suggestion(name, tree.joints)} (joints: {known})")
     return max((tree.joints[name].child for name in joint_names), key=lambda link: len(tree.ancestry(link)))
 
 

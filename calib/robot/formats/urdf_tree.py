@@ -11,10 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.errors import RobotError
+from calib.errors import RobotError, suggestion
 from calib.robot.chain import Joint
 from calib.robot.formats.markup import Node, parse
-from calib.robot.tables import nearest
 from calib.transforms import from_xyz_rpy
 
 MOVING = ("revolute", "continuous", "prismatic")
@@ -95,7 +94,7 @@ class Tree:
         if name not in self.bodies:
             known = ", ".join(self.bodies)
             raise RobotError(
-                f"{self.where}: no link '{name}' for the {role}{nearest(name, self.bodies)} (links: {known})"
+                f"{self.where}: no link '{name}' for the {role}{suggestion(name, self.bodies)} (links: {known})"
             )
         return name
 
@@ -203,7 +202,7 @@ def _joint(node: Node, links: Iterable[str], where: str) -> JointTag:
     name, kind = node.attributes["name"], node.attributes.get("type", "")
     place = f"{where}, line {node.line}, joint '{name}'"
     if kind not in KINDS:
-        raise RobotError(f"{place}: type '{kind}' is none of {', '.join(KINDS)}{nearest(kind, KINDS)}")
+        raise RobotError(f"{place}: type '{kind}' is none of {', '.join(KINDS)}{suggestion(kind, KINDS)}")
     ends = [_end(node, role, links, place) for role in ("parent", "child")]
     lower, upper, velocity, effort = _limits(node, kind, place)
     return JointTag(
@@ -228,7 +227,7 @@ def _end(node: Node, role: str, links: Iterable[str], place: str) -> str:
     if child is None or not (link := child.attributes.get("link")):
         raise RobotError(f"{place}: no <{role} link=.../>")
     if link not in links:
-        raise RobotError(f"{place}: its {role} '{link}' is no link of this file{nearest(link, list(links))}")
+        raise RobotError(f"{place}: its {role} '{link}' is no link of this file{suggestion(link, list(links))}")
     return link
 
 

@@ -123,7 +123,7 @@ def test_lines_and_shapes(room):
         ("[torque]\nq2 = 30.0\n", "joint 2 needs"),
         ("[torque]\nmargin = 1.5\n", "margin"),
         ("[target]\nheight = 0.9\n", "is broken by"),
-        ("[speed]\nall = 1.0\n", "unknown key 'speed'"),
+        ("[speed]\nall = 1.0\n", "there is no key 'speed'"),
     ],
 )
 def test_limits_that_leave_no_motion(room, capsys, limits, message):

@@ -156,10 +156,10 @@ def test_joint_names_choose_the_chain():
         ({"joint_names": ["torso", "l1", "r1"]}, r"joint '[lr]1' is not between 'base' and '(left|right)1'"),
         (
             {"joint_names": ["torso", "l11"]},
-            r"no joint 'l11'; did you mean 'l[12]'\? \(joints: torso, l1, l2, r1, r2\)",
+            r"no joint 'l11' \(did you mean 'l[12]'\?\) \(joints: torso, l1, l2, r1, r2\)",
         ),
-        ({"tip": "left_2"}, r"no link 'left_2' for the tip; did you mean 'left2'"),
-        ({"base": "bass", "tip": "left2"}, r"no link 'bass' for the base; did you mean 'base'"),
+        ({"tip": "left_2"}, r"no link 'left_2' for the tip .did you mean 'left2'"),
+        ({"base": "bass", "tip": "left2"}, r"no link 'bass' for the base .did you mean 'base'"),
         ({"base": "left1", "tip": "right2"}, r"link 'right2' does not hang on 'left1'"),
         ({"base": "left2", "tip": "left2"}, r"no actuated joint between 'left2' and 'left2'"),
         ({"base": "left2"}, r"no actuated joint hangs on 'left2'"),
