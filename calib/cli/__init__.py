@@ -26,7 +26,7 @@ app = typer.Typer(
     help="Calibrate a robot: choose poses, fit the geometry, validate on unseen poses, export.",
 )
 
-_FLAGS = ("--debug", "--help", "--line", "--refit-frames", "--no-refit-frames")
+_FLAGS = ("--debug", "--help", "--line", "--plots", "--no-plots", "--refit-frames", "--no-refit-frames")
 _USAGE: Any = typer.BadParameter.__mro__[2]  # ClickException, of the click that this typer uses (or brings)
 
 for _group in (geometry, dynamics, motion, session):

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.shared import Base, Robot, Seed, Tip, make_console, progress
+from calib.cli.shared import Base, Plots, Robot, Seed, Tip, make_console, progress
 
 app = typer.Typer()
 
@@ -28,11 +28,12 @@ def identify_dynamics(
     base: Base = None,
     tip: Tip = None,
     seed: Seed = 0,
+    plots: Plots = True,
 ) -> None:
     """Identify the dynamics of ROBOT from recordings, and say how well it predicts other motion."""
     from calib.identification.identify_options import read_options
     from calib.procedure.dynamic_stage import folder, identify, inputs
-    from calib.procedure.report import identification_console, identification_figures
+    from calib.procedure.report import identification_console
 
     chosen = read_options(options)
     folder.check_target(out)
@@ -48,7 +49,10 @@ def identify_dynamics(
     with progress() as say:
         outcome = identify.run(found, progress=say)
         say("writing")
-        folder.write_folder(outcome, out, identification_figures.write)
+        draw = None
+        if plots:
+            from calib.procedure.report.identification_figures import write as draw
+        folder.write_folder(outcome, out, draw)
     for line in identification_console.outcome_lines(outcome):
         console.print(line, soft_wrap=True)
     console.print(f"written to {out}", soft_wrap=True, markup=False)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from calib.cli.shared import Base, Robot, Seed, Tip, make_console, numbers, progress
+from calib.cli.shared import Base, Plots, Robot, Seed, Tip, make_console, numbers, progress
 
 app = typer.Typer()
 
@@ -41,6 +42,7 @@ def fit(
     base: Base = None,
     tip: Tip = None,
     seed: Seed = 0,
+    plots: Plots = True,
 ) -> None:
     """Fit the geometry of ROBOT to measured poses, and say how far to trust it.
 
@@ -78,7 +80,7 @@ def fit(
             seed=seed, progress=say,
         )  # fmt: skip
         say("writing")
-        outputs.write_folder(outcome, out, fit_certificate.write)
+        outputs.write_folder(outcome, out, partial(fit_certificate.write, plots=plots))
     for line in shown.section(geometry_section.outcome_section(fit_metrics(outcome))):
         console.print(line, soft_wrap=True)
     console.print(f"written to {out}", soft_wrap=True, markup=False)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.shared import Base, Robot, Seed, Tip, numbers, progress, say_written
+from calib.cli.shared import Base, Plots, Robot, Seed, Tip, numbers, progress, say_written
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, DEFAULT_PLAN, ExcitationSettings, PlanSettings
 
 app = typer.Typer()
@@ -51,11 +51,11 @@ def excite(
     base: Base = None,
     tip: Tip = None,
     seed: Seed = DESIGN.seed,
+    plots: Plots = True,
 ) -> None:
     """Design a motion that excites the dynamics of ROBOT within its limits."""
     from calib import workers as work
     from calib.procedure.excitation import design, folder
-    from calib.procedure.report import motion_figures
 
     settings = ExcitationSettings(
         goals=tuple(goal or ()), hard=tuple(hard or ()), period=period, harmonics=harmonics, family=family,
@@ -69,7 +69,10 @@ def excite(
             robot, settings, model=model, limits=limits, base=base, tip=tip, map=crew.map_without(lost), progress=say
         )
         say("writing")
-        folder.write_design(designed, out, motion_figures.write_design)
+        draw = None
+        if plots:
+            from calib.procedure.report.motion_figures import write_design as draw
+        folder.write_design(designed, out, draw)
     say_written([*folder.design_lines(designed), *(f"note: {note}" for note in lost)], out)
 
 
@@ -108,10 +111,10 @@ def plan(
     slower: Annotated[float, typer.Option(help="factor of a slow rehearsal, written beside the motion")] = PLAN.slower,
     base: Base = None,
     tip: Tip = None,
+    plots: Plots = True,
 ) -> None:
     """Plan the fastest motion of ROBOT through waypoints, within its speeds and torques."""
     from calib.procedure.excitation import folder, planning
-    from calib.procedure.report import motion_figures
 
     settings = PlanSettings(
         payloads=tuple(payload or ()), lines=line, rate=rate, shorten=shorten, stray=stray, start=_stands(start),
@@ -123,7 +126,10 @@ def plan(
             robot, waypoints, settings, model=model, limits=limits, drives=drives, base=base, tip=tip, progress=say
         )
         say("writing")
-        folder.write_plan(planned, out, motion_figures.write_plan)
+        draw = None
+        if plots:
+            from calib.procedure.report.motion_figures import write_plan as draw
+        folder.write_plan(planned, out, draw)
     say_written(folder.plan_lines(planned), out)
 
 

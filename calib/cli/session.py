@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calib.cli.shared import Base, Seed, Tip, make_console, told
+from calib.cli.shared import Base, Plots, Seed, Tip, make_console, told
 
 if TYPE_CHECKING:
     from calib.procedure.session.questions import Answers
@@ -99,18 +99,19 @@ def formats(
 
 
 @app.command("next")
-def next_step(folder: Folder) -> None:
+def next_step(folder: Folder, plots: Plots = True) -> None:
     """Do what can be done in a session, then say what to do at the robot."""
-    _go_on(folder, f"calib next {folder}")
+    _go_on(folder, f"calib next {folder}", plots=plots)
 
 
 @app.command()
 def redo(
     folder: Folder,
     step: Annotated[str, typer.Argument(help="a step's name or number, see calib status")],
+    plots: Plots = True,
 ) -> None:
     """Make a step of a session again, and all that rests on it."""
-    _go_on(folder, f"calib redo {folder} {step}", step)
+    _go_on(folder, f"calib redo {folder} {step}", step, plots)
 
 
 @app.command()
@@ -131,6 +132,7 @@ def demo(
     guided: Annotated[bool, typer.Option("--guided", help="stop where an engineer would")] = False,
     bring: Annotated[Path | None, typer.Option(help="let the simulated cell bring what this session waits for")] = None,
     seed: Seed = 0,
+    plots: Plots = True,
 ) -> None:
     """Calibrate a simulated robot with simulated instruments, and compare with the hidden truth."""
     from calib.procedure.session import demo as demonstration
@@ -140,7 +142,7 @@ def demo(
             demonstration.bring_what_waits(bring, say)
             return
         found = demonstration.run(
-            out, robot, seed, say, progress, dynamics=not geometry_only, guided=guided,
+            out, robot, seed, say, progress, dynamics=not geometry_only, guided=guided, plots=plots,
         )  # fmt: skip
     for line in ("", *found.asks):
         console.print(line, soft_wrap=True, markup=False)
@@ -156,6 +158,7 @@ def demo(
 def run_sessions(
     sessions: Annotated[list[Path], typer.Argument(help="session.toml files, or the sessions' folders")],
     workers: Annotated[str, typer.Option(help="local processes, or the address of a Dask scheduler")] = "1",
+    plots: Plots = True,
 ) -> None:
     """Run many SESSIONS, one folder per robot, each as far as it goes; a table at the end says how they stand.
 
@@ -169,7 +172,7 @@ def run_sessions(
     folders, started, outcomes = fleet.folders_of(sessions), time.perf_counter(), []
     with told() as (console, say, progress), work.workers(workers) as crew:
         progress(f"running {len(folders)} sessions")
-        for outcome in fleet.run(folders, crew, f"calib run --workers {workers}"):
+        for outcome in fleet.run(folders, crew, f"calib run --workers {workers}", plots):
             outcomes.append(outcome)
             say(fleet.line(outcome))
             progress(f"{len(outcomes)} of {len(folders)} sessions")
@@ -183,11 +186,11 @@ def run_sessions(
         raise typer.Exit(code)
 
 
-def _go_on(folder: Path, command: str, again: str = "") -> None:
+def _go_on(folder: Path, command: str, again: str = "", plots: bool = True) -> None:
     from calib.procedure.session import commands
 
     with told() as (console, say, progress):
-        stop = commands.go_on(folder, say, progress, command, again)
+        stop = commands.go_on(folder, say, progress, command, again, plots)
     for line in stop.lines:
         console.print(line, soft_wrap=True, markup=False)
     if stop.verdict == "fail":

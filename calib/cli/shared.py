@@ -16,6 +16,7 @@ PIPED = 160  # columns of tables that no terminal bounds
 Robot = Annotated[str, typer.Argument(help="a .urdf, an MDH .toml, a library name, or the folder of an earlier fit")]
 Base = Annotated[str | None, typer.Option(help="URDF: the link the arm starts at")]
 Tip = Annotated[str | None, typer.Option(help="URDF: the link the arm ends at")]
+Plots = Annotated[bool, typer.Option("--plots/--no-plots", help="draw figures, or leave them out")]
 Seed = Annotated[int, typer.Option(help="reproduces everything random")]
 
 

@@ -10,14 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from calib.errors import UsageError
 from calib.procedure.dynamic_stage.folder import UNSEEN, IdentificationFolder
 from calib.procedure.excitation import coefficients
-from calib.procedure.report import dynamics_figures, motion_figures, uncertainty_figures
 from calib.procedure.report.page import Block, KeyFigure, Picture, Pictures, Section, Table, Text
-from calib.procedure.report.style import HALF, WIDE, svg
 
 TOLD = 50.0  # RSD [%] from which on a parameter is not told from zero: two sigmas
 DRAWN = 300  # points per curve of the excitation
@@ -62,28 +59,26 @@ def read(folder: Path) -> DynamicReport:
     return DynamicReport(unseen["verdict"], unseen["reason"], metrics, estimate, unseen)
 
 
-def dynamics_stage(found: DynamicReport, folder: Path, excitation: Path, exported: Sequence[str] = ()) -> Section:
+def dynamics_stage(
+    found: DynamicReport, folder: Path, excitation: Path, exported: Sequence[str] = (), plots: bool = True
+) -> Section:
     """Return the stage of the dynamics: errors on unseen motion, torques, excitation, parameters, what is not told.
 
     Args:
         folder: of the identification.
         excitation: folder with ``training/trajectory.csv`` and its ``metrics.json``, if one was planned.
         exported: what the export had to say.
+        plots: whether there are to be figures.
     """
-    blocks: list[Block] = [error_table(found), Pictures("", judged_figures(found))]
-    for number, curves in enumerate(found.unseen["curves"]):
-        figure = torques(found, curves)
-        seen = "unseen" if found.unseen["validation"] else "fitted"
-        words = f"Torques on {curves['name']}, {seen}: measured, predicted, and what is left."
-        blocks.append(
-            Pictures("Torques" if number == 0 else "", [Picture(svg(figure, f"torques{number}"), words, True)])
-        )
-    blocks += planned(excitation)
+    blocks: list[Block] = [error_table(found)]
+    if plots:
+        blocks += [Pictures("", judged_figures(found)), Pictures("Torques", torques(found)), planned(excitation)]
     if len(found.metrics["ladder"]) > 1:
         blocks.append(friction_table(found))
     blocks.append(Text("What the motion can tell", identifiability(found)))
-    blocks += consistency(folder)
-    blocks += [Pictures("Dynamic parameters", [significance(found)]), parameter_table(found)]
+    if plots:
+        blocks += [consistency(folder), Pictures("Dynamic parameters", [significance(found)])]
+    blocks.append(parameter_table(found))
     if exported:
         blocks.append(Text("What was exported", exported))
     notes = [*found.metrics["warnings"], *(w for w in found.unseen["warnings"] if w not in found.metrics["warnings"])]
@@ -92,13 +87,21 @@ def dynamics_stage(found: DynamicReport, folder: Path, excitation: Path, exporte
     return Section("Dynamics", blocks, found.verdict, found.reason, key_figures(found))
 
 
-def torques(found: DynamicReport, curves: Mapping[str, Any]) -> Figure:
-    """Return the figure of the torques of one recording."""
-    raw = {**found.unseen["fit"], **found.unseen["validation"]}[curves["name"]]["raw"]["relative_error_percent"]
-    t, measured, predicted = (np.array(curves[key], dtype=float).T for key in ("t", "measured", "predicted"))
-    title = f"{curves['name']}: {percent(raw['total'])} of the torque unexplained"
-    rows, units = found.unseen["rows"], found.unseen["units"]
-    return dynamics_figures.torques(t, measured, predicted, rows, units, title, raw["joints"])
+def torques(found: DynamicReport) -> list[Picture]:
+    """Return a figure of the torques of each recording."""
+    from calib.procedure.report import dynamics_figures
+    from calib.procedure.report.style import picture
+
+    result, rows, units = [], found.unseen["rows"], found.unseen["units"]
+    seen = "unseen" if found.unseen["validation"] else "fitted"
+    for curves in found.unseen["curves"]:
+        raw = {**found.unseen["fit"], **found.unseen["validation"]}[curves["name"]]["raw"]["relative_error_percent"]
+        t, measured, predicted = (np.array(curves[key], dtype=float).T for key in ("t", "measured", "predicted"))
+        title = f"{curves['name']}: {percent(raw['total'])} of the torque unexplained"
+        figure = dynamics_figures.torques(t, measured, predicted, rows, units, title, raw["joints"])
+        words = f"Torques on {curves['name']}, {seen}: measured, predicted, and what is left."
+        result.append(picture(figure, words, True))
+    return result
 
 
 def proof_of(found: DynamicReport) -> tuple[Mapping[str, Any], str]:
@@ -160,6 +163,9 @@ def error_table(found: DynamicReport) -> Table:
 
 def judged_figures(found: DynamicReport) -> list[Picture]:
     """Return errors by row and autocorrelations of the recording that judges."""
+    from calib.procedure.report import dynamics_figures
+    from calib.procedure.report.style import HALF, WIDE, picture
+
     proof, where = proof_of(found)
     own = next(iter(found.unseen["fit"].values()))
     sides = [[x or 0.0 for x in one["raw"]["relative_error_percent"]["joints"]] for one in (own, proof)]
@@ -170,23 +176,16 @@ def judged_figures(found: DynamicReport) -> list[Picture]:
     many = len(rows) > dynamics_figures.FEW
     width = WIDE if many else HALF
     drawn = dynamics_figures.autocorrelations(white["values"], white["bound"], rows, "What is left", width)
-    return [
-        Picture(
-            svg(bars, "errors"),
-            f"Share of each torque that the model leaves, on the training motion and on {where}.",
-            many,
-        ),
-        Picture(
-            svg(drawn, "white"), f"Autocorrelation of what is left below the band on {name}; dashed: white noise.", many
-        ),
-    ]
+    left = f"Share of each torque that the model leaves, on the training motion and on {where}."
+    rest = f"Autocorrelation of what is left below the band on {name}; dashed: white noise."
+    return [picture(bars, left, many), picture(drawn, rest, many)]
 
 
-def planned(excitation: Path) -> list[Block]:
+def planned(excitation: Path) -> Pictures:
     """Return the designed motion: a picture, and how well it tells the parameters."""
     folder = excitation / "training"
     if not (folder / coefficients.NAME).exists():
-        return []
+        return Pictures("Excitation", [])
     motion = coefficients.read(folder)
     t = np.linspace(0.0, motion.period, DRAWN)
     q, v, _ = motion.orders(t)
@@ -198,18 +197,20 @@ def planned(excitation: Path) -> list[Block]:
         f"{condition['normalised']:.3g} with unit columns, of {len(setting['columns'])} columns. Every limit was kept, "
         f"at and between {setting['instants_verified']} instants; smallest margins: {margins}."
     )
+    from calib.procedure.report.motion_figures import motion_sheet
+    from calib.procedure.report.style import picture
+
     names, none = motion.joint_names, np.full(q.shape[1], np.inf)
     series = [(values, -none, none, title) for values, title in ((q, "position"), (v, "velocity"))]
-    figure = motion_figures.motion_sheet(t, series, ("rad", "rad/s"), names)
-    return [Pictures("Excitation", [Picture(svg(figure, "motion"), words, True)])]
+    figure = motion_sheet(t, series, ("rad", "rad/s"), names)
+    return Pictures("Excitation", [picture(figure, words, True)])
 
 
-def consistency(folder: Path) -> list[Block]:
-    """Return what the geometry's uncertainty does to the dynamics: figures of `consistency_figures`, if there are "
-    "any."""
-    drawn = uncertainty_figures.from_folder(folder)
-    items = [Picture(svg(one.figure, f"consistency-{name}"), one.caption, one.wide) for name, one in drawn.items()]
-    return [Pictures("Geometry and dynamics", items)] if items else []
+def consistency(folder: Path) -> Pictures:
+    """Return figures of what the geometry's uncertainty does to the dynamics; none of a robot without a fit."""
+    from calib.procedure.report import uncertainty_figures
+
+    return Pictures("Geometry and dynamics", list(uncertainty_figures.from_folder(folder).values()))
 
 
 def friction_table(found: DynamicReport) -> Table:
@@ -257,13 +258,16 @@ def identifiability(found: DynamicReport) -> list[str]:
 
 def significance(found: DynamicReport) -> Picture:
     """Return the figure of parameters over their sigma."""
+    from calib.procedure.report import dynamics_figures
+    from calib.procedure.report.style import picture
+
     names = [row["name"] for row in found.estimate]
     values, sigma = (np.array([float(row[key] or "nan") for row in found.estimate]) for key in ("value", "sigma"))
     known = np.isfinite(values) & np.isfinite(sigma) & (sigma > 0)
     shown = [name for name, use in zip(names, known) if use]
     figure = dynamics_figures.significance(shown, values[known], sigma[known])
     words = "How far each parameter is from zero, in its σ; grey, below the dashed line: not told from zero."
-    return Picture(svg(figure, "significance"), words, True)
+    return picture(figure, words, True)
 
 
 def parameter_table(found: DynamicReport) -> Table:

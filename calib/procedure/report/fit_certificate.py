@@ -8,23 +8,33 @@ from pathlib import Path
 from calib import files
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.folder import FitFolder
-from calib.procedure.report import certificate, figures, fit_report, geometry_section, html
+from calib.procedure.report import certificate, fit_report, geometry_section, html
 from calib.procedure.report.fit_report import Report
-from calib.procedure.report.page import Page
-from calib.procedure.report.style import save
+from calib.procedure.report.page import Page, Picture
 
 
-def write(outcome: Outcome, folder: Path) -> None:
-    """Write ``report.json``, the figures, and a certificate of the fit alone into a fit's folder."""
+def write(outcome: Outcome, folder: Path, plots: bool = True) -> None:
+    """Write ``report.json``, the figures, and a certificate of the fit alone into a fit's folder.
+
+    Args:
+        plots: whether there are to be figures; the certificate is written without them, too.
+    """
     report = fit_report.collect(outcome)
     fit_report.write(report, FitFolder(folder).report)
-    drawn = figures.draw(report)
+    drawn = draw(report) if plots else {}
     for name, figure in drawn.items():
-        save(figure.figure, folder / f"plot_{name}.png")
+        files.write(folder / f"plot_{name}.png", figure.png)
     files.write(folder / "certificate.html", html.render(of_fit(report, drawn)))
 
 
-def of_fit(report: Report, drawn: Mapping[str, figures.Drawn]) -> Page:
+def draw(report: Report) -> Mapping[str, Picture]:
+    """Return the figures by name; matplotlib is loaded here."""
+    from calib.procedure.report import figures
+
+    return figures.draw(report)
+
+
+def of_fit(report: Report, drawn: Mapping[str, Picture]) -> Page:
     """Return the certificate of a fit alone, without a session around it."""
     given = (
         ("robot", f"{report.robot}, {report.base} to {report.tip}, {len(report.joints)} joints"),

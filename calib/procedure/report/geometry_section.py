@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,9 +13,6 @@ from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import ComparedRows, ErrorStatistics, FitMetrics, OutlierRow, RepeatedPose
 from calib.procedure.report.fit_report import Report
 from calib.procedure.report.page import Block, KeyFigure, Picture, Pictures, Section, Table, Text
-
-if TYPE_CHECKING:
-    from calib.procedure.report.figures import Drawn
 
 KINDS = {
     "position_mm": ("position", "mm"),
@@ -68,7 +64,7 @@ def outcome_section(metrics: FitMetrics) -> Section:
     return Section("Geometry", blocks, metrics.verdict, metrics.reason)
 
 
-def certificate_section(report: Report, drawn: Mapping[str, Drawn]) -> Section:
+def certificate_section(report: Report, drawn: Mapping[str, Picture]) -> Section:
     """Return the section of a certificate: errors, ladder, parameters, identifiability, figures, outliers.
 
     Args:
@@ -246,11 +242,8 @@ def identifiability(report: Report) -> list[str]:
     return lines
 
 
-def _pictures(title: str, drawn: Mapping[str, Drawn], names: Sequence[str]) -> Pictures:
-    from calib.procedure.report.style import svg
-
-    found = [(name, drawn[name]) for name in names if name in drawn]
-    return Pictures(title, [Picture(svg(one.figure, name), one.caption, one.wide) for name, one in found])
+def _pictures(title: str, drawn: Mapping[str, Picture], names: Sequence[str]) -> Pictures:
+    return Pictures(title, [drawn[name] for name in names if name in drawn])
 
 
 def repeated_sentences(metrics: FitMetrics) -> list[str]:

@@ -48,9 +48,9 @@ class Text:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure as an SVG element; a wide one takes the whole line."""
+    """A figure, drawn once as PNG; a wide one takes the whole line."""
 
-    svg: str
+    png: bytes
     caption: str
     wide: bool = False
 

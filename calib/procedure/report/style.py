@@ -7,8 +7,6 @@ that a ``$`` in a name is a ``$``.
 
 from __future__ import annotations
 
-import base64
-import html
 import io
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -25,6 +23,7 @@ from matplotlib.font_manager import findfont, get_font
 from PIL import Image
 
 from calib import files
+from calib.procedure.report.page import Picture
 
 BEFORE, AFTER, MARK, QUIET, INK = "#e2a26b", "#17486e", "#b3261e", "#8a8f98", "#22262b"
 BROWN = "#a8622a"  # BEFORE, dark enough for letters
@@ -192,13 +191,6 @@ def save(figure: Figure, path: str | Path, dpi: float = DPI) -> Path:
     return files.write(path, png(figure, dpi))
 
 
-def image(drawn: bytes, words: str) -> str:
-    """Return a PNG as an element of a page that needs no other file; `words` say what it shows."""
-    source = base64.b64encode(drawn).decode()
-    form = "width: 100%; height: auto; display: block"
-    return f'<img style="{form}" alt="{html.escape(words, quote=True)}" src="data:image/png;base64,{source}">'
-
-
-def svg(figure: Figure, name: str) -> str:
-    """Return a figure as an element of a page."""
-    return image(png(figure), name)
+def picture(figure: Figure, caption: str, wide: bool = False) -> Picture:
+    """Draw a figure for a page, and for a file of its own."""
+    return Picture(png(figure), caption, wide)

@@ -14,17 +14,18 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from calib import files
 from calib.procedure.dynamic_stage.geometry_tables import EFFECTS, GEOMETRIES, LEAST
-from calib.procedure.report.figures import Drawn
-from calib.procedure.report.style import AFTER, BEFORE, MARK, QUIET, WIDE, legend, number, room, save, sheet, styled
+from calib.procedure.report.page import Picture
+from calib.procedure.report.style import AFTER, BEFORE, MARK, QUIET, WIDE, legend, number, picture, room, sheet, styled
 
 TOP = 15  # elements in the ranked figure
 Row = Mapping[str, str]
 
 
-def from_folder(folder: Path) -> dict[str, Drawn]:
+def from_folder(folder: Path) -> dict[str, Picture]:
     """Return the figures that an identification's folder gives, by name; none of a robot without a fit."""
-    result: dict[str, Drawn] = {}
+    result: dict[str, Picture] = {}
     rows = [row for row in _read(folder / GEOMETRIES) if row["essential"] == "yes" and float(row["calibrated"]) != 0.0]
     if rows:
         words = (
@@ -33,7 +34,7 @@ def from_folder(folder: Path) -> dict[str, Drawn]:
             "torque noise; calibrated: with the geometry's uncertainty). Below: how far the nominal one's estimate "
             "is off, in the calibrated one's sigmas."
         )
-        result["geometries"] = Drawn(geometries(rows), words, True)
+        result["geometries"] = picture(geometries(rows), words, True)
     known = [row for row in _read(folder / EFFECTS) if row["sigma"]]
     if known:
         words = (
@@ -41,7 +42,7 @@ def from_folder(folder: Path) -> dict[str, Drawn]:
             "it moves most, in that parameter's sigma from torque noise. Below the dashed line no sigma grows by more "
             "than 1 %."
         )
-        result["effects"] = Drawn(effects(known[:TOP]), words)
+        result["effects"] = picture(effects(known[:TOP]), words)
     return result
 
 
@@ -50,7 +51,7 @@ def write(folder: Path) -> None:
     drawn = from_folder(folder)
     for name, file in (("geometries", "plot_geometries.png"), ("effects", "plot_geometry_effects.png")):
         if name in drawn:
-            save(drawn[name].figure, folder / file)
+            files.write(folder / file, drawn[name].png)
 
 
 def geometries(rows: Sequence[Row]) -> Figure:

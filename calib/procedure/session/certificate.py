@@ -28,18 +28,18 @@ ROLES = {
 
 def certify(session: Session, say: Say) -> list[str]:
     """Print the certificate."""
-    from calib.procedure.report import dynamics_section, figures, geometry_section
+    from calib.procedure.report import dynamics_section, fit_certificate, geometry_section
 
-    say("drawing")
+    say("drawing" if session.plots else "writing")
     whole = whole_report(session)
-    section = geometry_section.certificate_section(whole, figures.draw(whole))
+    section = geometry_section.certificate_section(whole, fit_certificate.draw(whole) if session.plots else {})
     judged = [with_arrival(section, noticed(session, "3-measured", "validate"))]
     notes = [f"geometry {section.verdict}: {section.reason}"]
     if session.dynamic:
         dynamics = dynamics_section.read(session.identification.path)
         exported = read_state(session)["steps"].get("export", {}).get("notes", [])
         folders = session.identification.path, session.path("6-excitation")
-        section = dynamics_section.dynamics_stage(dynamics, *folders, exported)
+        section = dynamics_section.dynamics_stage(dynamics, *folders, exported, session.plots)
         judged.append(with_arrival(section, noticed(session, "7-recorded", "predict")))
         notes.append(f"dynamics {dynamics.verdict}: {dynamics.reason}")
     told = simulated(session)
@@ -51,7 +51,8 @@ def certify(session: Session, say: Say) -> list[str]:
         listed(session),
     )
     files.write(session.path("certificate.html"), html.render(page))
-    return [*notes, "certificate.html", viewer.write_beside(session.folder)]
+    recording = [viewer.write_beside(session.folder)] if session.plots else []
+    return [*notes, "certificate.html", *recording]
 
 
 def whole_report(session: Session) -> fit_report.Report:

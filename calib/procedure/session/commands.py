@@ -76,7 +76,7 @@ def begin(
     return create(folder, source, wanted, copied)
 
 
-def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "") -> Stop:
+def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", plots: bool = True) -> Stop:
     """Run what can be run, and say what to do then.
 
     Args:
@@ -84,8 +84,9 @@ def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "") 
         say, progress: lines that stay, and words that pass.
         command: for the record.
         again: name of a step to make again, with all that rests on it.
+        plots: whether figures are drawn.
     """
-    session = open_session(folder)
+    session = open_session(folder, plots)
     with locked(session, say):
         if again:
             steps.forget(session, steps.find(session, again))

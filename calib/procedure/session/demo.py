@@ -6,7 +6,7 @@ import resource
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -55,8 +55,9 @@ class DemoResult:
 
 
 def run(
-    folder: Path, robot: str, seed: int, say: Say, progress: Say, *, dynamics: bool = True, guided: bool = False
-) -> DemoResult:
+    folder: Path, robot: str, seed: int, say: Say, progress: Say, *, dynamics: bool = True, guided: bool = False,
+    plots: bool = True,
+) -> DemoResult:  # fmt: skip
     """Calibrate a simulated robot in a session, and compare with its hidden truth.
 
     Args:
@@ -66,6 +67,7 @@ def run(
         say, progress: lines that stay, and words that pass.
         dynamics: identify them, too, where the library knows the robot's masses.
         guided: stop where an engineer would; `bring_what_waits` then plays his part.
+        plots: whether figures are drawn.
     """
     started = time.perf_counter()
     cell = virtual_cell(robot, seed)
@@ -78,6 +80,7 @@ def run(
         dynamics = False
     motion = MOTION if dynamics else {}
     session = begin(folder, robot, "cmm", poses=FIT, validation=VALIDATION, seed=seed, dynamics=dynamics, **motion)
+    session = replace(session, plots=plots)
     say(f"the cell: {cell.note}")
     with locked(session):
         waiting = steps.run_next(session, say, progress, "calib demo")
@@ -113,7 +116,7 @@ def results(session: Session) -> tuple[tuple[str, str], ...]:
     """Return what to look at."""
     found = [
         ("certificate", "certificate.html"),
-        ("plots", "4-fit"),
+        ("plots" if session.plots else "fit", "4-fit"),
         ("calibrated URDF", f"{session.export}/robot.urdf"),
     ]
     if session.dynamic:

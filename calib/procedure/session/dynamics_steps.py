@@ -78,8 +78,10 @@ def excite(session: Session, say: Say) -> list[str]:
     from calib.procedure.excitation import design
     from calib.procedure.excitation import folder as motion_folder
     from calib.procedure.excitation.settings import ExcitationSettings
-    from calib.procedure.report import motion_figures
 
+    draw = None
+    if session.plots:
+        from calib.procedure.report.motion_figures import write_design as draw
     wanted, notes = session.settings.dynamics, []
     limits = session.path(wanted.limits) if wanted.limits else None
     names = ["training", "validation"] if wanted.validation else ["training"]
@@ -97,7 +99,7 @@ def excite(session: Session, say: Say) -> list[str]:
         )  # fmt: skip
         if designed.found.interrupted:  # a session is resumed, not gone on with half a search
             raise KeyboardInterrupt
-        motion_folder.write_design(designed, session.path("6-excitation") / name, motion_figures.write_design)
+        motion_folder.write_design(designed, session.path("6-excitation") / name, draw)
         cond = designed.condition
         notes.append(
             f"{name}: {designed.period:g} s, condition number {cond['raw']:.3g} raw, {cond['normalised']:.3g} "
@@ -167,8 +169,10 @@ def cut_paths(paths: list[Path], cuts: dict[str, Any]) -> list[str]:
 def identify(session: Session, say: Say) -> list[str]:
     """Identify base parameters and friction on the calibrated geometry; validation files are not looked at."""
     from calib.procedure.dynamic_stage import folder as identification_outputs
-    from calib.procedure.report import identification_figures
 
+    draw = None
+    if session.plots:
+        from calib.procedure.report.identification_figures import write as draw
     cuts = json.loads(session.path("7-recorded/cuts.json").read_text(encoding="utf-8"))
     given = inputs.gather(
         session.fit.path, cut_paths(recordings(session)[0], cuts), options=options_of(session),
@@ -176,7 +180,7 @@ def identify(session: Session, say: Say) -> list[str]:
     )  # fmt: skip
     outcome = identifying.run(given, progress=say)
     say("writing")
-    identification_outputs.write_folder(outcome, session.identification.path, identification_figures.write)
+    identification_outputs.write_folder(outcome, session.identification.path, draw)
     found = outcome.found
     raw, normalised = found.condition
     own = next(iter(outcome.fit.values()))

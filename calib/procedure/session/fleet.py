@@ -69,26 +69,27 @@ def folders_of(given: Sequence[Path]) -> list[Path]:
     return found
 
 
-def run(folders: Sequence[Path], workers: Workers, command: str) -> Iterator[FleetRow]:
+def run(folders: Sequence[Path], workers: Workers, command: str, plots: bool = True) -> Iterator[FleetRow]:
     """Run every session as far as it goes, and yield each outcome when its session ends.
 
     Args:
         folders: of the sessions.
         workers: where they run; on other machines the folders must have the same paths.
         command: for their records.
+        plots: whether figures are drawn.
     """
     sent = folders if workers.here else [folder.absolute() for folder in folders]
-    for number, outcome in workers.completed(partial(run_one, command=command), sent):
+    for number, outcome in workers.completed(partial(run_one, command=command, plots=plots), sent):
         name = str(folders[number])
         lost = isinstance(outcome, TaskLost)
         yield FleetRow(name, FAILED, words=str(outcome), code=2) if lost else replace(outcome, folder=name)
 
 
-def run_one(folder: Path, command: str = "calib run") -> FleetRow:
+def run_one(folder: Path, command: str = "calib run", plots: bool = True) -> FleetRow:
     """Run one session as far as it goes; what it says goes into its ``run.log``. Only Ctrl-C leaves this function."""
     started, said = time.perf_counter(), []
     try:
-        outcome = _go_on(folder, said.append, command)
+        outcome = _go_on(folder, said.append, command, plots)
     except Exception as error:  # a robot that fails must not stop the others
         code = exit_code(error)
         words = str(error) if code is not None else f"{type(error).__name__}: {error} (see {LOG})"
@@ -102,8 +103,8 @@ def run_one(folder: Path, command: str = "calib run") -> FleetRow:
     return replace(outcome, seconds=time.perf_counter() - started)
 
 
-def _go_on(folder: Path, say: Callable[[str], None], command: str) -> FleetRow:
-    session = open_session(folder)
+def _go_on(folder: Path, say: Callable[[str], None], command: str, plots: bool) -> FleetRow:
+    session = open_session(folder, plots)
     with locked(session, say):
         waiting = steps.run_next(session, say, lambda words: None, command)
     if waiting is not None:

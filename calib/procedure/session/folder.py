@@ -48,11 +48,12 @@ MARK = "simulated.txt"
 
 @dataclass(frozen=True)
 class Session:
-    """An open session: its folder, and its settings as they stand now."""
+    """An open session: its folder, its settings as they stand now, and whether what is made now is drawn, too."""
 
     folder: Path
     settings: SessionSettings
     notes: tuple[str, ...] = field(default=())
+    plots: bool = True
 
     def path(self, name: str) -> Path:
         """Return a file of the session by its name relative to the folder."""
@@ -128,7 +129,7 @@ def create(
     return open_session(folder)
 
 
-def open_session(folder: Path) -> Session:
+def open_session(folder: Path, plots: bool = True) -> Session:
     """Read the session in `folder`.
 
     Raises:
@@ -137,7 +138,7 @@ def open_session(folder: Path) -> Session:
     path = folder / "session.toml"
     if not path.exists():
         raise SessionError(f"{folder} is no session (no session.toml); make one with: calib new {folder}")
-    return Session(folder, read_settings(path))
+    return Session(folder, read_settings(path), plots=plots)
 
 
 def fingerprint(path: Path) -> str:

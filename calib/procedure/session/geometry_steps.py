@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -177,7 +178,7 @@ def fit(session: Session, say: Say) -> list[str]:
         gathered(session), options_of(session), model=settings.fit.model, loss=settings.fit.loss,
         tolerance=tolerance_of(session), seed=settings.seed, progress=say,
     )  # fmt: skip
-    outputs.write_folder(outcome, session.fit.path, fit_certificate.write)
+    outputs.write_folder(outcome, session.fit.path, partial(fit_certificate.write, plots=session.plots))
     count = len(outcome.climb.fit.free)
     notes = [f"model {outcome.climb.chosen}, {count} parameters on {outcome.fit.poses} poses", *outcome.warnings]
     if outcome.outliers:

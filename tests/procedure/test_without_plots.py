@@ -1,0 +1,73 @@
+"""Drawing can be left out, and broken off: --no-plots, and Ctrl-C while figures are drawn."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import planted_motion as planted
+import pytest
+
+from calib.procedure.report import style
+from calib.robot import description
+
+
+@pytest.fixture
+def figures() -> bool:
+    return True
+
+
+def names(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def test_a_fit_without_plots_has_its_certificate_and_all_else(cell, calib):
+    measured = cell.write("m.csv", cell.measure())
+    arguments = ("fit", "ur5", measured, "--holdout", 0.25, "--model", "geometry")
+    assert calib(*arguments, "--out", "with")[0] == calib(*arguments, "--out", "without", "--no-plots")[0] == 0
+    drawn, bare = names(cell.folder / "with"), names(cell.folder / "without")
+    assert len(drawn - bare) >= 6 and all(name.startswith("plot_") for name in drawn - bare) and bare < drawn
+    page = (cell.folder / "without/certificate.html").read_text(encoding="utf-8")
+    assert "<img" not in page and "Ladder of models" in page
+    for name in ("metrics.json", "estimate.csv", "report.json"):
+        assert (cell.folder / "with" / name).read_text() == (cell.folder / "without" / name).read_text()
+    assert calib(*arguments, "--out", "with", "--no-plots")[0] == 0
+    assert names(cell.folder / "with") == bare, "figures of the earlier fit are gone"
+
+
+def test_a_fit_without_plots_loads_no_matplotlib(cell):
+    measured = cell.write("m.csv", cell.measure(40))
+    command = ["fit", "ur5", str(measured), "--model", "geometry", "--out", "o", "--no-plots"]
+    code = f"import sys; from calib import cli; cli.run({command}); print('matplotlib' in sys.modules)"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=cell.folder)
+    assert said.stdout.splitlines()[-1] == "False"
+
+
+def test_ctrl_c_while_figures_are_drawn_leaves_nothing_half_made(cell, calib, monkeypatch):
+    measured = cell.write("m.csv", cell.measure(40))
+    arguments = ("fit", "ur5", measured, "--model", "geometry", "--out", "o")
+    drawn = []
+
+    def interrupted(figure, dpi=style.DPI):
+        drawn.append(figure)
+        if len(drawn) == 3:
+            raise KeyboardInterrupt
+        return b"\x89PNG"
+
+    with monkeypatch.context() as patch:
+        patch.setattr(style, "png", interrupted)
+        code, _, said = calib(*arguments)
+    assert code == 130 and "nothing was left half-written" in said and len(drawn) == 3
+    assert names(cell.folder) == {"m.csv"}
+    assert calib(*arguments)[0] == 0 and "plot_position.png" in names(cell.folder / "o")
+
+
+def test_an_identification_without_plots(tmp_path, calib, monkeypatch):
+    import numpy as np
+
+    monkeypatch.chdir(tmp_path)
+    description.write(tmp_path / "robot.toml", planted.arm())
+    np.savez(tmp_path / "train.npz", **planted.series(0))
+    code, _, _ = calib("identify", "robot.toml", "train.npz", "--friction", "standard", "--out", "o", "--no-plots")
+    assert code == 0 and not [name for name in names(tmp_path / "o") if name.endswith(".png")]
