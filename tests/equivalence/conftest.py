@@ -9,7 +9,6 @@ import planted_motion as planted
 import pytest
 from both_ways import go_on, session_with
 
-from calib.procedure.report import figures
 from calib.robot import description
 from calib.simulation.cells import measured_files
 from calib.simulation.cells.cell import measure
@@ -30,12 +29,6 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
             q = np.random.default_rng(seed).uniform(-2.0, 2.0, (count, planted.N))
             measured_files.write(measure(cell, q, seed=seed + 1), folder / f"{name}{kind}.csv")
     return folder
-
-
-@pytest.fixture
-def plain(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Draw no figures."""
-    monkeypatch.setattr(figures, "draw", lambda report: {})
 
 
 @pytest.fixture(scope="session")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,10 @@ import pytest
 from both_ways import Judgement, agree, command, read, refusal
 from sessions import quiet
 
-from calib.procedure.report import dynamics_section, identification_figures, motion_figures
+from calib.procedure.report import dynamics_section
 from calib.procedure.session import dynamics_steps, geometry_steps
 from calib.procedure.session.folder import Session, open_session
 
-pytestmark = pytest.mark.usefixtures("plain", "unplotted")
 Series = dict[str, np.ndarray]
 DYNAMICS = {
     "wanted": "true", "plan": "false", "validation": "false", "friction": '"standard"', "period": "4.0",
@@ -35,13 +35,6 @@ MODEL = (
     "findings",
     "unit",
 )
-
-
-@pytest.fixture(scope="module")
-def unplotted() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(identification_figures, "write", lambda outcome, folder: None)
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -153,9 +146,8 @@ def test_command_and_session_agree(
 
 
 @pytest.mark.slow
-def test_the_same_motion_is_designed(session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(motion_figures, "write_design", lambda designed, folder: None)
-    dynamics_steps.excite(session, quiet)
+def test_the_same_motion_is_designed(session: Session, tmp_path: Path) -> None:
+    dynamics_steps.excite(replace(session, plots=False), quiet)
     words = "--period 4 --harmonics 2 --rate 100 --starts 1 --evaluations 20 --repeat 1"
     assert not command("excite", session.path("4-fit"), *words.split(), "--out", tmp_path / "motion")
     names = {path.name for path in (tmp_path / "motion").iterdir()}

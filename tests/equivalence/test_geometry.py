@@ -15,8 +15,6 @@ from calib.data.poses.plans import read_poses
 from calib.procedure.session.folder import open_session
 from calib.robot.load import load
 
-pytestmark = pytest.mark.usefixtures("plain")
-
 
 def by_command(robot: Path, out: Path, model: str, fit: Path, unseen: Path) -> Judgement:
     refused = command("fit", robot, fit, "--validate", unseen, "--model", model, "--out", out)

@@ -12,9 +12,10 @@ def quiet(words: str) -> None:
     """Say nothing."""
 
 
-def go_on(session: Session) -> steps.State | None:
+def go_on(session: Session, plots: bool = False) -> steps.State | None:
+    """Run a session as far as it goes; figures take most of the time, so that a test has to ask for them."""
     with locked(session, quiet):
-        return steps.run_next(open_session(session.folder), quiet, quiet)
+        return steps.run_next(open_session(session.folder, plots), quiet, quiet)
 
 
 def edit(path: Path, old: str, new: str) -> None:

@@ -112,7 +112,6 @@ def test_cycles_of_a_pose_are_held_out_together():
 def files(tmp_path, monkeypatch) -> Path:
     """Forty poses once, five of them thirty times, and a validation file at the fit's joints."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("calib.procedure.report.fit_certificate.write", lambda outcome, folder: None)
     cell = perturbed_cell(load("ur5"), 1, SimulatedInstrument(position_sigma=2e-5, orientation_sigma=5e-5))
     rng = np.random.default_rng(3)
     once, five = rng.uniform(-2, 2, (60, 6)), rng.uniform(-2, 2, (5, 6))
@@ -125,7 +124,7 @@ def files(tmp_path, monkeypatch) -> Path:
 
 
 def test_the_fit_states_them_beside_its_own_errors(files, capsys):
-    arguments = ["fit", "ur5", "fit.csv", "--validate", "iso.csv", "--model", "geometry", "--out", "done"]
+    arguments = ["fit", "ur5", "fit.csv", "--validate", "iso.csv", "--model", "geometry", "--out", "done", "--no-plots"]
     assert cli.run([*arguments, "--stations", "one"]) == 0
     said = capsys.readouterr().out
     assert "ISO 9283 on 5 poses repeated 30 times" in said and "too few poses to state an accuracy" in said
@@ -140,7 +139,9 @@ def test_the_fit_states_them_beside_its_own_errors(files, capsys):
 
 
 def test_a_validation_at_the_fits_joints_proves_nothing(files, capsys):
-    code = cli.run(["fit", "ur5", "fit.csv", "--validate", "again.csv", "--model", "geometry", "--out", "done"])
+    code = cli.run(
+        ["fit", "ur5", "fit.csv", "--validate", "again.csv", "--model", "geometry", "--out", "done", "--no-plots"]
+    )
     said = capsys.readouterr().out
     assert "at joints that were fitted: not unseen" in said
     assert "NOT unseen" in said and code in (0, 1)

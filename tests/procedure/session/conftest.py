@@ -30,7 +30,7 @@ def finished_folder(planned_folder: Path, tmp_path_factory: pytest.TempPathFacto
     shutil.copytree(planned_folder, folder)
     session = open_session(folder)
     demo.bring(session, virtual_cell("lwr4plus"), 1)
-    assert go_on(session) is None
+    assert go_on(session, plots=True) is None
     return folder
 
 
@@ -50,11 +50,3 @@ def measured(planned: Session) -> Session:
 def finished(finished_folder: Path, tmp_path: Path) -> Session:
     shutil.copytree(finished_folder, tmp_path / "cell")
     return open_session(tmp_path / "cell")
-
-
-@pytest.fixture
-def plain(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Draw no figures: most claims about sessions are not about them, and drawing takes most of the time."""
-    from calib.procedure.report import figures
-
-    monkeypatch.setattr(figures, "draw", lambda report: {})

@@ -69,7 +69,7 @@ def test_it_says_what_a_professional_signs(page: str, finished_folder: Path) -> 
         assert name in text
 
 
-def test_a_simulated_session_says_that_it_is_and_another_does_not(page: str, finished: Session, plain: None) -> None:
+def test_a_simulated_session_says_that_it_is_and_another_does_not(page: str, finished: Session) -> None:
     assert "<h1>Simulated calibration of" in page and "SIMULATED: optical CMM" in page
     assert "simulated cell: " in page and "nothing was measured on a robot" in page
     finished.path("simulated.txt").unlink()
@@ -155,11 +155,7 @@ def test_every_figure_is_drawn_from_plain_arrays(tmp_path: Path) -> None:
 
 def test_a_figure_is_drawn_the_same_twice() -> None:
     one, two = (style.png(geometry_figures.singular_values(np.array([2.0, 1.0, 1e-12]), 2)) for _ in range(2))
-    assert (
-        one == two
-        and style.image(one, 'a "name"').startswith("<img ")
-        and "a &quot;name&quot;" in style.image(one, 'a "name"')
-    )
+    assert one == two
 
 
 @pytest.mark.parametrize("name", ["$q_1$", "5 $", "gelenk_€ $\\frac{1}$", "a^b_c$$"])

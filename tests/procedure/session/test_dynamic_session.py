@@ -13,7 +13,6 @@ from sessions import edit, go_on
 
 from calib import cli
 from calib.errors import MeasurementError
-from calib.procedure.report import identification_figures, motion_figures
 from calib.procedure.session import commands, demo, instructions, steps
 from calib.procedure.session.commands import begin
 from calib.procedure.session.folder import Session, open_session
@@ -37,9 +36,7 @@ def waiting_folder(finished_folder: Path, tmp_path_factory: pytest.TempPathFacto
     for key, value in QUICK.items():
         lines = [f"{key} = {value}" if line.startswith(f"{key} =") else line for line in path.read_text().splitlines()]
         path.write_text("\n".join(lines) + "\n")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(motion_figures, "save", lambda figure, path: path)
-        waiting = go_on(open_session(folder))
+    waiting = go_on(open_session(folder))
     assert waiting is not None and waiting.step.name == "record"
     return folder
 
@@ -57,9 +54,7 @@ def recorded_folder(waiting_folder: Path, tmp_path_factory: pytest.TempPathFacto
 def whole_folder(recorded_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("whole") / "cell"
     shutil.copytree(recorded_folder, folder)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(identification_figures, "write", lambda outcome, path: None)
-        assert go_on(open_session(folder)) is None
+    assert go_on(open_session(folder), plots=True) is None
     return folder
 
 

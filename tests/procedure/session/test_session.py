@@ -20,8 +20,6 @@ from calib.procedure.session import certificate, instructions, outcome, steps
 from calib.procedure.session.folder import Session, locked, open_session, read_state
 from calib.robot.load import load
 
-pytestmark = pytest.mark.usefixtures("plain")
-
 
 def kinds(session: Session) -> dict[str, str]:
     return {state.step.name: state.kind for state in steps.states(open_session(session.folder))}
@@ -188,7 +186,7 @@ def test_what_arrives_is_checked(measured: Session, change, message: str, capsys
     path = measured.path("3-measured/measured.csv")
     head, _, rest = path.read_text().partition("\n")
     path.write_text(f"{change(head)}\n{rest}")
-    assert cli.run(["next", str(measured.folder)]) == 2
+    assert cli.run(["next", "--no-plots", str(measured.folder)]) == 2
     said = capsys.readouterr().err
     assert "measured.csv" in said and message in said and "Traceback" not in said
     assert not measured.path("4-fit/robot.toml").exists()
@@ -228,7 +226,7 @@ def test_a_failed_robots_files_say_so_until_it_does_not_fail(finished: Session, 
     place, settings = finished.path("6-export"), finished.path("session.toml")
     before = (place / "robot.urdf").read_bytes()
     edit(settings, "tolerance_mm = 0.0", "tolerance_mm = 0.001")
-    assert cli.run(["next", str(finished.folder)]) == 1
+    assert cli.run(["next", "--no-plots", str(finished.folder)]) == 1
     said = capsys.readouterr().out.strip().split("\n")[-1]
     assert said.startswith("verdict fail: exported for inspection only") and "done; " not in said
     head = (place / "robot.urdf").read_text().split("<robot", 1)[0]
@@ -236,7 +234,7 @@ def test_a_failed_robots_files_say_so_until_it_does_not_fail(finished: Session, 
     assert (place / "README.txt").read_text().startswith("verdict fail: geometry: ")
     load(place / "robot.urdf")
     edit(settings, "tolerance_mm = 0.001", "tolerance_mm = 0.0")
-    assert cli.run(["next", str(finished.folder)]) == 0
+    assert cli.run(["next", "--no-plots", str(finished.folder)]) == 0
     assert (place / "robot.urdf").read_bytes() == before and not (place / "README.txt").exists()
 
 
