@@ -10,6 +10,7 @@ import numpy as np
 
 from calib.procedure.kinematic_stage import fit, inputs
 from calib.procedure.kinematic_stage import folder as outputs
+from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.robot.load import load
 from calib.simulation.cells import measured_files
 from calib.simulation.cells.cell import measure
@@ -23,8 +24,8 @@ cell = perturbed_cell(load("ur5"), seed=1)
 q = np.random.default_rng(0).uniform(-2.0, 2.0, (80, cell.nominal.n))
 measured_files.write(measure(cell, q, seed=2), folder / "measured.csv")
 
-found = inputs.gather("ur5", [folder / "measured.csv"], holdout=0.25)
-outcome = fit.run(found, model="geometry")
+found = inputs.gather("ur5", [folder / "measured.csv"], settings=FitSettings(model="geometry", holdout=0.25))
+outcome = fit.run(found, wanted=FitSettings(model="geometry"))
 outputs.write_folder(outcome, folder / "fit")
 
 for name, unseen in outcome.validation.items():

@@ -11,6 +11,7 @@ import numpy as np
 from calib.data.poses.target_files import Targets
 from calib.procedure.kinematic_stage import compensation, fit, inputs
 from calib.procedure.kinematic_stage import folder as outputs
+from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.robot.load import load
 from calib.simulation.cells import measured_files
 from calib.simulation.cells.cell import measure, true_poses
@@ -23,8 +24,8 @@ folder.mkdir(parents=True, exist_ok=True)
 cell = perturbed_cell(load("ur5"), seed=1)
 q = np.random.default_rng(0).uniform(-2.0, 2.0, (80, 6))
 measured_files.write(measure(cell, q, seed=2), folder / "measured.csv")
-found = inputs.gather("ur5", [folder / "measured.csv"], holdout=0.25)
-outputs.write_folder(fit.run(found, model="geometry"), folder / "fit")
+found = inputs.gather("ur5", [folder / "measured.csv"], settings=FitSettings(model="geometry", holdout=0.25))
+outputs.write_folder(fit.run(found, wanted=FitSettings(model="geometry")), folder / "fit")
 
 # targets: places of the measured tool in the instrument's frame, and the configuration to reach them in
 near = np.array([0.3, -1.2, 1.6, -1.1, -1.4, 0.5]) + np.random.default_rng(3).uniform(-0.4, 0.4, (50, 6))

@@ -51,34 +51,34 @@ def fit(
     to gain; that it is good enough is said only with --tolerance.
     """
     from calib.data.poses.fit_options import read_options
-    from calib.errors import UsageError
-    from calib.geometry.model_choice.effects import MODELS
     from calib.procedure.kinematic_stage import fit as fitting
     from calib.procedure.kinematic_stage import folder as outputs
     from calib.procedure.kinematic_stage import inputs
+    from calib.procedure.kinematic_stage.settings import FitSettings
     from calib.procedure.report import console as shown
     from calib.procedure.report import fit_certificate, geometry_section
     from calib.procedure.report.fit_report import fit_metrics
 
-    if model not in (None, "auto", *MODELS):
-        raise UsageError(f"--model {model}: expected auto, {', '.join(MODELS)}")
-    if tolerance is not None and not 0.0 < tolerance < float("inf"):
-        raise UsageError(f"--tolerance {tolerance:g}: expected a length above 0, in mm")
+    wanted = FitSettings(
+        model,
+        loss,
+        folds,
+        stations,
+        tools,
+        holdout,
+        refit_frames,
+        None if tolerance is None else 1e-3 * tolerance,
+        seed,
+    )
     chosen = read_options(options)
     outputs.check_target(out)
-    found = inputs.gather(
-        robot, measured, validate or [], options=chosen, holdout=holdout, stations=stations, tools=tools,
-        refit_frames=refit_frames, base=base, tip=tip, seed=seed,
-    )  # fmt: skip
+    found = inputs.gather(robot, measured, validate or [], options=chosen, settings=wanted, base=base, tip=tip)
     outputs.check_target(out, found.source)
     console = make_console()
     for line in shown.rendered(geometry_section.read_blocks(found)):
         console.print(line, soft_wrap=True)
     with progress() as say:
-        outcome = fitting.run(
-            found, chosen, model=model, loss=loss, tolerance=1e-3 * tolerance if tolerance else None, folds=folds,
-            seed=seed, progress=say,
-        )  # fmt: skip
+        outcome = fitting.run(found, chosen, wanted, say)
         say("writing")
         outputs.write_folder(outcome, out, partial(fit_certificate.write, plots=plots))
     for line in shown.section(geometry_section.outcome_section(fit_metrics(outcome))):

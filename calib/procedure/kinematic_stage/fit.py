@@ -29,6 +29,7 @@ from calib.procedure.kinematic_stage.comparison import (
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import Findings
 from calib.procedure.kinematic_stage.outliers import Outlier, named_outliers, plateau, remains
+from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import Arms, Assessment, assess
 from calib.procedure.kinematic_stage.verdict import Verdict
 from calib.robot.calibrated import CalibratedChain
@@ -95,12 +96,7 @@ class Outcome:
 def run(
     inputs: Inputs,
     options: FitOptions | None = None,
-    *,
-    model: str | None = None,
-    loss: str | None = None,
-    tolerance: float | None = None,
-    folds: str = "transfer",
-    seed: int = 0,
+    wanted: FitSettings | None = None,
     progress: Progress | None = None,
 ) -> Outcome:
     """Fit, compare on all rows, and judge.
@@ -108,18 +104,15 @@ def run(
     Args:
         inputs: see `calib.procedure.kinematic_stage.inputs.gather`.
         options: the fit options file's content.
-        model, loss: in place of the options'.
-        tolerance: largest rms on unseen poses that is good enough [m].
-        folds: how the ladder sets rows aside, see `calib.geometry.model_choice.folds.folds_by_name`.
-        seed: for everything random.
+        wanted: model, loss and folds of the ladder, tolerance, seed.
         progress: called with a few words at each stage.
 
     Raises:
         NotConverged: where the chosen model's fit did not come to an end.
     """
-    options, say = options or FitOptions(), progress or (lambda words: None)
-    settings = combine(Settings(), loss=loss or options.loss, loss_scale=options.loss_scale)
-    asked = model or options.model
+    options, wanted, say = options or FitOptions(), wanted or FitSettings(), progress or (lambda words: None)
+    settings = combine(Settings(), loss=wanted.loss or options.loss, loss_scale=options.loss_scale)
+    asked, seed = wanted.model or options.model, wanted.seed
     say("placing the instrument and the tool")
     start = install(inputs.chain, inputs.fit, inputs.known)
     torques = [gravity_of(inputs.chain, block) for block in inputs.fit]
@@ -131,7 +124,7 @@ def run(
         torques=torques,
         fixed=fixed_parameters(start, options),
         prior=stated_prior(start, options),
-        folds=folds_by_name(folds, inputs.fit, seed),
+        folds=folds_by_name(wanted.folds, inputs.fit, seed),
         seed=seed,
         progress=lambda done, total, what: say(f"fitting: {what}"),
     )
@@ -144,8 +137,8 @@ def run(
     notes = *moved_between(found.nominal.cell, inputs.fit, settings), *diagnose(found.fit)
     findings = found_of(inputs, found, named, notes)
     arms = Arms(found.nominal.cell, found.fit.cell, rigid.cell.chain)
-    result = assess(arms, inputs, findings, settings, asked=asked, tolerance=tolerance, seed=seed)
-    return Outcome(inputs, found, rigid, named, tuple(explain(found.fit)), findings, result, seed, tolerance)
+    result = assess(arms, inputs, findings, settings, asked=asked, tolerance=wanted.tolerance, seed=seed)
+    return Outcome(inputs, found, rigid, named, tuple(explain(found.fit)), findings, result, seed, wanted.tolerance)
 
 
 def found_of(inputs: Inputs, found: Climb, named: Sequence[Outlier], notes: Sequence[str]) -> Findings:

@@ -16,6 +16,7 @@ from calib.geometry.checks.orientations import check_orientations
 from calib.geometry.checks.repeatability import repeated_rows
 from calib.geometry.first_guess import check_scale
 from calib.procedure.kinematic_stage.copied_rows import repeated
+from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.robot import calibrated, description
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, Joint
@@ -75,68 +76,60 @@ class Inputs:
 
 
 def gather(
-    robot: str | Path,
-    files: Sequence[Path],
-    validate: Sequence[Path] = (),
+    robot: str | Path | CalibratedChain,
+    measured: Sequence[Path | PoseMeasurements],
+    validate: Sequence[Path | PoseMeasurements] = (),
     *,
     options: FitOptions | None = None,
-    holdout: float = 0.0,
-    stations: str = "each",
-    tools: str = "one",
-    refit_frames: bool = False,
+    settings: FitSettings | None = None,
     base: str | None = None,
     tip: str | None = None,
-    seed: int = 0,
 ) -> Inputs:
     """Read the robot and all files, name stations and tools, and set the unseen rows aside.
 
     Args:
-        robot: see `calib.robot.load`.
-        files: to fit on.
-        validate: to validate on.
+        robot: see `calib.robot.load`; or a robot in memory.
+        measured: files, or blocks in memory, to fit on.
+        validate: the same, to validate on.
         options: how files are read.
-        holdout: share of each fit file's poses kept aside: the last ones of ``default_rng(seed).permutation(poses)``.
-        stations: ``each`` file has a base placement of its own, or all share ``one``.
-        tools: all files share ``one`` tool (or one set of reflectors), or ``each`` has its own.
-        refit_frames: validation files get a base and tool placement of their own.
+        settings: stations, tools, rows to hold out, seed of their choice.
         base, tip: links of a URDF.
-        seed: for the permutation.
     """
-    options = options or FitOptions()
-    _choice(stations, ("each", "one"), "--stations")
-    _choice(tools, ("one", "each"), "--tools")
-    if not 0.0 <= holdout < 1.0:
-        raise UsageError(f"--holdout {holdout:g}: expected a share from 0 to below 1")
-    if not files:
+    options, settings = options or FitOptions(), settings or FitSettings()
+    if not measured:
         raise UsageError("no measurement file given")
-    check_files(options, [*files, *validate])
-    chain, source = load_robot(robot, files[0], options, base, tip)
+    files = [_path(each) for each in measured]
+    check_files(options, [*files, *map(_path, validate)])
+    if isinstance(robot, CalibratedChain):
+        chain, source, earlier = robot.complete, Path(robot.source or robot.chain.name), robot
+    else:
+        chain, source = load_robot(robot, files[0], options, base, tip)
+        earlier = calibrated.read(source) if source.suffix == ".toml" else None
     blocks = _named(
-        [(path, block) for path in files for block in read_file(path, chain, options)], options, stations, tools
-    )
+        [(path, block) for path, each in zip(files, measured) for block in _blocks(each, chain, options)],
+        options, settings.stations, settings.tools,
+    )  # fmt: skip
     unseen: dict[str, Unseen] = {}
     fit = []
     for block in blocks:
-        kept, aside = hold_out(block, holdout, seed)
+        kept, aside = hold_out(block, settings.holdout, settings.seed)
         fit.append(kept)
         if aside is not None:
             unseen[_free_name(unseen, block.file)] = Unseen(aside, held_out=True)
     notes: list[str] = []
-    for path in validate:
-        for block in read_file(path, chain, options):
-            again = any(Path(path).resolve() == Path(other).resolve() for other in files)
+    for each in validate:
+        for block in _blocks(each, chain, options):
+            again = any(_path(each).resolve() == other.resolve() for other in files)
             if again:
                 notes.append(f"{block.file} is a fit file too: its errors there say nothing of unseen poses")
-            own = refit_frames
-            shared = block if own else _shared(block, fit, notes)
-            unseen[_free_name(unseen, block.file)] = Unseen(shared, own_frames=own, seen=again)
+            shared = block if settings.refit_frames else _shared(block, fit, notes)
+            unseen[_free_name(unseen, block.file)] = Unseen(shared, own_frames=settings.refit_frames, seen=again)
     copied, told = repeated(fit, unseen)
     notes += told
     unseen = {name: replace(each, seen=each.seen or name in copied) for name, each in unseen.items()}
-    earlier = calibrated.read(source) if source.suffix == ".toml" else None
     if earlier is not None and earlier.corrections is not None:
-        count = len(earlier.deflection.terms)
-        notes.append(f"{robot} brings {count} deflection terms of an earlier fit; they stay as they are")
+        name, count = source if isinstance(robot, CalibratedChain) else robot, len(earlier.deflection.terms)
+        notes.append(f"{name} brings {count} deflection terms of an earlier fit; they stay as they are")
     return Inputs(chain, source, tuple(fit), unseen, tuple(notes), earlier)
 
 
@@ -160,7 +153,20 @@ def load_robot(
 def read_file(path: Path, chain: Chain, options: FitOptions) -> list[PoseMeasurements]:
     """Read one measurement file for a chain, held against its limits, its size and its orientations."""
     limits, kinds = (chain.lower, chain.upper), joint_kinds(chain)
-    blocks = read_measurements(path, chain.joint_names, options.for_file(path), kinds=kinds, limits=limits)
+    return _checked(
+        read_measurements(path, chain.joint_names, options.for_file(path), kinds=kinds, limits=limits), chain
+    )
+
+
+def _blocks(each: Path | PoseMeasurements, chain: Chain, options: FitOptions) -> list[PoseMeasurements]:
+    return read_file(each, chain, options) if isinstance(each, (str, Path)) else _checked([each], chain)
+
+
+def _path(each: Path | PoseMeasurements) -> Path:
+    return Path(each) if isinstance(each, (str, Path)) else Path(each.file or "measured")
+
+
+def _checked(blocks: list[PoseMeasurements], chain: Chain) -> list[PoseMeasurements]:
     for block in blocks:
         check_scale(block, forward(chain, block.q))  # unseen files, too: the fit looks at its own only
         check_orientations(chain, block)
@@ -212,11 +218,6 @@ def units(block: PoseMeasurements) -> np.ndarray:
 def pose_count(blocks: Sequence[PoseMeasurements]) -> int:
     """Return how many robot poses the blocks hold (several reflectors seen at once are one pose)."""
     return sum(len(np.unique(block.rows)) for block in blocks if block.rows is not None)
-
-
-def _choice(value: str, allowed: tuple[str, ...], option: str) -> None:
-    if value not in allowed:
-        raise UsageError(f"{option} {value}: expected one of {', '.join(allowed)}")
 
 
 def _named(

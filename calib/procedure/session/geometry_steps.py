@@ -14,11 +14,11 @@ from calib import files
 from calib.data.poses.fit_options import FileOptions, FitOptions, read_options
 from calib.data.poses.plans import check_against, read_poses, write_poses
 from calib.errors import RobotError, UsageError
-from calib.geometry.weighing import Settings as FitSettings
-from calib.geometry.weighing import combine
+from calib.geometry.weighing import Settings, combine
 from calib.procedure.kinematic_stage import fit as fitting
 from calib.procedure.kinematic_stage import folder as outputs
 from calib.procedure.kinematic_stage import inputs
+from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import assess
 from calib.procedure.report import fit_certificate, fit_report
 from calib.procedure.session import arrival
@@ -159,25 +159,29 @@ def drifts(session: Session, chain: Chain) -> list[str]:
     return arrival.drift(chain, first, again, session.settings.instrument.sigma_position)
 
 
+def fit_settings(session: Session) -> FitSettings:
+    """Return how the geometry is fitted and judged, as session.toml says."""
+    wanted = session.settings.fit
+    return FitSettings(
+        model=wanted.model, loss=wanted.loss, stations=wanted.stations, tolerance=tolerance_of(session),
+        refit_frames=wanted.validation_frames == "own", seed=session.settings.seed,
+    )  # fmt: skip
+
+
 def gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
     """Return the robot with the fit's measurements, and with validation files if asked for."""
-    fit = session.settings.fit
     chain = chain_of(session)
     links = (chain.base, chain.tip) if robot_file(session).suffix == ".urdf" else (None, None)
     return inputs.gather(
         robot_file(session), measured_files(session)[0], validate, options=options_of(session),
-        stations=fit.stations, refit_frames=fit.validation_frames == "own", base=links[0], tip=links[1],
-        seed=session.settings.seed,
+        settings=fit_settings(session), base=links[0], tip=links[1],
     )  # fmt: skip
 
 
 def fit(session: Session, say: Say) -> list[str]:
     """Fit the geometry to the measured files; validation files are not looked at."""
     settings = session.settings
-    outcome = fitting.run(
-        gathered(session), options_of(session), model=settings.fit.model, loss=settings.fit.loss,
-        tolerance=tolerance_of(session), seed=settings.seed, progress=say,
-    )  # fmt: skip
+    outcome = fitting.run(gathered(session), options_of(session), fit_settings(session), say)
     outputs.write_folder(outcome, session.fit.path, partial(fit_certificate.write, plots=session.plots))
     count = len(outcome.climb.fit.free)
     notes = [f"model {outcome.climb.chosen}, {count} parameters on {outcome.fit.poses} poses", *outcome.warnings]
@@ -201,11 +205,11 @@ def validate(session: Session, say: Say) -> list[str]:
     for path in unseen:
         notes += check_file(session, chain, path, plan)
     say("comparing on unseen poses")
-    given, options, wanted = gathered(session, unseen), options_of(session), session.settings.fit
-    settings = combine(FitSettings(), loss=wanted.loss, loss_scale=options.loss_scale)
+    given, options, wanted = gathered(session, unseen), options_of(session), fit_settings(session)
+    settings = combine(Settings(), loss=wanted.loss, loss_scale=options.loss_scale)
     found = assess(
-        fit.arms(given, settings), given, fit.findings(), settings, asked=wanted.model,
-        tolerance=tolerance_of(session), seed=session.settings.seed,
+        fit.arms(given, settings), given, fit.findings(), settings, asked=wanted.model or options.model,
+        tolerance=wanted.tolerance, seed=wanted.seed,
     )  # fmt: skip
     rows = [fit_report.rows_of(name, each, each.proves) for name, each in found.validation.items()]
     written = out.write(found, given, [asdict(each) for each in rows])

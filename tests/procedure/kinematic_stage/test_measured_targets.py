@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 from calib import cli
-from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.target_files import Targets
 from calib.geometry import inverse
 from calib.geometry.inverse import Goal
 from calib.procedure.kinematic_stage import compensation, inputs
+from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.transforms import from_quaternion
 
 CASES = [  # folder, robot, file, held-out share, goal [mm]
@@ -37,7 +37,7 @@ def test_commands_for_measured_poses_are_the_joints_they_were_measured_at(
     robot, file = data / folder / robot, data / folder / file
     arguments = ["fit", robot, file, "--holdout", share, "--out", tmp_path / "done", "--no-plots"]
     assert cli.run([str(each) for each in arguments]) in (0, 1)
-    unseen = inputs.gather(robot, [file], options=FitOptions(), holdout=share).unseen[file.name].block
+    unseen = inputs.gather(robot, [file], settings=FitSettings(holdout=share)).unseen[file.name].block
     fitted = compensation.read(tmp_path / "done")
     turns = None if unseen.quaternion is None else from_quaternion(unseen.position, unseen.quaternion)[:, :3, :3]
     targets = Targets(unseen.q, unseen.position, turns, file=file.name)

@@ -1,0 +1,49 @@
+"""How a geometry is fitted and judged: one value for the command, the guided run and scripts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from calib.data.poses.fit_options import MODELS
+from calib.errors import UsageError
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """How a geometry is fitted and judged.
+
+    Attributes:
+        model: ``auto`` climbs the ladder; else a rung of it and all below; None: as the options file says.
+        loss: ``auto``, ``none``, ``huber`` or ``cauchy``; None: as the options file says.
+        folds: rows the ladder sets aside: ``transfer`` (stations, files, regions), ``regions``, ``random``, ``poses``.
+        stations: ``each`` file has a base placement of its own, or all share ``one``.
+        tools: all files share ``one`` tool (or one set of reflectors), or ``each`` has its own.
+        holdout: share of each file's poses kept from the fit: the last of ``default_rng(seed).permutation(poses)``.
+        refit_frames: validation files get a base and tool placement of their own.
+        tolerance: largest rms on unseen poses that is good enough [m]; None: none is stated.
+        seed: of everything random.
+
+    Raises:
+        UsageError: for a value that is none of these.
+    """
+
+    model: str | None = None
+    loss: str | None = None
+    folds: str = "transfer"
+    stations: str = "each"
+    tools: str = "one"
+    holdout: float = 0.0
+    refit_frames: bool = False
+    tolerance: float | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for option, allowed in (("model", (None, *MODELS)), ("stations", ("each", "one")), ("tools", ("one", "each"))):
+            if (value := getattr(self, option)) not in allowed:
+                raise UsageError(f"--{option} {value}: expected one of {', '.join(name for name in allowed if name)}")
+        if not 0.0 <= self.holdout < 1.0:
+            raise UsageError(f"--holdout {self.holdout:g}: expected a share from 0 to below 1")
+        if self.tolerance is not None and not 0.0 < self.tolerance < float("inf"):
+            raise UsageError(f"--tolerance {1e3 * self.tolerance:g}: expected a length above 0, in mm")
+        if self.seed < 0:
+            raise UsageError(f"--seed {self.seed}: expected a whole number from 0")
