@@ -36,14 +36,14 @@ def identify_dynamics(
     from calib.procedure.report import identification_console
 
     chosen = read_options(options)
-    folder.check_target(out)
+    folder.check_identification_target(out, [options, *recordings, *(validate or [])])
     console = make_console()
     with progress() as say:
         found = inputs.gather(
             robot, recordings, validate or [], options=chosen, method=method, friction=friction, base=base, tip=tip,
             seed=seed, progress=say,
         )  # fmt: skip
-        folder.check_target(out, found.source)
+        folder.check_identification_target(out, [found.source, found.source.parent])
     for line in identification_console.read_lines(found):
         console.print(line, soft_wrap=True)
     with progress() as say:

@@ -71,9 +71,9 @@ def fit(
         seed,
     )
     chosen = read_options(options)
-    outputs.check_target(out)
+    outputs.check_fit_target(out, [options, *measured, *(validate or [])])
     found = inputs.gather(robot, measured, validate or [], options=chosen, settings=wanted, base=base, tip=tip)
-    outputs.check_target(out, found.source)
+    outputs.check_fit_target(out, [found.source])
     console = make_console()
     for line in shown.rendered(geometry_section.read_blocks(found)):
         console.print(line, soft_wrap=True)

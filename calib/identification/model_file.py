@@ -30,7 +30,6 @@ geometry's uncertainty is known, what it adds to sigma.
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -38,6 +37,7 @@ from typing import Any
 
 import numpy as np
 
+from calib import estimate_files
 from calib.dynamics.base import Base, expressions
 from calib.dynamics.bodies import bodies_of, with_gravity, with_payload
 from calib.dynamics.drives import DriveTerm
@@ -46,9 +46,11 @@ from calib.dynamics.torque_rows import torque_rows
 from calib.errors import RobotError, UsageError
 from calib.identification.prediction import Dynamics
 from calib.robot import description
+from calib.robot.calibrated import ROBOT
 from calib.robot.chain import Chain
 
 TORQUE = "N m"
+MODEL = "dynamics.json"
 NOTE = "regrouped parameters hold base values, the others are zero: torques are right, single ones need not be"
 
 
@@ -60,7 +62,7 @@ def read_dynamics(folder: str | Path) -> tuple[Chain, Dynamics]:
     """
     folder = Path(folder)
     table = read_table(folder)
-    chain = description.read(folder / "robot.toml")
+    chain = description.read(folder / ROBOT)
     try:
         return chain, from_table(chain, table)
     except (KeyError, TypeError, ValueError, IndexError) as error:
@@ -74,7 +76,7 @@ def read_table(folder: Path) -> dict[str, Any]:
         RobotError: where the folder holds none.
     """
     try:
-        found = json.loads((folder / "dynamics.json").read_text(encoding="utf-8"))
+        found = json.loads((folder / MODEL).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise RobotError(
             f"{folder} holds no identified model (dynamics.json): {error}; give the folder of an identification"
@@ -101,24 +103,12 @@ def refuse_currents(folder: Path, task: str) -> None:
 
 
 def read_covariance(folder: Path) -> tuple[tuple[str, ...], np.ndarray] | None:
-    """Return names and covariance (p, p) of the estimated parameters; None without ``covariance.csv``.
+    """Return names and covariance (p, p) of the estimated parameters; None where the folder has none.
 
     Raises:
         RobotError: where the file is damaged.
     """
-    path = folder / "covariance.csv"
-    if not path.is_file():
-        return None
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            header, *rows = list(csv.reader(file))
-        covariance = np.array([row[1:] for row in rows], dtype=float)
-    except (OSError, UnicodeDecodeError, ValueError) as error:
-        raise RobotError(f"{path} is damaged ({error}); run calib identify again") from error
-    count = len(header) - 1
-    if covariance.shape != (count, count) or not np.isfinite(covariance).all():
-        raise RobotError(f"{path}: expected {count} rows of finite numbers; run calib identify again")
-    return tuple(header[1:]), covariance
+    return estimate_files.read_covariance(folder) if (folder / estimate_files.COVARIANCE).is_file() else None
 
 
 def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, Any]:
@@ -127,7 +117,7 @@ def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, An
     bodies = model.inertial
     payloads = [label for label, coordinate in zip(model.bodies.labels, model.bodies.coordinates) if coordinate < 0]
     return {
-        "robot": "robot.toml",
+        "robot": ROBOT,
         "kind": model.torque_rows.name,
         "unit": unit,
         "gravity": model.bodies.gravity.tolist(),
@@ -148,7 +138,7 @@ def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, An
         ],
         "base": dict(zip(base.names, expressions(base))),
         "regrouping": regrouping(base),
-        "covariance": "covariance.csv",
+        "covariance": estimate_files.COVARIANCE,
         "note": NOTE,
     }
 

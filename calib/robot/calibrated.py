@@ -21,7 +21,6 @@ corrections (``provenance.rigid``, where there are any), by name; elements that 
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,9 +28,9 @@ from typing import Any
 
 import numpy as np
 
-from calib import files
 from calib.arrays import frozen, shaped
 from calib.errors import RobotError
+from calib.estimate_files import read_covariance, write_covariance
 from calib.robot import description
 from calib.robot.chain import Chain, element_index
 from calib.robot.deflection import Deflection, Term
@@ -150,8 +149,7 @@ def write(
     own = np.flatnonzero(np.diag(robot.covariance) > 0.0) if robot.covariance is not None else []
     if robot.covariance is not None and len(own):
         names = [robot.chain.names[k] for k in own]
-        rows = ([name, *map(float, row)] for name, row in zip(names, robot.covariance[np.ix_(own, own)]))
-        files.write_table(folder / COVARIANCE, ("name", *names), rows)
+        write_covariance(folder / COVARIANCE, names, robot.covariance[np.ix_(own, own)])
 
 
 def nominal_of(robot: CalibratedChain) -> Chain:
@@ -176,15 +174,8 @@ def _covariance(path: Path, chain: Chain) -> np.ndarray | None:
     """Return the covariance (K, K) of the element values in a table by name; None where there is none."""
     if not path.is_file():
         return None
-    with path.open(newline="", encoding="utf-8") as file:
-        header, *rows = list(csv.reader(file)) or [[]]
-    index = element_index(chain, header[1:])
-    try:
-        values = np.array([row[1:] for row in rows], dtype=float)
-    except ValueError as error:
-        raise RobotError(f"{path}: not a table of numbers ({error}); fit again") from None
-    if values.shape != (len(index), len(index)) or [row[0] for row in rows] != header[1:]:
-        raise RobotError(f"{path}: rows and columns do not name the same elements; fit again")
+    names, values = read_covariance(path)
+    index = element_index(chain, names)
     result = np.zeros((len(chain.elements), len(chain.elements)))
     result[np.ix_(index, index)] = values
     return result

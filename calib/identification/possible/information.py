@@ -8,22 +8,25 @@ instead (``information.csv``), so that what was known beforehand is not counted 
 from __future__ import annotations
 
 import csv
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calib import files
 from calib.arrays import frozen
 from calib.errors import RobotError
+from calib.estimate_files import read_covariance, read_estimate
 from calib.estimation.triangles import combine, retriangulate
-from calib.identification.model_file import read_dynamics
+from calib.identification.model_file import read_dynamics, read_table
 from calib.identification.prediction import Dynamics
 from calib.robot.chain import Chain
 
 if TYPE_CHECKING:
     from calib.identification.identify import Identification
+
+INFORMATION = "information.csv"
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,15 +108,16 @@ def read(folder: str | Path) -> Information:
     """
     folder = Path(folder)
     chain, dynamics = read_dynamics(folder)
-    groups = json.loads((folder / "dynamics.json").read_text(encoding="utf-8")).get("regrouping")
+    groups = read_table(folder).get("regrouping")
     if groups is None:
         raise RobotError(f"{folder}/dynamics.json does not say how parameters regroup; identify again")
     try:
-        names, units, values = _estimate(folder / "estimate.csv")
-        covariance = _numbers(folder / "covariance.csv", skip=1)
+        estimate = read_estimate(folder)
+        names, units, values = estimate.names, estimate.units, estimate.values
+        covariance = read_covariance(folder)[1]
         transform = _transform(names, groups, dynamics.model.names)
-        rested = (folder / "information.csv").is_file()
-        factor = _numbers(folder / "information.csv") if rested else whitened(values, covariance)
+        rested = (folder / INFORMATION).is_file()
+        factor = _numbers(folder / INFORMATION) if rested else whitened(values, covariance)
         if covariance.shape != (len(names), len(names)) or factor.shape[1] != len(names) + 1:
             raise ValueError("files of different sizes")
     except (OSError, KeyError, ValueError) as error:
@@ -141,17 +145,12 @@ def _transform(names: tuple[str, ...], groups: dict[str, dict[str, float]], stan
     return result
 
 
-def _estimate(path: Path) -> tuple[tuple[str, ...], tuple[str, ...], np.ndarray]:
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    return (
-        tuple(row["name"] for row in rows),
-        tuple(row["unit"] for row in rows),
-        np.array([float(row["value"]) for row in rows]),
-    )
+def write(found: Identification, folder: Path) -> None:
+    """Write the triangle of an identification's data (`information`)."""
+    files.write_table(folder / INFORMATION, (*found.names, "target"), information(found).tolist())
 
 
-def _numbers(path: Path, skip: int = 0) -> np.ndarray:
-    """Return the numbers of a CSV table below its header, without the first `skip` columns."""
+def _numbers(path: Path) -> np.ndarray:
+    """Return the numbers of a CSV table below its header."""
     with path.open(encoding="utf-8", newline="") as file:
-        return np.array([[float(cell) for cell in row[skip:]] for row in list(csv.reader(file))[1:]])
+        return np.array([[float(cell) for cell in row] for row in list(csv.reader(file))[1:]])

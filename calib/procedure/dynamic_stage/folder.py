@@ -13,18 +13,19 @@ import numpy as np
 from calib import files
 from calib.dynamics.base import expressions
 from calib.errors import UsageError
-from calib.folders import check_folder, write_staged
+from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
+from calib.folders import METRICS, check_target, write_staged
 from calib.identification.cases import Case
 from calib.identification.gains import DriveGains
 from calib.identification.methods.least_squares import ASSUMES
-from calib.identification.model_file import in_unit, read_dynamics, to_table
-from calib.identification.possible.information import information
+from calib.identification.model_file import MODEL, in_unit, read_dynamics, to_table
+from calib.identification.possible import information
 from calib.identification.prediction import Dynamics
 from calib.identification.scores import Score, TorqueErrors
 from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
-from calib.procedure.dynamic_stage.loop_tables import loop_table, write_instrumental
+from calib.procedure.dynamic_stage.loop_tables import INSTRUMENTAL, loop_table, write_instrumental
 from calib.procedure.dynamic_stage.tracking import tracking_table
 from calib.procedure.dynamic_stage.validation import Assessment, ModelFindings
 from calib.procedure.dynamic_stage.verdict import Resting
@@ -34,8 +35,8 @@ from calib.simulation.loop.controllers import Controller
 
 T = TypeVar("T")
 OURS = (
-    calibrated.ROBOT, "dynamics.json", "estimate.csv", "covariance.csv", "information.csv", "instrumental.csv",
-    "metrics.json", "drive_gains.csv",
+    calibrated.ROBOT, MODEL, ESTIMATE, COVARIANCE, information.INFORMATION, INSTRUMENTAL,
+    METRICS, "drive_gains.csv",
     "torques_1.csv", calibrated.COVARIANCE, geometry_tables.EFFECTS, geometry_tables.SENSITIVITY,
     geometry_tables.GEOMETRIES,
 )  # fmt: skip
@@ -117,17 +118,17 @@ class IdentificationFolder:
     @property
     def model(self) -> Path:
         """The model."""
-        return self.path / "dynamics.json"
+        return self.path / MODEL
 
     @property
     def numbers(self) -> Path:
         """Numbers, verdict and findings."""
-        return self.path / "metrics.json"
+        return self.path / METRICS
 
     @property
     def tables(self) -> tuple[Path, Path]:
         """The estimate, and its covariance."""
-        return self.path / "estimate.csv", self.path / "covariance.csv"
+        return self.path / ESTIMATE, self.path / COVARIANCE
 
     @property
     def unseen(self) -> UnseenFolder:
@@ -180,21 +181,16 @@ def _read(kind: type[T], path: Path) -> T:
         raise UsageError(f"{path} cannot be read ({error}); identify again") from error
 
 
-def check_target(out: Path, source: Path | None = None) -> None:
-    """Refuse, before any work is done, a folder that cannot be written or whose files are not ours to replace."""
-    check_folder(out)
-    if source is not None and source.resolve().parent == out.resolve():
-        raise UsageError(f"{out} holds the robot that is to be identified; choose another folder for --out")
-    present = [name for name in OURS if (out / name).exists()]
-    if present and not ((out / "metrics.json").exists() and (out / "dynamics.json").exists()):
-        raise UsageError(f"{out} holds {', '.join(present)} which no earlier identification left there; choose another")
+def check_identification_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
+    """Refuse, before any work is done, a folder that is not for an identification, or that holds one of its inputs."""
+    check_target(out, OURS, (METRICS, MODEL), "identification", inputs)
 
 
 def write_folder(
     outcome: IdentificationOutcome, out: Path, plots: Callable[[IdentificationOutcome, Path], None] | None = None
 ) -> Path:
     """Write all files of an identification, all or none; see `calib.folders`."""
-    check_target(out, outcome.inputs.source)
+    check_identification_target(out, [outcome.inputs.source, outcome.inputs.source.parent])
 
     def write(folder: Path) -> None:
         _write_all(outcome, folder)
@@ -208,24 +204,22 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     inputs, found = outcome.inputs, outcome.found
     robot = replace(inputs.robot, nominal=inputs.robot.nominal or inputs.chain, source=str(inputs.source))
     calibrated.write(folder, robot, comment=f"identified from {inputs.source}")
-    files.write_table(folder / "estimate.csv", HEADER, estimate_rows(outcome))
+    write_estimate(folder, HEADER, estimate_rows(outcome))
     estimate = found.fitted.estimate
     covariance = estimate.covariance if outcome.carried is None else outcome.carried.covariance
-    rows = ([name, *map(float, row)] for name, row in zip(found.names, covariance))
-    files.write_table(folder / "covariance.csv", ("name", *found.names), rows)
+    write_covariance(folder / COVARIANCE, found.names, covariance)
     geometry_tables.write(outcome, folder)
     write_instrumental(found.bias, folder)
     if found.prior is not None:  # else estimate and covariance say it all
-        triangle = information(found)
-        files.write_table(folder / "information.csv", (*found.names, "target"), triangle.tolist())
+        information.write(found, folder)
     first = (*inputs.unseen, *inputs.cases)[0]
     write_torques(first, outcome.predictions[first.name], folder / "torques_1.csv")
     table = to_table(found.dynamics, found.base, inputs.unit) | {"drive_gains": gain_table(inputs.gains, inputs.unit)}
-    files.write_json(folder / "dynamics.json", table)
+    files.write_json(folder / MODEL, table)
     if inputs.gains is not None:
         columns = (inputs.chain.joint_names, inputs.gains.gains.tolist(), inputs.gains.sigma.tolist())
         files.write_table(folder / "drive_gains.csv", ("joint", f"gain [{inputs.unit} per A]", "sigma"), zip(*columns))
-    files.write_json(folder / "metrics.json", metrics(outcome))
+    files.write_json(folder / METRICS, metrics(outcome))
 
 
 def write_torques(case: Case, predicted: np.ndarray, path: Path) -> Path:

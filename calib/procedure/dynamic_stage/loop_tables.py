@@ -13,6 +13,7 @@ from calib.identification.loop.bias import SMALL, LoopTest
 from calib.identification.methods.instrumental import Instrumental
 from calib.simulation.loop.controllers import Controller
 
+INSTRUMENTAL = "instrumental.csv"
 HEADER = ("name", "unit", "instrumental", "sigma", "least_squares", "shift_sigma", "explained_percent")
 
 
@@ -84,7 +85,7 @@ def write_instrumental(bias: LoopTest, folder: Path) -> None:
     """Write ``instrumental.csv``: both estimates of the standard model, parameter by parameter."""
     found = bias.found
     if found is not None:
-        files.write_table(folder / "instrumental.csv", HEADER, list(_rows(found)))
+        files.write_table(folder / INSTRUMENTAL, HEADER, list(_rows(found)))
 
 
 def _rows(found: Instrumental) -> Iterator[tuple[Any, ...]]:

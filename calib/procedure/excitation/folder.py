@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.errors import UsageError
-from calib.folders import check_folder, write_staged
+from calib.folders import METRICS, check_target, write_staged
 from calib.procedure.excitation import coefficients
 from calib.procedure.excitation.coefficients import Periodic
 from calib.procedure.excitation.design import INSTANTS, Designed
@@ -24,10 +23,11 @@ from trajectories.messages import joint_trajectory, to_json, to_yaml
 from trajectories.setpoints import Setpoints
 from trajectories.timing.time_scaling import ACTIVE
 
-DESIGN = ("metrics.json", "trajectory.csv", coefficients.NAME)
-PLAN = ("metrics.json", "motion.csv", "trajectory.yaml", "trajectory.json")
+DESIGN = (METRICS, "trajectory.csv", coefficients.NAME)
+PLAN = (METRICS, "motion.csv", "trajectory.yaml", "trajectory.json")
 """Files by which an earlier run's folder is known."""
-ALL = (*DESIGN, *PLAN[1:], "run.csv", "front.csv", "approach.csv", "rehearsal.csv")
+REHEARSAL = "rehearsal.csv"
+ALL = (*DESIGN, *PLAN[1:], "run.csv", "front.csv", "approach.csv", REHEARSAL)
 """Files of an earlier run that a new one replaces; besides plots, ``plot_*.png``."""
 MESSAGES = 100.0  # points per second of the ROS message, whose controllers interpolate (our choice)
 UNITS = {"velocity": "rad/s", "acceleration": "rad/s²", "torque": "N m"}
@@ -35,21 +35,12 @@ UNITS = {"velocity": "rad/s", "acceleration": "rad/s²", "torque": "N m"}
 
 def check_design_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
     """Refuse, before any work is done, a folder that is not for a designed motion, or that holds one of its inputs."""
-    _check(out, DESIGN, "excitation", inputs)
+    check_target(out, ALL, DESIGN, "excitation", inputs)
 
 
 def check_plan_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
     """Refuse, before any work is done, a folder that is not for a planned motion, or that holds one of its inputs."""
-    _check(out, PLAN, "plan", inputs)
-
-
-def _check(out: Path, marks: Sequence[str], what: str, inputs: Sequence[str | Path | None]) -> None:
-    check_folder(out)
-    read = [one for path in inputs if path is not None for one in (path, str(path).rpartition("@")[0] or path)]
-    files.check_not_input([out, *(out / name for name in ALL)], read)
-    present = [name for name in marks if (out / name).exists()]
-    if present and len(present) < len(marks):
-        raise UsageError(f"{out} holds {', '.join(present)} which no earlier {what} left there; choose another")
+    check_target(out, ALL, PLAN, "plan", inputs)
 
 
 def write_design(designed: Designed, out: Path, draw: Callable[[Designed, Path], None] | None = None) -> Path:
@@ -67,14 +58,14 @@ def write_design(designed: Designed, out: Path, draw: Callable[[Designed, Path],
         longer = played.approach is not None or played.repeat > 1
         _write_optional(played.run if longer else None, folder / "run.csv")
         _write_optional(played.approach, folder / "approach.csv")
-        _write_optional(played.rehearsal, folder / "rehearsal.csv")
+        _write_optional(played.rehearsal, folder / REHEARSAL)
         _write_messages(played.run, chain.joint_names, folder, max(1, round(period.rate / MESSAGES)))
         if draw is not None:
             draw(designed, folder)
         if designed.front is not None and len(designed.front.values):
             rows = [[*map(float, row), bool(best)] for row, best in zip(designed.front.values, designed.front.best)]
             files.write_table(folder / "front.csv", [*designed.front.names, "not dominated"], rows)
-        files.write_json(folder / "metrics.json", design_metrics(designed))
+        files.write_json(folder / METRICS, design_metrics(designed))
 
     return write_staged(out, ALL, write)
 
@@ -90,10 +81,10 @@ def write_plan(planned: Planned, out: Path, draw: Callable[[Planned, Path], None
         _write_setpoints(planned.track, folder / "motion.csv")
         _write_messages(planned.track, planned.chain.joint_names, folder)
         _write_optional(planned.approach, folder / "approach.csv")
-        _write_optional(planned.rehearsal, folder / "rehearsal.csv")
+        _write_optional(planned.rehearsal, folder / REHEARSAL)
         if draw is not None:
             draw(planned, folder)
-        files.write_json(folder / "metrics.json", plan_metrics(planned))
+        files.write_json(folder / METRICS, plan_metrics(planned))
 
     return write_staged(out, ALL, write)
 

@@ -36,7 +36,7 @@ from calib.dynamics import pseudo_inertia, rigid_body
 from calib.dynamics.bodies import Bodies, bodies_of, with_gravity
 from calib.errors import RobotError, UsageError
 from calib.identification.friction.drive_table import Drives, drive_table
-from calib.identification.model_file import refuse_currents
+from calib.identification.model_file import MODEL, refuse_currents
 from calib.identification.possible.information import Information
 from calib.identification.possible.information import read as read_told
 from calib.identification.possible.solve import Consistent, find_consistent
@@ -85,7 +85,7 @@ class Exported:
 
 def is_identified(folder: Path) -> bool:
     """Say whether a folder is that of an identification."""
-    return (folder / "dynamics.json").is_file()
+    return (folder / MODEL).is_file()
 
 
 def read(folder: Path) -> Exported:

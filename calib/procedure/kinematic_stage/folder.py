@@ -15,7 +15,8 @@ import numpy as np
 
 from calib import files
 from calib.errors import UsageError
-from calib.folders import check_folder, write_staged
+from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
+from calib.folders import METRICS, check_target, write_staged
 from calib.geometry.weighing import Settings, combine
 from calib.procedure.kinematic_stage import robot_file
 from calib.procedure.kinematic_stage.fit import Outcome
@@ -32,8 +33,8 @@ from calib.robot.formats import urdf_write
 T = TypeVar("T")
 OURS = (
     calibrated.ROBOT, "robot.urdf", "robot_for_corrections.urdf",
-    "estimate.csv", "covariance.csv", calibrated.COVARIANCE, "residuals.csv", "joint_corrections.csv",
-    "joint_corrections.txt", "report.json", "certificate.html", "metrics.json",
+    ESTIMATE, COVARIANCE, calibrated.COVARIANCE, "residuals.csv", "joint_corrections.csv",
+    "joint_corrections.txt", "report.json", "certificate.html", METRICS,
 )  # fmt: skip
 """Files of an earlier fit that a new one replaces; besides plots, ``plot_*.png``."""
 
@@ -91,11 +92,11 @@ class FitFolder:
     @property
     def tables(self) -> tuple[Path, Path]:
         """The estimate, and its covariance."""
-        return self.path / "estimate.csv", self.path / "covariance.csv"
+        return self.path / ESTIMATE, self.path / COVARIANCE
 
     def metrics(self) -> FitMetrics:
         """Read numbers, verdict and findings."""
-        return _read(FitMetrics, self.path / "metrics.json")
+        return _read(FitMetrics, self.path / METRICS)
 
     def findings(self) -> Findings:
         """Read what the fit says of itself; schema 1 keeps it with the report, without the loss."""
@@ -126,7 +127,7 @@ class ValidationFolder:
     @property
     def judged(self) -> Path:
         """Numbers and verdict."""
-        return self.path / "metrics.json"
+        return self.path / METRICS
 
     @property
     def errors(self) -> Path:
@@ -171,19 +172,14 @@ def _read(kind: type[T], path: Path) -> T:
         raise UsageError(f"{path} cannot be read ({error}); fit again") from error
 
 
-def check_target(out: Path, source: Path | None = None) -> None:
-    """Refuse, before any work is done, a folder that cannot be written or whose files are not ours to replace."""
-    check_folder(out)
-    if source is not None and source.resolve().parent == out.resolve() and source.name in OURS:
-        raise UsageError(f"{out} holds the robot that is to be calibrated; choose another folder for --out")
-    present = [name for name in OURS if (out / name).exists()]
-    if present and not (out / "metrics.json").exists():
-        raise UsageError(f"{out} holds {', '.join(present)} which no earlier fit has left there; choose another --out")
+def check_fit_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
+    """Refuse, before any work is done, a folder that is not for a fit, or that holds one of its inputs."""
+    check_target(out, OURS, (METRICS,), "fit", inputs)
 
 
 def write_folder(outcome: Outcome, out: Path, plots: Callable[[Outcome, Path], None] | None = None) -> Path:
     """Write all files of a fit, all or none; see `calib.folders`."""
-    check_target(out, outcome.inputs.source)
+    check_fit_target(out, [outcome.inputs.source])
 
     def write(folder: Path) -> None:
         _write_all(outcome, folder)
@@ -207,11 +203,10 @@ def _write_all(outcome: Outcome, folder: Path) -> None:
         else:
             files.write(folder / name, urdf_write.write_new(geometry))
     table = estimate_table(fit, outcome.climb.nominal.cell)
-    files.write_table(folder / "estimate.csv", HEADER, table.rows())
-    rows = ([name, *map(float, row)] for name, row in zip(table.names, table.covariance))
-    files.write_table(folder / "covariance.csv", ("name", *table.names), rows)
+    write_estimate(folder, HEADER, table.rows())
+    write_covariance(folder / COVARIANCE, table.names, table.covariance)
     write_residuals(outcome, folder / "residuals.csv")
-    files.write_json(folder / "metrics.json", metrics(outcome))
+    files.write_json(folder / METRICS, metrics(outcome))
 
 
 def metrics(outcome: Outcome) -> dict[str, object]:
@@ -264,7 +259,7 @@ def _record(outcome: Outcome) -> dict[str, object]:
         "model": outcome.climb.chosen,
         "seed": outcome.seed,
         "verdict": f"{outcome.verdict.level}: {outcome.verdict.reason}",
-        "covariance": "covariance.csv",
+        "covariance": COVARIANCE,
     }
 
 

@@ -6,13 +6,13 @@ rotation vector r, so that the covariance of (d, w) goes through  position = R d
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from calib import estimate_files
 from calib.errors import UsageError
 from calib.geometry.installation import Installation
 from calib.geometry.parameters import layout, parameter_values
@@ -73,21 +73,18 @@ def read_covariance(folder: Path, cell: Installation) -> tuple[np.ndarray, np.nd
         Positions (f,) in the parameter vector, and the covariance (f, f).
 
     Raises:
-        UsageError: where the file is missing, or belongs to another fit.
+        RobotError: where the file is missing or damaged.
+        UsageError: where it belongs to another fit.
     """
-    path = folder / "covariance.csv"
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            names, *rows = csv.reader(file)
-        names, table = names[1:], np.array([row[1:] for row in rows], dtype=float)
-    except (OSError, ValueError) as error:
-        raise UsageError(f"{path} cannot be read ({error}); fit again") from error
+    names, table = estimate_files.read_covariance(folder)
     parameters = layout(cell)
     place = {name: k for k, name in enumerate(parameters.names)}
     strange = [name for name in names if name not in place]
-    if strange or table.shape != (len(names), len(names)):
-        what = f"'{strange[0]}' is no parameter there" if strange else f"its shape is {table.shape}"
-        raise UsageError(f"{path} does not belong to the robot.toml beside it: {what}; fit again")
+    if strange:
+        raise UsageError(
+            f"{folder}/covariance.csv does not belong to the robot.toml beside it: '{strange[0]}' is no parameter "
+            "there; fit again"
+        )
     back, start = np.eye(len(parameters.names)), parameters.arm
     for placement in (*cell.stations, *cell.tools):
         block = slice(start, start + 6)

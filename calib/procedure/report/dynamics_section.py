@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,6 +11,8 @@ from typing import Any
 import numpy as np
 
 from calib.errors import UsageError
+from calib.estimate_files import read_estimate
+from calib.folders import METRICS
 from calib.procedure.dynamic_stage.folder import UNSEEN, IdentificationFolder
 from calib.procedure.excitation import coefficients
 from calib.procedure.report.page import Block, KeyFigure, Picture, Pictures, Section, Table, Text
@@ -50,8 +51,7 @@ def read(folder: Path) -> DynamicReport:
         place = IdentificationFolder(folder)
         metrics = json.loads(place.numbers.read_text(encoding="utf-8"))
         unseen = json.loads(place.unseen.report.read_text(encoding="utf-8"))
-        with place.tables[0].open(newline="", encoding="utf-8") as file:
-            estimate = tuple(csv.DictReader(file))
+        estimate = read_estimate(folder).rows
     except (OSError, ValueError) as error:
         raise UsageError(f"{folder}: {error}; identify again: calib redo … identify") from error
     if unseen.get("schema") != UNSEEN:
@@ -189,7 +189,7 @@ def planned(excitation: Path) -> Pictures:
     motion = coefficients.read(folder)
     t = np.linspace(0.0, motion.period, DRAWN)
     q, v, _ = motion.orders(t)
-    made = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    made = json.loads((folder / METRICS).read_text(encoding="utf-8"))
     condition, setting = made["condition_number"], made["setting"]
     margins = ", ".join(f"{name} {one['share']:.1%} of its scale" for name, one in made["margins"].items())
     words = (

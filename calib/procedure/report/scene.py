@@ -17,7 +17,9 @@ from calib.data.csv_table import read_table
 from calib.data.poses.plans import read_poses
 from calib.errors import UsageError
 from calib.geometry.installation import Installation, see
+from calib.procedure.excitation import coefficients
 from calib.procedure.kinematic_stage import robot_file
+from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.robot import calibrated, library
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward, joint_frames
@@ -108,14 +110,14 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
         raise UsageError(f"{folder} is no folder; give that of a fit, a session, an identification or a motion")
     chain, source = _arm(folder, robot)
     meshes, notes = _meshes(chain, source)
-    fits = [place for place in (folder, folder / "4-fit") if (place / "residuals.csv").is_file()]
+    fits = [place for place in (folder, folder / IN_SESSION) if FitFolder(place).residuals.is_file()]
     motions = [path for name in ("trajectory.csv", "motion.csv") for path in _below(folder, name)]
     torques = [path for path in _below(folder, "torques_*.csv") if not (path.parent / "unseen").is_dir()]
     scene = Scene(
         folder.resolve().name,
         chain,
         tuple(meshes),
-        tuple(_joined(_measured(place), folder / "5-validation" / "errors.csv") for place in fits),
+        tuple(_joined(_measured(place), ValidationFolder(folder / VALIDATED).errors) for place in fits),
         tuple((path.stem, _chosen(path, chain)) for path in sorted(folder.glob("2-poses/*.csv"))) if chain else (),
         tuple(_played(path, folder) for path in motions),
         tuple(_torques(path, folder) for path in torques),
@@ -140,14 +142,14 @@ def _arm(folder: Path, robot: str | None) -> tuple[Chain | None, Path | None]:
     """Return the arm to draw, and the file it was described in first."""
     if robot is not None:
         return load(robot), resolve(robot)
-    for place in (folder, folder / "4-fit"):
+    for place in (folder, folder / IN_SESSION):
         if (place / "robot.toml").is_file():
             known = calibrated.read(place)
             return known.complete, Path(known.source) if known.source and Path(known.source).is_file() else None
     for place in sorted(folder.glob("1-robot/robot.*")):
         return load(str(place)), place
     try:
-        name = tomllib.loads((folder / "trajectory.toml").read_text(encoding="utf-8")).get("robot", "")
+        name = tomllib.loads((folder / coefficients.NAME).read_text(encoding="utf-8")).get("robot", "")
     except (OSError, ValueError):
         return None, None
     return (load(name), None) if name in library.names() else (None, None)
@@ -172,7 +174,7 @@ def _chosen(path: Path, chain: Chain) -> np.ndarray:
 def _measured(place: Path) -> Measured:
     """Return the rows of ``residuals.csv`` whose position was measured, as both arms see them."""
     after, before = robot_file.read(place), robot_file.nominal(place)
-    with (place / "residuals.csv").open(encoding="utf-8", newline="") as file:
+    with FitFolder(place).residuals.open(encoding="utf-8", newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["dx [mm]"] and row["station"] in after.station_names]
     joints = [f"{joint.name} [{joint.unit}]" for joint in after.chain.joints]
     q = np.array([[float(row[name]) for name in joints] for row in rows]).reshape(-1, after.chain.n)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from calib.procedure.excitation import coefficients
 from calib.procedure.session import certificate, dynamics_steps, geometry_steps
 from calib.procedure.session.folder import MARK, Session
 
@@ -73,7 +74,7 @@ def _excited(session: Session) -> list[Path]:
 
 
 def _recorded(session: Session) -> list[Path]:
-    plan = session.path("6-excitation/training/trajectory.toml")
+    plan = session.path(f"6-excitation/training/{coefficients.NAME}")
     return [
         session.fit.robot,
         plan,
@@ -95,7 +96,7 @@ def _identified(session: Session) -> list[Path]:
 def _predicted(session: Session) -> list[Path]:
     found = session.identification
     own = [found.robot, found.model, found.numbers]
-    plan = session.path("6-excitation/validation/trajectory.toml")
+    plan = session.path(f"6-excitation/validation/{coefficients.NAME}")
     training, unseen = dynamics_steps.recordings(session)
     cuts = session.path("7-recorded/cuts.json")
     return [*own, plan, cuts, *_reading(session), *files_of(training), *files_of(unseen)]
@@ -146,7 +147,7 @@ STEPS = (
     SessionStep(
         "validate", "hold it against unseen poses", ("robot", "instrument", "poses", "fit", "seed"), _validated,
         geometry_steps.validate,
-        ("5-validation/metrics.json", "5-validation/errors.csv", "5-validation/rows.json", "5-validation/report.json"),
+        ("5-validation/*",),
     ),
     SessionStep(
         "excite", "design the motions to record", (*_keys(PLAN), "seed"), _excited, dynamics_steps.excite,

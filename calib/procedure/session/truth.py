@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +12,7 @@ from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.gravity import gravity_torques
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.rigid_body import inverse_dynamics
+from calib.estimate_files import read_estimate
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation, see
@@ -110,15 +110,10 @@ def transmitted_along(dynamics: Dynamics, q: np.ndarray, v: np.ndarray, a: np.nd
 
 def _parameters(session: Session, model: IdentificationModel, cell: Cell, arm: MovingArm) -> tuple[float, int]:
     """Return the share of estimated base parameters whose truth is within two sigmas, and how many there are."""
-    with session.identification.tables[0].open(newline="", encoding="utf-8") as file:
-        names = csv.DictReader(file)
-        rows = [
-            (bases.standard_name(row["name"], model.names), float(row["value"]), float(row["sigma"]))
-            for row in names
-            if row["sigma"]
-        ]
+    found = read_estimate(session.identification.path)
+    rows = zip((name.removesuffix("R") for name in found.names), found.values, found.sigma)
     true = true_base(model, cell, arm, session.settings.seed)
-    inside = [abs(value - true[name]) < 2 * sigma for name, value, sigma in rows if name in true]
+    inside = [abs(value - true[name]) < 2 * sigma for name, value, sigma in rows if name in true and sigma > 0]
     return (float(np.mean(inside)) if inside else 0.0), len(inside)
 
 

@@ -1,0 +1,41 @@
+"""A result file's name is written in one module of `calib`: whoever else needs the file asks there."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
+
+SOURCES = sorted((Path(__file__).parents[1] / "calib").rglob("*.py"))
+RESULTS = (
+    "metrics.json", "estimate.csv", "covariance.csv", "chain_covariance.csv", "information.csv", "instrumental.csv",
+    "dynamics.json", "drive_gains.csv", "errors.csv", "rows.json", "trajectory.toml", "front.csv", "rehearsal.csv",
+)  # fmt: skip
+
+
+def paths(source: Path) -> set[str]:
+    """Return the names of files in a module's string constants; sentences that speak of one are none."""
+    found = set()
+    for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            known = re.fullmatch(r"/?(?:[\w.*-]+/)*([\w-]+\.[a-z]+)", node.value)
+            found |= {known[1]} if known else set()
+    return found
+
+
+def test_a_results_name_has_one_home() -> None:
+    homes: dict[str, list[str]] = defaultdict(list)
+    for source in SOURCES:
+        for name in paths(source) & set(RESULTS):
+            homes[name].append(str(source.relative_to(SOURCES[0].parent)))
+    assert {name: where for name, where in homes.items() if len(where) > 1} == {}
+    assert set(homes) == set(RESULTS)
+
+
+@pytest.mark.parametrize("text", ["5-validation/metrics.json", "/metrics.json", "metrics.json"])
+def test_a_path_is_seen(tmp_path: Path, text: str) -> None:
+    (tmp_path / "m.py").write_text(f"x = folder / {text!r}\ny = 'see metrics.json there'\n")
+    assert paths(tmp_path / "m.py") == {"metrics.json"}
