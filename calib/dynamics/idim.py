@@ -7,6 +7,7 @@ Which torque rows those are, `TorqueRows` says.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
@@ -37,7 +38,7 @@ class IdentificationModel:
     torque_rows: TorqueRows = MOTOR
 
     def __post_init__(self) -> None:
-        doubled = sorted({name for name in self.names if self.names.count(name) > 1})
+        doubled = sorted(name for name, count in Counter(self.names).items() if count > 1)
         if doubled:
             raise CalibError(f"parameter '{doubled[0]}' occurs twice; remove one of its terms")
         for one in self.terms:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-import scipy.stats
+from scipy.special import fdtrc
 
 from calib.errors import CalibError, Unidentifiable
 from calib.estimation.linear import LinearFit, settled_std, wls
@@ -125,7 +125,7 @@ def nested_test(base: LinearFit, gone: Sequence[int]) -> tuple[float, float]:
     scale = np.sqrt(np.diag(covariance))
     y = x / scale
     f = float(y @ np.linalg.solve(covariance / np.outer(scale, scale), y)) / len(x)
-    return f, float(scipy.stats.f.sf(f, len(x), base.estimate.dof))
+    return f, float(fdtrc(len(x), base.estimate.dof, f))
 
 
 def _step(

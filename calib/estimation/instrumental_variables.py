@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.stats
+from scipy.special import chdtrc, fdtrc
 
 from calib.arrays import shaped
 from calib.errors import CalibError, Unidentifiable
@@ -228,7 +228,7 @@ def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: f
     target = factor[:, -1]
     first, second = _rss(whole, target), _rss(columns[:, split.kept], target)
     f = (first - second) / k / (second / (rows - p - k)) / inflation if second > 0.0 else np.inf
-    return ExogeneityTest(float(f), (k, dof), float(scipy.stats.f.sf(f, k, dof)))
+    return ExogeneityTest(float(f), (k, dof), float(fdtrc(k, dof, f)))
 
 
 def hausman(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1.0) -> ExogeneityTest:
@@ -254,7 +254,7 @@ def hausman(problem: Instruments, std: np.ndarray | None = None, inflation: floa
     variance = _rss(factor[:, p : 2 * p], factor[:, -1]) / (rows - p)
     distance = (vt @ upper @ (instrumental - ordinary))[open_]
     chi = float(np.sum(distance**2 * lam[open_] ** 2 / gap[open_]) / variance / inflation)
-    return ExogeneityTest(chi, (k, 0), float(scipy.stats.chi2.sf(chi, k)))
+    return ExogeneityTest(chi, (k, 0), float(chdtrc(k, chi)))
 
 
 def projected(problem: Instruments, std: np.ndarray | None = None) -> np.ndarray:

@@ -10,7 +10,7 @@ from functools import lru_cache
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from calib.estimation import robust
 
@@ -77,10 +77,10 @@ def variance_factor(size: np.ndarray, joints: np.ndarray, loss: str, gate: float
 
 def _weights(size: np.ndarray, joints: int, loss: str, gate: float | None) -> np.ndarray:
     w = np.ones_like(size) if loss == "none" else robust.weights(size, loss, tuning(joints, loss))
-    return w if gate is None else np.where(size**2 <= chi2.ppf(gate, joints), w, 0.0)
+    return w if gate is None else np.where(size**2 <= chdtri(joints, 1.0 - gate), w, 0.0)
 
 
 @lru_cache
 def _quantiles(joints: int) -> np.ndarray:
     """Return 4000 equally likely values of d²."""
-    return np.asarray(chi2.ppf((np.arange(4000) + 0.5) / 4000, joints))
+    return np.asarray(chdtri(joints, 1.0 - (np.arange(4000) + 0.5) / 4000))

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
 from calib import files
@@ -141,6 +140,8 @@ def _best_order(plan: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray
                 taken = planned.query(sign * q[:, k : k + 1])[0]
                 missed = KDTree(sign * q[:, k : k + 1]).query(plan[:, j : j + 1])[0]
                 cost[s, j, k] = np.minimum(taken, 1.0).mean() + np.minimum(missed, 1.0).mean() + 1e-9 * s
+    from scipy.optimize import linear_sum_assignment  # slow to load
+
     order = linear_sum_assignment(cost.min(axis=0))[1]
     sign = np.where(cost[0, np.arange(n), order] <= cost[1, np.arange(n), order], 1.0, -1.0)
     return order, sign

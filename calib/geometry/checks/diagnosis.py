@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial import KDTree
-from scipy.stats import mannwhitneyu
 
 from calib.geometry.fit import PLAUSIBLE
 from calib.geometry.observation import Block
@@ -68,8 +67,11 @@ def _setup_change(block: Block, part: Part) -> list[str]:
     weight = np.minimum(cuts, m - cuts)
     best = int(np.argmax((ratio - 1.0) * np.sqrt(weight)))
     cut, first_worse = int(cuts[best]), before[best] > after[best]
-    chance = float(mannwhitneyu(size[:cut], size[cut:]).pvalue) * len(cuts)  # Bonferroni: the best of many cuts
-    if ratio[best] < WORSE or chance > CHANCE:
+    if ratio[best] < WORSE:
+        return []
+    from scipy.stats import mannwhitneyu  # slow to load, and seldom needed
+
+    if float(mannwhitneyu(size[:cut], size[cut:]).pvalue) * len(cuts) > CHANCE:  # Bonferroni: the best of many cuts
         return []
     rows = block.measured.rows[part.index]
     bad = (rows[0], rows[cut - 1]) if first_worse else (rows[cut], rows[-1])

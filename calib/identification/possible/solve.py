@@ -108,12 +108,12 @@ def find_consistent(told: Information, weight: float | None = None) -> Consisten
     Raises:
         UsageError: for a model without bodies (motor side alone).
     """
-    from scipy.stats import chi2
+    from scipy.special import chdtri
 
     model = told.dynamics.model
     if not model.torque_rows.has_bodies:
         raise UsageError("the model holds drives alone (kind 'drive'): there are no bodies to make consistent")
-    allowed = float(np.sqrt(chi2.ppf(0.95, told.b)))
+    allowed = float(np.sqrt(chdtri(told.b, 0.05)))
     choices = [(references, make_problem(told, references)) for references in find_prior_bodies(told.chain, model)]
     away, problem = min(
         ((told.distance(border.nearest(problem)), problem) for _, problem in choices[:: max(len(choices) - 1, 1)]),
