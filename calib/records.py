@@ -2,14 +2,46 @@
 
 from __future__ import annotations
 
+import csv
 import types
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from functools import cache
 from numbers import Real
+from pathlib import Path
 from typing import Any, SupportsIndex, TypeVar, Union, get_args, get_origin, get_type_hints
 
 T = TypeVar("T")
+
+
+def read_rows(kind: type[T], path: Path) -> tuple[T, ...]:
+    """Return the rows of a CSV file of ours as values of the named tuple `kind`, whose fields are its columns.
+
+    Raises:
+        ValueError: where a column is missing or a cell is no number where one belongs.
+        OSError: where the file is missing.
+    """
+    with path.open(newline="", encoding="utf-8") as file:
+        return typed_rows(kind, list(csv.DictReader(file)), str(path))
+
+
+def typed_rows(kind: type[T], rows: Iterable[Mapping[str, str]], place: str) -> tuple[T, ...]:
+    """Return rows of text by column as values of the named tuple `kind`; `place` is for messages, see `read_rows`."""
+    hints = _hints(kind)
+    return tuple(kind(**{name: _cell(hint, row, name, place) for name, hint in hints.items()}) for row in rows)
+
+
+def _cell(hint: Any, row: Mapping[str, str], name: str, place: str) -> Any:
+    text = row.get(name)
+    wanted = [one for one in get_args(hint) or (hint,) if one is not types.NoneType]
+    if text is None:
+        raise ValueError(f"{place}: column {name} is missing")
+    if not text and wanted[0] is not str and len(get_args(hint)) > len(wanted):
+        return None
+    try:
+        return wanted[0](text)
+    except ValueError as error:
+        raise ValueError(f"{place}: {name}: {error}") from error
 
 
 def read_record(kind: type[T], content: Any, place: str = "") -> T:

@@ -33,7 +33,8 @@ def identify_dynamics(
     """Identify the dynamics of ROBOT from recordings, and say how well it predicts other motion."""
     from calib.identification.identify_options import read_options
     from calib.procedure.dynamic_stage import folder, identify, inputs
-    from calib.procedure.report import identification_console
+    from calib.procedure.report import console as shown
+    from calib.procedure.report import dynamics_section
 
     chosen = read_options(options)
     folder.check_identification_target(out, [options, *recordings, *(validate or [])])
@@ -44,7 +45,7 @@ def identify_dynamics(
             seed=seed, progress=say,
         )  # fmt: skip
         folder.check_identification_target(out, [found.source, found.source.parent])
-    for line in identification_console.read_lines(found):
+    for line in shown.rendered(dynamics_section.read_blocks(found)):
         console.print(line, soft_wrap=True)
     with progress() as say:
         outcome = identify.run(found, progress=say)
@@ -53,7 +54,7 @@ def identify_dynamics(
         if plots:
             from calib.procedure.report.identification_figures import write as draw
         folder.write_folder(outcome, out, draw)
-    for line in identification_console.outcome_lines(outcome):
+    for line in shown.section(dynamics_section.outcome_section(outcome)):
         console.print(line, soft_wrap=True)
     console.print(f"written to {out}", soft_wrap=True, markup=False)
     if outcome.verdict.level == "fail":

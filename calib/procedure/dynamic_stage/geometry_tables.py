@@ -16,26 +16,19 @@ Beside what every identification writes (``calib identify --out``)::
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import RenderableType
-from rich.markup import escape
-from rich.table import Table
 
 from calib import files
 from calib.identification.geometry_uncertainty import NOTHING, TILTS, GeometryUncertainty
 from calib.identification.two_geometries import GeometryComparison
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
+from calib.procedure.dynamic_stage.metrics import GeometricEffect
 
 EFFECTS, SENSITIVITY, GEOMETRIES = "geometry_effects.csv", "sensitivity.csv", "geometries.csv"
-SHOWN = 8  # rows on the console
-HEADER = (
-    "rank", "element", "unit", "sigma", "matters", "parameter", "shift_sigma", "parameters_moved", "torque_rms",
-    "torque_rms_left", "shift_sigma_per_milli",
-)  # fmt: skip
 LEAST = float(np.sqrt((1.0 + NOTHING) ** 2 - 1.0))  # a shift, in σ_torque, that raises a σ by more than `NOTHING`
 GEOMETRIES_HEADER = (
     "name", "unit", "nominal", "sigma_nominal", "calibrated", "sigma_calibrated", "relative_percent",
@@ -51,7 +44,7 @@ def write(outcome: IdentificationOutcome, folder: Path) -> None:
     rows = ([name, *map(float, row)] for name, row in zip(carried.names, carried.sensitivity))
     header = [f"{name} [{unit}]" for name, unit in zip(carried.elements, carried.units)]
     files.write_table(folder / SENSITIVITY, ("name", *header), rows)
-    files.write_table(folder / EFFECTS, HEADER, effects(carried))
+    files.write_table(folder / EFFECTS, GeometricEffect._fields, effects(carried))
     if outcome.geometries is not None:
         table = geometries(outcome.geometries, essential_names(outcome))
         files.write_table(folder / GEOMETRIES, GEOMETRIES_HEADER, table)
@@ -65,8 +58,8 @@ def ranking(carried: GeometryUncertainty) -> np.ndarray:
     return np.lexsort((-size, ~known))
 
 
-def effects(carried: GeometryUncertainty) -> list[tuple[Any, ...]]:
-    """Return the rows of ``geometry_effects.csv`` (`HEADER`), the most harmful element first.
+def effects(carried: GeometryUncertainty) -> list[GeometricEffect]:
+    """Return the rows of ``geometry_effects.csv``, the most harmful element first.
 
     shift_sigma: of the parameter that moves most, by one σ of the element, in that parameter's σ from torque noise;
     shift_sigma_per_milli: by 1 mm or 1 mrad. torque_rms: what one σ does to the rigid torque at fixed parameters;
@@ -80,7 +73,7 @@ def effects(carried: GeometryUncertainty) -> list[tuple[Any, ...]]:
         known = bool(np.isfinite(sigma))
         shifts = per_unit * sigma
         found.append(
-            (
+            GeometricEffect(
                 rank, carried.elements[k], carried.units[k], float(sigma) if known else None,
                 ("yes" if shifts.max() > LEAST else "no") if known else "",
                 carried.names[worst] if per_unit[worst] > 0.0 else "",
@@ -145,31 +138,6 @@ def summary(carried: GeometryUncertainty) -> str:
     more = f"; it exceeds the torque noise's part in {len(over)}: {', '.join(over)}" if over else ""
     rest = f"; in the other {p - count} propagation changes nothing" if count < p else ""
     return f"the geometry's uncertainty raises {count} of {p} sigmas by more than {100 * NOTHING:g} %{more}{rest}"
-
-
-def lines(outcome: IdentificationOutcome) -> Iterator[RenderableType]:
-    """Say on the console which geometric errors matter for the dynamics."""
-    carried = outcome.carried
-    if carried is None:
-        return
-    yield escape(summary(carried))
-    if carried.geometry is None:
-        return
-    name, size = tilt(carried)
-    if size > LEAST:
-        yield escape(
-            f"not part of it is how level the base stands: 1 mrad against gravity would move {name} by {size:.2g} of "
-            "its sigma of torque noise"
-        )
-    if not carried.changed.any():
-        return
-    table = Table("geometric error", title="which geometric errors matter for the dynamics", title_justify="left")
-    for name in ("sigma", "moves most", "by, in its sigma of torque", "parameters moved", "torque rms [N m]"):
-        table.add_column(name, justify="right")
-    for row in [row for row in effects(carried) if row[4] == "yes"][:SHOWN]:
-        sigma = f"{1e3 * row[3]:.3g} {'mm' if row[2] == 'm' else 'mrad'}"
-        table.add_row(escape(row[1]), sigma, row[5], f"{row[6]:.2f}", f"{row[7]}", f"{row[8]:.2g}")
-    yield table
 
 
 def tilt(carried: GeometryUncertainty) -> tuple[str, float]:

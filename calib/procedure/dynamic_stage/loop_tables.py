@@ -1,4 +1,4 @@
-"""What instruments from simulation say, for the console and the folder of an identification."""
+"""What instruments from simulation say, for the folder of an identification."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.identification.loop.bias import SMALL, LoopTest
+from calib.identification.loop.bias import LoopTest
 from calib.identification.methods.instrumental import Instrumental
 from calib.simulation.loop.controllers import Controller
 
@@ -17,42 +17,15 @@ INSTRUMENTAL = "instrumental.csv"
 HEADER = ("name", "unit", "instrumental", "sigma", "least_squares", "shift_sigma", "explained_percent")
 
 
-def loop_lines(bias: LoopTest) -> Iterator[str]:
-    """Say how the simulated loop went and what it says of least squares."""
-    if bias.loops is not None:
-        yield from bias.loops.notes
-    found = bias.found
-    if found is None:
-        return
-    verdict, strength = found.verdict, found.strength
-    yield (
-        f"closed loop simulated, {len(found.rounds)} rounds; simulated against recorded motion "
-        f"{_joints(found.distance)} % apart, torque {_joints(found.direct)} %"
-    )
-    yield (
-        f"instruments: full rank, Cragg-Donald {strength.cragg_donald:.3g} ({'weak' if strength.weak else 'strong'}), "
-        f"least share of a column explained {100 * strength.partial_r2.min():.3g} %"
-    )
-    said = "least squares is biased" if verdict.biased() else "no bias of least squares is seen"
-    if verdict.biased() and found.shift.max() < SMALL:
-        said = "least squares is biased, surely but by little"
-    if not found.valid:
-        said += ", but these instruments are not to be trusted"
-    p = f"p = {verdict.p:.2g}" if verdict.p > 0.0 else "p < 1e-300"
-    yield (
-        f"Durbin-Wu-Hausman: F({verdict.degrees[0]}, {verdict.degrees[1]}) = {verdict.statistic:.3g}, {p}: {said}; "
-        f"largest shift {found.shift.max():.3g} sigma"
-    )
-
-
 def loop_table(bias: LoopTest) -> dict[str, Any] | None:
     """Return what ``metrics.json`` holds under ``loop``; None where no loop was stated."""
-    if bias.found is None:
-        return {"failure": bias.failure} if bias.failure else None
     found, loops = bias.found, bias.loops
+    notes = {"notes": list(loops.notes)} if loops is not None and loops.notes else {}
+    if found is None:
+        return ({"failure": bias.failure} if bias.failure else {}) | notes or None
     assert loops is not None  # the estimate came from them
     identified = loops.identified
-    return {
+    return notes | {
         "controller": controller_table(loops.controller),
         "controller_explains_percent": None if identified is None else _floats(identified.explained),
         "instruments": bias.method,
@@ -95,10 +68,6 @@ def _rows(found: Instrumental) -> Iterator[tuple[Any, ...]]:
             name, estimate.units[k], float(estimate.values[k]), float(estimate.sigma[k]), float(plain[k]),
             float(found.shift[k]), float(100.0 * found.strength.partial_r2[k]),
         )  # fmt: skip
-
-
-def _joints(values: np.ndarray) -> str:
-    return " ".join(f"{x:.3g}" for x in values)
 
 
 def _floats(values: np.ndarray) -> list[float | None]:

@@ -1,22 +1,19 @@
-"""The second judgement of an identification: tracking with the model fed forward, in words and numbers."""
+"""The second judgement of an identification: tracking with the model fed forward, in numbers."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from rich.markup import escape
-from rich.table import Table
 
 from calib.errors import CalibError
 from calib.identification.loop.loop_settings import stated_controller
-from calib.identification.loop.replay import CAD, DAMPING, FEEDBACK, FLOOR, FREQUENCY, IDENTIFIED, Replay, replay
+from calib.identification.loop.replay import CAD, FEEDBACK, FLOOR, IDENTIFIED, Replay, replay
 from calib.identification.prediction import Dynamics
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.loop_tables import controller_table
-from calib.robot.chain import Chain
 from calib.simulation.loop.controllers import Controller
 
 MOST = 3  # recordings that are replayed
@@ -61,38 +58,6 @@ def track(
     except CalibError as error:
         return Tracking(unseen=bool(inputs.unseen), failure=str(error))
     return Tracking(replays, bool(inputs.unseen))
-
-
-def tracking_lines(tracking: Tracking, chain: Chain) -> Iterator[Table | str]:
-    """Say how far the simulated robot strays, and what that means."""
-    if tracking.failure:
-        yield escape(f"tracking with the model fed forward was not simulated: {tracking.failure}")
-    if not tracking.replays:
-        return
-    table = Table(
-        "file", "tracking, simulated", title=escape("rms of q - reference [mrad or mm]"), title_justify="left"
-    )
-    for joint in range(chain.n):
-        table.add_column(f"{joint + 1}", justify="right")
-    for one in tracking.replays:
-        for name, rms in one.rms.items():
-            table.add_row(escape(one.name), name, *(f"{1e3 * x:.3g}" for x in rms))
-    yield table
-    first = tracking.replays[0]
-    if first.added.any():
-        shown = " ".join(f"{x:.2g}" for x in first.added)
-        yield (
-            f"the identified model is no possible robot: it is simulated with motor inertia added, {shown} kg m² (kg); "
-            "compare the rows, do not trust their size"
-        )
-    control = (
-        "the controller of [loop]" if first.stated else f"a PD of {FREQUENCY:g} Hz, damping {DAMPING:g} (our default)"
-    )
-    motion = "motion the fit has not seen" if tracking.unseen else "the motion of the fit itself, which flatters"
-    yield escape(
-        f"the simulated robot is the identified model, disturbed by the torque it left unexplained; {control}; "
-        f"{motion}: feeding the model forward divides the tracking error by {first.gain:.3g}"
-    )
 
 
 def tracking_table(tracking: Tracking) -> dict[str, Any] | None:

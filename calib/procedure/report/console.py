@@ -26,8 +26,9 @@ def rendered(blocks: Iterable[Block]) -> Iterator[RenderableType]:
 
 def rich_table(table: Table) -> RichTable:
     """Return a table of `page` as rich's."""
+    title = table.title[:1].lower() + table.title[1:]
     result = RichTable(
-        title=escape(table.title), title_justify="left", caption=escape(table.note) or None, caption_justify="left",
+        title=escape(title), title_justify="left", caption=escape(table.note) or None, caption_justify="left",
         box=box.HEAVY_HEAD,
     )  # fmt: skip
     numbers = set(table.numbers)

@@ -1,4 +1,4 @@
-"""The dynamics on a certificate: torque errors on unseen motion, parameters, excitation, what could not be told."""
+"""The dynamics in a report: what the console says of an identification and what stands on the certificate."""
 
 from __future__ import annotations
 
@@ -6,21 +6,49 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from calib.errors import UsageError
 from calib.estimate_files import read_estimate
-from calib.folders import METRICS
+from calib.identification.loop.bias import SMALL
+from calib.identification.loop.replay import DAMPING, FREQUENCY
+from calib.identification.scores import relative_error_sigma
+from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.folder import UNSEEN, IdentificationFolder
-from calib.procedure.excitation import coefficients
-from calib.procedure.report.page import Block, KeyFigure, Picture, Pictures, Section, Table, Text
+from calib.procedure.dynamic_stage.folder import metrics as metrics_of
+from calib.procedure.dynamic_stage.identify import IdentificationOutcome
+from calib.procedure.dynamic_stage.inputs import IdentificationInputs
+from calib.procedure.dynamic_stage.metrics import (
+    GeometricEffect,
+    IdentifiedParameter,
+    LoopMetrics,
+    ModelMetrics,
+    Numbers,
+    RecordingErrors,
+    ReplayMetrics,
+    UnseenReport,
+    model_metrics,
+)
+from calib.procedure.dynamic_stage.tracking import KEYS
+from calib.procedure.report.geometry_section import relative_sigma
+from calib.procedure.report.page import Block, KeyFigure, Pictures, Section, Table, Text
+from calib.records import read_record, read_rows, typed_rows
 
 TOLD = 50.0  # RSD [%] from which on a parameter is not told from zero: two sigmas
-DRAWN = 300  # points per curve of the excitation
 WORDS = 46  # letters of what a parameter holds that are printed
+SHOWN = 8  # geometric errors listed
 WHITE = 0.10  # share of autocorrelations beyond the bound below which a residual may be called white (0.05 if it is)
+ERROR_NOTE = (
+    "Error: 100 ‖τ - τ̂‖ / ‖τ‖ of the torque as recorded; in band: both low-passed to the band of the motion; moving, "
+    "standing: as recorded, where the joint moves or stands. What of the torque lies above that band (noise, ripple) "
+    "no model of q, v, a explains. ACF outside: share of the residual's autocorrelations beyond the 95 % bounds of "
+    "white noise; 5 % if it is white."
+)
+EFFECTS_HEADER = (
+    "geometric error", "sigma", "moves most", "by, in its sigma of torque", "parameters moved", "torque rms [N m]",
+)  # fmt: skip
+SHORT = {key: words for words, key in KEYS.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,17 +56,16 @@ class DynamicReport:
     """What an identification and its validation left behind.
 
     Attributes:
-        verdict, reason: of the dynamics.
-        metrics: of the identification, as in ``metrics.json``.
-        estimate: rows of ``estimate.csv``.
-        unseen: ``unseen/report.json``.
+        metrics: of the identification.
+        estimate: the parameters.
+        effects: what the geometry's errors do to them; none where the geometry is taken as exact.
+        unseen: the model on unseen motion, with the verdict.
     """
 
-    verdict: str
-    reason: str
-    metrics: Mapping[str, Any]
-    estimate: tuple[Mapping[str, str], ...]
-    unseen: Mapping[str, Any]
+    metrics: ModelMetrics
+    estimate: tuple[IdentifiedParameter, ...]
+    effects: tuple[GeometricEffect, ...]
+    unseen: UnseenReport
 
 
 def read(folder: Path) -> DynamicReport:
@@ -47,81 +74,114 @@ def read(folder: Path) -> DynamicReport:
     Raises:
         UsageError: where it is missing or made by another version.
     """
+    effects = folder / geometry_tables.EFFECTS
     try:
         place = IdentificationFolder(folder)
-        metrics = json.loads(place.numbers.read_text(encoding="utf-8"))
+        metrics = model_metrics(json.loads(place.numbers.read_text(encoding="utf-8")))
         unseen = json.loads(place.unseen.report.read_text(encoding="utf-8"))
-        estimate = read_estimate(folder).rows
+        if unseen.get("schema") != UNSEEN:
+            found = f"schema {unseen.get('schema')}, this version reads {UNSEEN}"
+            raise UsageError(f"{place.unseen.report}: {found}")
+        return DynamicReport(
+            metrics,
+            typed_rows(IdentifiedParameter, read_estimate(folder).rows, str(folder)),
+            read_rows(GeometricEffect, effects) if effects.exists() else (),
+            read_record(UnseenReport, unseen),
+        )
     except (OSError, ValueError) as error:
         raise UsageError(f"{folder}: {error}; identify again: calib redo … identify") from error
-    if unseen.get("schema") != UNSEEN:
-        raise UsageError(f"{folder}/unseen/report.json: schema {unseen.get('schema')}, this version reads {UNSEEN}")
-    return DynamicReport(unseen["verdict"], unseen["reason"], metrics, estimate, unseen)
 
 
-def dynamics_stage(
-    found: DynamicReport, folder: Path, excitation: Path, exported: Sequence[str] = (), plots: bool = True
+def read_blocks(inputs: IdentificationInputs) -> list[Block]:
+    """Return robot and recordings as they were read, in sentences."""
+    chain = inputs.chain
+    how = "calibrated" if inputs.robot.moved else "nominal geometry"
+    lines = [f"robot {chain.name}: {chain.n} joints, {chain.base} to {chain.tip}, {how}"]
+    for case in (*inputs.cases, *inputs.unseen):
+        motion = case.motion
+        role = "unseen" if any(case is other for other in inputs.unseen) else "to learn from"
+        load = f", carrying {', '.join(case.carried)}" if case.carried else ""
+        lines.append(
+            f"{case.name.rstrip(':')}: {case.duration:.1f} s at {motion.rate:.4g} Hz, {motion.kind}{load}, {role}"
+        )
+    return [Text("What was read", [*lines, *(f"  {_plain(note)}" for note in inputs.notes)])]
+
+
+def _plain(note: str) -> str:
+    """Return a note to print; a cut that is open at its end has a colon of its own."""
+    return note.replace(":: ", ": ")
+
+
+def outcome_section(outcome: IdentificationOutcome) -> Section:
+    """Return what an identification came to as the console says it: ladder, model, errors, tracking, verdict."""
+    found = model_metrics(metrics_of(outcome))
+    chain, torques = outcome.inputs.chain, outcome.found.settings.torque_rows
+    effects = () if outcome.carried is None else geometry_tables.effects(outcome.carried)
+    blocks: list[Block] = [friction_table(found)] if found.ladder else []
+    blocks += [Text("", model_sentences(found)), *geometry_blocks(found, effects)]
+    if found.loop:
+        blocks.append(Text("", loop_sentences(found.loop)))
+    rows = torques.titles(chain.joint_names)
+    units = torques.units([joint.kind == "prismatic" for joint in chain.joints])
+    units = units if found.unit == "N m" else (found.unit,) * len(units)
+    blocks += [
+        error_table(found.identification, found.validation, rows, units),
+        *tracking_blocks(found.tracking, found.tracking_failure),
+    ]
+    blocks.append(Text("", [_plain(line) for line in found.warnings], "note"))
+    return Section("Dynamics", blocks, found.verdict, found.reason)
+
+
+def certificate_section(
+    found: DynamicReport, drawn: Mapping[str, Pictures], exported: Sequence[str] = (), tolerance: float = 0.0
 ) -> Section:
-    """Return the stage of the dynamics: errors on unseen motion, torques, excitation, parameters, what is not told.
+    """Return the section of a certificate: errors on unseen motion, torques, excitation, parameters, what is not told.
 
     Args:
-        folder: of the identification.
-        excitation: folder with ``training/trajectory.csv`` and its ``metrics.json``, if one was planned.
+        drawn: figures by name, see `calib.procedure.report.figures.draw_dynamics`; those not there are left out.
         exported: what the export had to say.
-        plots: whether there are to be figures.
+        tolerance: largest error of the torque on unseen motion that is good enough [%]; 0: none.
     """
-    blocks: list[Block] = [error_table(found)]
-    if plots:
-        blocks += [Pictures("", judged_figures(found)), Pictures("Torques", torques(found)), planned(excitation)]
-    if len(found.metrics["ladder"]) > 1:
-        blocks.append(friction_table(found))
-    blocks.append(Text("What the motion can tell", identifiability(found)))
-    if plots:
-        blocks += [consistency(folder), Pictures("Dynamic parameters", [significance(found)])]
-    blocks.append(parameter_table(found))
-    if exported:
-        blocks.append(Text("What was exported", exported))
-    notes = [*found.metrics["warnings"], *(w for w in found.unseen["warnings"] if w not in found.metrics["warnings"])]
-    if notes:
-        blocks.append(Text("Notes on the dynamics", notes))
-    return Section("Dynamics", blocks, found.verdict, found.reason, key_figures(found))
+    metrics, unseen = found.metrics, found.unseen
+    pictures = lambda name: [drawn[name]] if name in drawn else []  # noqa: E731
+    blocks: list[Block] = [error_table(unseen.fit, unseen.validation, unseen.rows, unseen.units)]
+    blocks += [*pictures("errors"), *pictures("torques"), *pictures("excitation")]
+    if len(metrics.ladder) > 1:
+        blocks.append(friction_table(metrics))
+    blocks += [Text("The model", model_sentences(metrics)), Text("What the motion can tell", identifiability(found))]
+    blocks += [*geometry_blocks(metrics, found.effects), *pictures("geometry")]
+    blocks += [*pictures("parameters"), parameter_table(found)]
+    if metrics.loop:
+        blocks.append(Text("Closed loop", loop_sentences(metrics.loop)))
+    blocks += tracking_blocks(metrics.tracking, metrics.tracking_failure)
+    blocks.append(Text("What was exported", exported))
+    blocks.append(Text("Notes on the dynamics", list(dict.fromkeys((*metrics.warnings, *unseen.warnings)))))
+    return Section("Dynamics", blocks, unseen.verdict, unseen.reason, key_figures(unseen, tolerance))
 
 
-def torques(found: DynamicReport) -> list[Picture]:
-    """Return a figure of the torques of each recording."""
-    from calib.procedure.report import dynamics_figures
-    from calib.procedure.report.style import picture
-
-    result, rows, units = [], found.unseen["rows"], found.unseen["units"]
-    seen = "unseen" if found.unseen["validation"] else "fitted"
-    for curves in found.unseen["curves"]:
-        raw = {**found.unseen["fit"], **found.unseen["validation"]}[curves["name"]]["raw"]["relative_error_percent"]
-        t, measured, predicted = (np.array(curves[key], dtype=float).T for key in ("t", "measured", "predicted"))
-        title = f"{curves['name']}: {percent(raw['total'])} of the torque unexplained"
-        figure = dynamics_figures.torques(t, measured, predicted, rows, units, title, raw["joints"])
-        words = f"Torques on {curves['name']}, {seen}: measured, predicted, and what is left."
-        result.append(picture(figure, words, True))
-    return result
+def proof_of(unseen: UnseenReport) -> tuple[str, RecordingErrors, str]:
+    """Return name and errors of the recording that judges (the worst unseen one, else the fitted one), and on what."""
+    where = "unseen motion" if unseen.proofs else "the training motion"
+    sets = unseen.proofs or unseen.fit
+    name, found = max(sets.items(), key=lambda item: item[1].raw.relative_error_percent.total or 0.0)
+    return name, found, where
 
 
-def proof_of(found: DynamicReport) -> tuple[Mapping[str, Any], str]:
-    """Return the scores that judge, and on what: the worst unseen recording, else the fitted one."""
-    proofs = {name: one for name, one in found.unseen["validation"].items() if one["evidence"]}
-    where = "unseen motion" if proofs else "the training motion"
-    sets = proofs or found.unseen["fit"]
-    return max(sets.values(), key=lambda one: one["raw"]["relative_error_percent"]["total"] or 0.0), where
-
-
-def key_figures(found: DynamicReport) -> list[KeyFigure]:
-    """Return four numbers for the head of the stage: label, value, remark."""
-    proof, where = proof_of(found)
-    raw, band = proof["raw"]["relative_error_percent"], proof["filtered"]["relative_error_percent"]
-    rows = [(x, name) for x, name in zip(band["joints"], found.unseen["rows"]) if x is not None]
-    worst, name = max(rows, default=(None, "torque"))
+def key_figures(unseen: UnseenReport, tolerance: float = 0.0) -> list[KeyFigure]:
+    """Return the errors of the torque that the verdict rests on, of the worst unseen recording."""
+    name, proof, _ = proof_of(unseen)
+    count = len(unseen.proofs)
+    basis = {0: "the training motion", 1: "1 unseen motion"}.get(count, f"worst of {count} unseen motions")
+    raw, band = proof.raw.relative_error_percent, proof.filtered.relative_error_percent
+    curves = next((one for one in unseen.curves if one.name == name), None)
+    sigma = np.nan if curves is None else relative_error_sigma(np.array(curves.measured), np.array(curves.predicted))
+    spread = f"± {sigma:.2g} %" if np.isfinite(sigma) else ""
+    worst, row = max(((x, row) for x, row in zip(band.joints, unseen.rows) if x is not None), default=(None, "torque"))
+    allowed = f"{tolerance:g} %" if tolerance else ""
     return [
-        KeyFigure("torque unexplained", "", percent(raw["total"]), "", where),
-        KeyFigure("torque unexplained, in the motion's band", "", percent(band["total"]), "", where),
-        KeyFigure(f"the same, worst joint ({name})", "", percent(worst), "", where),
+        KeyFigure("torque unexplained", "", percent(raw.total), spread, basis, allowed),
+        KeyFigure("the same in the motion's band", "", percent(band.total), "", basis),
+        KeyFigure(f"its worst row, {row}", "", percent(worst), "", basis),
     ]
 
 
@@ -130,156 +190,202 @@ def percent(value: float | None) -> str:
     return "–" if value is None else f"{value:.3g} %"
 
 
-def error_table(found: DynamicReport) -> Table:
-    """Return errors of the torque per row, of every recording."""
+def error_table(
+    training: Mapping[str, RecordingErrors], unseen: Mapping[str, RecordingErrors], rows: Sequence[str],
+    units: Sequence[str],
+) -> Table:  # fmt: skip
+    """Return errors of the torque per row, of every recording.
+
+    Args:
+        training, unseen: recordings by name.
+        rows, units: names and units of the torque rows.
+    """
+    cells: list[Sequence[str]] = []
+    strong = set()
+    labelled = [(name, one, "fitted") for name, one in training.items()]
+    labelled += [(name, one, "unseen" if one.evidence else "repeat: no evidence") for name, one in unseen.items()]
+    for name, one, label in labelled:
+        parts = one.raw, one.filtered, one.moving, one.standing
+        cells.append((f"{name} ({label})",))
+        strong.add(len(cells))
+        cells.append(("all", *(percent(part.relative_error_percent.total) for part in parts), "", "", ""))
+        for j, row in enumerate(rows):
+            rms, white = one.raw.rms[j], one.whiteness[j]
+            cells.append((
+                row, *(percent(part.relative_error_percent.joints[j]) for part in parts),
+                percent(one.above_band_percent[j]),
+                "" if rms is None else f"{rms:.3g} {units[j]}",
+                "" if white is None else f"{100 * white.outside:.0f} %",
+            ))  # fmt: skip
+    header = ("torque", "error", "in band", "moving", "standing", "torque above band", "rms", "ACF outside")
+    return Table("Torque errors", header, cells, ERROR_NOTE, frozenset(strong), range(1, 8))
+
+
+def friction_table(metrics: ModelMetrics) -> Table:
+    """Return the friction models tried, with their error on time left out, of all rows and of each."""
     rows, strong = [], set()
-    for role, sets in (("training", found.unseen["fit"]), ("unseen", found.unseen["validation"])):
-        for name, one in sets.items():
-            label = role if role == "training" or one["evidence"] else "repeat: no evidence"
-            total = one["raw"]["relative_error_percent"]["total"], one["filtered"]["relative_error_percent"]["total"]
-            if role == "unseen":
-                strong.add(len(rows))
-            rows.append((f"{name} ({label})", "all", percent(total[0]), percent(total[1]), "", "", ""))
-            for j, row in enumerate(found.unseen["rows"]):
-                white = one["whiteness"][j]
-                rms = one["raw"]["rms"][j]
-                rows.append((
-                    "", row, percent(one["raw"]["relative_error_percent"]["joints"][j]),
-                    percent(one["filtered"]["relative_error_percent"]["joints"][j]),
-                    percent(one["above_band_percent"][j]),
-                    "" if rms is None else f"{rms:.3g} {found.unseen['units'][j]}",
-                    "" if white is None else f"{100 * white['outside']:.0f} %",
-                ))  # fmt: skip
-    header = ("recording", "torque", "error", "in band", "torque above band", "rms", "ACF outside")
-    note = (
-        "Error: 100 ‖τ - τ̂‖ / ‖τ‖ of the torque as recorded; in band: both low-passed to the band of the motion. "
-        "What of "
-        "the torque lies above that band (noise, ripple) no model of q, v, a explains. ACF outside: share of the "
-        "residual's "
-        "autocorrelations beyond the 95 % bounds of white noise; 5 % if it is white."
-    )
-    return Table("Torque errors", header, rows, note, frozenset(strong), range(2, 7))
-
-
-def judged_figures(found: DynamicReport) -> list[Picture]:
-    """Return errors by row and autocorrelations of the recording that judges."""
-    from calib.procedure.report import dynamics_figures
-    from calib.procedure.report.style import HALF, WIDE, picture
-
-    proof, where = proof_of(found)
-    own = next(iter(found.unseen["fit"].values()))
-    sides = [[x or 0.0 for x in one["raw"]["relative_error_percent"]["joints"]] for one in (own, proof)]
-    rows = found.unseen["rows"]
-    bars = dynamics_figures.errors_by_row(sides[0], sides[1], rows)
-    name = next(iter(found.unseen["autocorrelation"]))
-    white = found.unseen["autocorrelation"][name]
-    many = len(rows) > dynamics_figures.FEW
-    width = WIDE if many else HALF
-    drawn = dynamics_figures.autocorrelations(white["values"], white["bound"], rows, "What is left", width)
-    left = f"Share of each torque that the model leaves, on the training motion and on {where}."
-    rest = f"Autocorrelation of what is left below the band on {name}; dashed: white noise."
-    return [picture(bars, left, many), picture(drawn, rest, many)]
-
-
-def planned(excitation: Path) -> Pictures:
-    """Return the designed motion: a picture, and how well it tells the parameters."""
-    folder = excitation / "training"
-    if not (folder / coefficients.NAME).exists():
-        return Pictures("Excitation", [])
-    motion = coefficients.read(folder)
-    t = np.linspace(0.0, motion.period, DRAWN)
-    q, v, _ = motion.orders(t)
-    made = json.loads((folder / METRICS).read_text(encoding="utf-8"))
-    condition, setting = made["condition_number"], made["setting"]
-    margins = ", ".join(f"{name} {one['share']:.1%} of its scale" for name, one in made["margins"].items())
-    words = (
-        f"The training motion, one period of {setting['period']:g} s: condition number {condition['raw']:.3g} raw, "
-        f"{condition['normalised']:.3g} with unit columns, of {len(setting['columns'])} columns. Every limit was kept, "
-        f"at and between {setting['instants_verified']} instants; smallest margins: {margins}."
-    )
-    from calib.procedure.report.motion_figures import motion_sheet
-    from calib.procedure.report.style import picture
-
-    names, none = motion.joint_names, np.full(q.shape[1], np.inf)
-    series = [(values, -none, none, title) for values, title in ((q, "position"), (v, "velocity"))]
-    figure = motion_sheet(t, series, ("rad", "rad/s"), names)
-    return Pictures("Excitation", [picture(figure, words, True)])
-
-
-def consistency(folder: Path) -> Pictures:
-    """Return figures of what the geometry's uncertainty does to the dynamics; none of a robot without a fit."""
-    from calib.procedure.report import uncertainty_figures
-
-    return Pictures("Geometry and dynamics", list(uncertainty_figures.from_folder(folder).values()))
-
-
-def friction_table(found: DynamicReport) -> Table:
-    """Return the ladder of friction models."""
-    rows, strong = [], set()
-    for rung in found.metrics["ladder"]:
-        if rung["kept"]:
+    for step in metrics.ladder:
+        if step.kept:
             strong.add(len(rows))
-        at = ", ".join(map(str, rung["kept_at_joints"]))
-        rows.append(
-            (rung["model"], str(rung["parameters"]), percent(rung["cross_validated_percent"]), at or rung["note"])
-        )
-    header = ("friction", "parameters", "error on time left out", "kept at joints")
-    note = f"Chosen: {found.metrics['friction']}."
-    return Table("Ladder of friction models", header, rows, note, frozenset(strong), (1, 2))
+        at = ", ".join(map(str, step.kept_at_joints))
+        joints = ["–" if x is None else f"{x:.1f}" for x in step.joints_percent]
+        total = "–" if step.cross_validated_percent is None else f"{step.cross_validated_percent:.2f}"
+        rows.append((step.model, str(step.parameters), total, *joints, at or step.note))
+    each = [str(j + 1) for j in range(max((len(step.joints_percent) for step in metrics.ladder), default=0))]
+    rows = [(*row[:-1], *[""] * (len(each) + 4 - len(row)), row[-1]) for row in rows]
+    header = ("friction", "p", "total", *each, "kept at joints")
+    title = "Ladder of friction models: relative error on time left out [%]"
+    return Table(title, header, rows, f"Chosen: {metrics.friction}.", frozenset(strong), range(1, 3 + len(each)))
 
 
-def identifiability(found: DynamicReport) -> list[str]:
-    """Return what the motion can and cannot tell, in words."""
-    counts, condition = found.metrics["parameters"], found.metrics["condition_number"]
-    lines = [
-        f"Of {counts['standard']} standard parameters the torques of any motion of this arm tell {counts['base']} "
-        f"combinations; {counts['essential']} of them this motion tells well enough to be kept.",
-        f"Condition number of the observation matrix: {condition['raw']:.3g} in its units, "
-        f"{condition['normalised']:.3g} "
-        "with columns of unit norm.",
-    ]
-    weak = [row["name"] for row in found.estimate if row["rsd"] and float(row["rsd"]) > TOLD]
-    if weak:
-        lines.append(f"Not told from zero (σ above half the value): {', '.join(weak)}.")
-    proof, where = proof_of(found)
-    coloured = [
-        row for row, white in zip(found.unseen["rows"], proof["whiteness"]) if white and white["outside"] > WHITE
-    ]
-    if coloured:
+def model_sentences(metrics: ModelMetrics) -> list[str]:
+    """Return how many parameters there are, by which method they were found, and which the data do not tell."""
+    lines = []
+    for one in metrics.ripple:
+        others = ("" if wave.gear == one.joint else f" of joint {wave.gear}" for wave in one.waves)
+        waves = (f"{wave.order_per_turn:g}{other}" for wave, other in zip(one.waves, others))
         lines.append(
-            f"What is left on {where} is not white in {', '.join(coloured)}: something the model does not hold is in "
-            "it, "
-            "and σ, which takes it for noise, is too small there."
+            f"ripple at joint {one.joint}, orders {', '.join(waves)} per turn: explains "
+            f"{100 * one.explained_share_on_unseen_blocks:.0f} % of the fast residual's power on time blocks left out; "
+            "not part of the covariance"
         )
-    elif any(proof["whiteness"]):
-        lines.append(f"What is left on {where} cannot be told from white noise.")
+    lines.append(f"method {metrics.method}: takes for granted that {metrics.method_assumes}")
+    count, columns = metrics.parameters, metrics.counts
+    base = count.standard - columns.without_effect - columns.regrouped
+    raw, normalised = metrics.condition_number.raw, metrics.condition_number.normalised
+    condition = ", with unit columns ".join("infinite" if x is None else f"{x:.0f}" for x in (raw, normalised))
+    lines.append(
+        f"{count.standard} standard parameters: {columns.without_effect} without effect, {columns.regrouped} "
+        f"regrouped, {base} base; {count.base - base} of richer friction; condition {condition}"
+    )
+    if metrics.elimination or count.essential < count.base:
+        gone = ", ".join(
+            one.name if one.rsd is None else f"{one.name} ({one.rsd:.0f} %)" for one in metrics.elimination
+        )
+        lines.append(f"{count.essential} essential parameters; left out, with their RSD: {gone or 'none'}")
     return lines
 
 
-def significance(found: DynamicReport) -> Picture:
-    """Return the figure of parameters over their sigma."""
-    from calib.procedure.report import dynamics_figures
-    from calib.procedure.report.style import picture
+def geometry_blocks(metrics: ModelMetrics, effects: Sequence[GeometricEffect]) -> list[Block]:
+    """Return which geometric errors matter for the dynamics: a summary, and the worst of them."""
+    found = metrics.geometry
+    if found is None:
+        return []
+    lines, tilt = [found.summary], found.moved_by_1_mrad_of_tilt
+    if found.propagated and tilt.sigmas > geometry_tables.LEAST:
+        lines.append(
+            f"not part of it is how level the base stands: 1 mrad against gravity would move {tilt.parameter} by "
+            f"{tilt.sigmas:.2g} of its sigma of torque noise"
+        )
+    rows = [
+        (
+            one.element, f"{1e3 * one.sigma:.3g} {'mm' if one.unit == 'm' else 'mrad'}", one.parameter,
+            f"{one.shift_sigma:.2f}", str(one.parameters_moved), f"{one.torque_rms or 0.0:.2g}",
+        )
+        for one in effects
+        if one.matters == "yes" and one.sigma is not None and one.shift_sigma is not None
+    ]  # fmt: skip
+    blocks: list[Block] = [Text("Geometry and dynamics", lines)]
+    if found.changed and rows:
+        title = "Which geometric errors matter for the dynamics"
+        blocks.append(Table(title, EFFECTS_HEADER, rows[:SHOWN], numbers=(1, 3, 4, 5)))
+    return blocks
 
-    names = [row["name"] for row in found.estimate]
-    values, sigma = (np.array([float(row[key] or "nan") for row in found.estimate]) for key in ("value", "sigma"))
-    known = np.isfinite(values) & np.isfinite(sigma) & (sigma > 0)
-    shown = [name for name, use in zip(names, known) if use]
-    figure = dynamics_figures.significance(shown, values[known], sigma[known])
-    words = "How far each parameter is from zero, in its σ; grey, below the dashed line: not told from zero."
-    return picture(figure, words, True)
+
+def loop_sentences(loop: LoopMetrics) -> list[str]:
+    """Return how the simulated loop went and what it says of least squares."""
+    lines, test = list(loop.notes), loop.durbin_wu_hausman
+    if test is None:
+        return lines
+    lines.append(
+        f"closed loop simulated, {loop.rounds} rounds; simulated against recorded motion "
+        f"{_joints(loop.distance_percent)} % apart, torque {_joints(loop.simulated_torque_error_percent)} %"
+    )
+    strength = "weak" if loop.instruments_weak else "strong"
+    lines.append(
+        f"instruments: full rank, Cragg-Donald {_number(loop.cragg_donald)} ({strength}), least share of a column "
+        f"explained {100 * loop.least_partial_r2:.3g} %"
+    )
+    said = "no bias of least squares is seen"
+    if test.least_squares_biased:
+        little = loop.largest_shift_sigma < SMALL
+        said = "least squares is biased, surely but by little" if little else "least squares is biased"
+    if not loop.valid:
+        said += ", but these instruments are not to be trusted"
+    p = f"p = {test.p:.2g}" if test.p > 0.0 else "p < 1e-300"
+    degrees = ", ".join(f"{one:g}" for one in test.degrees)
+    lines.append(
+        f"Durbin-Wu-Hausman: F({degrees}) = {_number(test.f)}, {p}: {said}; largest shift "
+        f"{loop.largest_shift_sigma:.3g} sigma"
+    )
+    return lines
+
+
+def _joints(shares: Numbers) -> str:
+    return " ".join(map(_number, shares))
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3g}"
+
+
+def tracking_blocks(replays: Mapping[str, ReplayMetrics], failure: str = "") -> list[Block]:
+    """Return how far the simulated robot strays with the model fed forward, and what that means."""
+    if failure:
+        why = f"tracking with the model fed forward was not simulated: {failure}"
+        return [Text("Tracking, simulated", [why])]
+    if not replays:
+        return []
+    first = next(iter(replays.values()))
+    rows: list[Sequence[str]] = []
+    for name, one in replays.items():
+        rows.append((name,))
+        rows += [(SHORT.get(key, key), *(_number(x and 1e3 * x) for x in rms)) for key, rms in one.rms.items()]
+    joints = [str(j + 1) for j in range(len(first.inertia_added))]
+    lines = []
+    if any(first.inertia_added):
+        shown = " ".join(f"{x:.2g}" for x in first.inertia_added if x is not None)
+        lines.append(
+            f"the identified model is no possible robot: it is simulated with motor inertia added, {shown} kg m² (kg); "
+            "compare the rows, do not trust their size"
+        )
+    default = f"a PD of {FREQUENCY:g} Hz, damping {DAMPING:g} (our default)"
+    control = "the controller of [loop]" if first.controller.stated else default
+    motion = "motion the fit has not seen" if first.unseen else "the motion of the fit itself, which flatters"
+    lines.append(
+        f"the simulated robot is the identified model, disturbed by the torque it left unexplained; {control}; "
+        f"{motion}: feeding the model forward divides the tracking error by {first.feedback_over_model:.3g}"
+    )
+    title = "Tracking, simulated: rms of q - reference [mrad or mm]"
+    return [Table(title, ("fed forward", *joints), rows, numbers=range(1, 1 + len(joints))), Text("", lines)]
+
+
+def identifiability(found: DynamicReport) -> list[str]:
+    """Return what the motion can and cannot tell, in sentences."""
+    lines = []
+    weak = [row.name for row in found.estimate if row.rsd is not None and row.rsd > TOLD]
+    if weak:
+        lines.append(f"Not told from zero (σ above half the value): {', '.join(weak)}.")
+    _, proof, where = proof_of(found.unseen)
+    coloured = [row for row, white in zip(found.unseen.rows, proof.whiteness) if white and white.outside > WHITE]
+    if coloured:
+        lines.append(
+            f"What is left on {where} is not white in {', '.join(coloured)}: something the model does not hold is in "
+            "it, and σ, which takes it for noise, is too small there."
+        )
+    elif any(proof.whiteness):
+        lines.append(f"What is left on {where} cannot be told from white noise.")
+    return lines
 
 
 def parameter_table(found: DynamicReport) -> Table:
     """Return the identified parameters with σ and RSD, and what is regrouped in them."""
     rows = []
     for row in found.estimate:
-        rsd = float(row["rsd"]) if row["rsd"] else np.inf
-        shown = "" if rsd > 999 else f"{rsd:.0f} %" if rsd >= 10 else f"{rsd:.2g} %"
-        sigma = f"{float(row['sigma']):.2g}" if row["sigma"] else ""
-        words = row["expression"]
+        words = row.expression
         words = words if len(words) <= WORDS else f"{words[:WORDS].rsplit(' ', 2)[0]} …"
-        rows.append((row["name"], row["unit"], f"{float(row['value']):.4g}", sigma, shown, words))
+        sigma = "" if row.sigma is None else f"{row.sigma:.2g}"
+        rows.append((row.name, row.unit, f"{row.value:.4g}", sigma, relative_sigma(row.rsd), words))
     note = "R marks parameters into which others are regrouped; in full in 8-dynamics/estimate.csv."
     header = ("parameter", "unit", "value", "σ", "RSD", "what it holds")
     return Table("Identified parameters", header, rows, note, numbers=range(2, 5))

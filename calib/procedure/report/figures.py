@@ -1,16 +1,26 @@
-"""Which figures a geometric calibration gets, with captions; drawn from a `Report`."""
+"""Which figures a certificate gets, with captions: of the geometry from a `Report`, of the dynamics from its own."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
+from calib.folders import METRICS
+from calib.procedure.dynamic_stage.metrics import UnseenReport
+from calib.procedure.excitation import coefficients
+from calib.procedure.excitation.metrics import DesignMetrics
 from calib.procedure.kinematic_stage.metrics import LadderStep
-from calib.procedure.report import geometry_figures
+from calib.procedure.report import dynamics_figures, geometry_figures, motion_figures, uncertainty_figures
+from calib.procedure.report.dynamics_section import DynamicReport, percent, proof_of
 from calib.procedure.report.fit_report import Report, RowErrors
-from calib.procedure.report.page import Picture
-from calib.procedure.report.style import picture
+from calib.procedure.report.page import Picture, Pictures
+from calib.procedure.report.style import HALF, WIDE, picture
+from calib.records import read_record
+
+DRAWN = 300  # points per curve of the excitation
 
 
 def draw(report: Report) -> dict[str, Picture]:
@@ -70,3 +80,81 @@ def _over_workspace(report: Report, proof: RowErrors, label: str) -> dict[str, P
             geometry_figures.error_map(points, after), f"Remaining error over the workspace, {label}.", True
         ),
     }
+
+
+def draw_dynamics(found: DynamicReport, folder: Path, excitation: Path) -> dict[str, Pictures]:
+    """Return the figures of the dynamics by name, as a page shows them; those that the data do not give are empty.
+
+    Args:
+        folder: of the identification.
+        excitation: folder with ``training/trajectory.csv`` and its ``metrics.json``, if a motion was designed.
+    """
+    return {
+        "errors": Pictures("", _judged(found.unseen)),
+        "torques": Pictures("Torques", _torques(found.unseen)),
+        "excitation": Pictures("Excitation", _excitation(excitation)),
+        "geometry": Pictures("", list(uncertainty_figures.from_folder(folder).values())),
+        "parameters": Pictures("Dynamic parameters", [_significance(found)]),
+    }
+
+
+def _judged(unseen: UnseenReport) -> list[Picture]:
+    """Return errors by row and autocorrelations of the recording that judges."""
+    _, proof, where = proof_of(unseen)
+    own = next(iter(unseen.fit.values()))
+    sides = [[x or 0.0 for x in one.raw.relative_error_percent.joints] for one in (own, proof)]
+    name, white = next(iter(unseen.autocorrelation.items()))
+    many = len(unseen.rows) > dynamics_figures.FEW
+    width = WIDE if many else HALF
+    bars = dynamics_figures.errors_by_row(sides[0], sides[1], unseen.rows)
+    drawn = dynamics_figures.autocorrelations(white.values, white.bound, unseen.rows, "What is left", width)
+    shares = f"Share of each torque that the model leaves, on the training motion and on {where}."
+    rest = f"Autocorrelation of what is left below the band on {name}; dashed: white noise."
+    return [picture(bars, shares, many), picture(drawn, rest, many)]
+
+
+def _torques(unseen: UnseenReport) -> list[Picture]:
+    """Return measured and predicted torques of each unseen recording, or of those fitted."""
+    seen = "unseen" if unseen.validation else "fitted"
+    result = []
+    for curves in unseen.curves:
+        t, measured, predicted = (
+            np.array(each, dtype=float).T for each in (curves.t, curves.measured, curves.predicted)
+        )
+        raw = {**unseen.fit, **unseen.validation}[curves.name].raw.relative_error_percent
+        title = f"{curves.name}: {percent(raw.total)} of the torque unexplained"
+        figure = dynamics_figures.torques(t, measured, predicted, unseen.rows, unseen.units, title, raw.joints)
+        words = f"Torques on {curves.name}, {seen}: measured, predicted, and what is left."
+        result.append(picture(figure, words, True))
+    return result
+
+
+def _excitation(excitation: Path) -> list[Picture]:
+    """Return the designed motion, and how well it tells the parameters; nothing where none was designed."""
+    folder = excitation / "training"
+    if not (folder / coefficients.NAME).exists():
+        return []
+    motion = coefficients.read(folder)
+    t = np.linspace(0.0, motion.period, DRAWN)
+    q, v, _ = motion.orders(t)
+    made = read_record(DesignMetrics, json.loads((folder / METRICS).read_text(encoding="utf-8")))
+    margins = ", ".join(f"{name} {one.share:.1%} of its scale" for name, one in made.margins.items())
+    words = (
+        f"The training motion, one period of {made.setting.period:g} s: condition number "
+        f"{made.condition_number.raw:.3g} raw, {made.condition_number.normalised:.3g} with unit columns, of "
+        f"{len(made.setting.columns)} columns. Every limit was kept, at and between {made.setting.instants_verified} "
+        f"instants; smallest margins: {margins}."
+    )
+    names, none = motion.joint_names, np.full(q.shape[1], np.inf)
+    series = [(each, -none, none, title) for each, title in ((q, "position"), (v, "velocity"))]
+    figure = motion_figures.motion_sheet(t, series, ("rad", "rad/s"), names)
+    return [picture(figure, words, True)]
+
+
+def _significance(found: DynamicReport) -> Picture:
+    """Return the figure of parameters over their sigma."""
+    known = [row for row in found.estimate if row.sigma]
+    sigma = np.array([row.sigma or np.nan for row in known])
+    figure = dynamics_figures.significance([row.name for row in known], np.array([row.value for row in known]), sigma)
+    words = "How far each parameter is from zero, in its σ; grey, below the dashed line: not told from zero."
+    return picture(figure, words, True)

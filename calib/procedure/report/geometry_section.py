@@ -196,7 +196,8 @@ def outlier_sentences(metrics: FitMetrics) -> list[str]:
     count = len({(each.file, each.row) for each in metrics.outliers})
     worst = "; ".join(map(_outlier_words, metrics.outliers[:FEW]))
     more = "; ..." if len(metrics.outliers) > FEW else ""
-    how = "kept in the fit" if metrics.loss in ("", "none") else f"weighed down by the {metrics.loss} loss"
+    loss = metrics.findings.loss if metrics.findings else ""
+    how = "kept in the fit" if loss in ("", "none") else f"weighed down by the {loss} loss"
     return [f"{count} rows beyond 4 robust sigma, {how}: {worst}{more}"]
 
 

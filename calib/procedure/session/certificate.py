@@ -38,10 +38,15 @@ def certify(session: Session, say: Say) -> list[str]:
     if session.dynamic:
         dynamics = dynamics_section.read(session.identification.path)
         exported = read_state(session)["steps"].get("export", {}).get("notes", [])
-        folders = session.identification.path, session.path("6-excitation")
-        section = dynamics_section.dynamics_stage(dynamics, *folders, exported, session.plots)
+        drawn = {}
+        if session.plots:
+            from calib.procedure.report.figures import draw_dynamics
+
+            drawn = draw_dynamics(dynamics, session.identification.path, session.path("6-excitation"))
+        tolerance = session.settings.dynamics.tolerance_percent
+        section = dynamics_section.certificate_section(dynamics, drawn, exported, tolerance)
         judged.append(with_arrival(section, noticed(session, "7-recorded", "predict")))
-        notes.append(f"dynamics {dynamics.verdict}: {dynamics.reason}")
+        notes.append(f"dynamics {section.verdict}: {section.reason}")
     told = simulated(session)
     page = certificate.certificate(
         f"{'Simulated calibration' if told else 'Calibration'} of {session.settings.name}",

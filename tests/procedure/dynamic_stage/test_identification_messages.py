@@ -16,11 +16,9 @@ from calib.cli.shared import make_console
 from calib.config import check_keys
 from calib.dynamics.torque_rows import MOTOR
 from calib.errors import UsageError
-from calib.identification.loop.replay import CAD, FEEDBACK, FLOOR, IDENTIFIED, Replay
 from calib.identification.scores import TorqueErrors
-from calib.procedure.dynamic_stage import tracking
-from calib.procedure.dynamic_stage.tracking import Tracking
-from calib.procedure.report import identification_figures
+from calib.procedure.dynamic_stage.metrics import ReplayController, ReplayMetrics
+from calib.procedure.report import console, dynamics_section, identification_figures
 from calib.procedure.report.style import motion_units
 
 
@@ -42,10 +40,10 @@ def test_ctrl_c_says_what_the_same_command_will_do(monkeypatch, capsys, command,
 
 
 def test_names_in_brackets_reach_the_console():
-    still = {name: np.full(3, 1e-3) for name in (FEEDBACK, CAD, IDENTIFIED, FLOOR)}
-    one = Replay("log.npz", 1.0, None, True, (), np.zeros(3), still)
-    *_, last = tracking.tracking_lines(Tracking((one,), True), planted.arm())
-    assert "the controller of [loop];" in Text.from_markup(last).plain
+    rms = {key: (1e-3,) * 3 for key in ("feedback", "cad", "model", "floor")}
+    one = ReplayMetrics(rms, 30.0, True, ReplayController(True), (0.0,) * 3)
+    *_, last = console.rendered(dynamics_section.tracking_blocks({"log.npz": one}))
+    assert isinstance(last, str) and "the controller of [loop];" in Text.from_markup(last).plain
 
 
 def test_figures_have_units_at_their_axes():
