@@ -142,15 +142,12 @@ def _for_toml(found: Any) -> Any:
     for key, value in found.items():
         if key in ("properties", "$defs"):
             result[key] = {name: _for_toml(item) for name, item in value.items() if item.get("not") != {}}
-        elif key == "default" and value is not None:
+        elif key == "default" and value not in (None, [None]):  # None of a list: infinity, which JSON does not have
             result[key] = value
         elif key not in ("title", "default"):
             result[key] = _for_toml(value)
-    choices = [item for item in result.get("anyOf", ()) if item != {"type": "null"}]
-    if len(choices) == 1:
-        del result["anyOf"]
-        return {**choices[0], **result}
-    return result
+    choices = [item for item in result.pop("anyOf", ()) if item != {"type": "null"}]
+    return {**choices[0], **result} if len(choices) == 1 else {**({"anyOf": choices} if choices else {}), **result}
 
 
 def inherited(table: Mapping[str, Any], kind: type) -> dict[str, Any]:
@@ -507,6 +504,14 @@ class Spread:
 
 
 @dataclass(frozen=True)
+class Filled:
+    """A list of tables that is not empty."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        return {**handler(source), "min_length": 1}
+
+
+@dataclass(frozen=True)
 class Hidden:
     """A field that no file states: as a key it is unknown."""
 
@@ -560,6 +565,12 @@ def _label(value: Any) -> str:
     return value if isinstance(value, str) else f"{value:.12g}"
 
 
+def _numeric(value: Any) -> Any:
+    if isinstance(value, bool) or not isinstance(value, (str, int, float)):
+        raise ValueError(f"expected a number, or a text with a unit, found {shown(value)}")
+    return value
+
+
 def _filled(value: Any) -> Any:
     if not isinstance(value, str) or not value.strip():
         raise ValueError(f"expected a text, found {shown(value)}")
@@ -577,5 +588,5 @@ JointNumber = Annotated[int, Index()]
 Length = Annotated[float, Real(quantity="length")]
 Angle = Annotated[float, Real(quantity="angle")]
 Ratio = Annotated[float, Real(quantity="1")]
-Numeric = Annotated[Any, Checked(lambda value: value, {"type": ["number", "string"]})]
+Numeric = Annotated[Any, Checked(_numeric, {"type": ["number", "string"]})]
 """A number or a text with a unit that the caller reads by `number`: of what quantity it is, another key says."""

@@ -134,4 +134,4 @@ def plan(
 
 
 def _stands(start: str | None) -> tuple[float, ...] | None:
-    return None if start is None else tuple(numbers(start, start.count(",") + 1, "--start"))
+    return None if start is None else tuple(numbers(start, start.count(",") + 1, "--start", finite=False))

@@ -91,11 +91,17 @@ def formats(
             "session, limits, waypoints, excitation or recordings"
         ),
     ] = None,
+    schema: Annotated[
+        bool, typer.Option("--schema", help="the JSON schema of a TOML file, for editors that complete its keys")
+    ] = False,
 ) -> None:
     """Print what the files of this toolkit hold: columns, keys, units."""
     from calib.procedure import formats as documents
 
-    print(documents.describe(topic) if topic else "\n".join(documents.overview()))
+    if schema:
+        print(documents.json_schema(topic or ""), end="")
+    else:
+        print(documents.describe(topic) if topic else "\n".join(documents.overview()))
 
 
 @app.command("next")

@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,7 +18,7 @@ Robot = Annotated[str, typer.Argument(help="a .urdf, an MDH .toml, a library nam
 Base = Annotated[str | None, typer.Option(help="URDF: the link the arm starts at")]
 Tip = Annotated[str | None, typer.Option(help="URDF: the link the arm ends at")]
 Plots = Annotated[bool, typer.Option("--plots/--no-plots", help="draw figures, or leave them out")]
-Seed = Annotated[int, typer.Option(help="reproduces everything random")]
+Seed = Annotated[int, typer.Option(min=0, help="reproduces everything random")]
 
 
 def make_console(**options: Any) -> Any:
@@ -55,13 +56,13 @@ def told() -> Iterator[tuple[Any, Any, Any]]:
         yield console, say, lambda words: status.update(escape(words))
 
 
-def numbers(text: str, count: int, option: str) -> list[float]:
+def numbers(text: str, count: int, option: str, finite: bool = True) -> list[float]:
     from calib.errors import UsageError
 
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
         values = []
-    if len(values) != count:
-        raise UsageError(f"{option} {text}: expected {count} numbers with commas between them")
+    if len(values) != count or (finite and not all(map(isfinite, values))):
+        raise UsageError(f"{option} {text}: expected {count} finite numbers with commas between them")
     return values

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from importlib import import_module
 
+from calib.config import schema
 from calib.errors import UsageError
 
 TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
@@ -60,6 +62,15 @@ TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     ),
 }
 
+SCHEMAS: Mapping[str, tuple[str, str]] = {
+    "options": ("calib.data.poses.fit_options", "FitOptions"),
+    "identify-options": ("calib.identification.identify_options", "OptionsFile"),
+    "constraints": ("calib.procedure.kinematic_stage.pose_limits", "ConstraintsFile"),
+    "limits": ("calib.procedure.excitation.limits", "LimitsFile"),
+    "session": ("calib.procedure.session.settings", "SessionSettings"),
+}
+"""Topic → module and dataclass of the TOML files that people write."""
+
 
 def overview() -> list[str]:
     """Return one line per topic."""
@@ -80,6 +91,19 @@ def describe(topic: str) -> str:
 
         parts.append(f"session.toml, as calib new writes it:\n\n{example()}")
     return "\n\n".join(part.strip() for part in parts) + "\n"
+
+
+def json_schema(topic: str) -> str:
+    """Return the JSON schema (draft 2020-12) of a TOML file, as editors take it to complete keys and check values.
+
+    Raises:
+        UsageError: for a topic without one, with those that have one.
+    """
+    if topic not in SCHEMAS:
+        raise UsageError(f"no JSON schema of '{topic}'; there are those of {', '.join(SCHEMAS)}")
+    module, name = SCHEMAS[topic]
+    title = f"{TOPICS[topic][0]} (armature-calib)"
+    return json.dumps(schema(getattr(import_module(module), name), title), indent=2, ensure_ascii=False) + "\n"
 
 
 def _plain(text: str) -> str:

@@ -18,19 +18,45 @@ With ``family = "bspline"`` a joint has ``points``, control points of a periodic
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
+from calib.config import Expect, Filled, Name, OneOf, Positive, Real, Whole, parse, read_toml
 from calib.errors import UsageError
 from trajectories.bspline import bspline_family
 from trajectories.errors import BadInput
 from trajectories.fourier import evaluate
 
 NAME = "trajectory.toml"
+
+
+Numbers = Annotated[tuple[float, ...], Expect("a list of finite numbers")]
+
+
+@dataclass(frozen=True)
+class JointTable:
+    """[[joint]], see the module."""
+
+    name: Name
+    q0: Annotated[float, Real()] | None = None
+    a: Numbers | None = None
+    b: Numbers | None = None
+    points: Numbers | None = None
+
+
+@dataclass(frozen=True)
+class TrajectoryFile:
+    """The file; keys that are none of these are left to who wrote them."""
+
+    family: Annotated[str, OneOf(("fourier", "bspline"))]
+    period: Positive
+    rate: Positive
+    joint: Annotated[tuple[JointTable, ...], Filled()]
+    repeat: Annotated[int, Whole(1)] = 1
+    degree: Annotated[int, Whole(1, 20)] = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,23 +111,25 @@ def read(folder: Path) -> Periodic:
         UsageError: where there is none, or it is damaged.
     """
     path = folder / NAME
+    if not path.is_file():
+        raise UsageError(f"{folder} holds no {NAME}: give the folder that calib excite wrote")
+    table = parse(TrajectoryFile, read_toml(path), str(path))
+    coefficients = []
+    for number, joint in enumerate(table.joint, 1):
+        place = f"{path}: [[joint]] number {number}"
+        stated = (joint.points,) if table.family == "bspline" else ((joint.q0,), joint.a, joint.b)
+        own = [part for part in stated if part is not None and None not in part]
+        if len(own) < len(stated):
+            raise UsageError(f"{place}: family {table.family} needs {'points' if len(stated) == 1 else 'q0, a and b'}")
+        if len(own) == 3 and not len(own[1]) == len(own[2]) == len(table.joint[0].a or ()):
+            raise UsageError(f"{place}: a and b have to be as many as joint 1's a, {len(table.joint[0].a or ())}")
+        coefficients.append(np.concatenate([np.array(part, dtype=float) for part in own]))
+    found = Periodic(
+        tuple(joint.name for joint in table.joint), table.period, table.rate, table.repeat, table.family,
+        tuple(coefficients), table.degree,
+    )  # fmt: skip
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-        kind = str(table["family"])
-        keys = {"fourier": ("q0", "a", "b"), "bspline": ("points",)}[kind]
-        coefficients = tuple(
-            np.concatenate([np.atleast_1d(np.asarray(joint[key], dtype=float)) for key in keys])
-            for joint in table["joint"]
-        )
-        found = Periodic(
-            tuple(str(joint["name"]) for joint in table["joint"]), float(table["period"]), float(table["rate"]),
-            int(table.get("repeat", 1)), kind, coefficients, int(table.get("degree", 5)),
-        )  # fmt: skip
-        if not all(np.isfinite(c).all() for c in coefficients):
-            raise ValueError("a coefficient is not finite")
         found.orders(np.zeros(1))
-    except (FileNotFoundError, NotADirectoryError):
-        raise UsageError(f"{folder} holds no {NAME}: give the folder that calib excite wrote") from None
-    except (OSError, KeyError, TypeError, ValueError, BadInput) as error:
-        raise UsageError(f"{path} is damaged ({error!r}): was it edited?") from error
+    except (ValueError, IndexError, BadInput) as error:
+        raise UsageError(f"{path} is damaged ({error}): was it edited?") from error
     return found

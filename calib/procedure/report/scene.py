@@ -7,15 +7,15 @@ All points are in the base of the arm that is drawn.
 from __future__ import annotations
 
 import csv
-import tomllib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
+from calib.config import read_toml
 from calib.data.csv_table import read_table
 from calib.data.poses.plans import read_poses
-from calib.errors import UsageError
+from calib.errors import CalibError, UsageError
 from calib.geometry.installation import Installation, see
 from calib.procedure.excitation import coefficients
 from calib.procedure.kinematic_stage import robot_file
@@ -149,8 +149,8 @@ def _arm(folder: Path, robot: str | None) -> tuple[Chain | None, Path | None]:
     for place in sorted(folder.glob("1-robot/robot.*")):
         return load(str(place)), place
     try:
-        name = tomllib.loads((folder / coefficients.NAME).read_text(encoding="utf-8")).get("robot", "")
-    except (OSError, ValueError):
+        name = read_toml(folder / coefficients.NAME).get("robot", "")
+    except CalibError:
         return None, None
     return (load(name), None) if name in library.names() else (None, None)
 

@@ -34,7 +34,7 @@ from pathlib import Path
 from typing import Any
 
 from calib import files
-from calib.config import parse
+from calib.config import Text, parse
 from calib.errors import CalibError, SessionError
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
@@ -44,6 +44,23 @@ FOLDERS = ("1-robot", "2-poses", "3-measured", "4-fit", "5-validation")
 DYNAMIC = ("6-excitation", "7-recorded", "8-dynamics")
 EXPORT = {False: "6-export", True: "9-export"}  # without, with dynamics
 MARK = "simulated.txt"
+
+
+@dataclass(frozen=True)
+class StepRecord:
+    """What ``state.json`` has to say of a step; it says more, which is for people."""
+
+    finished: Text
+    inputs: Mapping[str, Text]
+    outputs: Mapping[str, Text]
+
+
+@dataclass(frozen=True)
+class StateFile:
+    """``state.json``: the steps that were made, and the one that runs."""
+
+    steps: Mapping[str, StepRecord]
+    running: Text = ""
 
 
 @dataclass(frozen=True)
@@ -159,13 +176,16 @@ def read_state(session: Session) -> dict[str, Any]:
     path = session.path("state.json")
     if not path.exists():
         return {"schema": SCHEMA, "steps": {}}
+    advice = "delete it, and calib next makes the steps again"
     try:
         state = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(state["steps"], dict):
-            raise TypeError("steps")
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise SessionError(f"{path} is damaged ({error}); delete it, and calib next makes the steps again") from error
-    check_schema(path, state.get("schema"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise SessionError(f"{path} is damaged ({error}); {advice}") from error
+    check_schema(path, state.get("schema") if isinstance(state, dict) else None)
+    try:
+        parse(StateFile, state, "what it records", SessionError)
+    except SessionError as error:
+        raise SessionError(f"{path} is damaged ({error}); {advice}") from None
     return state
 
 

@@ -1,0 +1,260 @@
+"""Option files of every kind: whatever they hold, they are read or refused in one form, never with a traceback."""
+
+from __future__ import annotations
+
+import copy
+import datetime
+import json
+import math
+import re
+import tomllib
+from collections.abc import Callable, Iterator
+from dataclasses import fields
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from jsonschema import Draft202012Validator
+
+from calib.cli import run
+from calib.config import located, number, parse, read_toml, schema, shown
+from calib.data.poses import fit_options
+from calib.errors import CalibError, UsageError
+from calib.identification import identify_options
+from calib.procedure.excitation import limits
+from calib.procedure.excitation.coefficients import TrajectoryFile
+from calib.procedure.formats import SCHEMAS
+from calib.procedure.kinematic_stage import pose_limits
+from calib.procedure.session.folder import StateFile
+from calib.procedure.session.settings import SessionSettings, example
+
+FEW = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+
+
+def documented(module: Any) -> dict[str, Any]:
+    """Return the file that a module's docstring shows."""
+    text = "\n".join(line[4:] for line in module.__doc__.splitlines() if line.startswith("    "))
+    return tomllib.loads(text)
+
+
+LIMITS = documented(limits) | {"target": {"height": [0.2, 1.5], "facing": [0, 0, 1]}}
+LIMITS["friction"] = {key: value[:6] for key, value in LIMITS["friction"].items()}
+TRAJECTORY = {
+    "robot": "ur5", "family": "fourier", "period": 20.0, "rate": 1000.0, "repeat": 5,
+    "joint": [{"name": "a", "q0": 0.1, "a": [0.1], "b": [0.2]}],
+}  # fmt: skip
+STEP = {"finished": "2026-01-01T00:00:00", "inputs": {"a.csv": "12"}, "outputs": {"b.csv": "34"}, "notes": []}
+FILES: dict[str, tuple[dict[str, Any], Callable[[dict[str, Any]], object]]] = {
+    "options": (documented(fit_options), fit_options.parse_options),
+    "identify-options": (documented(identify_options), identify_options.parse_options),
+    "constraints": (documented(pose_limits), lambda table: parse(pose_limits.ConstraintsFile, table, "c.toml")),
+    "limits": (LIMITS, lambda table: parse(limits.LimitsFile, table, "l.toml")),
+    "session": (
+        tomllib.loads(example().replace('file = ""', 'file = "robot.urdf"')),
+        lambda table: parse(SessionSettings, table, "session.toml"),
+    ),
+    "trajectory": (TRAJECTORY, lambda table: parse(TrajectoryFile, table, "trajectory.toml")),
+    "state": ({"schema": 2, "steps": {"fit": STEP}}, lambda table: parse(StateFile, table, "state.json")),
+}
+LEAVES = st.one_of(
+    st.none().map(lambda _: datetime.date(1979, 5, 27)), st.just(datetime.time(7, 32)), st.booleans(),
+    st.integers(), st.sampled_from([10**400, -(10**30), 0, -1]), st.floats(), st.text(max_size=20),
+    st.sampled_from(["1/0", "pi*" * 5000 + "1", "(" * 300, "90 deg", "1e999", "()", "9" * 5000, "\0", "1 m", "inf"]),
+)  # fmt: skip
+VALUES = st.recursive(
+    LEAVES, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=3)
+)
+
+
+def places(table: Any, above: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Yield the place of every value in a table, and of a key beside each."""
+    for key, value in table.items() if isinstance(table, dict) else enumerate(table):
+        yield (*above, key)
+        if isinstance(value, (dict, list)):
+            yield from places(value, (*above, key))
+    if isinstance(table, dict):
+        yield (*above, "kind of nothing")
+
+
+@pytest.mark.parametrize("kind", FILES)
+@FEW
+@given(data=st.data())
+def test_a_wrong_value_anywhere_is_a_complaint_of_one_line(kind: str, data: st.DataObject) -> None:
+    """What is read, its JSON schema accepts, too: an editor shows no error where there is none."""
+    base, read = FILES[kind]
+    table = copy.deepcopy(base)
+    *way, key = data.draw(st.sampled_from(list(places(base))))
+    place = table
+    for part in way:
+        place = place[part]
+    place[key] = data.draw(VALUES)
+    try:
+        read(table)
+    except UsageError as error:
+        assert len(str(error)) < 2500 and "pydantic" not in str(error)
+        return
+    if kind in SCHEMAS and not_finite(table):
+        assert not list(validator(kind).iter_errors(table))
+
+
+def not_finite(value: Any) -> bool:
+    """Return whether JSON knows the value."""
+    inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return all(map(not_finite, inner)) and not (isinstance(value, float) and not math.isfinite(value))
+
+
+def validator(kind: str) -> Draft202012Validator:
+    module, name = SCHEMAS[kind]
+    return Draft202012Validator(schema(getattr(import_module(module), name), kind))
+
+
+@pytest.mark.parametrize("kind", SCHEMAS)
+def test_the_json_schema_knows_every_key_and_refuses_others(kind: str, capsys: pytest.CaptureFixture) -> None:
+    assert run(["formats", kind, "--schema"]) == 0
+    found = json.loads(capsys.readouterr().out, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
+    assert found["$schema"] == "https://json-schema.org/draft/2020-12/schema"
+    Draft202012Validator.check_schema(found)
+    assert '"null"' not in json.dumps(found), "TOML has none"
+    base = FILES[kind][0]
+    module, name = SCHEMAS[kind]
+    assert set(found["properties"]) == {f.name for f in fields(getattr(import_module(module), name))} - {"source"}
+    ours = Draft202012Validator(found)
+    assert not list(ours.iter_errors({key: value for key, value in base.items() if key not in ("slow",)}))
+    for key in base:
+        assert list(ours.iter_errors(base | {key: datetime.date(1979, 5, 27)})), key
+        assert list(ours.iter_errors(base | {f"{key}z": base[key]})), key
+
+
+def test_a_topic_without_schema_says_which_have_one(capsys: pytest.CaptureFixture) -> None:
+    assert run(["formats", "mdh", "--schema"]) == 2
+    assert "there are those of options, identify-options" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"a = 1" + b"0" * 400, "a: a whole number of more than 64 bits"),
+        (b"a = 1" + b"0" * 5000, "a whole number of thousands of digits"),
+        (b"a = " + b"[" * 5000 + b"]" * 5000, "is nested too deeply"),
+        (b"a = " + b"{b=" * 5000 + b"1" + b"}" * 5000, "is nested too deeply"),
+        (b"a." * 5000 + b"a = 1", "is nested too deeply"),
+        (b"a = " + b"[" * 40 + b"]" * 40, "is nested too deeply: more than 32 levels"),
+        (b"a = 1\nb = \n", "is no TOML.*line 2"),
+        (b"a = '\xff'", "is no TOML"),
+        (b"# " + b"x" * 8_000_000, "is larger than 8 MB"),
+        (b"a = 2021-13-40", "is no TOML"),
+    ],
+)
+def test_hostile_files_get_a_message(tmp_path: Path, content: bytes, words: str) -> None:
+    path = tmp_path / "a.toml"
+    path.write_bytes(content)
+    with pytest.raises(UsageError, match=rf"a\.toml: .*{words}"):
+        read_toml(path)
+
+
+def test_what_is_no_file(tmp_path: Path) -> None:
+    (tmp_path / "loop.toml").symlink_to(tmp_path / "loop.toml")
+    for name in ("absent.toml", ".", "loop.toml", "x" * 300, "a\0b"):
+        with pytest.raises(UsageError):
+            read_toml(f"{tmp_path}/{name}")
+    (tmp_path / "mark.toml").write_bytes(b"\xef\xbb\xbfa = 1\r\n")
+    assert read_toml(tmp_path / "mark.toml") == {"a": 1}
+
+
+def test_places_are_named_as_toml_names_them() -> None:
+    assert located(("sigma", "position")) == "sigma.position"
+    assert located(("files", "day 2.csv", "kind")) == 'files."day 2.csv".kind'
+    assert located(("obstacle", 1, "size")) == "[[obstacle]] number 2, size"
+    assert located(("obstacle", 0)) == "[[obstacle]] number 1"
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"obstacle": 5}, r"expected a list of tables, \[\[obstacle\]\], found 5"),
+        ({"obstacle": [{"kind": "box"}]}, r"\[\[obstacle\]\] number 1: there is no 'size'; needed are kind, size"),
+        ({"obstacle": [{"kind": "bax", "size": [1]}]}, r"\[\[obstacle\]\] number 1, kind: expected one of.*mean 'box'"),
+        ({"obstacle": [{"kind": "box", "size": [-1, 1, 1]}]}, "number 1, size: expected lengths above 0"),
+        ({"target": {"reach": -1}}, "target.reach: expected a number above 0, found -1"),
+        ({"target": {"facing": [0, 0, 0]}}, r"target: facing: \[0, 0, 0\] is no direction"),
+        ({"target": {"height": [1, 0]}}, "target: height: 1 is not below 0"),
+        ({"target": {"height": "1 rad"}}, "target.height: cannot read '1 rad' as a number .here .*: m, mm, um, cm, in"),
+        ({"instrument": {"xyz": [0, 0, 1], "sight": "-10 deg"}}, "instrument.sight: expected a number above 0"),
+        ({"instrument": {"sight": "40 deg"}}, "instrument: sight needs the place of the instrument, xyz"),
+        ({"collision": {"margin": -1}}, "collision.margin: expected 0 or more, found -1"),
+        ({"joints": {"q1": [1, 2, 3]}}, "joints.q1: expected a list of 2 numbers, lower and upper"),
+    ],
+)
+def test_constraints_that_cannot_be(table: dict[str, Any], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        parse(pose_limits.ConstraintsFile, table, "c.toml")
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"gains": [10, 1111111111111111111111111]}, None),
+        ({"gains": [10, 0]}, "gains: expected finite numbers, none of them zero"),
+        ({"filter": {"order": 2.0}}, "filter.order: expected a whole number from 1 to 12, found 2.0"),
+        (
+            {"recording": {"names": {"torqe": "x"}}},
+            "names: 'torqe' is none of our names .did you mean 'torque'",
+        ),
+        ({"recording": {"rows": "both"}}, "recording: there is no key 'rows'"),
+        (
+            {"term": [{"name": "x", "shape": "sine"}]},
+            r"\[\[term\]\] number 1: there is no 'joint'; needed are name",
+        ),
+        ({"term": {"name": "x"}}, r"expected a list of tables, \[\[term\]\]"),
+        ({"coupling": [{"joints": [1, 0]}]}, r"number 1, joints: expected two numbers of joints, counted from 1"),
+        ({"slow": [0.1, -1]}, "slow: expected a number above 0, found -1"),
+        ({"files": {"run": {"npz": {"gains": [1.0]}}}}, r'the dot needs quotes: \[files."run.npz"\]'),
+        ({"files": {"a.npz": {"payload": ["tool"]}}}, 'files."a.npz".payload: there is no key .tool.; there are none'),
+        ({"payload": 3}, "payload: expected a table, found 3"),
+        ({"gain_identification": {"loaded": "a"}}, "there is no 'unloaded'; needed are unloaded, loaded"),
+    ],
+)
+def test_identify_options_that_cannot_be(table: dict[str, Any], words: str | None) -> None:
+    if words is None:
+        assert identify_options.parse_options(table).every.gains == (10.0, 1111111111111111111111111.0)
+        return
+    with pytest.raises(UsageError, match=words):
+        identify_options.parse_options(table)
+
+
+def test_what_holds_for_every_recording_is_handed_down_to_one() -> None:
+    table = {"filter": {"band": 5.0, "order": 2}, "gains": [1.0], "files": {"a.npz": {"filter": {"band": 7.0}}}}
+    found = identify_options.parse_options(table)
+    own = found.for_file("x/a.npz")
+    assert (own.filter.band, own.filter.order, own.gains, own.payload) == (7.0, 2, (1.0,), ())
+    assert found.for_file("b.npz").filter.band == 5.0
+
+
+@FEW
+@given(st.text(max_size=40) | st.text("0123456789.+-*/() pie degmm", max_size=60))
+def test_an_expression_is_a_number_or_a_complaint(text: str) -> None:
+    try:
+        assert not math.isnan(number(text, "x", "angle"))
+    except CalibError as error:
+        assert str(error).startswith("x: ")
+
+
+@given(st.integers() | st.floats() | st.text() | st.lists(st.integers()) | st.dates())
+def test_a_value_is_shown_in_about_a_line(value: Any) -> None:
+    assert len(shown(value)) < 400 and "\n" not in shown(value)
+
+
+def test_nothing_but_a_file_loads_pydantic() -> None:
+    import subprocess
+    import sys
+
+    code = (
+        "import sys, calib.cli, calib.data.poses.fit_options as f, calib.identification.identify_options as i\n"
+        "f.read_options(), i.read_options(); print('pydantic' in sys.modules); f.parse_options({})\n"
+        "print('pydantic' in sys.modules)"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert re.split(r"\s+", said.strip()) == ["False", "True"]
