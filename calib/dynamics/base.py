@@ -12,14 +12,14 @@ Columns are chosen on the nominal chain; `regroup` recomputes K on the calibrate
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calib.arrays import frozen, shaped
-from calib.dynamics.bodies import FIXED, PRISMATIC
 from calib.dynamics.idim import IdentificationModel, friction_states
+from calib.dynamics.regressor_model import Loads, RegressorModel, States
 from calib.errors import CalibError
 from calib.estimation.base_columns import ColumnSplit, split_columns
 from calib.estimation.triangles import retriangulate
@@ -27,9 +27,6 @@ from calib.estimation.triangles import retriangulate
 SAMPLES = 500
 BLOCK = 2048  # samples per factorisation: bounds the memory, and keeps it in the processor's cache
 NEGLIGIBLE = 1e-11  # coefficients below this part of the largest of their column are rounding
-KEPT_LAST = {"revolute": (3, 8, 9), "prismatic": (0, 1, 2, 3, 4, 5)}  # YY MZ M; XX to ZZ, in frames with axis z
-
-Loads = Sequence[Collection[str] | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,41 +129,19 @@ class BaseModel:
         return self.model.regressor_gradient(q, v, a, full)
 
 
-@dataclass(frozen=True, eq=False)
-class States:
-    """States over which columns are compared, random or recorded.
-
-    Attributes:
-        q, v, a: (N, n) [rad or m, and per s, per s²].
-        load: (N, n) transmitted torques, where a friction term depends on them.
-        states: (s, N) of `idim.friction_states`, where a friction term remembers.
-    """
-
-    q: np.ndarray
-    v: np.ndarray
-    a: np.ndarray
-    load: np.ndarray | None = None
-    states: np.ndarray | None = None
-
-
 def random_samples(
-    model: IdentificationModel,
+    model: RegressorModel,
     count: int = SAMPLES,
     seed: int | np.random.Generator = 0,
     lower: np.ndarray | None = None,
     upper: np.ndarray | None = None,
 ) -> States:
-    """Draw states: q uniform within its limits (default ±π), v and a uniform within ±3 per s and ±3 per s²."""
-    rng, n = np.random.default_rng(seed), model.n
-    low = np.full(n, -np.pi) if lower is None else lower
-    q = rng.uniform(low, np.full(n, np.pi) if upper is None else upper, (count, n))
-    v, a, load = rng.uniform(-3.0, 3.0, (3, count, n))
-    remembering = sum(len(one.acts) for one in model.columns if one.form.remembers)
-    return States(q, v, a, load, rng.uniform(-1.0, 1.0, (remembering, count)))
+    """Draw `count` states of a model, within limits (n,) of its coordinates; see its `sample`."""
+    return model.sample(count, np.random.default_rng(seed), lower, upper)
 
 
 def find(
-    model: IdentificationModel, samples: States | None = None, loads: Loads | None = None, tolerance: float = 1e-6
+    model: RegressorModel, samples: States | None = None, loads: Loads | None = None, tolerance: float = 1e-6
 ) -> Base:
     """Choose the base columns of a model.
 
@@ -178,13 +153,13 @@ def find(
         tolerance: a column counts where, at unit norm, more than this of it is independent of the columns before.
     """
     samples = random_samples(model) if samples is None else samples
-    cases = _load_cases(model, loads)
+    cases = model.load_cases() if loads is None else loads
     factor = r_factor(model, samples, cases)
-    split = _clean(split_columns(factor, [np.array([k]) for k in preference(model)], tolerance))
+    split = _clean(split_columns(factor, [np.array([k]) for k in model.preference()], tolerance))
     return _describe(model, split, factor, len(cases) * len(samples.q))
 
 
-def regroup(base: Base, model: IdentificationModel, samples: States | None = None, loads: Loads | None = None) -> Base:
+def regroup(base: Base, model: RegressorModel, samples: States | None = None, loads: Loads | None = None) -> Base:
     """Recompute K on another geometry (the calibrated chain), the columns kept: W_dropped ≈ W_kept K, least squares.
 
     The remainder says how well that holds over the samples. Columns without effect on the nominal chain (on the
@@ -192,7 +167,7 @@ def regroup(base: Base, model: IdentificationModel, samples: States | None = Non
     """
     _require_same(base, model)
     samples = random_samples(model) if samples is None else samples
-    cases = _load_cases(model, loads)
+    cases = model.load_cases() if loads is None else loads
     factor = r_factor(model, samples, cases)
     kept, dropped = base.split.kept, base.split.dropped
     silent, scale = _norms(factor)
@@ -207,24 +182,7 @@ def regroup(base: Base, model: IdentificationModel, samples: States | None = Non
     return _describe(model, _clean(split), factor, len(cases) * len(samples.q))
 
 
-def preference(model: IdentificationModel) -> np.ndarray:
-    """Return all columns in the order they are tried: of moving links what Khalil keeps, drives, the rest, payloads."""
-    bodies = model.bodies
-    first: list[int] = []
-    late: list[int] = []
-    fixed: list[int] = []
-    for i in range(model.inertial // 10):
-        if bodies.kinds[i] == FIXED:
-            fixed += range(10 * i, 10 * i + 10)
-            continue
-        last = KEPT_LAST["prismatic" if bodies.kinds[i] == PRISMATIC else "revolute"]
-        for c in range(10):
-            (late if c in last else first).append(10 * i + int(bodies.order[i, c]))
-    inertial = len(first) + len(late) + len(fixed)
-    return np.array([*first, *range(inertial, model.p), *late, *fixed], dtype=int)
-
-
-def r_factor(model: IdentificationModel, samples: States, loads: Loads = (None,)) -> np.ndarray:
+def r_factor(model: RegressorModel, samples: States, loads: Loads = (None,)) -> np.ndarray:
     """Return the R factor (p, p) of the observation matrix over samples and load cases, block by block.
 
     One triangle per torque row is updated with the columns that row can see at all (a joint does not feel the links
@@ -275,13 +233,6 @@ def to_standard(base: Base, values: np.ndarray) -> np.ndarray:
     return result
 
 
-def _load_cases(model: IdentificationModel, loads: Loads | None) -> Loads:
-    """Return the load cases: all payloads and none, where the model has payloads."""
-    if loads is not None:
-        return loads
-    return (None, ()) if model.inertial and np.any(model.bodies.kinds == FIXED) else (None,)
-
-
 def _updated(triangle: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Return the R factor of [triangle; columnsᵀ] (p, p); columns (p, N)."""
     live = np.flatnonzero(columns.any(axis=1) | triangle.any(axis=0))
@@ -310,7 +261,7 @@ def _norms(factor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return silent, np.where(silent, 1.0, norms)
 
 
-def _describe(model: IdentificationModel, split: ColumnSplit, factor: np.ndarray, samples: int) -> Base:
+def _describe(model: RegressorModel, split: ColumnSplit, factor: np.ndarray, samples: int) -> Base:
     """Return the base with ‖W_d - W_k K‖ per dropped column, relative and as rms torque."""
     silent, scale = _norms(factor)
     rest = np.linalg.norm(factor[:, split.dropped] - factor[:, split.kept] @ split.coefficients, axis=0)
@@ -321,6 +272,6 @@ def _describe(model: IdentificationModel, split: ColumnSplit, factor: np.ndarray
     )
 
 
-def _require_same(base: Base, model: IdentificationModel) -> None:
+def _require_same(base: Base, model: RegressorModel) -> None:
     if (base.rows, base.standard) != (model.torque_rows.name, model.names):
         raise CalibError("the base parameters belong to another model: its rows or its parameters' names differ")

@@ -15,12 +15,15 @@ import numpy as np
 
 from calib.arrays import shaped
 from calib.dynamics import drives, rigid_body
-from calib.dynamics.bodies import Bodies, bodies_of, with_payload
+from calib.dynamics.bodies import FIXED, PRISMATIC, Bodies, bodies_of, with_payload
 from calib.dynamics.drives import DriveTerm
+from calib.dynamics.regressor_model import Loads, RegressorModel, States
 from calib.dynamics.shapes import V0
 from calib.dynamics.torque_rows import BODIES, MOTOR, TorqueRows
 from calib.errors import CalibError
 from calib.robot.chain import Chain
+
+KEPT_LAST = {"revolute": (3, 8, 9), "prismatic": (0, 1, 2, 3, 4, 5)}  # YY MZ M; XX to ZZ, in frames with axis z
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +52,12 @@ class IdentificationModel:
     @property
     def n(self) -> int:
         return self.bodies.n
+
+    @property
+    def prismatic(self) -> np.ndarray:
+        """(n,) bool by coordinate."""
+        moved = {int(c): int(kind) for c, kind in zip(self.bodies.coordinates[::-1], self.bodies.kinds[::-1])}
+        return np.array([moved.get(j) == PRISMATIC for j in range(self.n)], dtype=bool)
 
     @property
     def inertial(self) -> int:
@@ -142,6 +151,76 @@ class IdentificationModel:
             entries[0, [row for row, _ in one.acts], self.inertial + k] = 1.0
         return self.torque_rows.observe(entries, self.sides, *state[:2])[0].T != 0.0
 
+    def torque(
+        self,
+        values: np.ndarray,
+        q: np.ndarray,
+        v: np.ndarray,
+        a: np.ndarray,
+        carried: Collection[str] | None = None,
+        states: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Return the torques (N, rows) of parameters (p,), by recursive Newton-Euler and without the regressor.
+
+        Friction that depends on the load feels the torque that the bodies need by the model.
+        """
+        load = self.transmitted(values, q, v, a, carried) if self.inertial else None
+        states = drives.friction_states(self.columns, np.ascontiguousarray(q.T)) if states is None else states
+        parts, state = {BODIES: np.zeros(np.shape(q)) if load is None else load}, 0
+        motions = [q.T, v.T, a.T, None if load is None else load.T]
+        for one, value in zip(self.columns, values[self.inertial :]):
+            own, used = parts.setdefault(one.side, np.zeros(np.shape(q))), len(one.acts) if one.form.remembers else 0
+            for row, column in drives.acting(one, motions, states[state : state + used]):
+                own[:, row] += value * column
+            state += used
+        result = np.zeros((len(q), self.rows))
+        for side, own in parts.items():
+            result += self.torque_rows.observe(own[:, :, None], (side,), q, v)[:, :, 0]
+        return result
+
+    def transmitted(
+        self, values: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray, carried: Collection[str] | None = None
+    ) -> np.ndarray:
+        """Return the torques (N, n) that the gears pass on to the bodies: what load-dependent friction feels."""
+        present = np.ones(self.inertial) if carried is None else self.carried_columns(carried)
+        bodies = np.array(values[: self.inertial]) * present
+        return rigid_body.inverse_dynamics(self.bodies, bodies, q, v, a)
+
+    def carried_columns(self, carried: Collection[str]) -> np.ndarray:
+        """Return (10 B,) one for parameters of bodies that are there, zero for those of payloads that are not."""
+        kinds = zip(self.bodies.labels, self.bodies.kinds)
+        present = [kind != FIXED or label in carried for label, kind in kinds]
+        return np.repeat(np.array(present, dtype=float), 10)
+
+    def preference(self) -> np.ndarray:
+        """Return the columns in the order they are tried: of moving links what Khalil keeps, drives, rest, payloads."""
+        bodies = self.bodies
+        first: list[int] = []
+        late: list[int] = []
+        fixed: list[int] = []
+        for i in range(self.inertial // 10):
+            if bodies.kinds[i] == FIXED:
+                fixed += range(10 * i, 10 * i + 10)
+                continue
+            last = KEPT_LAST["prismatic" if bodies.kinds[i] == PRISMATIC else "revolute"]
+            for c in range(10):
+                (late if c in last else first).append(10 * i + int(bodies.order[i, c]))
+        return np.array([*first, *range(self.inertial, self.p), *late, *fixed], dtype=int)
+
+    def load_cases(self) -> Loads:
+        """Return all payloads and none, where the model has payloads."""
+        return (None, ()) if self.inertial and np.any(self.bodies.kinds == FIXED) else (None,)
+
+    def sample(
+        self, count: int, rng: np.random.Generator, lower: np.ndarray | None = None, upper: np.ndarray | None = None
+    ) -> States:
+        """Draw states: q uniform within its limits (default ±π), v and a uniform within ±3 per s and ±3 per s²."""
+        low = np.full(self.n, -np.pi) if lower is None else lower
+        q = rng.uniform(low, np.full(self.n, np.pi) if upper is None else upper, (count, self.n))
+        v, a, load = rng.uniform(-3.0, 3.0, (3, count, self.n))
+        remembering = sum(len(one.acts) for one in self.columns if one.form.remembers)
+        return States(q, v, a, load, rng.uniform(-1.0, 1.0, (remembering, count)))
+
     def _drop_absent(self, out: np.ndarray, carried: Collection[str] | None) -> None:
         """Zero the columns of fixed bodies that are not carried."""
         if carried is None:
@@ -177,9 +256,9 @@ def from_chain(
     return IdentificationModel(bodies, drives.standard(each, v0, linear), rows)
 
 
-def friction_states(model: IdentificationModel, q: np.ndarray) -> np.ndarray:
+def friction_states(model: RegressorModel, q: np.ndarray) -> np.ndarray:
     """Return the states (s, N) of friction with memory along one uninterrupted record q (N, n), to slice in blocks."""
-    return drives.friction_states(model.columns, np.ascontiguousarray(shaped(q, (None, model.bodies.n), "q").T))
+    return drives.friction_states(model.columns, np.ascontiguousarray(shaped(q, (None, model.n), "q").T))
 
 
 def with_terms(model: IdentificationModel, *terms: DriveTerm) -> IdentificationModel:

@@ -38,7 +38,6 @@ from calib.dynamics.bodies import Bodies
 from calib.dynamics.torque_rows import BODIES
 from calib.identification.cases import Case
 from calib.identification.identify import Identification, common_decimator
-from calib.identification.prediction import carried_columns
 from calib.identification.reweighted import cut, estimator, inverted, stacked, weights
 from calib.identification.rows import ObservationRows, segments
 from calib.identification.settings import make_model
@@ -229,7 +228,7 @@ def _differences(
     """
     model, motion, b = found.dynamics.model, case.motion, found.base.b
     bodies = model.inertial
-    onboard = carried_columns(model, case.carried)
+    onboard = model.carried_columns(case.carried)
     parameters = bases.to_standard(found.base, found.fitted.estimate.values[:b])[:bodies] * onboard
     q, v, a = (np.asarray(x[span]) for x in (motion.q, motion.v, motion.a))
     felt = model.torque_rows.fold(spread(residual, decimator, len(q))[:, :, None], (BODIES,))[:, :, 0]

@@ -2,64 +2,56 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass
+from typing import Generic
 
 import numpy as np
+from typing_extensions import TypeVar
 
 from calib.arrays import frozen
-from calib.dynamics.bodies import FIXED
 from calib.dynamics.idim import IdentificationModel
-from calib.dynamics.rigid_body import inverse_dynamics
-from calib.dynamics.torque_rows import BODIES
+from calib.dynamics.regressor_model import RegressorModel
 from calib.identification.cases import Case
-from calib.identification.rows import BLOCK, term_columns
+from calib.identification.rows import BLOCK, segmented_states
+
+Model = TypeVar("Model", bound=RegressorModel, default=IdentificationModel, covariant=True)
 
 
 @dataclass(frozen=True, eq=False)
-class Dynamics:
+class Dynamics(Generic[Model]):
     """A model with numbers.
 
     Attributes:
-        model: bodies and drive terms.
+        model: bodies and drive terms, or whatever else is linear in its parameters.
         values: (p,) a value of every standard parameter and term; regrouped parameters hold base values, the others
             zero, so that single ones need not be those of any body (`calib.dynamics.base.to_standard`).
     """
 
-    model: IdentificationModel
+    model: Model
     values: np.ndarray
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "values", frozen(self.values))
 
 
-def predict(dynamics: Dynamics, case: Case) -> np.ndarray:
+def predict(dynamics: Dynamics[RegressorModel], case: Case) -> np.ndarray:
     """Return the torques of all rows at the full rate (N, rows) [N m or N]: W(q, v, a) · values, without W."""
     model, motion = dynamics.model, case.motion
-    load = transmitted(dynamics, case) if model.inertial else None
-    parts = {BODIES: np.zeros(motion.q.shape) if load is None else load}
-    for one, value in zip(model.columns, dynamics.values[model.inertial :]):
-        own = parts.setdefault(one.side, np.zeros(motion.q.shape))
-        for row, values in term_columns(one, case, load):
-            own[:, row] += value * values
-    result = np.zeros((len(motion), model.rows))
-    for side, own in parts.items():
-        result += model.torque_rows.observe(own[:, :, None], (side,), motion.q, motion.v)[:, :, 0]
+    states = segmented_states(model.columns, case)
+    result = np.empty((len(motion), model.rows))
+    for start in range(0, len(motion), BLOCK):
+        part = slice(start, start + BLOCK)
+        q, v, a = motion.q[part], motion.v[part], motion.a[part]
+        result[part] = model.torque(dynamics.values, q, v, a, case.carried, states[:, part])
     return result
 
 
 def transmitted(dynamics: Dynamics, case: Case) -> np.ndarray:
     """Return the torques (N, n) the gears pass on to the bodies, by the model: what load-dependent friction feels."""
     model, motion = dynamics.model, case.motion
-    bodies = np.array(dynamics.values[: model.inertial]) * carried_columns(model, case.carried)
     result = np.empty(motion.q.shape)
     for start in range(0, len(motion), BLOCK):
         part = slice(start, start + BLOCK)
-        result[part] = inverse_dynamics(model.bodies, bodies, motion.q[part], motion.v[part], motion.a[part])
+        q, v, a = motion.q[part], motion.v[part], motion.a[part]
+        result[part] = model.transmitted(dynamics.values, q, v, a, case.carried)
     return result
-
-
-def carried_columns(model: IdentificationModel, carried: Collection[str]) -> np.ndarray:
-    """Return (10 B,) one for parameters of bodies that are there, zero for those of payloads that are not."""
-    present = [kind != FIXED or label in carried for label, kind in zip(model.bodies.labels, model.bodies.kinds)]
-    return np.repeat(np.array(present, dtype=float), 10)

@@ -11,7 +11,7 @@ import numpy as np
 from calib.data.signals.decimation import Decimator, decimate, decimate_blocks, kept
 from calib.dynamics import drives
 from calib.dynamics.drives import DriveTerm
-from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.regressor_model import RegressorModel
 from calib.estimation.triangles import Triangles, absorb, empty, retriangulate
 from calib.identification.cases import Case
 
@@ -42,7 +42,7 @@ class ObservationRows:
 
 
 def observe(
-    model: IdentificationModel, columns: np.ndarray, case: Case, decimator: Decimator, load: np.ndarray | None = None
+    model: RegressorModel, columns: np.ndarray, case: Case, decimator: Decimator, load: np.ndarray | None = None
 ) -> ObservationRows:
     """Return the rows of a case in the model's `columns`, filtered and thinned by `decimator`.
 
@@ -157,7 +157,7 @@ def pool(data: Triangles, rows: int, blocks: Sequence[int] | None = None) -> Tri
     return replace(data, factors=factors, rows=data.rows[index].sum(axis=1))
 
 
-def _live(model: IdentificationModel, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _live(model: RegressorModel, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return (k,) column, of those chosen, and (k,) torque row of all entries of the regressor that can differ from 0.
 
     A body's parameters reach the joints before it, a drive's its own: half of all entries, or less.
@@ -167,7 +167,7 @@ def _live(model: IdentificationModel, columns: np.ndarray) -> tuple[np.ndarray, 
 
 
 def _block(
-    model: IdentificationModel,
+    model: RegressorModel,
     columns: np.ndarray,
     rows: np.ndarray,
     case: Case,

@@ -10,7 +10,6 @@ import numpy as np
 
 from calib.dynamics.base import standard_name
 from calib.dynamics.idim import with_load
-from calib.dynamics.rigid_body import inverse_dynamics
 from calib.errors import UsageError
 from calib.identification.model_file import read_covariance
 from calib.identification.prediction import Dynamics
@@ -44,8 +43,7 @@ class Uncertainty:
             q, v, a = (np.ascontiguousarray(x[part]) for x in (sampled.q, sampled.v, sampled.a))
             load = None
             if with_load(model):
-                bodies = np.array(self.dynamics.values[: model.inertial])
-                load = inverse_dynamics(model.bodies, bodies, q, v, a)
+                load = model.transmitted(self.dynamics.values, q, v, a)
             W = model.regressor(q, v, a, load, self.carried)[:, -n:][:, :, self.columns]
             variance = np.einsum("Nib,bc,Nic->Ni", W, self.covariance, W, optimize=True)
             largest = np.maximum(largest, np.sqrt(np.maximum(variance, 0.0)).max(axis=0))

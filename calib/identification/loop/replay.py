@@ -35,7 +35,7 @@ from calib.dynamics.rigid_body import mass_matrix
 from calib.errors import CalibError
 from calib.identification.cases import Case
 from calib.identification.loop.loop_recordings import periods_per_sample, take
-from calib.identification.prediction import Dynamics, carried_columns
+from calib.identification.prediction import Dynamics
 from calib.identification.rows import segments
 from calib.robot.chain import Chain
 from calib.simulation.loop.closed_loop import SIMULATED, Plant, inertia_diagonal
@@ -140,7 +140,7 @@ def _robot(dynamics: Dynamics, case: Case) -> tuple[Plant, tuple[str, ...]]:
     bodies = model.inertial
     kept = [k for k, one in enumerate(model.columns) if one.shape in SIMULATED]
     terms = tuple(replace(model.columns[k], side="motor") for k in kept)
-    values = dynamics.values[:bodies] * carried_columns(model, case.carried)
+    values = dynamics.values[:bodies] * model.carried_columns(case.carried)
     left_out = tuple(one.name for one in model.columns if one.shape not in SIMULATED)
     return Plant(model.bodies, terms, np.concatenate([values, dynamics.values[bodies:][kept]])), left_out
 

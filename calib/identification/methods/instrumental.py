@@ -32,7 +32,6 @@ from calib.estimation.linear import LinearFit, settled_std, wls
 from calib.estimation.triangles import absorb, empty, residual_squares, select
 from calib.estimation.whiteness import inflation
 from calib.identification.cases import Case
-from calib.identification.prediction import carried_columns
 from calib.identification.rows import ObservationRows, observe
 from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, inertia_diagonal, simulate, with_parameters
 from calib.simulation.loop.controllers import Controller, scaled
@@ -327,7 +326,7 @@ def _runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
 
 def _loaded(plant: Plant, case: Case) -> Plant:
     """Return the plant without the payloads that the case does not carry."""
-    there = carried_columns(IdentificationModel(plant.bodies), case.carried)
+    there = IdentificationModel(plant.bodies).carried_columns(case.carried)
     return with_parameters(plant, plant.parameters * np.append(there, np.ones(len(plant.terms))))
 
 

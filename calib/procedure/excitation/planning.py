@@ -18,7 +18,7 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.path_dynamics import PathDynamics, of_standard
 from calib.errors import RobotError, UsageError
 from calib.identification.model_file import read_dynamics, refuse_currents
-from calib.identification.prediction import Dynamics, carried_columns
+from calib.identification.prediction import Dynamics
 from calib.identification.torque_uncertainty import Uncertainty, read_uncertainty
 from calib.procedure.excitation.limits import MotionLimits, read_motion_limits
 from calib.procedure.excitation.playback import approach_to, check_slower
@@ -254,7 +254,7 @@ def _identified(chain: Chain, folder: Path, payloads: Sequence[str]) -> tuple[Pa
     if not model.torque_rows.has_bodies:
         return of_standard(model, dynamics.values), None  # which says why that cannot be
     values = np.array(dynamics.values)
-    values[: model.inertial] *= carried_columns(model, payloads)
+    values[: model.inertial] *= model.carried_columns(payloads)
     return of_standard(model, values), read_uncertainty(folder, Dynamics(model, values), payloads)
 
 

@@ -17,7 +17,7 @@ from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation, see
 from calib.identification.model_file import read_dynamics
-from calib.identification.prediction import Dynamics, carried_columns
+from calib.identification.prediction import Dynamics
 from calib.procedure.kinematic_stage import robot_file
 from calib.procedure.session.folder import Session
 from calib.robot import calibrated
@@ -104,8 +104,7 @@ def _percent(error: np.ndarray, size: np.ndarray) -> float:
 def transmitted_along(dynamics: Dynamics, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
     """Return what the gears pass on to the bodies by the model, without payloads (N, n): load-dependent friction."""
     model = dynamics.model
-    bodies = dynamics.values[: model.inertial] * carried_columns(model, ())
-    return inverse_dynamics(model.bodies, bodies, q, v, a)
+    return model.transmitted(dynamics.values, q, v, a, ())
 
 
 def _parameters(session: Session, model: IdentificationModel, cell: Cell, arm: MovingArm) -> tuple[float, int]:
