@@ -69,6 +69,14 @@ class NotConverged(CalibError):
         super().__init__(message)
 
 
+class CannotSimulate(NotConverged):
+    """Parameters of a robot that no simulation can follow, nor any near them."""
+
+
+class Diverged(NotConverged):
+    """An iteration whose estimates went from bad to worse."""
+
+
 class TaskLost(CalibError):
     """A task of many whose worker process died, also when it was tried again; the others' results are good.
 

@@ -134,7 +134,7 @@ class TorqueRows:
     def of_joints(self, mask: np.ndarray) -> np.ndarray:
         """Return for (N, n) flags of the joints those of the rows (N, rows): all joints' where rows mix them."""
         if self.projection is not None:
-            return np.repeat(mask.all(axis=1)[:, None], len(self.projection.labels), axis=1)
+            return np.repeat(mask.all(axis=1, keepdims=True), len(self.projection.labels), axis=1)
         return np.tile(mask, (1, len(self.blocks)))
 
     def observe(self, torques: np.ndarray, sides: Sequence[str], q: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Generic, TypeGuard, cast
 
 import numpy as np
 
@@ -11,25 +12,23 @@ from calib.data.signals.decimation import Decimator, design_decimator
 from calib.data.signals.persistency import report_excitation
 from calib.dynamics import base as bases
 from calib.dynamics.base import Base
+from calib.dynamics.bodies import standard_parameters
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel, with_terms
+from calib.dynamics.regressor_model import RegressorModel, States
 from calib.errors import MeasurementError, UsageError
-from calib.estimation import instrumental_variables
 from calib.estimation.essential import Elimination, Rule, eliminate
-from calib.estimation.linear import LinearFit, ridge
-from calib.estimation.triangles import Triangles, combine, condition_numbers, retriangulate
+from calib.estimation.triangles import condition_numbers
 from calib.identification.cases import Case
-from calib.identification.friction.friction_ladder import (
-    FrictionCandidates,
-    FrictionSelection,
-    select_friction,
-)
+from calib.identification.friction.friction_ladder import FrictionCandidates, FrictionSelection, select_friction
 from calib.identification.friction.ripple import Ripple, find_all
 from calib.identification.friction.time_folds import estimate
-from calib.identification.loop.bias import LoopTest, require_loop, try_loop
-from calib.identification.methods.least_squares import MethodEstimate, fit_rows, residual_inflation, scaled
-from calib.identification.prediction import Dynamics, predict, transmitted
-from calib.identification.prior import Prior, bounded, find_prior
+from calib.identification.methods.bias import LoopTest, compare_with_loop, require_loop
+from calib.identification.methods.least_squares import residual_inflation, scaled
+from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate
+from calib.identification.methods.registry import method_named
+from calib.identification.prediction import Dynamics, Model, predict, transmitted
+from calib.identification.prior import Prior, find_prior
 from calib.identification.rows import ObservationRows, extend, observe, observe_terms, pool, triangulate, with_blocks
 from calib.identification.settings import IdentificationSettings, make_model, per_joint
 from calib.robot.calibrated import CalibratedChain, as_calibrated
@@ -38,10 +37,11 @@ from calib.robot.chain import Chain, sampling_limits
 CONDITION = 150.0  # of the observation matrix, unit columns, from which on the prior is used
 
 Progress = Callable[[str], None]
+FirstFit = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
-class Identification:
+class Identification(Generic[Model]):
     """What was identified.
 
     Attributes:
@@ -58,7 +58,7 @@ class Identification:
         bias: what the simulated closed loop says of least squares, where a loop is stated.
     """
 
-    dynamics: Dynamics
+    dynamics: Dynamics[Model]
     base: Base
     fitted: MethodEstimate
     elimination: Elimination | None
@@ -95,98 +95,162 @@ def identify(
         robot: as a geometric fit returns it, or a chain that no fit has moved. Base columns are chosen on its nominal
             geometry; joint corrections take no part.
         cases: recordings to learn from.
+        settings: the choices; None: those that suit a serial arm with motor torques.
         progress: called with a few words at each stage.
     """
+    settings, robot = settings or IdentificationSettings(), as_calibrated(robot)
+    model = make_model(robot.chain, settings)
+    nominal = None if robot.nominal is None or not robot.moved else make_model(robot.nominal, settings)
+    states = chain_states(robot.chain, nominal or model, settings.seed)
+    found = identify_model(
+        model, cases, settings, nominal=nominal, states=states, cad=_known_masses(robot.chain), progress=progress
+    )  # fmt: skip
+    return cast(Identification, found)  # its model is the chain's
+
+
+def identify_model(
+    model: RegressorModel,
+    cases: Sequence[Case],
+    settings: IdentificationSettings | None = None,
+    *,
+    nominal: RegressorModel | None = None,
+    states: States | None = None,
+    cad: np.ndarray | None = None,
+    progress: Progress | None = None,
+) -> Identification[RegressorModel]:
+    """Identify the parameters of a model that is linear in them from recordings.
+
+    Base columns, what is known beforehand, richer friction, the method's estimate, ripple, essential parameters: a
+    sequence of steps around one method, each of which says what it accepts.
+
+    Args:
+        model: of a serial chain, or of anything else that meets the protocol.
+        cases: recordings to learn from, their targets those of the model's torque rows.
+        settings: the choices; what makes a chain's model of them (drives, payloads, gravity) is in `model` already.
+        nominal: the same model on the geometry that base columns are chosen on; None: `model`.
+        states: to choose base columns over; None: the model's own.
+        cad: the first of the model's parameters by the robot's description; None where it holds no masses.
+        progress: called with a few words at each stage.
+
+    Raises:
+        CalibError: the method's failure, where there is no estimate.
+    """
     settings, say = settings or IdentificationSettings(), progress or (lambda words: None)
-    robot = as_calibrated(robot)
-    chain, nominal = robot.chain, robot.nominal if robot.moved else None
     if not cases:
         raise UsageError("no recording to identify from")
-    settings = require_loop(settings) if settings.method == "iv" else settings
-    model = make_model(chain, settings)
+    method = method_named(settings.method)
+    settings = require_loop(settings) if method.simulates else settings
     _require_motion(cases)
     noise = repeats_noise(cases, settings)
     say("base parameters")
-    base = find_base(chain, model, settings, nominal, cases)
+    states = bases.random_samples(model, seed=settings.seed) if states is None else states
+    base = find_base(model, cases, states, nominal)
     decimator = common_decimator(cases, settings)
     say("observation matrix")
     rows = with_blocks([observe(model, base.kept, case, decimator) for case in cases], settings.folds)
     _require_enough(rows, base)
     say("first fit")
-    std, tau, values = first_fit(rows, noise)
-    first = Dynamics(model, bases.to_standard(base, values))
-    friction = "standard" if settings.friction == "auto" and _all_poor(cases) else settings.friction
-    loaded = settings.torque_rows.motors_alone and friction not in ("standard", "ripple")
-    loads = [transmitted(first, case) if loaded else None for case in cases]
-    prior = _prior(chain, model, base, rows, cases, std, tau, settings)
-    known = None if prior is None else prior.rows
-    n = chain.n
-    ground = FrictionCandidates(
-        cases, rows, loads, decimator, std, tau, np.array(per_joint(settings.v0, n, "v0")),
-        np.array([joint.kind == "prismatic" for joint in chain.joints]), known,
-    )  # fmt: skip
-    climbed = (
-        select_friction(ground, friction, progress)
-        if settings.torque_rows.motors_alone
-        else FrictionSelection((), (), ())
-    )
-    say("estimate")
-    full = [
-        extend(part, climbed.terms, observe_terms(climbed.terms, case, decimator, load))
+    first = first_fit(rows, noise)
+    prior = _prior(method, model, base, rows, cases, first, settings, cad)
+    friction, loads = _richer_friction(model, base, rows, cases, decimator, first, prior, settings, progress)
+    own = [None if k < model.inertial else model.columns[k - model.inertial] for k in base.kept]
+    full = tuple(
+        extend(part, friction.terms, observe_terms(friction.terms, case, decimator, load))
         for part, case, load in zip(rows, cases, loads)
-    ]
-    plain = replace(settings, method="wls") if settings.method == "iv" else settings
-    fitted, condition = _estimate(full, model, base, climbed, plain, prior, noise)
-    if settings.loop is not None:
-        say("simulating the closed loop")
-    bias = try_loop(chain, model, base, cases, decimator, settings)
-    if settings.method == "iv" and bias.found is not None:
-        fitted = replace(fitted, fit=bias.found.fit, std=bias.found.std, method="iv")
-    richer = with_terms(model, *climbed.terms)
-    values = fitted.estimate.values
-    standard = np.concatenate([bases.to_standard(base, values[: base.b]), values[base.b :]])
-    ripples: list[Ripple] = []
-    if settings.torque_rows.motors_alone and friction in ("auto", "ripple"):
-        say("ripple")
-        so_far = Dynamics(richer, standard)
-        ripples = find_all(cases, [case.target - predict(so_far, case) for case in cases])
-        richer = with_terms(richer, *(one for ripple in ripples for one in ripple.terms))
-        standard = np.concatenate([standard, *(ripple.values for ripple in ripples)])
-    standard = _with_payloads(standard, richer, cases, settings)
-    say("essential parameters")
-    gone = _essential(fitted, settings, prior, bias)
-    return Identification(
-        Dynamics(richer, standard), base, fitted, gone, climbed, settings, tuple(full), condition, prior,
-        tuple(ripples), bias,
+    )
+    problem = IdentificationProblem(
+        model, base, cases, decimator, full, (*own, *friction.terms),
+        np.concatenate([np.full(base.b, -1), friction.groups]), noise, prior, settings.loop, cad,
     )  # fmt: skip
+    say("simulating the closed loop" if method.simulates else "estimate")
+    found = method.estimate(problem)
+    values = found.estimate.values
+    if settings.loop is not None and not method.simulates:
+        say("simulating the closed loop")
+    bias = compare_with_loop(problem, found)
+    richer = with_terms(model, *friction.terms) if _joint_by_joint(model) else model
+    dynamics = Dynamics(richer, np.concatenate([bases.to_standard(base, values[: base.b]), values[base.b :]]))
+    dynamics, ripples = _with_ripple(dynamics, cases, settings, say)
+    dynamics = _with_payloads(dynamics, cases, settings)
+    say("essential parameters")
+    gone = _essential(found, settings, prior)
+    condition = condition_numbers(problem.pooled.factors.reshape(-1, len(values) + 1)[:, : base.b])
+    return Identification(dynamics, base, found, gone, friction, settings, full, condition, prior, ripples, bias)
 
 
-def _with_payloads(
-    standard: np.ndarray, model: IdentificationModel, cases: Sequence[Case], settings: IdentificationSettings
-) -> np.ndarray:
-    """Return the standard parameters with those of payloads that no case carries, where they are known."""
-    result = np.array(standard)
-    for label, known in settings.payload_values.items():
-        if not any(label in case.carried for case in cases):
-            first = 10 * model.bodies.labels.index(label)
-            result[first : first + 10] = known
-    return result
+def chain_states(chain: Chain, model: RegressorModel, seed: int = 0) -> States:
+    """Return random states of a chain's model within the chain's limits."""
+    lower, upper = sampling_limits(chain)
+    return bases.random_samples(model, seed=seed, lower=lower, upper=upper)
 
 
 def find_base(
-    chain: Chain,
-    model: IdentificationModel,
-    settings: IdentificationSettings,
-    nominal: Chain | None,
-    cases: Sequence[Case],
+    model: RegressorModel, cases: Sequence[Case], states: States, nominal: RegressorModel | None = None
 ) -> Base:
-    """Return base columns chosen on the nominal chain and regrouped on the calibrated one."""
+    """Return base columns of a model over states and the cases' payloads, chosen on the nominal one and regrouped."""
     loads = tuple(dict.fromkeys(tuple(sorted(case.carried)) for case in cases))
-    original = model if nominal is None else make_model(nominal, settings)
-    lower, upper = sampling_limits(chain)
-    samples = bases.random_samples(original, seed=settings.seed, lower=lower, upper=upper)
-    found = bases.find(original, samples, loads)
-    return found if nominal is None else bases.regroup(found, model, samples, loads)
+    found = bases.find(model if nominal is None else nominal, states, loads)
+    return found if nominal is None else bases.regroup(found, model, states, loads)
+
+
+def _known_masses(chain: Chain) -> np.ndarray | None:
+    """Return the standard parameters (10 B,) of a chain's description; None where it holds no masses."""
+    known = chain.inertias is not None and np.any(chain.inertias[:, 9] > 0.0)
+    return standard_parameters(chain) if known else None
+
+
+def _joint_by_joint(model: RegressorModel) -> TypeGuard[IdentificationModel]:
+    """Tell whether richer friction and ripple, which are terms of single joints, have a place in a model."""
+    return isinstance(model, IdentificationModel) and model.torque_rows.motors_alone
+
+
+def _richer_friction(
+    model: RegressorModel, base: Base, rows: Sequence[ObservationRows], cases: Sequence[Case], decimator: Decimator,
+    first: FirstFit, prior: Prior | None, settings: IdentificationSettings, progress: Progress | None,
+) -> tuple[FrictionSelection, Sequence[np.ndarray | None]]:  # fmt: skip
+    """Return the friction terms that unseen time rewards, and the torques (N, n) that load-dependent ones feel."""
+    nothing: list[np.ndarray | None] = [None] * len(cases)
+    if not _joint_by_joint(model):
+        return FrictionSelection((), (), ()), nothing
+    std, tau, values = first
+    friction = _wanted_friction(cases, settings)
+    plain = Dynamics(model, bases.to_standard(base, values))
+    loads = nothing if friction in ("standard", "ripple") else [transmitted(plain, case) for case in cases]
+    candidates = FrictionCandidates(
+        cases, rows, loads, decimator, std, tau, np.array(per_joint(settings.v0, model.n, "v0")), model.prismatic,
+        None if prior is None else prior.rows,
+    )  # fmt: skip
+    return select_friction(candidates, friction, progress), loads
+
+
+def _wanted_friction(cases: Sequence[Case], settings: IdentificationSettings) -> str:
+    """Return what friction is asked for; of poor motion, whose blocks of time judge nothing, the standard one."""
+    return "standard" if settings.friction == "auto" and _all_poor(cases) else settings.friction
+
+
+def _with_ripple(
+    dynamics: Dynamics[RegressorModel], cases: Sequence[Case], settings: IdentificationSettings, say: Progress
+) -> tuple[Dynamics[RegressorModel], tuple[Ripple, ...]]:
+    """Return the model with gear ripple found in what it leaves, where that is asked for."""
+    model = dynamics.model
+    if not _joint_by_joint(model) or _wanted_friction(cases, settings) not in ("auto", "ripple"):
+        return dynamics, ()
+    say("ripple")
+    ripples = tuple(find_all(cases, [case.target - predict(dynamics, case) for case in cases]))
+    richer = with_terms(model, *(one for ripple in ripples for one in ripple.terms))
+    return Dynamics(richer, np.concatenate([dynamics.values, *(ripple.values for ripple in ripples)])), ripples
+
+
+def _with_payloads(
+    dynamics: Dynamics[RegressorModel], cases: Sequence[Case], settings: IdentificationSettings
+) -> Dynamics[RegressorModel]:
+    """Return the model with the parameters of payloads that no case carries, where they are known."""
+    model, values = dynamics.model, np.array(dynamics.values)
+    for label, known in settings.payload_values.items():
+        if isinstance(model, IdentificationModel) and not any(label in case.carried for case in cases):
+            first = 10 * model.bodies.labels.index(label)
+            values[first : first + 10] = known
+    return Dynamics(model, values)
 
 
 def common_decimator(cases: Sequence[Case], settings: IdentificationSettings) -> Decimator:
@@ -217,7 +281,7 @@ def repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> np
     """
     if settings.weights == "residuals":
         return None
-    if settings.method != "wls" or not settings.torque_rows.motors_alone:
+    if not method_named(settings.method).takes_prior or not settings.torque_rows.motors_alone:
         raise UsageError(
             f'weights = "repeats" goes with method wls and rows motor, found {settings.method} and '
             f"{settings.torque_rows.name}"
@@ -239,9 +303,7 @@ def repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> np
     return np.asarray(np.sqrt(np.average(squares, axis=0, weights=[len(case.motion) for case in cases])))
 
 
-def first_fit(
-    rows: Sequence[ObservationRows], noise: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def first_fit(rows: Sequence[ObservationRows], noise: np.ndarray | None = None) -> FirstFit:
     """Return standard deviation and inflation of the residuals (rows,), and values (b,) of a fit that always exists."""
     count = rows[0].target.shape[1]
     data = pool(triangulate(rows), count)
@@ -257,51 +319,17 @@ def first_fit(
 
 
 def _prior(
-    chain: Chain, model: IdentificationModel, base: Base, rows: Sequence[ObservationRows], cases: Sequence[Case],
-    std: np.ndarray, tau: np.ndarray, settings: IdentificationSettings,
+    method: Method, model: RegressorModel, base: Base, rows: Sequence[ObservationRows], cases: Sequence[Case],
+    first: FirstFit, settings: IdentificationSettings, cad: np.ndarray | None,
 ) -> Prior | None:  # fmt: skip
     """Return the prior, where it is asked for or the motion is too poor to do without."""
-    if settings.prior == "none" or settings.method != "wls" or not settings.torque_rows.has_bodies:
+    if settings.prior == "none" or not method.takes_prior or not model.inertial:
         return None
     data = pool(triangulate(rows), rows[0].target.shape[1])
     normalised = condition_numbers(data.factors.reshape(-1, data.parameters + 1)[:, :-1])[1]
     if settings.prior == "auto" and not _all_poor(cases) and normalised < CONDITION:
         return None
-    return find_prior(chain, model, base, data, std, tau, settings.prior)
-
-
-def _estimate(
-    rows: Sequence[ObservationRows],
-    model: IdentificationModel,
-    base: Base,
-    climbed: FrictionSelection,
-    settings: IdentificationSettings,
-    prior: Prior | None,
-    noise: np.ndarray | None,
-) -> tuple[MethodEstimate, tuple[float, float]]:
-    """Return the final fit; richer friction keeps the ridge that the evidence chose."""
-    data = triangulate(rows)
-    fitted = fit_rows(rows, data, settings.method, prior is None, noise)
-    more = len(climbed.terms)
-    own = data.parameters - more
-    condition = condition_numbers(fitted.pooled.factors.reshape(-1, data.parameters + 1)[:, :own])
-    if settings.method != "wls" or (not climbed.terms and prior is None):
-        return fitted, condition
-    group = np.concatenate([np.full(own, -1), climbed.groups]).astype(int)
-    known = None if prior is None else np.hstack([prior.rows[:, :-1], np.zeros((own, more)), prior.rows[:, -1:]])
-    _, ridges = estimate(fitted.pooled, fitted.std, fitted.inflation, group, known)
-    covariance = np.diag(np.where(group < 0, np.inf, np.maximum(ridges, 1e-12) ** 2))
-    mean = np.zeros(len(ridges))
-    if prior is not None:
-        covariance[:own, :own], mean[:own] = prior.covariance, prior.mean
-    std = fitted.std * np.sqrt(fitted.inflation)
-    drawn: LinearFit = ridge(fitted.pooled, mean, covariance, std)
-    if prior is not None:
-        drives = np.array([one.nonnegative for one in model.columns], dtype=bool)
-        every = np.concatenate([np.zeros(model.inertial, dtype=bool), drives])
-        nonnegative = np.concatenate([every[base.kept], [one.nonnegative for one in climbed.terms]]).astype(bool)
-        drawn = _bounded(drawn, fitted.pooled, std, mean, covariance, nonnegative)
-    return replace(fitted, fit=drawn), condition
+    return find_prior(cad, model, base, data, first[0], first[1], settings.prior)
 
 
 def _all_poor(cases: Sequence[Case]) -> bool:
@@ -309,31 +337,11 @@ def _all_poor(cases: Sequence[Case]) -> bool:
     return all(report_excitation(case.motion).poor for case in cases)
 
 
-def _bounded(
-    drawn: LinearFit, data: Triangles, std: np.ndarray, mean: np.ndarray, covariance: np.ndarray,
-    nonnegative: np.ndarray,
-) -> LinearFit:  # fmt: skip
-    """Return the fit with drive parameters that are not negative; the covariance is that without the bounds."""
-    known = np.isfinite(np.diag(covariance))
-    unit = np.sqrt(np.diag(covariance)[known])
-    lower = np.linalg.cholesky(covariance[np.ix_(known, known)] / np.outer(unit, unit) + 1e-9 * np.eye(len(unit)))
-    rows = np.zeros((len(unit), data.parameters + 1))
-    rows[:, np.flatnonzero(known)] = np.linalg.solve(lower, np.diag(1.0 / unit))
-    rows[:, -1] = rows[:, :-1] @ mean
-    values = bounded(retriangulate(np.vstack([combine(data, std), rows])), nonnegative)
-    return replace(drawn, estimate=replace(drawn.estimate, values=values))
-
-
-def _essential(
-    fitted: MethodEstimate, settings: IdentificationSettings, prior: Prior | None, bias: LoopTest
-) -> Elimination | None:
+def _essential(found: MethodEstimate, settings: IdentificationSettings, prior: Prior | None) -> Elimination | None:
     """Return the elimination; none where the data alone do not determine the base parameters."""
     if settings.essential == "none" or prior is not None:
         return None
-    data, std, inflation = fitted.pooled, fitted.std, fitted.inflation
-    if fitted.method == "iv" and bias.found is not None:
-        data = instrumental_variables.testable(bias.found.problem, bias.found.fit, bias.found.std)
-        std, inflation = np.ones(1), np.array([bias.found.inflation])
+    data, std, inflation = found.testable()
     return eliminate(
         data, Rule(settings.essential), ratio=settings.ratio, level=settings.level,
         keep=[bases.standard_name(name, data.names) for name in settings.keep],

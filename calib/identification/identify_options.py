@@ -97,7 +97,7 @@ from calib.dynamics.torque_rows import ROWS, TorqueRows
 from calib.errors import CalibError, UsageError
 from calib.identification.friction.friction_ladder import NAMES
 from calib.identification.loop.loop_settings import LoopSettings, check_loop
-from calib.identification.methods.least_squares import METHODS
+from calib.identification.methods.registry import METHODS
 from calib.identification.settings import PRIORS, RULES, WEIGHTS, Coupling, IdentificationSettings, Payload
 
 
@@ -150,7 +150,7 @@ class OptionsFile:
     """The keys of the file; None where it says nothing and the default of `IdentificationSettings` stands."""
 
     friction: Annotated[str, OneOf(NAMES)] | None = None
-    method: Annotated[str, OneOf(METHODS)] | None = None
+    method: Annotated[str, OneOf(tuple(METHODS))] | None = None
     weights: Annotated[str, OneOf(WEIGHTS)] | None = None
     drives: Texts | None = None
     v0: Annotated[tuple[Positive, ...], Spread()] | None = None

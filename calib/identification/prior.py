@@ -21,11 +21,9 @@ import scipy.optimize
 
 from calib.arrays import frozen
 from calib.dynamics.base import Base
-from calib.dynamics.bodies import standard_parameters
-from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import UsageError
 from calib.estimation.triangles import Triangles, retriangulate
-from calib.robot.chain import Chain
 
 SCALES = tuple(float(10.0 ** (k / 4)) for k in range(-6, 7))  # f from 0.03 to 30
 MOST = 1.0  # largest f of a CAD prior: what no model explains must not pass for a wrong CAD (our choice)
@@ -63,19 +61,20 @@ class Prior:
 
 
 def find_prior(
-    chain: Chain, model: IdentificationModel, base: Base, data: Triangles, std: np.ndarray, inflation: np.ndarray,
-    wanted: str = "auto",
+    cad: np.ndarray | None, model: RegressorModel, base: Base, data: Triangles, std: np.ndarray,
+    inflation: np.ndarray, wanted: str = "auto",
 ) -> Prior:  # fmt: skip
     """Return the prior whose strength the evidence chose.
 
     Args:
+        cad: the first of the model's parameters by the robot's description; None where it holds no masses.
         data: triangles of the base columns, one group per row.
         std, inflation: (rows,) of the residuals.
-        wanted: ``cad``: the chain's inertias must be there; ``auto``: sizes alone serve where they are not.
+        wanted: ``cad``: these must be there; ``auto``: sizes alone serve where they are not.
     """
     weight = 1.0 / (std * np.sqrt(inflation))
     factor = retriangulate((data.factors * weight[:, None, None]).reshape(-1, data.parameters + 1))
-    mean, covariance, source = _shape(chain, model, base, data, wanted)
+    mean, covariance, source = _shape(cad, model, base, data, wanted)
     drives = model.inertial
     inertial = np.array([k < drives for k in base.kept])
     both = np.outer(inertial, inertial)
@@ -92,19 +91,17 @@ def resting(prior: Prior, covariance: np.ndarray) -> np.ndarray:
 
 
 def _shape(
-    chain: Chain, model: IdentificationModel, base: Base, data: Triangles, wanted: str
+    own: np.ndarray | None, model: RegressorModel, base: Base, data: Triangles, wanted: str
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """Return mean, covariance at f = 1, and where they come from."""
     bodies = model.inertial
     squares = np.sum(data.factors**2, axis=(0, 1))
     size = np.sqrt(squares[-1] / np.maximum(squares[:-1], 1e-12 * squares[:-1].max()))  # would explain all of y
-    known = chain.inertias is not None and np.any(chain.inertias[:, 9] > 0.0)
-    if not known:
+    if own is None:
         if wanted == "cad":
             raise UsageError("prior = 'cad', but the robot's description holds no masses")
         return np.zeros(base.b), np.diag(np.where(base.kept < bodies, size, DRIVES * size) ** 2), "sizes"
     cad = np.zeros(len(base.standard))
-    own = standard_parameters(chain)
     cad[: len(own)] = own
     spread = np.zeros(len(base.standard))
     for first in range(0, len(own), 10):

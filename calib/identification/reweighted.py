@@ -34,9 +34,8 @@ def estimator(found: Identification) -> Estimator:
     """Return how an identification weighed its rows, and what it knew beforehand."""
     fitted = found.fitted
     p = fitted.pooled.parameters
-    drawn = fitted.method == "wls" and (found.prior is not None or len(found.friction.terms) > 0)
-    deviation = np.ones(len(fitted.std)) if fitted.method == "ols" else np.array(fitted.std)
-    if not drawn:
+    deviation = np.array(fitted.std) if fitted.weighted else np.ones(len(fitted.std))
+    if not fitted.drawn:
         return Estimator(deviation, np.zeros((p, p)), np.zeros(p))
     deviation = deviation * np.sqrt(fitted.inflation)
     factors = (fitted.pooled.factors / deviation[:, None, None]).reshape(-1, p + 1)

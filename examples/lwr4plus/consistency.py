@@ -35,7 +35,7 @@ from calib.geometry.first_guess import install
 from calib.geometry.fit import fit
 from calib.identification import geometry_uncertainty, reweighted
 from calib.identification.cases import Case, make_case
-from calib.identification.identify import Identification, common_decimator, find_base, identify
+from calib.identification.identify import Identification, chain_states, common_decimator, find_base, identify
 from calib.identification.settings import IdentificationSettings, Payload, make_model
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, random_joints
@@ -110,7 +110,8 @@ def world(setup: Setup, kind: str, seed: int) -> World:
     motion, true = reference(seed), cell.truth.chain
     values, clean = true_torques(true, settings, motion)
     cases = cases_of(motion, clean, kind, np.zeros(true.n), 0)
-    base = find_base(true, make_model(true, settings), settings, cell.nominal, cases)
+    nominal = make_model(cell.nominal, settings)
+    base = find_base(make_model(true, settings), cases, chain_states(true, nominal, settings.seed), nominal)
     noise = known_robots.truth("lwr4plus")["noise"]["sigma_tau_l" if kind == "link" else "sigma_tau_m"] * LIMIT
     poses = random_joints(cell.nominal, setup.poses, [seed, setup.poses])
     return World(cell, settings, motion, clean, base.names, base.transform @ values, noise, poses)

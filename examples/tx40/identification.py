@@ -41,7 +41,8 @@ from calib.estimation.linear import LinearFit, subsystem_std
 from calib.estimation.triangles import collect
 from calib.identification.cases import Case, make_case
 from calib.identification.loop.controller import identify_controller
-from calib.identification.methods.instrumental import Instrumental, Loop, Round, identify_instrumental, simulated_case
+from calib.identification.loop.loop_recordings import Loop
+from calib.identification.methods.instrumental import Instrumental, Round, identify_instrumental, simulated_case
 from calib.identification.rows import observe
 from calib.simulation.cells import known_robots
 from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, simulate

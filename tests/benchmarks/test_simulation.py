@@ -18,7 +18,8 @@ from calib.dynamics import base as bases
 from calib.dynamics import model, rigid_body
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.identification.cases import Case, make_case
-from calib.identification.methods.instrumental import Loop, identify_instrumental
+from calib.identification.loop.loop_recordings import Loop
+from calib.identification.methods.instrumental import identify_instrumental
 from calib.robot import description, library
 from calib.simulation.cells import known_robots
 from calib.simulation.loop.closed_loop import Plant, Sensing, forward_dynamics, simulate

@@ -11,7 +11,7 @@ from calib.dynamics.drives import term
 from calib.errors import CalibError, MeasurementError, UsageError
 from calib.identification.friction.friction_ladder import FrictionCandidates, select_friction
 from calib.identification.gains import identify_gains
-from calib.identification.identify import common_decimator, find_base, first_fit, identify
+from calib.identification.identify import chain_states, common_decimator, find_base, first_fit, identify
 from calib.identification.prediction import Dynamics, predict
 from calib.identification.reweighted import standstill_shift
 from calib.identification.rows import observe, pool, triangulate, with_blocks
@@ -91,7 +91,7 @@ def test_gains_come_from_a_payload_of_known_mass():
     settings = IdentificationSettings(payloads={"load": Payload(2.0)})
     cases = [planted.case("u", 0, gains=gains, noise=0.1), planted.case("l", 0, ("load",), gains=gains, noise=0.1)]
     model = make_model(arm, settings)
-    base = find_base(arm, model, settings, None, cases)
+    base = find_base(model, cases, chain_states(arm, model, settings.seed))
     rows = with_blocks([observe(model, base.kept, one, common_decimator(cases, settings)) for one in cases], 6)
     data = pool(triangulate(rows), 3)
     found = identify_gains(data, {"Mload": 2.0}, first_fit(rows)[1])
@@ -154,7 +154,7 @@ def test_a_long_recording_keeps_its_band_and_loses_rows():
     few = common_decimator(cases, IdentificationSettings(samples=100))
     assert few.band == all_of_them.band and few.factor % all_of_them.factor == 0
     model = planted.model()
-    base = find_base(planted.arm(), model, IdentificationSettings(), None, cases)
+    base = find_base(model, cases, chain_states(planted.arm(), model))
     full, part = (observe(model, base.kept, cases[0], one) for one in (all_of_them, few))
     assert len(part.target) <= 101 < len(full.target)
     step = few.factor // all_of_them.factor

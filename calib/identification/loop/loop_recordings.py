@@ -17,14 +17,12 @@ from calib.data.signals.bandwidth import USABLE
 from calib.data.signals.decimation import Decimator
 from calib.data.signals.filtering import border, low_pass
 from calib.data.signals.motion import ROWS, Motion
-from calib.dynamics.bodies import Bodies, standard_parameters
+from calib.dynamics.bodies import Bodies
 from calib.errors import MeasurementError, NotConverged, UsageError
 from calib.identification.cases import Case
 from calib.identification.loop.controller import IdentifiedController, identify_controller
 from calib.identification.loop.loop_settings import LoopSettings, completed, per_joint, stated_controller
-from calib.identification.methods.instrumental import Loop
 from calib.identification.rows import segments
-from calib.robot.chain import Chain
 from calib.simulation.loop.closed_loop import Plant
 from calib.simulation.loop.controllers import Controller, with_feedforward
 from calib.simulation.loop.references import Reference
@@ -39,11 +37,30 @@ DEGREES = 180.0 / np.pi
 
 
 @dataclass(frozen=True, eq=False)
+class Loop:
+    """The closed loop that a recording came from.
+
+    Attributes:
+        controller: given, identified from the log (`calib.identification.loop.controller`) or guessed: a third of the
+            bandwidth still serves.
+        reference: at the controller's rate, in the recording's time, and spanning it.
+        every: control periods per recorded sample.
+        design: (n,) inertia for which the gains are what they say [kg m²]; the simulated robot then gets gains times
+            J(x_k) / design, so that its bandwidth stays (Gautier & Janot). None: gains as they are.
+    """
+
+    controller: Controller
+    reference: Reference
+    every: int = 1
+    design: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class ClosedLoops:
     """Stretches of recordings, each with its loop.
 
     Attributes:
-        pairs: what `calib.identification.methods.instrumental` takes.
+        pairs: each stretch and its loop.
         controller: of all.
         identified: how the controller was read from the logs; None where it was stated.
         notes: what a user should know.
@@ -56,14 +73,14 @@ class ClosedLoops:
 
 
 def close_loops(
-    chain: Chain, bodies: Bodies, cases: Sequence[Case], decimator: Decimator, loop: LoopSettings
+    bodies: Bodies, cases: Sequence[Case], decimator: Decimator, loop: LoopSettings, cad: np.ndarray | None = None
 ) -> ClosedLoops:
     """Return the loops of recordings whose motions hold `q_ref`.
 
     Args:
-        chain: the robot; its inertias serve a feed-forward of kind ``cad``.
         bodies: the model's.
         decimator: of the rows; stretches that it eats up are left out.
+        cad: standard parameters by the robot's description, for a feed-forward of kind ``cad``; None: not known.
 
     Raises:
         MeasurementError: where a recording has no reference, or one that cannot be its own.
@@ -80,10 +97,10 @@ def close_loops(
     if not stretches:
         raise MeasurementError("no stretch without gaps is long enough to be simulated", cases[0].motion.file)
     controller, identified, notes = _controller(loop, max((s[1:3] for s in stretches), key=lambda s: len(s[0].motion)))
-    design = per_joint(loop, "design", chain.n) if loop.design else None
+    design = per_joint(loop, "design", bodies.n) if loop.design else None
     pairs = []
     for _, part, reference, every in stretches:
-        own = _fed_forward(controller, loop, chain, bodies, part.motion, reference, every)
+        own = _fed_forward(controller, loop, cad, bodies, part.motion, reference, every)
         pairs.append((take(part, _inside(part.motion)), Loop(own, reference, every, design)))
     return ClosedLoops(tuple(pairs), controller, identified, notes)
 
@@ -207,8 +224,8 @@ def _controller(
 
 
 def _fed_forward(
-    controller: Controller, loop: LoopSettings, chain: Chain, bodies: Bodies, motion: Motion, reference: Reference,
-    every: int,
+    controller: Controller, loop: LoopSettings, cad: np.ndarray | None, bodies: Bodies, motion: Motion,
+    reference: Reference, every: int,
 ) -> Controller:  # fmt: skip
     """Return the controller with the torques it adds along the reference."""
     if loop.feedforward == "none":
@@ -218,8 +235,7 @@ def _fed_forward(
             raise MeasurementError("[loop] feedforward: the recording has no column tau_ff", motion.file)
         grid = np.arange(len(motion))
         return with_feedforward(controller, CubicSpline(grid, motion.tau_ff)(np.arange(len(reference.t)) / every))
-    if chain.inertias is None:
-        raise UsageError(f"[loop] feedforward = 'cad': robot '{chain.name}' has no inertias")
-    own = standard_parameters(chain)
-    inertial = frozen(np.concatenate([own, np.zeros(10 * bodies.count - len(own))]))
+    if cad is None:
+        raise UsageError("[loop] feedforward = 'cad': the robot's description holds no masses")
+    inertial = frozen(np.concatenate([cad, np.zeros(10 * bodies.count - len(cad))]))
     return with_feedforward(controller, feed_forward(Plant(bodies, (), inertial), reference))

@@ -11,7 +11,7 @@ a bias.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,7 +24,7 @@ from calib.dynamics import base as bases
 from calib.dynamics.base import Base
 from calib.dynamics.drives import standard
 from calib.dynamics.idim import IdentificationModel
-from calib.errors import CalibError, NotConverged, UsageError
+from calib.errors import CalibError, CannotSimulate, Diverged, NotConverged, UsageError
 from calib.estimation import instrumental_variables
 from calib.estimation.constrained import Constrained, within
 from calib.estimation.instrumental_variables import ExogeneityTest, Instruments, InstrumentStrength
@@ -32,33 +32,28 @@ from calib.estimation.linear import LinearFit, settled_std, wls
 from calib.estimation.triangles import absorb, empty, residual_squares, select
 from calib.estimation.whiteness import inflation
 from calib.identification.cases import Case
+from calib.identification.loop.loop_recordings import Loop
 from calib.identification.rows import ObservationRows, observe
 from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, inertia_diagonal, simulate, with_parameters
-from calib.simulation.loop.controllers import Controller, scaled
-from calib.simulation.loop.references import Reference
+from calib.simulation.loop.controllers import scaled
 
-METHODS = ("iv", "didim")
 LIMIT = 10  # iterations; 3 to 6 are usual
 RETREATS = 6  # halvings of a step to parameters that cannot be simulated
 
 
-@dataclass(frozen=True, eq=False)
-class Loop:
-    """The closed loop that a recording came from.
+@dataclass(frozen=True)
+class RoundEstimator:
+    """What a round makes of the triangles of [Z W y].
 
     Attributes:
-        controller: given, identified from the log (`calib.identification.loop.controller`) or guessed: a third of the
-            bandwidth still serves.
-        reference: at the controller's rate, in the recording's time, and spanning it.
-        every: control periods per recorded sample.
-        design: (n,) inertia for which the gains are what they say [kg m²]; the simulated robot then gets gains times
-            J(x_k) / design, so that its bandwidth stays (Gautier & Janot). None: gains as they are.
+        name: what options and files call it.
+        fit: of triangles, (g,) std of the groups and inflation.
+        measured: whether the measured motion, W, is in the estimate.
     """
 
-    controller: Controller
-    reference: Reference
-    every: int = 1
-    design: np.ndarray | None = None
+    name: str
+    fit: Callable[[Instruments, np.ndarray, float], LinearFit]
+    measured: bool
 
 
 Runs = list[tuple[tuple[Case, Loop], SimulatedRun]]
@@ -97,6 +92,7 @@ class Instrumental:
             controller is not the robot's.
         constrained: the optimum under constraints, where there are any; `fit` has its values and covariance.
         problem: triangles of [Z W y], one group per torque row.
+        estimator: what each round made of them.
     """
 
     fit: LinearFit
@@ -111,6 +107,7 @@ class Instrumental:
     distance: np.ndarray
     constrained: Constrained | None
     problem: Instruments
+    estimator: RoundEstimator
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -170,18 +167,22 @@ def identify_instrumental(
 
     Raises:
         Unidentifiable: where the instruments do not tell the parameters apart.
-        NotConverged: with the last `LinearFit`, after `limit` iterations.
+        NotConverged: with the last `LinearFit`, after `limit` iterations; `Diverged` where they led away.
+        CannotSimulate: where the loop is unstable with the robot it starts from, or with an estimate and all near it.
     """
-    if method not in METHODS:
-        raise UsageError(f"method '{method}' is none of {', '.join(METHODS)}")
+    if method not in ROUNDS:
+        raise UsageError(f"method '{method}' is none of {', '.join(ROUNDS)}")
     if not model.torque_rows.motors_alone or not cases:
         raise UsageError("instruments from simulation need motor torques, and a recording with its reference")
-    task = _task(model, base, cases, decimator, method, columns, positive)
+    task = _task(model, base, cases, decimator, ROUNDS[method], columns, positive)
     ordinary = _ordinary(task.observed)
     plant, std = _regular(model, cases[0][1], inertia), ordinary.group_std
     before: LinearFit | None = None
     rounds: list[Round] = []
-    runs, retreats, tau = _runs(plant, cases), 0, 1.0
+    try:
+        runs, retreats, tau = _runs(plant, cases), 0, 1.0
+    except NotConverged as error:
+        raise CannotSimulate(str(error), error.last) from error
     for _ in range(limit):
         found = _estimate_round(task, runs, std, tau)
         new = _with_values(plant, task.standard(found.fit.estimate.values))
@@ -194,7 +195,8 @@ def identify_instrumental(
             return _result(task, found, ordinary, new, rounds, std, runs)
         plant, runs, retreats = _simulate_new(plant, new, cases)
         before, std, tau = found.fit, found.fit.group_std, found.tau
-    raise NotConverged(
+    kind = Diverged if len(rounds) > 2 and rounds[-1].change > rounds[1].change else NotConverged
+    raise kind(
         f"instruments from simulation: parameters still change by {100 * rounds[-1].change:.3g} % after {limit} "
         "rounds; estimate fewer (essential ones), or look at the controller's gains",
         before,
@@ -202,7 +204,7 @@ def identify_instrumental(
 
 
 @dataclass(frozen=True, eq=False)
-class _Task:
+class _Fixed:
     """What stays the same from round to round."""
 
     model: IdentificationModel
@@ -211,7 +213,7 @@ class _Task:
     cases: Sequence[tuple[Case, Loop]]
     decimator: Decimator
     observed: Sequence[ObservationRows]
-    method: str
+    estimator: RoundEstimator
     positive: Sequence[str]
 
     def standard(self, values: np.ndarray) -> np.ndarray:
@@ -232,16 +234,16 @@ class _Found:
 
 
 def _task(
-    model: IdentificationModel, base: Base, cases: Sequence[tuple[Case, Loop]], decimator: Decimator, method: str,
-    columns: np.ndarray | None, positive: Sequence[str],
-) -> _Task:  # fmt: skip
+    model: IdentificationModel, base: Base, cases: Sequence[tuple[Case, Loop]], decimator: Decimator,
+    estimator: RoundEstimator, columns: np.ndarray | None, positive: Sequence[str],
+) -> _Fixed:  # fmt: skip
     kept = np.arange(base.b) if columns is None else np.asarray(columns, dtype=int)
     observed = [observe(model, base.kept[kept], case, decimator) for case, _ in cases]
     observed = [replace(rows, names=tuple(base.names[k] for k in kept)) for rows in observed]
-    return _Task(model, base, kept, cases, decimator, observed, method, positive)
+    return _Fixed(model, base, kept, cases, decimator, observed, estimator, positive)
 
 
-def _estimate_round(task: _Task, runs: Runs, std: np.ndarray, tau: float) -> _Found:
+def _estimate_round(task: _Fixed, runs: Runs, std: np.ndarray, tau: float) -> _Found:
     """Return the estimate with the instruments of these runs; its sigmas with the inflation `tau` of the last."""
     columns = task.base.kept[task.kept]
     simulated = [
@@ -249,21 +251,21 @@ def _estimate_round(task: _Task, runs: Runs, std: np.ndarray, tau: float) -> _Fo
         for (case, loop), run in runs
     ]
     problem = _stack(task.observed, simulated)
-    fit, bound = _constrain(problem, _estimate(problem, task.method, std, tau), std, task.positive)
+    fit, bound = _constrain(problem, task.estimator.fit(problem, std, tau), std, task.positive)
     return _Found(problem, fit, _inflation(task.observed, fit), bound)
 
 
 def _result(
-    task: _Task, found: _Found, ordinary: LinearFit, plant: Plant, rounds: Sequence[Round], std: np.ndarray, runs: Runs
+    task: _Fixed, found: _Found, ordinary: LinearFit, plant: Plant, rounds: Sequence[Round], std: np.ndarray, runs: Runs
 ) -> Instrumental:  # fmt: skip
     """Return the last round, sigmas with its own inflation, with what the tests say of it."""
-    fit = _estimate(found.problem, task.method, std, found.tau)
+    fit = task.estimator.fit(found.problem, std, found.tau)
     fit = replace(fit, estimate=replace(fit.estimate, values=found.fit.estimate.values))
     verdict = instrumental_variables.exogeneity(found.problem, std, found.tau)
     strength = instrumental_variables.strength(found.problem, std)
     return Instrumental(
         fit, ordinary, frozen(task.kept, int), plant, tuple(rounds), strength, verdict, frozen(std), found.tau,
-        _distance(runs), found.bound, found.problem,
+        _distance(runs), found.bound, found.problem, task.estimator,
     )  # fmt: skip
 
 
@@ -339,7 +341,7 @@ def _simulate_new(old: Plant, new: Plant, cases: Sequence[tuple[Case, Loop]]) ->
             return tried, _runs(tried, cases), retreats
         except CalibError as error:
             problem = error
-    raise NotConverged(f"the estimate cannot be simulated, nor anything near: {problem}", new)
+    raise CannotSimulate(f"the estimate cannot be simulated, nor anything near: {problem}", new)
 
 
 def _stack(observed: Sequence[ObservationRows], simulated: Sequence[np.ndarray]) -> Instruments:
@@ -367,10 +369,8 @@ def _ordinary(observed: Sequence[ObservationRows]) -> LinearFit:
     return wls(data, settled_std(data, 1e-3))
 
 
-def _estimate(problem: Instruments, method: str, std: np.ndarray, tau: float = 1.0) -> LinearFit:
-    """Return the estimate from the triangles of [Z W y]: by instruments, or (DIDIM) from [Z y] alone."""
-    if method == "iv":
-        return instrumental_variables.iv(problem, std, tau)
+def _from_simulation(problem: Instruments, std: np.ndarray, tau: float) -> LinearFit:
+    """Return DIDIM's estimate, from [Z y] alone."""
     p = len(problem.names)
     simulated = replace(select(problem.data, np.arange(p)), names=problem.names)
     return wls(simulated, std, np.full(problem.data.groups, tau))
@@ -415,3 +415,12 @@ def _distance(runs: Runs) -> np.ndarray:
         away += np.sum((motion.q - _filtered(run.q, motion)[index]) ** 2, axis=0)
         size += np.sum((motion.q - motion.q.mean(axis=0)) ** 2, axis=0)
     return frozen(100.0 * np.sqrt(away / size))
+
+
+ROUNDS = {
+    one.name: one
+    for one in (
+        RoundEstimator("iv", instrumental_variables.iv, True),
+        RoundEstimator("didim", _from_simulation, False),
+    )
+}

@@ -1,95 +1,68 @@
-"""The estimators of the LS family by name, on rows."""
+"""The methods of the least-squares family: ordinary, weighted, robust and total, on the rows as they were observed."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
-from calib.errors import UsageError
-from calib.estimation.estimate import Estimate
-from calib.estimation.linear import LinearFit, ols, settled_std, wls
+from calib.estimation.linear import LinearFit, ols, ridge, settled_std, wls
 from calib.estimation.samples import irls, stack
 from calib.estimation.total import tls
-from calib.estimation.triangles import Triangles, residual_squares
+from calib.estimation.triangles import Triangles, combine, residual_squares, retriangulate
 from calib.estimation.whiteness import inflation
 from calib.identification.friction.time_folds import estimate
-from calib.identification.rows import ObservationRows, pool
+from calib.identification.methods.method import IdentificationProblem, MethodEstimate, Status, attempted
+from calib.identification.prior import Prior, bounded
+from calib.identification.rows import ObservationRows
 
-METHODS = ("ols", "wls", "irls", "tls", "iv")
 COLUMN_NOISE = 0.01  # of a column's rms: what filtered derivatives miss (our choice)
-ASSUMES = {
-    "ols": "the torques of all joints are equally noisy, q, v and a exact",
-    "wls": "each joint's torque is as noisy as its own residuals say, q, v and a exact",
-    "irls": "torques are noisy together across joints, and samples that do not fit at all are gated out; q, v, a exact",
-    "tls": (
-        f"columns of W are noisy too: each by {COLUMN_NOISE:.0%} of its rms where a joint's torque is noisy by its "
-        "residuals, all up to one factor that the data tell, independently from row to row; offsets and signs are exact"
-    ),
-    "iv": "the controller and its reference are those of the loop, the model's friction that of the robot",
-}
-"""What an estimate rests on, for the user."""
 
 
-@dataclass(frozen=True, eq=False)
-class MethodEstimate:
-    """A fit of base parameters.
+class _Solve(Protocol):
+    def __call__(self, problem: IdentificationProblem, std: np.ndarray, tau: np.ndarray, /) -> LinearFit: ...
+
+
+@dataclass(frozen=True)
+class LeastSquares:
+    """A method that solves the rows directly.
 
     Attributes:
-        fit: the estimate and what it rests on.
-        pooled: triangles of all rows, one group per row.
-        std: (rows,) standard deviation that each row is weighed with: that of its residuals, unless stated.
-        inflation: (rows,) how many rows count as one, from the residuals' autocorrelation.
-        method: one of `METHODS`.
+        name, assumes, takes_prior: see `calib.identification.methods.method.Method`.
+        solve: the problem, (rows,) standard deviations and inflation to the fit.
+        weighted: whether rows are weighed with their standard deviations.
     """
 
-    fit: LinearFit
-    pooled: Triangles
-    std: np.ndarray
-    inflation: np.ndarray
-    method: str
+    name: str
+    assumes: str
+    solve: _Solve
+    takes_prior: bool = False
+    weighted: bool = True
 
     @property
-    def estimate(self) -> Estimate:
-        return self.fit.estimate
+    def simulates(self) -> bool:
+        return False
 
+    def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
+        """Return the estimate of the problem's columns, with a covariance that knows of residuals correlated in time.
 
-def fit_rows(
-    all_rows: Sequence[ObservationRows],
-    data: Triangles,
-    method: str = "wls",
-    exact: bool = True,
-    noise: np.ndarray | None = None,
-) -> MethodEstimate:
-    """Estimate the columns' parameters, with a covariance that knows that residuals are correlated in time.
+        A prior of base parameters and the ridges of richer friction take part where the method takes them.
+        """
+        return attempted(self.name, problem, lambda: self._estimate(problem))
 
-    Args:
-        all_rows: of all cases.
-        data: their triangles (`rows.triangulate`).
-        exact: False where a prior will decide on what the data leave open.
-        method: ``ols``, ``wls``, ``irls`` (across joints, with a gate) or ``tls`` (noise in the columns
-            in proportion to their size).
-        noise: (rows,) where it is known from elsewhere, up to a common factor (`scaled`); None: from the residuals.
-    """
-    if method not in METHODS:
-        raise UsageError(f"method '{method}' is none of {', '.join(METHODS)}")
-    rows = all_rows[0].target.shape[1]
-    pooled = pool(data, rows)
-    if not exact:
-        return _least_norm(all_rows, pooled, method, noise)
-    std = settled_std(pooled) if noise is None else noise * wls(pooled, noise).estimate.residual_std
-    first = wls(pooled, std)
-    tau = residual_inflation(all_rows, first.estimate.values)
-    if method == "ols":
-        fit = ols(pooled, tau)
-    elif method == "irls":
-        fit = _irls(all_rows, float(np.median(tau)))
-    elif method == "tls":
-        fit = _tls(pooled, std)
-    else:
-        fit = wls(pooled, std, tau)
-    return MethodEstimate(fit, pooled, std, tau, method)
+    def _estimate(self, problem: IdentificationProblem) -> MethodEstimate:
+        prior = problem.prior if self.takes_prior else None
+        if prior is None:
+            std, tau = _weighing(problem)
+            fit = self.solve(problem, std, tau)
+            drawn = self.takes_prior and bool((problem.groups >= 0).any())
+            fit = _drawn(problem, None, std, tau) if drawn else fit
+        else:  # what the data leave open, the prior decides
+            std, tau = _least_norm_weighing(problem)
+            fit, drawn = _drawn(problem, prior, std, tau), True
+        return MethodEstimate(self.name, Status.FOUND, fit, problem.pooled, std, tau, self.weighted, drawn)
 
 
 def scaled(noise: np.ndarray | None, std: np.ndarray, counts: np.ndarray) -> np.ndarray:
@@ -100,22 +73,6 @@ def scaled(noise: np.ndarray | None, std: np.ndarray, counts: np.ndarray) -> np.
     for all joints, drops out.
     """
     return std if noise is None else noise * np.sqrt(np.average((std / noise) ** 2, weights=np.maximum(counts, 1)))
-
-
-def _least_norm(
-    all_rows: Sequence[ObservationRows], pooled: Triangles, method: str, noise: np.ndarray | None
-) -> MethodEstimate:
-    """Return a fit whose values serve for its residuals alone: a prior will decide what the data leave open."""
-    std, tau = np.ones(pooled.groups), np.ones(pooled.groups)
-    values = np.zeros(pooled.parameters)
-    for _ in range(4):
-        values = estimate(pooled, std, tau, np.full(pooled.parameters, -1))[0]
-        std = np.sqrt(residual_squares(pooled, values) / np.maximum(pooled.rows, 1))
-        std = scaled(noise, np.maximum(std, 1e-9 * max(float(std.max()), 1e-300)), pooled.rows)
-    covariance = np.zeros((pooled.parameters, pooled.parameters))
-    holder = Estimate(pooled.names, pooled.units, values, covariance, 1.0, int(pooled.rows.sum()))
-    tau = residual_inflation(all_rows, values)
-    return MethodEstimate(LinearFit(holder, std, np.inf, np.inf), pooled, std, tau, method)
 
 
 def residual_inflation(all_rows: Sequence[ObservationRows], values: np.ndarray) -> np.ndarray:
@@ -129,23 +86,100 @@ def residual_inflation(all_rows: Sequence[ObservationRows], values: np.ndarray) 
     return np.maximum(total / max(weight, 1.0), 1.0)
 
 
-def _irls(all_rows: Sequence[ObservationRows], inflated: float) -> LinearFit:
-    matrix = np.concatenate([part.matrix for part in all_rows])
-    target = np.concatenate([part.target for part in all_rows])
-    present = np.concatenate([part.present for part in all_rows])
-    samples = stack(matrix, target, present, all_rows[0].names, all_rows[0].units)
-    return irls(samples, inflation=inflated).fit
-
-
-def _tls(pooled: Triangles, std: np.ndarray) -> LinearFit:
+def scaled_tls(pooled: Triangles, std: np.ndarray, exact: np.ndarray) -> LinearFit:
     """Return the scaled TLS fit: columns that move have noise of `COLUMN_NOISE` of their size, y that of its residuals.
 
-    Columns of ones (offsets) and of signs are exact. The common level is the smallest singular value's; the ratio of
-    the noises, which no single recording tells, is our choice.
+    The common level is the smallest singular value's; the ratio of the noises, which no single recording tells, is our
+    choice.
+
+    Args:
+        pooled: triangles, one group per torque row.
+        std: (rows,) of the residuals.
+        exact: (p,) bool, columns without noise: ones (offsets) and signs.
     """
     p = pooled.parameters
     stacked = np.sum((pooled.factors / std[:, None, None]) ** 2, axis=(0, 1))
     size = np.sqrt(stacked / max(float(pooled.rows.sum()), 1.0))
-    exact = np.array([name.startswith(("off", "Fc")) for name in pooled.names])
     noise = np.append(np.where(exact, 0.0, COLUMN_NOISE * size[:p]), 1.0)
     return tls(pooled, noise, std)
+
+
+def _weighing(problem: IdentificationProblem) -> tuple[np.ndarray, np.ndarray]:
+    """Return (rows,) standard deviations and inflation of a problem whose data determine every parameter."""
+    pooled, noise = problem.pooled, problem.noise
+    std = settled_std(pooled) if noise is None else noise * wls(pooled, noise).estimate.residual_std
+    return std, residual_inflation(problem.rows, wls(pooled, std).estimate.values)
+
+
+def _least_norm_weighing(problem: IdentificationProblem) -> tuple[np.ndarray, np.ndarray]:
+    """Return the same from a fit of least norm, whose values serve for its residuals alone."""
+    pooled = problem.pooled
+    std, tau = np.ones(pooled.groups), np.ones(pooled.groups)
+    values = np.zeros(pooled.parameters)
+    for _ in range(4):
+        values = estimate(pooled, std, tau, np.full(pooled.parameters, -1))[0]
+        std = np.sqrt(residual_squares(pooled, values) / np.maximum(pooled.rows, 1))
+        std = scaled(problem.noise, np.maximum(std, 1e-9 * max(float(std.max()), 1e-300)), pooled.rows)
+    return std, residual_inflation(problem.rows, values)
+
+
+def _drawn(problem: IdentificationProblem, prior: Prior | None, std: np.ndarray, tau: np.ndarray) -> LinearFit:
+    """Return WLS with ridges of richer friction as strong as the evidence says, and with a prior of the base columns.
+
+    With a prior, drive parameters are kept from being negative; the covariance is that without these bounds.
+    """
+    pooled, group = problem.pooled, problem.groups
+    own, more = problem.base.b, pooled.parameters - problem.base.b
+    known = None if prior is None else np.hstack([prior.rows[:, :-1], np.zeros((own, more)), prior.rows[:, -1:]])
+    ridges = estimate(pooled, std, tau, group, known)[1]
+    covariance = np.diag(np.where(group < 0, np.inf, np.maximum(ridges, 1e-12) ** 2))
+    mean = np.zeros(len(ridges))
+    if prior is not None:
+        covariance[:own, :own], mean[:own] = prior.covariance, prior.mean
+    fit = ridge(pooled, mean, covariance, std * np.sqrt(tau))
+    if prior is None:
+        return fit
+    values = _bounded(pooled, std * np.sqrt(tau), mean, covariance, problem.nonnegative)
+    return replace(fit, estimate=replace(fit.estimate, values=values))
+
+
+def _bounded(
+    data: Triangles, std: np.ndarray, mean: np.ndarray, covariance: np.ndarray, nonnegative: np.ndarray
+) -> np.ndarray:
+    """Return the values of data and prior with some parameters not negative."""
+    known = np.isfinite(np.diag(covariance))
+    unit = np.sqrt(np.diag(covariance)[known])
+    lower = np.linalg.cholesky(covariance[np.ix_(known, known)] / np.outer(unit, unit) + 1e-9 * np.eye(len(unit)))
+    rows = np.zeros((len(unit), data.parameters + 1))
+    rows[:, np.flatnonzero(known)] = np.linalg.solve(lower, np.diag(1.0 / unit))
+    rows[:, -1] = rows[:, :-1] @ mean
+    return bounded(retriangulate(np.vstack([combine(data, std), rows])), nonnegative)
+
+
+def _irls(problem: IdentificationProblem, std: np.ndarray, tau: np.ndarray) -> LinearFit:
+    rows = problem.rows
+    matrix, target, present = (np.concatenate([getattr(part, key) for part in rows]) for key in _STACKED)
+    samples = stack(matrix, target, present, rows[0].names, rows[0].units)
+    return irls(samples, inflation=float(np.median(tau))).fit
+
+
+_STACKED = ("matrix", "target", "present")
+OLS = LeastSquares(
+    "ols", "the torques of all joints are equally noisy, q, v and a exact",
+    lambda problem, std, tau: ols(problem.pooled, tau), weighted=False,
+)  # fmt: skip
+WLS = LeastSquares(
+    "wls", "each joint's torque is as noisy as its own residuals say, q, v and a exact",
+    lambda problem, std, tau: wls(problem.pooled, std, tau), takes_prior=True,
+)  # fmt: skip
+IRLS = LeastSquares(
+    "irls",
+    "torques are noisy together across joints, and samples that do not fit at all are gated out; q, v, a exact",
+    _irls,
+)
+TLS = LeastSquares(
+    "tls",
+    f"columns of W are noisy too: each by {COLUMN_NOISE:.0%} of its rms where a joint's torque is noisy by its "
+    "residuals, all up to one factor that the data tell, independently from row to row; offsets and signs are exact",
+    lambda problem, std, tau: scaled_tls(problem.pooled, std, problem.exact),
+)

@@ -17,7 +17,7 @@ from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_e
 from calib.folders import METRICS, check_target, write_staged
 from calib.identification.cases import Case
 from calib.identification.gains import DriveGains
-from calib.identification.methods.least_squares import ASSUMES
+from calib.identification.methods.registry import METHODS
 from calib.identification.model_file import MODEL, in_unit, read_dynamics, to_table
 from calib.identification.possible import information
 from calib.identification.prediction import Dynamics
@@ -305,7 +305,7 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
         "friction": found.friction.chosen,
         "switched_off": list(switched_off(found.names, found.base.b, found.fitted.estimate.sigma)),
         "method": found.fitted.method,
-        "method_assumes": ASSUMES[found.fitted.method],
+        "method_assumes": METHODS[found.fitted.method].assumes,
         "ladder": [
             {
                 "model": rung.model,

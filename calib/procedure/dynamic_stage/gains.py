@@ -14,7 +14,7 @@ from calib.data.signals.motion import Motion, make_motion
 from calib.errors import UsageError
 from calib.identification.cases import Case, make_case
 from calib.identification.gains import DriveGains, identify_gains
-from calib.identification.identify import common_decimator, find_base, first_fit
+from calib.identification.identify import chain_states, common_decimator, find_base, first_fit
 from calib.identification.identify_options import FileSettings, IdentifyOptions, file_settings
 from calib.identification.model_file import TORQUE
 from calib.identification.rows import observe, pool, triangulate, with_blocks
@@ -144,7 +144,7 @@ def _identify(
     reference: int | None,
 ) -> DriveGains:
     model = make_model(chain, settings)
-    base = find_base(chain, model, settings, None, cases)
+    base = find_base(model, cases, chain_states(chain, model, settings.seed))
     missing = [name for name in known if name not in [model.names[k] for k in base.kept]]
     if missing:
         raise UsageError(f"'{missing[0]}' is no parameter of its own in these recordings; is the loaded run loaded?")

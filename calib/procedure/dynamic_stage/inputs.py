@@ -115,7 +115,7 @@ def gather(
 def with_choices(options: IdentifyOptions, method: str | None, friction: str | None, seed: int) -> IdentifyOptions:
     """Return the options with the command's choices in them, held against what exists."""
     from calib.identification.friction.friction_ladder import NAMES
-    from calib.identification.methods.least_squares import METHODS
+    from calib.identification.methods.registry import METHODS
 
     settings: IdentificationSettings = replace(options.settings, seed=seed)
     for value, allowed, key in ((method, METHODS, "method"), (friction, NAMES, "friction")):

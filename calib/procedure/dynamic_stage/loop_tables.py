@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.identification.loop.bias import LoopTest
+from calib.identification.methods.bias import LoopTest
 from calib.identification.methods.instrumental import Instrumental
 from calib.simulation.loop.controllers import Controller
 
@@ -28,7 +28,7 @@ def loop_table(bias: LoopTest) -> dict[str, Any] | None:
     return notes | {
         "controller": controller_table(loops.controller),
         "controller_explains_percent": None if identified is None else _floats(identified.explained),
-        "instruments": bias.method,
+        "instruments": found.estimator.name,
         "rounds": len(found.rounds),
         "retreats": sum(one.retreats for one in found.rounds),
         "durbin_wu_hausman": {

@@ -187,7 +187,7 @@ def model_warnings(
         )
     if excitation and all(report.poor for report in excitation.values()) and found.settings.friction == "auto":
         told.append("friction: standard only, since on so poor a motion no block of time judges another")
-    told += found.bias.lines(found.fitted.method)
+    told += found.bias.lines(found.fitted.instrumental is not None)
     told += _rests(found)
     told += _elastic(cases)
     told += _slow_bias(cases, found)

@@ -11,8 +11,8 @@ import numpy as np
 
 from calib.errors import UsageError
 from calib.estimate_files import read_estimate
-from calib.identification.loop.bias import SMALL
 from calib.identification.loop.replay import DAMPING, FREQUENCY
+from calib.identification.methods.bias import SMALL
 from calib.identification.scores import relative_error_sigma
 from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.folder import UNSEEN, IdentificationFolder

@@ -35,7 +35,7 @@ from calib.config import (
 from calib.data.poses.fit_options import LOSSES, MODELS
 from calib.errors import SessionError
 from calib.identification.friction.friction_ladder import NAMES as FRICTION
-from calib.identification.methods.least_squares import METHODS
+from calib.identification.methods.registry import METHODS
 from poses.indices import Index
 from poses.select import Method
 
@@ -150,7 +150,7 @@ class DynamicsSection:
     friction: Annotated[
         str, OneOf(FRICTION), About("or standard, or one rung of the ladder; see calib identify --friction")
     ] = "auto"
-    method: Annotated[str, OneOf(METHODS), About("or ols, irls, tls")] = "wls"
+    method: Annotated[str, OneOf(tuple(METHODS)), About("or ols, irls, tls")] = "wls"
     options: Annotated[Beside, About("a TOML file beside this one; see `calib formats identify-options`")] = ""
     tolerance_percent: Annotated[
         NotNegative, About("largest torque error on unseen motion that is good enough; 0: none")

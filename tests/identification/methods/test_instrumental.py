@@ -17,7 +17,8 @@ from calib.errors import MeasurementError, NotConverged, Unidentifiable, UsageEr
 from calib.estimation import instrumental_variables
 from calib.identification.cases import make_case
 from calib.identification.loop.controller import identify_controller
-from calib.identification.methods.instrumental import Loop, identify_instrumental
+from calib.identification.loop.loop_recordings import Loop
+from calib.identification.methods.instrumental import identify_instrumental
 from calib.robot import mdh
 from calib.simulation.loop import controllers, references
 from calib.simulation.loop.closed_loop import Plant, Sensing, simulate

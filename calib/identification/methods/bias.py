@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.data.signals.decimation import Decimator
 from calib.data.signals.motion import velocity_noise
-from calib.dynamics.base import Base
-from calib.dynamics.idim import IdentificationModel
 from calib.errors import CalibError, UsageError
-from calib.identification.cases import Case
-from calib.identification.loop.loop_recordings import ClosedLoops, close_loops
-from calib.identification.loop.loop_settings import per_joint
-from calib.identification.methods.instrumental import Instrumental, identify_instrumental
+from calib.identification.loop.loop_recordings import ClosedLoops
+from calib.identification.methods.instrumental import Instrumental
+from calib.identification.methods.method import IdentificationProblem, MethodEstimate
+from calib.identification.methods.simulated import IV
 from calib.identification.settings import IdentificationSettings
-from calib.robot.chain import Chain
 
 FOLLOWS = 10.0  # [%] of a joint's motion by which the simulated robot may miss the recorded one (our choice)
 BLUR = 3.0  # widths of the smoothed sign that the noise of the velocity may have (our choice)
@@ -32,71 +27,60 @@ class LoopTest:
         found: their estimate of the standard model, with the test of least squares; None where there is none.
         loops: what was simulated.
         failure: why there is no estimate.
-        method: of the instruments, ``iv`` or ``didim``.
     """
 
     found: Instrumental | None = None
     loops: ClosedLoops | None = None
     failure: str = ""
-    method: str = "iv"
 
-    def lines(self, method: str) -> list[str]:
-        """Return what a user should be warned of who took the estimate of `method`."""
+    def lines(self, taken: bool) -> list[str]:
+        """Return what a user should be warned of who took this estimate, or (`taken` False) one of least squares."""
         if self.failure:
             return [f"the test of least squares by simulation of the closed loop failed: {self.failure}"]
         if self.found is None:
             return []
         told = [*_weakness(self.found), *_distance(self.found)]
-        return told + (_blurred(self) if method == "iv" else _words(self.found))
+        return told + (_blurred(self) if taken else _words(self.found))
 
 
 def require_loop(settings: IdentificationSettings) -> IdentificationSettings:
-    """Return the settings of method ``iv``, whose model is one that can be simulated.
+    """Return the settings of a method that simulates, whose model is one that can be.
 
     Raises:
         UsageError: where no loop is stated, or the model cannot be simulated.
     """
+    name = settings.method
     if settings.loop is None:
         raise UsageError(
-            "method 'iv' simulates the closed loop: state its controller in the options file, [loop] controller = … "
-            "(calib formats identify-options), and log or state the reference; from q and torque alone use wls or irls"
+            f"method '{name}' simulates the closed loop: state its controller in the options file, [loop] controller = "
+            "… (calib formats identify-options), and log or state the reference; from q and torque alone use wls or "
+            "irls"
         )
     if not settings.torque_rows.motors_alone:
         raise UsageError(
-            f"method 'iv' explains motor torques; rows = '{settings.torque_rows.name}' needs ols, wls, irls or tls"
+            f"method '{name}' explains motor torques; rows = '{settings.torque_rows.name}' needs ols, wls, irls or tls"
         )
     if settings.friction not in ("auto", "standard"):
         raise UsageError(
-            f"method 'iv' simulates standard friction only, not friction = '{settings.friction}'; use wls, whose "
+            f"method '{name}' simulates standard friction only, not friction = '{settings.friction}'; use wls, whose "
             "estimate a [loop] then tests for bias"
         )
     return replace(settings, friction="standard")
 
 
-def try_loop(
-    chain: Chain, model: IdentificationModel, base: Base, cases: Sequence[Case], decimator: Decimator,
-    settings: IdentificationSettings,
-) -> LoopTest:  # fmt: skip
-    """Return the IV estimate of the standard model; nothing without a loop.
+def compare_with_loop(problem: IdentificationProblem, estimate: MethodEstimate) -> LoopTest:
+    """Return what instruments from simulation say of an estimate's problem; nothing without a loop.
 
-    Where it stands beside another method's estimate its failure is told; where it is the method, raised.
+    An estimate that came from them is the comparison itself; beside another method's, their failure is told.
     """
-    loop, loops = settings.loop, None
-    if loop is None:
+    if problem.loop is None:
         return LoopTest()
-    try:
-        if not settings.torque_rows.motors_alone:
-            raise UsageError("instruments from simulation are for motor torques alone")
-        loops = close_loops(chain, model.bodies, cases, decimator, loop)
-        start = per_joint(loop, "inertia", chain.n) if loop.inertia else None
-        found = identify_instrumental(
-            model, base, loops.pairs, decimator, method=loop.instruments, inertia=start, positive=loop.positive
-        )  # fmt: skip
-    except CalibError as error:
-        if settings.method == "iv":
-            raise
-        return LoopTest(None, loops, str(error))
-    return LoopTest(found, loops, method=loop.instruments)
+    if estimate.instrumental is None:
+        try:
+            estimate = IV.beside(problem, estimate)
+        except CalibError as error:
+            return LoopTest(failure=str(error))
+    return LoopTest(estimate.instrumental, estimate.loops, "" if estimate.found else str(estimate.failure))
 
 
 def _weakness(found: Instrumental) -> list[str]:
@@ -142,7 +126,7 @@ def _blurred(test: LoopTest) -> list[str]:
     noise = velocity_noise(case.motion)
     widths = {one.acts[0][0]: one.settings[-1] for one in test.found.plant.terms if one.shape == "sign"}
     wide = [f"{noise[j] / width:.2g} at joint {j + 1}" for j, width in widths.items() if noise[j] > BLUR * width]
-    if not wide or test.method == "didim":
+    if not wide or not test.found.estimator.measured:
         return []
     return [
         f"the noise of the velocities is wider than the Coulomb sign ({', '.join(wide)} widths v0): the sign's columns "

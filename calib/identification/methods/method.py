@@ -1,0 +1,211 @@
+"""What every method of identification is: a problem goes in, an estimate with its status comes out.
+
+A failure is a status, not an exception: studies compare methods over conditions in which some of them fail. The error
+that says what to do about it is in the estimate, for whoever wants it raised (`MethodEstimate.fit`).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+
+from calib.arrays import frozen
+from calib.data.signals.decimation import Decimator
+from calib.dynamics.base import Base
+from calib.dynamics.drives import DriveTerm
+from calib.dynamics.regressor_model import RegressorModel
+from calib.errors import CannotSimulate, Diverged, NotConverged, Unidentifiable
+from calib.estimation import instrumental_variables
+from calib.estimation.estimate import Estimate
+from calib.estimation.linear import LinearFit
+from calib.estimation.triangles import Triangles
+from calib.identification.cases import Case
+from calib.identification.loop.loop_recordings import ClosedLoops
+from calib.identification.loop.loop_settings import LoopSettings
+from calib.identification.methods.instrumental import Instrumental
+from calib.identification.prior import Prior
+from calib.identification.rows import ObservationRows, pool, triangulate
+
+
+class Status(Enum):
+    """How an estimation ended."""
+
+    FOUND = "found"
+    CANNOT_BE_SIMULATED = "cannot be simulated"
+    DIVERGED = "diverged"
+    NOT_CONVERGED = "not converged"
+    RANK_DEFICIENT = "rank deficient"
+
+
+_STATUS = (
+    (Unidentifiable, Status.RANK_DEFICIENT),
+    (CannotSimulate, Status.CANNOT_BE_SIMULATED),
+    (Diverged, Status.DIVERGED),
+    (NotConverged, Status.NOT_CONVERGED),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class IdentificationProblem:
+    """What there is to estimate from.
+
+    Attributes:
+        model: linear in its parameters, with standard friction.
+        base: its base columns.
+        cases: recordings, with their motion at the full rate.
+        decimator: the parallel filter of all rows.
+        rows: observation matrix and torques of each case, p columns: the base columns, then richer friction.
+        terms: (p,) the drive term behind each column; None for parameters of bodies.
+        groups: (p,) ridge group of each column of richer friction; -1 for base columns.
+        noise: (rows,) of the torques, up to a common factor; None: from their residuals.
+        prior: of the base parameters; None where nothing is known beforehand.
+        loop: the closed loop that the recordings came from; None where none is stated.
+        cad: standard parameters of the bodies by the robot's description, for a loop that feeds them forward.
+    """
+
+    model: RegressorModel
+    base: Base
+    cases: Sequence[Case]
+    decimator: Decimator
+    rows: tuple[ObservationRows, ...]
+    terms: tuple[DriveTerm | None, ...]
+    groups: np.ndarray
+    noise: np.ndarray | None = None
+    prior: Prior | None = None
+    loop: LoopSettings | None = None
+    cad: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "groups", frozen(self.groups, int))
+
+    @cached_property
+    def pooled(self) -> Triangles:
+        """Triangles of all rows, one group per torque row."""
+        return pool(triangulate(self.rows), self.rows[0].target.shape[1])
+
+    @property
+    def nonnegative(self) -> np.ndarray:
+        """(p,) bool: inertia and friction of drives, of which no robot has less than none."""
+        return np.array([one is not None and one.nonnegative for one in self.terms], dtype=bool)
+
+    @property
+    def exact(self) -> np.ndarray:
+        """(p,) bool: columns free of the noise of positions."""
+        return np.array([one is not None and one.form.exact for one in self.terms], dtype=bool)
+
+
+@dataclass(frozen=True, eq=False)
+class MethodEstimate:
+    """What a method made of a problem.
+
+    Attributes:
+        method: its name.
+        status: how it ended.
+        solution: values with covariance, and what they rest on; None unless found.
+        pooled: triangles of all rows, one group per row.
+        std: (rows,) standard deviation that each row is weighed with: that of its residuals, unless stated.
+        inflation: (rows,) how many rows count as one, from the residuals' autocorrelation.
+        weighted: whether the rows were weighed with `std` (all but OLS).
+        drawn: whether a prior or ridges took part.
+        iterations: rounds of simulation and estimation; 1 for a method that needs none.
+        simulations: runs of the closed loop.
+        seconds: that it took.
+        failure: why there is no solution, and what to do.
+        instrumental: what the simulated closed loop says besides, where the method simulates.
+        loops: what was simulated.
+    """
+
+    method: str
+    status: Status
+    solution: LinearFit | None
+    pooled: Triangles
+    std: np.ndarray
+    inflation: np.ndarray
+    weighted: bool = True
+    drawn: bool = False
+    iterations: int = 1
+    simulations: int = 0
+    seconds: float = 0.0
+    failure: Unidentifiable | NotConverged | None = None
+    instrumental: Instrumental | None = None
+    loops: ClosedLoops | None = None
+
+    @property
+    def found(self) -> bool:
+        return self.status is Status.FOUND
+
+    @property
+    def fit(self) -> LinearFit:
+        """The solution.
+
+        Raises:
+            Unidentifiable, NotConverged: where there is none.
+        """
+        if self.solution is None:
+            raise self.failure or NotConverged(f"{self.method}: {self.status.value}")
+        return self.solution
+
+    @property
+    def estimate(self) -> Estimate:
+        return self.fit.estimate
+
+    def testable(self) -> tuple[Triangles, np.ndarray, np.ndarray]:
+        """Return triangles on which least squares gives this estimate, (g,) std and (g,) inflation: to test with."""
+        if self.instrumental is None:
+            return self.pooled, self.std, self.inflation
+        own = self.instrumental
+        data = instrumental_variables.testable(own.problem, own.fit, own.std)
+        return data, np.ones(1), np.array([own.inflation])
+
+
+class Method(Protocol):
+    """A way from a problem to an estimate.
+
+    The steps around a method (prior, richer friction, stated noise, elimination) ask it what it accepts.
+    """
+
+    @property
+    def name(self) -> str:
+        """What options and files call it."""
+        ...
+
+    @property
+    def assumes(self) -> str:
+        """What its estimate rests on, for the user."""
+        ...
+
+    @property
+    def takes_prior(self) -> bool:
+        """Whether a prior, the ridges of richer friction and a stated noise of the rows have a place in it."""
+        ...
+
+    @property
+    def simulates(self) -> bool:
+        """Whether it needs a closed loop, and a model that can be simulated."""
+        ...
+
+    def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
+        """Return the estimate of the problem's p columns, or the status that says why there is none."""
+        ...
+
+
+def attempted(
+    method: str, problem: IdentificationProblem, run: Callable[[], MethodEstimate], loops: ClosedLoops | None = None
+) -> MethodEstimate:
+    """Return what `run` makes of a problem, with the time it took; its failure as a status."""
+    began = time.perf_counter()
+    try:
+        found = run()
+    except (Unidentifiable, NotConverged) as error:
+        status = next(own for kind, own in _STATUS if isinstance(error, kind))
+        nothing = np.full(problem.pooled.groups, np.nan)
+        found = MethodEstimate(
+            method, status, None, problem.pooled, nothing, nothing, failure=error, loops=loops
+        )  # fmt: skip
+    return replace(found, seconds=time.perf_counter() - began)

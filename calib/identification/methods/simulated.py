@@ -1,0 +1,83 @@
+"""Methods that simulate the closed loop a recording came from: instrumental variables, and DIDIM."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from calib.dynamics.idim import IdentificationModel
+from calib.errors import UsageError
+from calib.identification.loop.loop_recordings import ClosedLoops, close_loops
+from calib.identification.loop.loop_settings import LoopSettings, per_joint
+from calib.identification.methods.instrumental import identify_instrumental
+from calib.identification.methods.least_squares import WLS
+from calib.identification.methods.method import IdentificationProblem, MethodEstimate, attempted
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """A method that simulates.
+
+    Attributes:
+        name, assumes: see `calib.identification.methods.method.Method`.
+        instruments: what it makes of the simulated motion, see `calib.identification.methods.instrumental.ROUNDS`;
+            "": what the loop's settings say.
+    """
+
+    name: str
+    assumes: str
+    instruments: str = ""
+
+    @property
+    def takes_prior(self) -> bool:
+        return False
+
+    @property
+    def simulates(self) -> bool:
+        return True
+
+    def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
+        """Return the estimate of the base columns; weights and inflation beside it are those of WLS.
+
+        Raises:
+            UsageError, MeasurementError: for a loop or recordings that no simulation can start from.
+        """
+        if problem.loop is None or not isinstance(problem.model, IdentificationModel):
+            raise UsageError(f"method '{self.name}' needs a [loop], and a robot that can be simulated")
+        plain = WLS.estimate(problem)
+        if not plain.found:
+            return replace(plain, method=self.name)
+        found = self.beside(problem, plain)
+        return replace(found, seconds=plain.seconds + found.seconds)
+
+    def beside(self, problem: IdentificationProblem, plain: MethodEstimate) -> MethodEstimate:
+        """Return the same beside least squares that is there already."""
+        model, loop = problem.model, problem.loop
+        if loop is None or not isinstance(model, IdentificationModel) or not model.torque_rows.motors_alone:
+            raise UsageError("instruments from simulation are for motor torques alone")
+        loops = close_loops(model.bodies, problem.cases, problem.decimator, loop, problem.cad)
+        return attempted(self.name, problem, lambda: self._estimate(problem, plain, model, loop, loops), loops)
+
+    def _estimate(
+        self, problem: IdentificationProblem, plain: MethodEstimate, model: IdentificationModel, loop: LoopSettings,
+        loops: ClosedLoops,
+    ) -> MethodEstimate:  # fmt: skip
+        found = identify_instrumental(
+            model, problem.base, loops.pairs, problem.decimator, method=self.instruments or loop.instruments,
+            inertia=per_joint(loop, "inertia", model.n) if loop.inertia else None, positive=loop.positive,
+        )  # fmt: skip
+        return replace(
+            plain, method=self.name, solution=found.fit, std=found.std, iterations=len(found.rounds),
+            simulations=len(loops.pairs) * sum(1 + one.retreats for one in found.rounds), drawn=False,
+            instrumental=found, loops=loops,
+        )  # fmt: skip
+
+
+IV = Simulated(
+    "iv", "the controller and its reference are those of the loop, the model's friction that of the robot"
+)  # fmt: skip
+DIDIM = Simulated(
+    "didim",
+    "the simulated robot moves as the real one: controller and reference are those of the loop, the model's friction "
+    "that of the robot; no measured position takes part",
+    "didim",
+)
