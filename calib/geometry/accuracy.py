@@ -17,10 +17,9 @@ from itertools import combinations
 
 import numpy as np
 
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import PoseMeasurements, Positions, Sockets
 from calib.geometry.installation import Installation
-from calib.geometry.observation import Block, observe, predict, prepare
-from calib.geometry.residuals import Part
+from calib.geometry.observation import observe, predict, prepare
 
 NATURE = {
     "position": "position",
@@ -56,13 +55,6 @@ class Errors:
         return np.zeros(0) if chosen is None else chosen
 
 
-def residual_parts(
-    cell: Installation, measured: Sequence[PoseMeasurements], torques: Torques = None
-) -> list[list[Part]]:
-    """Return the residual parts of each block, without Jacobians."""
-    return [observe(cell, block, _NONE) for block in prepare(cell, measured, torques)]
-
-
 def errors(cell: Installation, measured: Sequence[PoseMeasurements], torques: Torques = None) -> Errors:
     """Return the size of every error.
 
@@ -75,8 +67,8 @@ def errors(cell: Installation, measured: Sequence[PoseMeasurements], torques: To
     for block in prepare(cell, measured, torques):
         for part in observe(cell, block, _NONE):
             found[NATURE[part.label]].append(np.linalg.norm(part.value, axis=0))
-        if block.measured.kind == "sockets" and not block.measured.links:
-            found["distance"].append(_socket_spread(cell, block))
+        if isinstance(block.measured, Sockets) and not block.measured.links:
+            found["distance"].append(_socket_spread(predict(cell, block).point, block.measured))
     joined = {name: np.concatenate(sizes) if sizes else np.zeros(0) for name, sizes in found.items()}
     return Errors(**{name: sizes if len(sizes) else None for name, sizes in joined.items()})
 
@@ -135,7 +127,7 @@ def pair_errors(
     generator = np.random.default_rng(seed)
     result = [np.zeros(0)]
     for block in prepare(cell, measured, torques):
-        if block.measured.position is None or len(block.measured) < 2:
+        if not isinstance(block.measured, Positions) or len(block.measured) < 2:
             continue
         first, second = _pairs(len(block.measured), limit, generator)
         point, seen = predict(cell, block).point.T, block.measured.position
@@ -152,13 +144,12 @@ def _pairs(m: int, limit: int, generator: np.random.Generator) -> tuple[np.ndarr
     return first, (first + generator.integers(1, m, limit)) % m
 
 
-def _socket_spread(cell: Installation, block: Block) -> np.ndarray:
+def _socket_spread(point: np.ndarray, measured: Sockets) -> np.ndarray:
     """Return how far the distance of the same two sockets is from its mean over the fixture's positions [m].
 
-    A group's name is ``<fixture position>/<socket>``; empty where no pair of sockets occurs in two positions.
+    Of predicted points (3, m) [m]. A group's name is ``<fixture position>/<socket>``; empty where no pair of sockets
+    occurs in two positions.
     """
-    measured = block.measured
-    point = predict(cell, block).point
     sockets: dict[str, dict[str, np.ndarray]] = {}
     for number in np.unique(measured.group):
         name = measured.group_names[number] if measured.group_names else str(number)

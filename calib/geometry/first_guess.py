@@ -13,14 +13,14 @@ Each guess then gets a few robust Gauss–Newton steps on the frames alone (`cal
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import singledispatch
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.data.poses.measurements import PoseMeasurements, take
+from calib.data.poses.measurements import PoseMeasurements, Poses, Positions, Sockets, take
 from calib.errors import MeasurementError
 from calib.geometry.installation import Installation
-from calib.geometry.observation import has_instrument
 from calib.robot.chain import Chain
 from calib.robot.deflection import Deflection
 from calib.robot.kinematics import forward
@@ -50,8 +50,7 @@ def install(chain: Chain, measured: Sequence[PoseMeasurements], known: Deflectio
     """
     stations: dict[str, np.ndarray] = {}
     tools: dict[str, np.ndarray] = {}
-    rank = {"pose": 0, "position": 1, "sockets": 2}
-    for block in sorted(measured, key=lambda b: (rank.get(b.kind, 3), -len(b))):
+    for block in sorted(measured, key=lambda b: (_rank(b), -len(b))):
         block = take(block, np.unique(np.linspace(0, len(block) - 1, ENOUGH).astype(int)))
         arm = forward(chain, block.q)
         check_scale(block, arm)
@@ -59,9 +58,9 @@ def install(chain: Chain, measured: Sequence[PoseMeasurements], known: Deflectio
             name, rows = block.tool_names[number], block.tool == number
             station, tool = _guess(block, arm, rows, stations.get(block.station), tools.get(name))
             tools.setdefault(name, tool)
-            if has_instrument(block) and station is not None:
+            if block.has_instrument and station is not None:
                 stations.setdefault(block.station, station)
-    station_names = tuple(dict.fromkeys(b.station for b in measured if has_instrument(b))) or ("station",)
+    station_names = tuple(dict.fromkeys(b.station for b in measured if b.has_instrument)) or ("station",)
     tool_names = tuple(dict.fromkeys(name for b in measured for name in b.tool_names))
     return Installation(
         chain,
@@ -83,7 +82,7 @@ def check_scale(block: PoseMeasurements, arm: np.ndarray) -> None:
     Raises:
         MeasurementError: for a ratio beyond `WRONG_UNIT`, with the unit that would explain it.
     """
-    if block.position is None or len(block) < 3:
+    if not isinstance(block, Positions) or len(block) < 3:
         return
     measured, predicted = (np.linalg.norm(x.std(axis=0)) for x in (block.position, arm[:, :3, 3]))
     if predicted < 1e-3:
@@ -101,26 +100,49 @@ def check_scale(block: PoseMeasurements, arm: np.ndarray) -> None:
     )
 
 
+def _rank(block: PoseMeasurements) -> int:
+    """Return how far behind others a block's kind is in telling where instrument and target stand."""
+    telling = (Poses, Positions, Sockets)
+    return next((rank for rank, kind in enumerate(telling) if isinstance(block, kind)), len(telling))
+
+
+Guess = tuple[np.ndarray | None, np.ndarray]
+
+
+@singledispatch
 def _guess(
     block: PoseMeasurements, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
-) -> tuple[np.ndarray | None, np.ndarray]:
-    """Place one target of a block, and its station where it is not placed yet."""
-    if block.kind == "pose":
-        assert block.position is not None and block.quaternion is not None
-        _enough(block, rows, 3)
-        seen = pose(Rotation.from_quat(block.quaternion[rows]).as_matrix(), block.position[rows])
-        if station is not None:
-            return station, average_pose(invert(arm[rows]) @ invert(station) @ seen)
-        if tool is not None:
-            return average_pose(seen @ invert(arm[rows] @ tool)), tool
-        return place_pose(arm[rows], seen)
-    if block.kind == "position":
-        assert block.position is not None
-        _enough(block, rows, 4)
-        return place_position(arm[rows], block.position[rows], station, tool)
-    if block.kind == "sockets" and tool is None:
-        return None, pose(None, place_sockets(arm[rows], block.group[rows]))
+) -> Guess:
+    """Place one target of a block, and its station where it is not placed yet; by the type of the measurements."""
     return None, np.eye(4) if tool is None else tool
+
+
+@_guess.register
+def _guess_from_poses(
+    block: Poses, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
+) -> Guess:
+    _enough(block, rows, 3)
+    seen = pose(Rotation.from_quat(block.quaternion[rows]).as_matrix(), block.position[rows])
+    if station is not None:
+        return station, average_pose(invert(arm[rows]) @ invert(station) @ seen)
+    if tool is not None:
+        return average_pose(seen @ invert(arm[rows] @ tool)), tool
+    return place_pose(arm[rows], seen)
+
+
+@_guess.register
+def _guess_from_positions(
+    block: Positions, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
+) -> Guess:
+    _enough(block, rows, 4)
+    return place_position(arm[rows], block.position[rows], station, tool)
+
+
+@_guess.register
+def _guess_from_sockets(
+    block: Sockets, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
+) -> Guess:
+    return None, pose(None, place_sockets(arm[rows], block.group[rows])) if tool is None else tool
 
 
 def _enough(block: PoseMeasurements, rows: np.ndarray, needed: int) -> None:

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import Poses, Positions
 from calib.errors import Unidentifiable, UsageError
 from calib.geometry.identifiability import base_columns
 from calib.geometry.installation import Installation, see
@@ -20,7 +21,7 @@ from calib.robot.chain import Chain, random_joints
 from calib.robot.kinematics import element_jacobian, joint_jacobian
 from calib.transforms import pose, to_quaternion
 
-KINDS = ("pose", "position")
+KINDS = (Poses.kind, Positions.kind)
 SAMPLES = 300  # random postures that decide what is identifiable
 SIGMA_POSITION, SIGMA_ORIENTATION = 1e-4, 1e-4  # [m], [rad]: our choice where none is stated
 
@@ -31,13 +32,13 @@ class Observation:
 
     Attributes:
         cell: the nominal arm, its base at the instrument's origin, with its targets.
-        kind: ``pose`` (six rows per target) or ``position`` (three).
+        full: whether orientations are seen, too: six rows per target, not three.
         free: (p,) the parameters that such measurements can tell, in the full vector.
         sigmas: of a position [m] and of an orientation [rad].
     """
 
     cell: Installation
-    kind: str
+    full: bool
     free: np.ndarray
     sigmas: tuple[float, float] = (SIGMA_POSITION, SIGMA_ORIENTATION)
 
@@ -45,10 +46,10 @@ class Observation:
         rows = []
         for number in range(len(self.cell.tools)):
             seen = see(self.cell, q, 0, np.full(len(q), number))
-            block = Block(_measured(q, self.cell, number, self.kind), 0, np.full(len(q), number))
+            block = Block(_measured(q, self.cell, number, self.full), 0, np.full(len(q), number))
             jacobian = target_jacobian(self.cell, block, seen, self.free)
             rows.append(jacobian[:, :3] / self.sigmas[0])
-            if self.kind == "pose":
+            if self.full:
                 rows.append(jacobian[:, 3:] / self.sigmas[1])
         return np.concatenate(rows, axis=1).transpose(2, 1, 0)
 
@@ -96,27 +97,23 @@ def observation(
     """
     if kind not in KINDS:
         raise UsageError(f"kind '{kind}' is none of {', '.join(KINDS)}")
+    full = kind == Poses.kind
     q = random_joints(cell.chain, SAMPLES, seed)
-    blocks = prepare(cell, [_measured(q, cell, number, kind) for number in range(len(cell.tools))])
+    blocks = prepare(cell, [_measured(q, cell, number, full) for number in range(len(cell.tools))])
     columns = np.arange(len(layout(cell).names))
-    if kind == "position":  # a point has no orientation of its own
+    if not full:  # a point has no orientation of its own
         turns = [k for k in layout(cell).tool_index if layout(cell).units[k] == "rad"]
         columns = np.setdiff1d(columns, turns)
     split = base_columns(cell, blocks, columns)
     if not split.rank:
         raise Unidentifiable(f"robot '{cell.chain.name}': no parameter has an effect on what is measured")
-    return Observation(cell, kind, columns[split.kept], sigmas or (SIGMA_POSITION, SIGMA_ORIENTATION))
+    return Observation(cell, full, columns[split.kept], sigmas or (SIGMA_POSITION, SIGMA_ORIENTATION))
 
 
-def _measured(q: np.ndarray, cell: Installation, number: int, kind: str) -> PoseMeasurements:
+def _measured(q: np.ndarray, cell: Installation, number: int, full: bool) -> Positions:
     """Return what an exact instrument would measure of one target."""
     poses = see(cell, q, 0, np.full(len(q), number)).poses()
-    return PoseMeasurements(
-        kind,
-        q,
-        cell.chain.joint_names,
-        position=poses[:, :3, 3],
-        quaternion=to_quaternion(poses) if kind == "pose" else None,
-        tool_names=(cell.tool_names[number],),
-        station=cell.station_names[0],
-    )
+    common: dict[str, Any] = {"tool_names": (cell.tool_names[number],), "station": cell.station_names[0]}
+    if full:
+        return Poses(q, cell.chain.joint_names, poses[:, :3, 3], to_quaternion(poses), **common)
+    return Positions(q, cell.chain.joint_names, poses[:, :3, 3], **common)

@@ -48,18 +48,13 @@ def prepare(
     blocks = []
     for number, block in enumerate(measured):
         torque = torques[number] if torques is not None else None
-        station = _index(cell.station_names, block.station, "station") if has_instrument(block) else -1
+        station = _index(cell.station_names, block.station, "station") if block.has_instrument else -1
         tools = np.array([_index(cell.tool_names, name, "tool") for name in block.tool_names])
         bases = deflection.evaluate(cell.deflection, block.q, torque) if cell.deflection.terms else None
         known = deflection.evaluate(cell.known, block.q, torque) if cell.known.terms else None
         given = deflection.extra_displacements(cell.chain, cell.known, block.q, known)
         blocks.append(Block(block, station, tools[block.tool], torque, bases, given))
     return blocks
-
-
-def has_instrument(measured: PoseMeasurements) -> bool:
-    """Say whether the rows are seen from a station whose placement matters."""
-    return measured.kind in ("pose", "position")
 
 
 def _index(names: tuple[str, ...], name: str, what: str) -> int:

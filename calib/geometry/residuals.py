@@ -8,13 +8,13 @@ the Jacobian is Kaufman's 1975, whose gradient is exact).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import singledispatch
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import Bars, Distances, Planes, PoseMeasurements, Poses, Positions, Sockets
 from calib.errors import MeasurementError
 from calib.geometry.installation import Seen
 
@@ -40,20 +40,24 @@ class Part:
     index: np.ndarray
 
 
+@singledispatch
 def parts(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[Part]:
-    """Return the residual parts of one block.
+    """Return the residual parts of one block by the function registered for its type.
 
     Args:
         measured: the block, m rows.
         seen: the predicted targets.
         jacobian: (f, 6, m), [v; ω] of the target.
+
+    Raises:
+        MeasurementError: for a type without one.
     """
-    return _KINDS[measured.kind](measured, seen, jacobian)
+    raise MeasurementError(f"no residual is registered for measurements of kind '{measured.kind}'", measured.file)
 
 
-def _pose(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[Part]:
+@parts.register
+def _pose(measured: Poses, seen: Seen, jacobian: np.ndarray) -> list[Part]:
     """r = [y - p; log(R_y Rᵀ)]; d log = J_r⁻¹(r) ω."""
-    assert measured.quaternion is not None
     predicted = Rotation.from_matrix(seen.rotation.transpose(2, 1, 0))
     turn = (Rotation.from_quat(measured.quaternion) * predicted.inv()).as_rotvec().T
     sigma = None if measured.sigma_rotation is None else measured.sigma_rotation.T
@@ -62,28 +66,27 @@ def _pose(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[
     return [*_position(measured, seen, jacobian), Part("orientation", turn, angular, sigma, 0, everywhere)]
 
 
-def _position(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[Part]:
+@parts.register
+def _position(measured: Positions, seen: Seen, jacobian: np.ndarray) -> list[Part]:
     """r = y - p."""
-    assert measured.position is not None
     sigma = None if measured.sigma is None else measured.sigma.T
     everywhere = np.arange(len(measured))
     return [Part("position", measured.position.T - seen.point, jacobian[:, :3], sigma, 0, everywhere)]
 
 
-def _distance(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[Part]:
+@parts.register
+def _distance(measured: Distances, seen: Seen, jacobian: np.ndarray) -> list[Part]:
     """r = L - |p_a - p_b| for the two rows of each pair."""
-    assert measured.distance is not None
     first, second = _pairs(measured)
     gap = seen.point[:, first] - seen.point[:, second]
     length = np.linalg.norm(gap, axis=0)
     along = np.einsum("im,fim->fm", gap / length, jacobian[:, :3, first] - jacobian[:, :3, second])
-    sigma = None if measured.sigma is None else measured.sigma[first, :1].T
+    sigma = None if measured.sigma is None else measured.sigma[first][None]
     return [Part("distance", (measured.distance[first] - length)[None], along[:, None], sigma, 0, first)]
 
 
-def _pairs(measured: PoseMeasurements) -> tuple[np.ndarray, np.ndarray]:
+def _pairs(measured: Distances) -> tuple[np.ndarray, np.ndarray]:
     """Return the row indices of the first and second pose of each pair."""
-    assert measured.group is not None and measured.rows is not None
     order = np.argsort(measured.group, kind="stable")
     groups, counts = np.unique(measured.group, return_counts=True)
     if np.any(counts != 2):
@@ -95,7 +98,8 @@ def _pairs(measured: PoseMeasurements) -> tuple[np.ndarray, np.ndarray]:
     return order[0::2], order[1::2]
 
 
-def _sockets(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[Part]:
+@parts.register
+def _sockets(measured: Sockets, seen: Seen, jacobian: np.ndarray) -> list[Part]:
     """r = mean of its group - p, and L - |mean_a - mean_b| for sockets whose distance is known."""
     groups, inverse, counts = np.unique(measured.group, return_inverse=True, return_counts=True)
     average = np.zeros((len(measured), len(groups)))
@@ -119,7 +123,8 @@ def _sockets(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> li
     return result
 
 
-def _plane(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[Part]:
+@parts.register
+def _plane(measured: Planes, seen: Seen, jacobian: np.ndarray) -> list[Part]:
     """r = -n · (p - mean), n the normal of the best plane of each group."""
     value, slope = np.zeros(len(measured)), np.zeros((len(jacobian), len(measured)))
     groups = np.unique(measured.group)
@@ -132,13 +137,13 @@ def _plane(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list
         value[rows] = -axes[:, 2] @ points
         nuisance = np.column_stack([np.ones(len(rows)), points.T @ axes[:, :2]])
         slope[:, rows] = _project(np.einsum("i,fim->fm", axes[:, 2], jacobian[:, :3, rows]), nuisance)
-    sigma = None if measured.sigma is None else measured.sigma[:, :1].T
+    sigma = None if measured.sigma is None else measured.sigma[None]
     return [Part("plane", value[None], slope[:, None], sigma, _unknowns(measured), np.arange(len(measured)))]
 
 
-def _bar(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[Part]:
+@parts.register
+def _bar(measured: Bars, seen: Seen, jacobian: np.ndarray) -> list[Part]:
     """r = L - |p - c|, c the best centre of each group."""
-    assert measured.distance is not None
     value, slope = np.zeros(len(measured)), np.zeros((len(jacobian), len(measured)))
     groups = np.unique(measured.group)
     for group in groups:
@@ -150,11 +155,11 @@ def _bar(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[P
         unit = away / np.linalg.norm(away, axis=0)
         value[rows] = lengths - np.linalg.norm(away, axis=0)
         slope[:, rows] = _project(np.einsum("im,fim->fm", unit, jacobian[:, :3, rows]), unit.T)
-    sigma = None if measured.sigma is None else measured.sigma[:, :1].T
+    sigma = None if measured.sigma is None else measured.sigma[None]
     return [Part("distance", value[None], slope[:, None], sigma, _unknowns(measured), np.arange(len(measured)))]
 
 
-def _unknowns(measured: PoseMeasurements) -> int:
+def _unknowns(measured: Planes | Bars) -> int:
     """Return how many numbers of planes or centres were eliminated: three each, or all a small group has."""
     _, counts = np.unique(measured.group, return_counts=True)
     return int(np.minimum(counts, 3).sum())
@@ -198,13 +203,3 @@ def _inverse_right_jacobian(turn: np.ndarray, angular: np.ndarray) -> np.ndarray
     once = np.cross(turn.T[None], angular.transpose(0, 2, 1))
     twice = np.cross(turn.T[None], once)
     return (angular.transpose(0, 2, 1) + 0.5 * once + factor[:, None] * twice).transpose(0, 2, 1)
-
-
-_KINDS: dict[str, Callable[[PoseMeasurements, Seen, np.ndarray], list[Part]]] = {
-    "pose": _pose,
-    "position": _position,
-    "distance": _distance,
-    "sockets": _sockets,
-    "plane": _plane,
-    "bar": _bar,
-}

@@ -52,7 +52,7 @@ def _sigmas(
     tool: int,
 ) -> np.ndarray:
     m = len(q)
-    rows = PoseMeasurements("position", q, cell.chain.joint_names, position=np.zeros((m, 3)))
+    rows = PoseMeasurements(q, cell.chain.joint_names)
     block = Block(rows, station, np.full(m, tool), torque, evaluate(cell.deflection, q, torque))
     jacobian = target_jacobian(cell, block, predict(cell, block), free)
     spread = (root.T @ jacobian.reshape(len(free), 6 * m)).reshape(-1, 6, m)

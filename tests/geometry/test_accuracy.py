@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import KINDS, PoseMeasurements, Sockets
 from calib.geometry.accuracy import errors, pair_errors, statistics, summary
 from calib.geometry.installation import Installation, see
 from calib.robot.load import load
@@ -24,7 +24,7 @@ IN_BASE = see(replace(CELL, stations=np.eye(4)[None]), Q).point.T
 
 
 def block(kind: str, **values) -> PoseMeasurements:
-    return PoseMeasurements(kind, Q[: len(next(iter(values.values())))], CELL.chain.joint_names, **values)
+    return KINDS[kind](Q[: len(next(iter(values.values())))], CELL.chain.joint_names, **values)
 
 
 def test_position_and_orientation_are_lengths_of_vectors():
@@ -59,7 +59,7 @@ def test_distances_have_no_position():
 def test_sockets_scatter_about_their_mean():
     group = np.repeat([0, 1], 12)
     names, links = ("a/0", "a/1"), ((0, 1, 0.05),)
-    linked = PoseMeasurements("sockets", Q, CELL.chain.joint_names, group=group, group_names=names, links=links)
+    linked = Sockets(Q, CELL.chain.joint_names, group=group, group_names=names, links=links)
     found = errors(CELL, [linked])
     means = np.array([IN_BASE[group == k].mean(axis=0) for k in (0, 1)])
     assert found.position == pytest.approx(np.linalg.norm(IN_BASE - means[group], axis=1))
@@ -69,11 +69,11 @@ def test_sockets_scatter_about_their_mean():
 def test_sockets_of_unknown_distance_compare_over_the_fixtures_positions():
     group = np.repeat(np.arange(4), 6)
     names = ("left/0", "left/1", "right/0", "right/1")
-    found = errors(CELL, [PoseMeasurements("sockets", Q, CELL.chain.joint_names, group=group, group_names=names)])
+    found = errors(CELL, [Sockets(Q, CELL.chain.joint_names, group=group, group_names=names)])
     means = np.array([IN_BASE[group == k].mean(axis=0) for k in range(4)])
     left, right = np.linalg.norm(means[0] - means[1]), np.linalg.norm(means[2] - means[3])
     assert found.distance == pytest.approx([abs(left - right) / 2] * 2)
-    alone = PoseMeasurements("sockets", Q[:12], CELL.chain.joint_names, group=group[:12], group_names=names[:2])
+    alone = Sockets(Q[:12], CELL.chain.joint_names, group=group[:12], group_names=names[:2])
     assert errors(CELL, [alone]).distance is None
 
 

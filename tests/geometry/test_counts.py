@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from planted import cell, load, measure, perturb, random_joints
 
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import PoseMeasurements, Poses
 from calib.geometry.identifiability import base_columns, observation_matrix
 from calib.geometry.installation import Installation, see
 from calib.geometry.observation import prepare
@@ -29,7 +29,7 @@ def split(installation: Installation, kind: str = "pose", candidates=None, toler
 def exact_poses(installation: Installation, q: np.ndarray) -> PoseMeasurements:
     poses = see(installation, q).poses()
     names = installation.chain.joint_names
-    return PoseMeasurements("pose", q, names, position=poses[:, :3, 3], quaternion=to_quaternion(poses))
+    return Poses(q, names, position=poses[:, :3, 3], quaternion=to_quaternion(poses))
 
 
 def scara(beta: bool = True) -> Chain:

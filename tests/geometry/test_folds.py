@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from planted import cell, load, measure
 
-from calib.data.poses.measurements import PoseMeasurements, take
+from calib.data.poses.measurements import PoseMeasurements, Sockets, take
 from calib.errors import UsageError
 from calib.geometry.model_choice.folds import Folds, folds_by_name, random_folds, region_folds, transfer_folds
 
@@ -87,7 +87,7 @@ def sockets(fixtures: int, file: str = "one", linked: bool = True) -> PoseMeasur
     group = np.random.default_rng(1).permutation(np.repeat(np.arange(2 * fixtures), 8))
     links = tuple((2 * k, 2 * k + 1, 0.05) for k in range(fixtures)) if linked else ()
     q = np.random.default_rng(2).normal(size=(len(group), 3))
-    return PoseMeasurements("sockets", q, ("a", "b", "c"), group=group, links=links, file=file)
+    return Sockets(q, ("a", "b", "c"), group=group, links=links, file=file)
 
 
 @pytest.mark.parametrize("fixtures", [3, 5, 8])

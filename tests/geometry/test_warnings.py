@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from planted import cell, load, measure, perturb, random_joints
 
-from calib.data.poses.measurements import PoseMeasurements, take
+from calib.data.poses.measurements import PoseMeasurements, Positions, take
 from calib.geometry.checks.diagnosis import diagnose, neighbour_floor
 from calib.geometry.checks.explanation import explain
 from calib.geometry.first_guess import install
@@ -35,7 +35,7 @@ def nearby(truth: Installation, centres: int, each: int, seed: int, sigma: float
     q = q + wide * rng.normal(size=q.shape)
     point = see(truth, q).point.T
     position = point + sigma * rng.normal(size=point.shape)
-    return PoseMeasurements("position", q, truth.chain.joint_names, position=position, file="cluster.csv")
+    return Positions(q, truth.chain.joint_names, position=position, file="cluster.csv")
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -120,9 +120,7 @@ def test_tool_and_base_are_said_to_be_confused_only_where_they_are(seed):
     q = centre + np.array([0.3, 0.3, 0.3, 1e-4, 1e-4, 1e-4]) * rng.normal(size=(150, 6))
     q[:, 3] -= (q[:, 1:3] - centre[1:3]).sum(axis=1)
     point = see(truth, q).point.T
-    still = PoseMeasurements(
-        "position", q, truth.chain.joint_names, position=point + SIGMA * rng.normal(size=point.shape)
-    )
+    still = Positions(q, truth.chain.joint_names, position=point + SIGMA * rng.normal(size=point.shape))
     assert any("cannot be told from the base" in line for line in explain(calibrate(still)))
     free = measure(truth, "position", 150, seed, sigma=SIGMA)
     assert not any("cannot be told" in line for line in explain(calibrate(free)))

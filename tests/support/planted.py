@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import KINDS, Planes, PoseMeasurements, Sockets
 from calib.geometry.installation import Installation, see
 from calib.geometry.observation import observe, prepare, stack
 from calib.geometry.result import GeometricFit
@@ -71,15 +72,14 @@ def measure(
     bases = deflection.evaluate(truth.deflection, q, torque(q) if torque else None)
     seen = see(truth, q, station, tool, bases)
     point = seen.point.T
-    common = dict(
-        kind=kind,
+    common: dict[str, Any] = dict(
         q=q,
         joint_names=truth.chain.joint_names,
         tool=np.searchsorted(np.unique(tools), tool),
         tool_names=tuple(truth.tool_names[k] for k in np.unique(tools)),
         station=truth.station_names[station],
         file=file,
-        sigma=np.full((count, 3), sigma) if stated and sigma else None,
+        sigma=np.full(count if kind in ("distance", "bar") else (count, 3), sigma) if stated and sigma else None,
     )
     if kind in ("pose", "position"):
         common["position"] = point + sigma * rng.normal(size=point.shape)
@@ -96,7 +96,7 @@ def measure(
         centres = rng.uniform(-2.0, 2.0, (3, 3))[np.minimum(group, 2)]
         length = np.linalg.norm(point - centres, axis=1) + sigma * rng.normal(size=count)
         common |= {"distance": length, "group": np.minimum(group, 2)}
-    return PoseMeasurements(**common)
+    return KINDS[kind](**common)
 
 
 def _touched(
@@ -134,19 +134,18 @@ def _touched(
         q = q + change
     good = np.linalg.norm(miss[:, :, 0], axis=1) < 1e-12
     assert good.mean() > 0.6, "the arm does not reach its sockets"
-    links = tuple((2 * k, 2 * k + 1, 0.1) for k in range(count // 2)) if kind == "sockets" else ()
-    return PoseMeasurements(
-        kind,
-        q[good],
-        truth.chain.joint_names,
+    common: dict[str, Any] = dict(
         group=group[good],
         group_names=tuple(f"place{k // 2}/{k % 2}" for k in range(count)),
-        links=links,
         tool=np.zeros(good.sum()),
         tool_names=(truth.tool_names[tool[0]],),
-        sigma=np.full((good.sum(), 3), sigma) if stated and sigma else None,
         file=file,
     )
+    spread = np.full((good.sum(), 3), sigma) if stated and sigma else None
+    if kind == "plane":
+        return Planes(q[good], truth.chain.joint_names, sigma=None if spread is None else spread[:, 0], **common)
+    links = tuple((2 * k, 2 * k + 1, 0.1) for k in range(count // 2))
+    return Sockets(q[good], truth.chain.joint_names, sigma=spread, links=links, **common)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

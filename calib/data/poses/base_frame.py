@@ -11,10 +11,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import Poses, Positions
 
 
-def relative_to_base(block: PoseMeasurements, position: np.ndarray, quaternion: np.ndarray) -> PoseMeasurements:
+def relative_to_base(block: Positions, position: np.ndarray, quaternion: np.ndarray) -> Positions:
     """Return the block as seen from the base frame that was measured with every row.
 
         p = R_bᵀ (p_t - p_b),   R = R_bᵀ R_t
@@ -23,24 +23,24 @@ def relative_to_base(block: PoseMeasurements, position: np.ndarray, quaternion: 
     The base is taken to be measured as well as the target: the same sigmas. Of the covariances the diagonals are kept.
 
     Args:
-        block: rows of kind ``pose`` or ``position``, in the instrument's frame.
+        block: positions or poses, in the instrument's frame.
         position: (m, 3) of the base frame [m].
         quaternion: (m, 4) of the base frame, x y z w, unit norm.
     """
-    assert block.position is not None
     base = Rotation.from_quat(quaternion)
     lever = block.position - position
     turn = base.inv().as_matrix()
     changes: dict[str, np.ndarray] = {"position": base.inv().apply(lever)}
-    if block.quaternion is not None:
+    stated = block.sigma_rotation if isinstance(block, Poses) else None
+    if isinstance(block, Poses):
         changes["quaternion"] = (base.inv() * Rotation.from_quat(block.quaternion)).as_quat(canonical=True)
-    if block.sigma_rotation is not None:
-        changes["sigma_rotation"] = _turned(turn, 2.0 * _diagonal(block.sigma_rotation))
+    if stated is not None:
+        changes["sigma_rotation"] = _turned(turn, 2.0 * _diagonal(stated))
     if block.sigma is not None:
         covariance = 2.0 * _diagonal(block.sigma)
-        if block.sigma_rotation is not None:
+        if stated is not None:
             cross = _cross(lever)
-            covariance = covariance + cross @ _diagonal(block.sigma_rotation) @ np.swapaxes(cross, 1, 2)
+            covariance = covariance + cross @ _diagonal(stated) @ np.swapaxes(cross, 1, 2)
         changes["sigma"] = _turned(turn, covariance)
     note = (
         "positions are relative to the base frame measured with each row; its noise is counted as large as the target's"

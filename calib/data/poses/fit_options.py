@@ -101,7 +101,7 @@ class FileOptions:
         where: column → the texts whose rows are kept.
     """
 
-    kind: Annotated[str, OneOf(KINDS)] = ""
+    kind: Annotated[str, OneOf(tuple(KINDS))] = ""
     format: Annotated[str, OneOf(FORMATS)] = ""
     euler: Annotated[str, OneOf(EULER)] = "wpr"
     columns: Mapping[str, Name] = field(default_factory=dict)

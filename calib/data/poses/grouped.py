@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
@@ -11,35 +12,33 @@ from calib.data.csv_table import Table
 from calib.data.poses import plausible
 from calib.data.poses.columns import Layout
 from calib.data.poses.fit_options import FileOptions
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import Bars, Distances, GroupedMeasurements, Planes, Sockets
 from calib.errors import MeasurementError
 
 
-def read_groups(table: Table, options: FileOptions, layout: Layout, q: np.ndarray) -> PoseMeasurements:
+def read_groups(table: Table, options: FileOptions, layout: Layout, q: np.ndarray) -> GroupedMeasurements:
     """Return the rows of `table`, with joint values q (m, n), as groups."""
     names, group = labels(table, layout.group)
     tool_names, tool = labels(table, (layout.tool,)) if layout.tool else ((options.tool,), np.zeros(len(q), dtype=int))
-    distance, sigma = _read_distance(table, options, layout)
-    if layout.kind == "distance" and distance is not None:
-        _check_pairs(table, layout, group, names, distance)
-    if sigma is None and options.sigma.position is not None:
-        sigma = np.tile(options.sigma.position, (len(q), 1))
     single = [name for name, size in zip(names, np.bincount(group)) if size == 1]
-    return PoseMeasurements(
-        layout.kind,
-        q,
-        layout.joints,
-        sigma=sigma,
-        distance=distance,
-        group=group,
-        group_names=names,
-        links=_links(table, options, layout, group) if layout.kind == "sockets" else (),
-        tool=tool,
-        tool_names=tool_names,
-        file=table.file,
-        rows=table.rows,
-        notes=(f"one row alone tells nothing: {layout.kind} {', '.join(single[:5])}",) if single else (),
-    )
+    common: dict[str, Any] = {
+        "group": group, "group_names": names, "tool": tool, "tool_names": tool_names, "file": table.file,
+        "rows": table.rows,
+        "notes": (f"one row alone tells nothing: {layout.kind} {', '.join(single[:5])}",) if single else (),
+    }  # fmt: skip
+    stated = None if options.sigma.position is None else np.tile(options.sigma.position, (len(q), 1))
+    if layout.kind == Sockets.kind:
+        links = _links(table, options, layout, group)
+        return Sockets(q, layout.joints, sigma=stated, links=links, **common)
+    along = None if stated is None else stated[:, 0]
+    if layout.kind == Planes.kind:
+        return Planes(q, layout.joints, sigma=along, **common)
+    distance, sigma = _read_distance(table, options, layout)
+    sigma = along if sigma is None else sigma
+    if layout.kind == Bars.kind:
+        return Bars(q, layout.joints, distance, sigma=sigma, **common)
+    _check_pairs(table, layout, group, names, distance)
+    return Distances(q, layout.joints, distance, sigma=sigma, **common)
 
 
 def labels(table: Table, columns: Sequence[str]) -> tuple[tuple[str, ...], np.ndarray]:
@@ -54,19 +53,17 @@ def labels(table: Table, columns: Sequence[str]) -> tuple[tuple[str, ...], np.nd
     return tuple(place), np.array([place[name] for name in joined])
 
 
-def _read_distance(table: Table, options: FileOptions, layout: Layout) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Return distances (m,) [m] and their sigmas (m, 3), the same in each column."""
-    if not layout.distance:
-        return None, None
+def _read_distance(table: Table, options: FileOptions, layout: Layout) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return distances (m,) and their sigmas (m,) [m], None where not stated."""
     value = table.numbers(layout.distance, "length", options.units.get("distance", ""))[:, None]
     plausible.check_lengths(value, table, (layout.distance,))
     plausible.check_positive(value, table, (layout.distance,), "a distance must be above 0")
-    sigma = None if options.sigma.distance is None else np.full((len(value), 3), options.sigma.distance)
+    sigma = None if options.sigma.distance is None else np.full(len(value), options.sigma.distance)
     if layout.sigma_distance:
         column = table.numbers(layout.sigma_distance, "length", options.units.get("sigma", ""))
         column = np.maximum(column, options.sigma.floor)[:, None]
         plausible.check_positive(column, table, (layout.sigma_distance,), "a sigma must be above 0 (see sigma.floor)")
-        sigma = np.repeat(column, 3, axis=1)
+        sigma = column[:, 0]
     return value[:, 0], sigma
 
 

@@ -1,91 +1,226 @@
-"""What was measured at poses: one frozen block per file, kind and station; knows no robot."""
+"""What was measured at poses: one frozen type per kind of measurement over common rows; knows no robot.
+
+A kind says something of the tool point p (and frame R) that the robot carries. What it says of the geometry is a
+residual function registered for the type in `calib.geometry.residuals`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, replace
+from typing import ClassVar, TypeVar
 
 import numpy as np
 
 from calib.arrays import frozen
 from calib.errors import MeasurementError
 
-KINDS = ("pose", "position", "distance", "bar", "sockets", "plane")
-
 
 @dataclass(frozen=True, eq=False)
 class PoseMeasurements:
-    """m measured rows of one kind from one file.
+    """m measured rows of one kind from one file: what all kinds have in common.
 
     Attributes:
-        kind: what a row says of the tool point p (and frame R) that the robot carries:
-            ``pose``: p and R in the station's frame; ``position``: p in the station's frame; ``distance``: |p_a - p_b|
-            of the two rows of a group; ``bar``: |p - c| with one unknown point c per group; ``sockets``: p is one
-            unknown fixed point per group; ``plane``: p lies on one unknown plane per group.
         q: (m, n) joint values [rad or m], columns as in ``joint_names``.
-        position: (m, 3) [m], for ``pose`` and ``position``.
-        quaternion: (m, 4) x y z w of unit norm, for ``pose``.
-        sigma: (m, 3) standard deviation of the position [m]; None where not stated.
-        sigma_rotation: (m, 3) of the orientation, about the station's axes [rad]; None where not stated.
-        distance: (m,) [m], for ``distance`` (the same in both rows of a pair) and ``bar``.
-        group: (m,) index of the socket, plane, pair or bar centre; zeros for ``pose`` and ``position``.
-        group_names: one per group.
-        links: known distances between sockets, each (group, group, distance [m]).
-        tool: (m,) index into ``tool_names``: which reflector or target of the tool was seen.
-        station: name of the instrument placement that these rows share (unused for the kinds without an instrument).
-        file, rows: where they came from; rows count data rows from 1.
         joint_names: as in the file's header.
+        tool: (m,) index into ``tool_names``: which reflector or target of the tool was seen.
+        station: name of the instrument placement that these rows share (unused by kinds without an instrument).
+        file, rows: where they came from; rows (m,) count data rows from 1.
         ignored: header names that were not used, for the message.
         notes: what is odd but was accepted, for the message.
+
+    Of a kind:
+        kind: its name in files.
+        has_instrument: whether rows are seen from a station whose placement matters.
+        per_row: fields that hold one entry per row (None where not stated), of whole numbers in `_COUNTS`.
     """
 
-    kind: str
     q: np.ndarray
     joint_names: tuple[str, ...]
-    position: np.ndarray | None = None
-    quaternion: np.ndarray | None = None
-    sigma: np.ndarray | None = None
-    sigma_rotation: np.ndarray | None = None
-    distance: np.ndarray | None = None
-    group: np.ndarray = None  # type: ignore[assignment]  # set below
-    group_names: tuple[str, ...] = ()
-    links: tuple[tuple[int, int, float], ...] = ()
+    _: KW_ONLY
     tool: np.ndarray = None  # type: ignore[assignment]  # set below
     tool_names: tuple[str, ...] = ("tool",)
     station: str = "station"
     file: str = ""
     rows: np.ndarray = None  # type: ignore[assignment]  # set below
-    ignored: tuple[str, ...] = field(default=())
-    notes: tuple[str, ...] = field(default=())
+    ignored: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    kind: ClassVar[str] = ""
+    has_instrument: ClassVar[bool] = False
+    per_row: ClassVar[tuple[str, ...]] = ("q", "tool", "rows")
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise MeasurementError(f"kind '{self.kind}' is none of {', '.join(KINDS)}", self.file)
         m = len(self.q)
-        object.__setattr__(self, "q", frozen(self.q))
-        for name in ("position", "quaternion", "sigma", "sigma_rotation", "distance"):
-            if (value := getattr(self, name)) is not None:
-                object.__setattr__(self, name, frozen(value))
-        for name, default in (("group", np.zeros(m)), ("tool", np.zeros(m)), ("rows", np.arange(1, m + 1))):
-            value = getattr(self, name)
-            object.__setattr__(self, name, frozen(default if value is None else value, int))
-        needed = {"pose": ("position", "quaternion"), "position": ("position",), "distance": ("distance",)}
-        needed["bar"] = ("distance",)
-        for name in needed.get(self.kind, ()):
-            if getattr(self, name) is None:
-                raise MeasurementError(f"kind '{self.kind}' needs {name}", self.file)
-        for name in ("position", "quaternion", "sigma", "sigma_rotation", "distance", "group", "tool", "rows"):
-            value = getattr(self, name)
-            if value is not None and len(value) != m:
+        for name, default in _COUNTS.items():
+            if name in self.per_row and getattr(self, name) is None:
+                object.__setattr__(self, name, np.arange(default, m + default) if default else np.zeros(m))
+        for name in self.per_row:
+            if (value := getattr(self, name)) is None:
+                continue
+            if len(value) != m:
                 raise MeasurementError(f"{name} has {len(value)} rows where q has {m}", self.file)
+            object.__setattr__(self, name, frozen(value, int if name in _COUNTS else float))
 
     def __len__(self) -> int:
         return len(self.q)
 
+    @property
+    def together(self) -> np.ndarray:
+        """(m,) number of the robot pose, or of the pair of poses, without whose other rows a row says nothing."""
+        return self.rows
 
-def take(measured: PoseMeasurements, index: Sequence[int] | np.ndarray) -> PoseMeasurements:
+    @property
+    def measured(self) -> np.ndarray:
+        """(m, k) the numbers that tell one measurement from another at the same joints."""
+        return np.zeros((len(self), 0))
+
+    @property
+    def states_sigma(self) -> bool:
+        """Whether the file says how well it was measured."""
+        return getattr(self, "sigma", None) is not None
+
+
+_COUNTS = {"tool": 0, "group": 0, "rows": 1}  # whole numbers, and what they count from
+
+
+@dataclass(frozen=True, eq=False)
+class Positions(PoseMeasurements):
+    """p in the station's frame.
+
+    Attributes:
+        position: (m, 3) [m].
+        sigma: (m, 3) standard deviation of the position [m]; None where not stated.
+    """
+
+    position: np.ndarray
+    _: KW_ONLY
+    sigma: np.ndarray | None = None
+
+    kind: ClassVar[str] = "position"
+    has_instrument: ClassVar[bool] = True
+    per_row: ClassVar[tuple[str, ...]] = (*PoseMeasurements.per_row, "position", "sigma")
+
+    @property
+    def measured(self) -> np.ndarray:
+        return self.position
+
+
+@dataclass(frozen=True, eq=False)
+class Poses(Positions):
+    """p and R in the station's frame.
+
+    Attributes:
+        quaternion: (m, 4) x y z w of unit norm.
+        sigma_rotation: (m, 3) standard deviation of the orientation, about the station's axes [rad]; None where not
+            stated.
+    """
+
+    quaternion: np.ndarray
+    _: KW_ONLY
+    sigma_rotation: np.ndarray | None = None
+
+    kind: ClassVar[str] = "pose"
+    per_row: ClassVar[tuple[str, ...]] = (*Positions.per_row, "quaternion", "sigma_rotation")
+
+    @property
+    def measured(self) -> np.ndarray:
+        return np.hstack([self.position, self.quaternion])
+
+
+@dataclass(frozen=True, eq=False)
+class GroupedMeasurements(PoseMeasurements):
+    """Rows that say something of each other, without an instrument.
+
+    Attributes:
+        group: (m,) index of the socket, plane, pair or bar centre.
+        group_names: one per group.
+        sigma: standard deviation [m], of a shape that the kind says; None where not stated.
+    """
+
+    _: KW_ONLY
+    group: np.ndarray = None  # type: ignore[assignment]  # set in the base class
+    group_names: tuple[str, ...] = ()
+    sigma: np.ndarray | None = None
+
+    per_row: ClassVar[tuple[str, ...]] = (*PoseMeasurements.per_row, "group", "sigma")
+
+    @property
+    def measured(self) -> np.ndarray:
+        return self.group[:, None].astype(float)
+
+
+@dataclass(frozen=True, eq=False)
+class Distances(GroupedMeasurements):
+    """|p_a - p_b| of the two rows of a group.
+
+    Attributes:
+        distance: (m,) [m], the same in both rows of a pair; so is ``sigma`` (m,).
+    """
+
+    distance: np.ndarray
+
+    kind: ClassVar[str] = "distance"
+    per_row: ClassVar[tuple[str, ...]] = (*GroupedMeasurements.per_row, "distance")
+
+    @property
+    def together(self) -> np.ndarray:
+        return self.group
+
+    @property
+    def measured(self) -> np.ndarray:
+        return np.column_stack([self.distance, self.group])
+
+
+@dataclass(frozen=True, eq=False)
+class Bars(GroupedMeasurements):
+    """|p - c| with one unknown point c per group (a ball bar's other end).
+
+    Attributes:
+        distance: (m,) [m], with ``sigma`` (m,).
+    """
+
+    distance: np.ndarray
+
+    kind: ClassVar[str] = "bar"
+    per_row: ClassVar[tuple[str, ...]] = (*GroupedMeasurements.per_row, "distance")
+
+    @property
+    def measured(self) -> np.ndarray:
+        return self.distance[:, None]
+
+
+@dataclass(frozen=True, eq=False)
+class Sockets(GroupedMeasurements):
+    """p is one unknown fixed point per group; ``sigma`` (m, 3).
+
+    Attributes:
+        links: known distances between sockets, each (group, group, distance [m]).
+    """
+
+    _: KW_ONLY
+    links: tuple[tuple[int, int, float], ...] = ()
+
+    kind: ClassVar[str] = "sockets"
+
+
+@dataclass(frozen=True, eq=False)
+class Planes(GroupedMeasurements):
+    """p lies on one unknown plane per group; ``sigma`` (m,) along its normal."""
+
+    kind: ClassVar[str] = "plane"
+
+
+KINDS: dict[str, type[PoseMeasurements]] = {
+    each.kind: each for each in (Poses, Positions, Distances, Bars, Sockets, Planes)
+}
+"""The types by the names that files and options give them."""
+
+Measured = TypeVar("Measured", bound=PoseMeasurements)
+
+
+def take(measured: Measured, index: Sequence[int] | np.ndarray) -> Measured:
     """Return the rows at `index`; groups keep their numbers, so that links stay valid."""
     index = np.asarray(index)
-    names = ("q", "position", "quaternion", "sigma", "sigma_rotation", "distance", "group", "tool", "rows")
-    picked = {name: None if (value := getattr(measured, name)) is None else value[index] for name in names}
+    picked = {name: None if (value := getattr(measured, name)) is None else value[index] for name in measured.per_row}
     return replace(measured, **picked)

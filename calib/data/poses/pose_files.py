@@ -22,6 +22,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -32,7 +33,7 @@ from calib.data.poses.base_frame import relative_to_base
 from calib.data.poses.columns import OURS, SUFFIXES, Layout, find_layout
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.grouped import labels, read_groups
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.data.poses.plausible import Limits
 from calib.errors import MeasurementError
 
@@ -130,7 +131,7 @@ def _numbers(
     return np.stack([table.numbers(name, dimension, unit, gaps) for name, unit in zip(names, stated)], axis=1)
 
 
-def _read_targets(table: Table, options: FileOptions, layout: Layout, q: np.ndarray) -> PoseMeasurements:
+def _read_targets(table: Table, options: FileOptions, layout: Layout, q: np.ndarray) -> Positions:
     """Read positions and poses; each target that was seen makes a row, in the file's order."""
     several = len(layout.positions) > 1
     position = np.stack([_position(table, options, names, several) for names in layout.positions], axis=1)
@@ -144,26 +145,21 @@ def _read_targets(table: Table, options: FileOptions, layout: Layout, q: np.ndar
     elif layout.tool:
         names, tool = labels(table, (layout.tool,))
     sigma = _sigma(table, options, layout, seen)
-    block = PoseMeasurements(
-        layout.kind,
-        q[index],
-        layout.joints,
-        position[index, target],
-        _orientation(table, options, layout),
-        None if sigma is None else sigma[index, target],
-        _sigma_rotation(table, options, layout),
-        tool=tool,
-        tool_names=names,
-        file=table.file,
-        rows=table.rows[index],
-        notes=_unseen(seen, layout),
-    )
+    common: dict[str, Any] = {
+        "sigma": None if sigma is None else sigma[index, target], "tool": tool, "tool_names": names,
+        "file": table.file, "rows": table.rows[index], "notes": _unseen(seen, layout),
+    }  # fmt: skip
+    q, places = q[index], position[index, target]
+    block = Positions(q, layout.joints, places, **common)
+    if layout.kind == Poses.kind:
+        turns, about = _orientation(table, options, layout), _sigma_rotation(table, options, layout)
+        block = Poses(q, layout.joints, places, turns, sigma_rotation=about, **common)
     return _seen_from_base(block, table, options, layout, index) if layout.base else block
 
 
 def _seen_from_base(
-    block: PoseMeasurements, table: Table, options: FileOptions, layout: Layout, index: np.ndarray
-) -> PoseMeasurements:
+    block: Positions, table: Table, options: FileOptions, layout: Layout, index: np.ndarray
+) -> Positions:
     """Return a block relative to the base frame that stands in the same rows."""
     position = _numbers(table, options, layout.base[:3], "length", "position")
     quaternion = plausible.unit_quaternions(_numbers(table, options, layout.base[3:], "", ""), table, layout.base[3:])
@@ -192,9 +188,7 @@ def _unseen(seen: np.ndarray, layout: Layout) -> tuple[str, ...]:
     )
 
 
-def _orientation(table: Table, options: FileOptions, layout: Layout) -> np.ndarray | None:
-    if not layout.orientation:
-        return None
+def _orientation(table: Table, options: FileOptions, layout: Layout) -> np.ndarray:
     values = _numbers(table, options, layout.orientation, "", "")
     if len(layout.orientation) == 4:
         return plausible.unit_quaternions(values, table, layout.orientation)
@@ -224,8 +218,6 @@ def _no_gaps(sigma: np.ndarray, seen: np.ndarray, table: Table, names: Sequence[
 
 
 def _sigma_rotation(table: Table, options: FileOptions, layout: Layout) -> np.ndarray | None:
-    if layout.kind != "pose":
-        return None
     if not layout.sigma_rotation:
         return None if options.sigma.orientation is None else np.tile(options.sigma.orientation, (len(table), 1))
     values = _numbers(table, options, layout.sigma_rotation, "angle", "sigma_rotation")

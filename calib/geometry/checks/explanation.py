@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.geometry.observation import has_instrument
 from calib.geometry.parameters import Layout, layout
 from calib.geometry.result import GeometricFit
 from calib.robot.kinematics import forward
@@ -131,7 +130,7 @@ def _confused(found: GeometricFit, own: list[int], index: dict[str, int]) -> str
 
 def orientation_range(found: GeometricFit) -> float | None:
     """Return the 95 % range of the flange's orientation over the poses an instrument saw [deg]; None without any."""
-    q = [block.measured.q for block in found.blocks if has_instrument(block.measured)]
+    q = [block.measured.q for block in found.blocks if block.measured.has_instrument]
     if not q:
         return None
     turns = Rotation.from_matrix(forward(found.cell.chain, np.concatenate(q))[:, :3, :3])

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import PoseMeasurements, Poses
 from calib.errors import MeasurementError
 from calib.geometry.first_guess import place_pose
 from calib.robot.chain import Chain
@@ -33,7 +33,7 @@ def check_orientations(chain: Chain, block: PoseMeasurements) -> None:
     Raises:
         MeasurementError: where the orientations contradict the arm as they are read, and agree read otherwise.
     """
-    if block.quaternion is None or block.position is None:
+    if not isinstance(block, Poses):
         return
     rows = np.flatnonzero(block.tool == np.argmax(np.bincount(block.tool)))
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, ROWS).astype(int))]

@@ -21,10 +21,10 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.geometry.accuracy import Torques
 from calib.geometry.installation import Installation
-from calib.geometry.observation import Block, has_instrument, predict, prepare
+from calib.geometry.observation import Block, predict, prepare
 
 SAME = 1e-3  # joints of one commanded pose, as read back, differ by less [rad or m]; our choice, as the next two
 FEWEST = 3  # cycles that make a repeated pose
@@ -65,9 +65,9 @@ def repeats(
         same: joints that differ by no more are one commanded pose [rad or m].
     """
     found = [
-        _one(cell, block, index)
+        _one(cell, block, block.measured, index)
         for block in prepare(cell, measured, torques)
-        if has_instrument(block.measured)
+        if isinstance(block.measured, Positions)
         for index in repeated_rows(block.measured, same)
     ]
     if not found:
@@ -88,9 +88,10 @@ def repeats(
 def repeated_rows(measured: PoseMeasurements, same: float = SAME) -> list[np.ndarray]:
     """Return for each pose measured at least `FEWEST` times the indices of its rows, in the file's order.
 
-    Rows with the very same numbers are copies of one measurement and count once.
+    Rows with the very same numbers are copies of one measurement and count once. Empty for kinds without positions.
     """
-    assert measured.position is not None
+    if not isinstance(measured, Positions):
+        return []
     table = np.hstack([measured.q, measured.position, measured.tool[:, None].astype(float)])
     _, first = np.unique(np.round(table, 12), axis=0, return_index=True)
     rows = np.sort(first)
@@ -111,16 +112,14 @@ def spread(points: np.ndarray) -> float:
     return float(length.mean() + 3.0 * length.std(ddof=1))
 
 
-def _one(cell: Installation, block: Block, index: np.ndarray) -> tuple:
+def _one(cell: Installation, block: Block, measured: Positions, index: np.ndarray) -> tuple:
     """Return rows, accuracy, repeatability, those of orientation or None, and variation of one pose."""
-    measured = block.measured
-    assert measured.position is not None and measured.rows is not None
     seen = predict(cell, block)
     base = cell.stations[block.station][:3, :3]
     points = measured.position[index]
     command, shift = seen.point[:, index].mean(axis=1), points.mean(axis=0)
     turn, about = None, None
-    if measured.quaternion is not None:
+    if isinstance(measured, Poses):
         turns = Rotation.from_quat(measured.quaternion[index])
         middle = turns.mean()
         wanted = Rotation.from_matrix(seen.rotation.transpose(2, 1, 0)[index]).mean()
@@ -130,12 +129,11 @@ def _one(cell: Installation, block: Block, index: np.ndarray) -> tuple:
     return measured.rows[index], base.T @ (shift - command), spread(points), turn, about, variation
 
 
-def _directions(measured: PoseMeasurements, index: np.ndarray) -> np.ndarray:
+def _directions(measured: Positions, index: np.ndarray) -> np.ndarray:
     """Return where each row was approached from (k, 3), by the row before it in the file; NaN where that is not there.
 
     Both as measured: what counts is the direction, not the tenths of a millimetre.
     """
-    assert measured.position is not None and measured.rows is not None
     result = np.full((len(index), 3), np.nan)
     place = {int(row): k for k, row in reversed(list(enumerate(measured.rows)))}
     for number, k in enumerate(index):

@@ -17,7 +17,7 @@ from calib.estimation.relevance import Gram, gram, relevance
 from calib.geometry.fit import plausible_deviation
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.folds import Folds
-from calib.geometry.observation import has_instrument, observe, prepare
+from calib.geometry.observation import observe, prepare
 from calib.geometry.parameters import layout
 from calib.geometry.result import GeometricFit, row_weights, used_sigmas
 from calib.robot.chain import Chain
@@ -130,7 +130,7 @@ def judge(
     rigid = len(found.free)
     each: list[Gram] = []
     held_out, rows = [], []
-    pooled = all(has_instrument(block) for block in measured)
+    pooled = all(block.has_instrument for block in measured)
     for fold in range(folds.count):
         inside = [np.flatnonzero(members == fold) for members in folds.members]
         metric, whitened, count = _statistics(
@@ -177,7 +177,7 @@ def _statistics(
     count = 0.0
     for number, (block, rows) in enumerate(zip(measured, chosen)):
         frames: list[tuple[np.ndarray, np.ndarray]] = []
-        pieces = np.array_split(rows, max(1, len(rows) // CHUNK)) if has_instrument(block) else [rows]
+        pieces = np.array_split(rows, max(1, len(rows) // CHUNK)) if block.has_instrument else [rows]
         for piece in pieces:
             if len(piece) == 0:
                 continue

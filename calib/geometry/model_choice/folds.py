@@ -11,9 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import Distances, PoseMeasurements, Sockets
 from calib.errors import UsageError
-from calib.geometry.observation import has_instrument
 
 REGIONS = 20
 FOLDS = 5
@@ -42,8 +41,8 @@ def transfer_folds(measured: Sequence[PoseMeasurements], seed: int = 0) -> Folds
     without an instrument: leave one file out. Several fixtures (groups of linked sockets, planes): leave some out. Else
     `REGIONS` regions of the joint space by k-means, in `FOLDS` folds, both fewer where there are few rows.
     """
-    stations = list(dict.fromkeys(block.station for block in measured if has_instrument(block)))
-    if len(stations) >= 2 and all(has_instrument(block) for block in measured):
+    stations = list(dict.fromkeys(block.station for block in measured if block.has_instrument))
+    if len(stations) >= 2 and all(block.has_instrument for block in measured):
         count = min(len(stations), 2 * FOLDS)
         members = tuple(np.full(len(b), stations.index(b.station) % count) for b in measured)
         return Folds("stations", count, members)
@@ -51,7 +50,7 @@ def transfer_folds(measured: Sequence[PoseMeasurements], seed: int = 0) -> Folds
     if len(files) >= 2 and not stations:
         count = min(len(files), 2 * FOLDS)
         return Folds("files", count, tuple(np.full(len(b), files.index(b.file) % count) for b in measured))
-    if len(measured) == 1 and measured[0].kind == "sockets" and (fixtures := _fixtures(measured[0])) is not None:
+    if len(measured) == 1 and isinstance(measured[0], Sockets) and (fixtures := _fixtures(measured[0])) is not None:
         return fixtures
     return region_folds(measured, seed=seed)
 
@@ -104,7 +103,7 @@ def random_folds(measured: Sequence[PoseMeasurements], folds: int | None = 10, s
     """
     members = []
     for number, block in enumerate(measured):
-        _, unit = np.unique(block.group if block.kind == "distance" else block.rows, return_inverse=True)
+        _, unit = np.unique(block.together, return_inverse=True)
         count = int(unit.max(initial=-1)) + 1
         wanted = count if folds is None else min(folds, count)
         order = np.random.default_rng([seed, number]).permutation(count)
@@ -115,13 +114,13 @@ def random_folds(measured: Sequence[PoseMeasurements], folds: int | None = 10, s
 
 def _whole(block: PoseMeasurements, fold: np.ndarray) -> np.ndarray:
     """Keep the two rows of a distance in one fold."""
-    if block.kind != "distance":
+    if not isinstance(block, Distances):
         return fold
     _, first, inverse = np.unique(block.group, return_index=True, return_inverse=True)
     return fold[first][inverse]
 
 
-def _fixtures(block: PoseMeasurements) -> Folds | None:
+def _fixtures(block: Sockets) -> Folds | None:
     """Return folds of whole fixtures, sockets tied by known distances counting as one; None for fewer than three."""
     root = {int(group): int(group) for group in np.unique(block.group)}
     for a, b, _ in block.links:

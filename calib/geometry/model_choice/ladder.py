@@ -24,7 +24,7 @@ from calib.geometry.installation import Installation
 from calib.geometry.model_choice.cross_validation import Judge, judge
 from calib.geometry.model_choice.effects import EFFECTS, MODELS, Effect, term_groups, term_sizes
 from calib.geometry.model_choice.folds import Folds, transfer_folds
-from calib.geometry.observation import has_instrument, prepare
+from calib.geometry.observation import prepare
 from calib.geometry.parameters import layout
 from calib.geometry.result import GeometricFit, outliers
 from calib.geometry.weighing import Settings
@@ -147,7 +147,7 @@ class _Climber:
         self.best, self.rungs, self.chosen = self.nominal, [], "frames"
         self.stiff = self.nominal
         self.steps = 0
-        self.drawn = not all(has_instrument(block) for block in measured)
+        self.drawn = not all(block.has_instrument for block in measured)
 
     def rigid(self, model: str) -> None:
         """Try frames, joint offsets and the full geometry."""

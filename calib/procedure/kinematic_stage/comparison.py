@@ -110,9 +110,7 @@ def compare_unseen(
     elif unseen.held_out:
         words = "those of the fit"
     else:
-        words = (
-            f"those of the fit, station '{block.station}'" if block.kind in ("pose", "position") else "tool of the fit"
-        )
+        words = f"those of the fit, station '{block.station}'" if block.has_instrument else "tool of the fit"
     shares = not (unseen.own_frames or unseen.held_out)
     return compare(
         nominal, calibrated, [block], torques, words, not unseen.seen, seed, alone=alone, shares_frames=shares

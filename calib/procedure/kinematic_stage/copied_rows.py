@@ -60,7 +60,7 @@ def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, Aside]) -> tu
 
 def _measured_again(fit: Sequence[PoseMeasurements], aside: PoseMeasurements) -> np.ndarray:
     """Say which rows (m,) were measured at joints at which rows of the fit were measured."""
-    seen = [block.q for block in fit if block.kind == aside.kind and block.kind in ("pose", "position")]
+    seen = [block.q for block in fit if type(block) is type(aside) and block.has_instrument]
     if not seen:
         return np.zeros(len(aside), dtype=bool)
     return KDTree(np.concatenate(seen)).query(aside.q, p=np.inf)[0] <= SAME
@@ -68,15 +68,11 @@ def _measured_again(fit: Sequence[PoseMeasurements], aside: PoseMeasurements) ->
 
 def _marks(block: PoseMeasurements) -> list[bytes]:
     """Return for each row what it says, joint values and measured numbers, to 12 digits."""
-    columns = [block.q, block.position, block.quaternion, block.tool]
-    columns.append(block.distance if block.position is None else None)
-    columns.append(block.group if block.kind in ("sockets", "plane", "distance") else None)
-    table = np.column_stack([column for column in columns if column is not None]).astype(float)
+    table = np.column_stack([block.q, block.tool.astype(float), block.measured])
     return [row.tobytes() for row in np.round(table, 12) + 0.0]
 
 
 def _numbers(block: PoseMeasurements, chosen: Sequence[bool] | np.ndarray) -> list[int]:
-    assert block.rows is not None
     return [int(row) for row in dict.fromkeys(block.rows[np.array(chosen, dtype=bool)])]
 
 

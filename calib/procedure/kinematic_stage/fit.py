@@ -18,7 +18,6 @@ from calib.geometry.fit import fit, polish_frames
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.folds import folds_by_name
 from calib.geometry.model_choice.ladder import Climb, climb
-from calib.geometry.observation import has_instrument
 from calib.geometry.parameters import layout
 from calib.geometry.result import GeometricFit, calibrated_chain
 from calib.geometry.weighing import Settings, combine
@@ -162,7 +161,7 @@ def rigid_fit(found: Climb, measured: Sequence[PoseMeasurements], settings: Sett
     if not found.rigid.cell.known.terms:
         return found.rigid
     bare = polish_frames(replace(found.nominal.cell, known=Deflection()), measured, settings).cell
-    drawn = not all(has_instrument(block) for block in measured)
+    drawn = not all(block.has_instrument for block in measured)
     table = layout(bare)
     every = np.concatenate([table.arm_index, table.frame_index])
     return fit(bare, measured, every, settings=settings, drawn=drawn)
@@ -204,7 +203,7 @@ def reach(chain: Chain) -> float:
 
 def moved_between(nominal: Installation, blocks: Sequence[PoseMeasurements], settings: Settings) -> list[str]:
     """Say that several files share one station where stations of their own explain them far better."""
-    own = [block for block in blocks if has_instrument(block)]
+    own = [block for block in blocks if block.has_instrument]
     if len({block.file for block in own}) < 2 or len({block.station for block in own}) > 1:
         return []
     apart = [replace(block, station=f"{number}") for number, block in enumerate(own)]

@@ -205,9 +205,8 @@ def units(block: PoseMeasurements) -> np.ndarray:
 
     Cycles of one repeated pose are one pose.
     """
-    assert block.rows is not None and block.group is not None
-    labels = np.array(block.group if block.kind == "distance" else block.rows)
-    for cycles in repeated_rows(block) if block.kind in ("pose", "position") else []:
+    labels = np.array(block.together)
+    for cycles in repeated_rows(block):
         labels[np.isin(labels, labels[cycles])] = labels[cycles[0]]
     _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
     rank = np.empty(len(first), dtype=int)
@@ -217,7 +216,7 @@ def units(block: PoseMeasurements) -> np.ndarray:
 
 def pose_count(blocks: Sequence[PoseMeasurements]) -> int:
     """Return how many robot poses the blocks hold (several reflectors seen at once are one pose)."""
-    return sum(len(np.unique(block.rows)) for block in blocks if block.rows is not None)
+    return sum(len(np.unique(block.rows)) for block in blocks)
 
 
 def _named(
@@ -251,8 +250,8 @@ def _free_name(taken: Mapping[str, Unseen], file: str) -> str:
 def _shared(block: PoseMeasurements, fit: Sequence[PoseMeasurements], notes: list[str]) -> PoseMeasurements:
     """Return a validation block seen from a station of the fit, with the fit's tools."""
     first = fit[0]
-    if block.kind in ("pose", "position"):
-        stations = [other.station for other in fit if other.kind in ("pose", "position")]
+    if block.has_instrument:
+        stations = [other.station for other in fit if other.has_instrument]
         if not stations:
             raise UsageError(f"{block.file}: no fit file places the instrument; give --refit-frames")
         if block.station not in stations:

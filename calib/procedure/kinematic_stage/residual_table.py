@@ -49,7 +49,6 @@ def _weights(outcome: Outcome) -> dict[tuple[str, int, str], float]:
 
 
 def _key(measured: PoseMeasurements, i: int) -> tuple[str, int, str]:
-    assert measured.rows is not None and measured.tool is not None
     return measured.file, int(measured.rows[i]), measured.tool_names[measured.tool[i]]
 
 
@@ -73,7 +72,7 @@ def _residual_rows(label: str, comparison: Comparison, named: set, weights: dict
         sizes = _row_sizes(columns)
         for i in range(m):
             key = _key(measured, i)
-            station = measured.station if measured.kind in ("pose", "position") else ""
+            station = measured.station if measured.has_instrument else ""
             row: list[object] = [label, key[0], key[1], station, key[2], *map(float, measured.q[i])]
             row += [_number(value) for values in columns.values() for value in values[:, i]]
             row += [_number(sizes[i]), _number(first[i]), weights.get(key), int(key[:2] in named and label == "fit")]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import PoseMeasurements, Positions
 from calib.geometry.accuracy import Errors
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
@@ -202,7 +202,7 @@ def write_errors(path: Path, chain: Chain, validation: Mapping[str, Comparison])
 def _places(found: Comparison, number: int) -> np.ndarray:
     """Return seen position [m] and the ways from there to both arms' [mm] of one block (m, 9); NaN without any."""
     block, torque = found.blocks[number], [found.torques[number]]
-    if block.position is None:
+    if not isinstance(block, Positions):
         return np.full((len(block), 9), np.nan)
     ready = [prepare(cell, [block], torque)[0] for cell in found.cells]
     base = invert(found.cells[1].stations[ready[1].station])

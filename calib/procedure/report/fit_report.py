@@ -14,7 +14,7 @@ from calib import files
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import UsageError
 from calib.estimation.estimate import strong_correlations
-from calib.geometry.observation import has_instrument, predict, prepare
+from calib.geometry.observation import predict, prepare
 from calib.geometry.parameters import layout
 from calib.procedure.kinematic_stage.comparison import Comparison
 from calib.procedure.kinematic_stage.fit import Outcome
@@ -171,7 +171,7 @@ def _points(comparison: Comparison) -> np.ndarray:
     cell, points = comparison.cells[1], []
     for block in prepare(cell, comparison.blocks, comparison.torques):
         point = predict(cell, block).point.T
-        base = cell.stations[block.station] if has_instrument(block.measured) else cell.stations[0]
+        base = cell.stations[block.station] if block.measured.has_instrument else cell.stations[0]
         back = invert(base)
         points.append(point @ back[:3, :3].T + back[:3, 3])
     return np.concatenate(points)

@@ -48,7 +48,7 @@ def read_blocks(inputs: Inputs) -> list[Block]:
     for block in inputs.fit:
         tools = f", {len(block.tool_names)} targets" if len(block.tool_names) > 1 else ""
         ignored = f"; ignored: {', '.join(block.ignored)}" if block.ignored else ""
-        sigma = "stated" if block.sigma is not None else "estimated"
+        sigma = "stated" if block.states_sigma else "estimated"
         lines.append(f"{Path(block.file).name}: {len(block)} rows of kind {block.kind}{tools}, sigmas {sigma}{ignored}")
     for name, unseen in inputs.unseen.items():
         role = "held out" if unseen.held_out else "validation"

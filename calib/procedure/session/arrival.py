@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import KDTree
 
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import PoseMeasurements, Positions
 from calib.data.poses.plans import NEAR
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
@@ -47,18 +47,18 @@ def drift(
         sigma: of one position, per axis [m]; 0: not known, then only the figure is given.
     """
     notes = []
-    seen = [(block, k) for block in blocks if block.position is not None for k in range(len(block))]
+    seen = [(block, k) for block in blocks if isinstance(block, Positions) for k in range(len(block))]
     for later in again:
-        pairs = _pairs(seen, [(later, k) for k in range(len(later))], chain)
+        pairs = _pairs(seen, [(later, k) for k in range(len(later))] if isinstance(later, Positions) else [], chain)
         notes += _judged(pairs, sigma, f"{Path(later.file).name}: measured again at the end")
     for block in blocks:
-        own = [(block, k) for k in range(len(block))] if block.position is not None else []
+        own = [(block, k) for k in range(len(block))] if isinstance(block, Positions) else []
         notes += _judged(_pairs(own, own, chain), sigma, f"{Path(block.file).name}: measured more than once")
     return notes
 
 
 def _pairs(
-    first: Sequence[tuple[PoseMeasurements, int]], later: Sequence[tuple[PoseMeasurements, int]], chain: Chain
+    first: Sequence[tuple[Positions, int]], later: Sequence[tuple[Positions, int]], chain: Chain
 ) -> list[tuple[float, float]]:
     """Return the shift between two visits of one pose, and what their joints explain of it [m]."""
     if not first or not later:
@@ -72,7 +72,6 @@ def _pairs(
         if not near:
             continue
         other, row = first[near[0]]
-        assert other.position is not None and block.position is not None
         both = forward(chain, np.array([other.q[row], block.q[k]]))[:, :3, 3]
         shift = float(np.linalg.norm(block.position[k] - other.position[row]))
         result.append((shift, float(np.linalg.norm(both[1] - both[0]))))

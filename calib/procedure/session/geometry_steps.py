@@ -12,6 +12,7 @@ import numpy as np
 
 from calib import files
 from calib.data.poses.fit_options import FileOptions, FitOptions, read_options
+from calib.data.poses.measurements import Poses, Positions
 from calib.data.poses.plans import check_against, read_poses, write_poses
 from calib.errors import RobotError, UsageError
 from calib.geometry.weighing import Settings, combine
@@ -139,7 +140,7 @@ def check_file(session: Session, chain: Chain, path: Path, plan: np.ndarray | No
     notes = []
     for block in inputs.read_file(path, chain, options_of(session)):
         wanted = session.settings.instrument.measures
-        if wanted == "pose" and block.kind == "position":
+        if wanted == Poses.kind and isinstance(block, Positions) and not isinstance(block, Poses):
             notes.append(f"{path.name}: positions only, where the instrument gives poses")
         ignored = f", ignored: {', '.join(block.ignored)}" if block.ignored else ""
         notes.insert(0, f"{path.name}: {len(block)} rows of kind {block.kind}{ignored}")

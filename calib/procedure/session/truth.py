@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import Poses
 from calib.dynamics import base as bases
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.gravity import gravity_torques
@@ -40,7 +40,7 @@ def against_truth(session: Session, cell: Cell) -> tuple[float, float, float]:
     q = random_joints(cell.nominal, TRUTH, 12345)
     true = true_poses(cell, q)
     points = true[:, :3, 3]
-    block = PoseMeasurements("pose", q, cell.nominal.joint_names, position=points, quaternion=to_quaternion(true))
+    block = Poses(q, cell.nominal.joint_names, points, to_quaternion(true))
     rigid = calibrated.read(session.fit.path).chain
     nominal, alone = (polish_frames(install(chain, [block]), [block]).cell for chain in (cell.nominal, rigid))
     found = robot_file.read(session.fit.path)

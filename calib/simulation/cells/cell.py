@@ -10,12 +10,13 @@ base's orientation noise acts with the lever between the two.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.arrays import shaped
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import Poses, Positions
 from calib.dynamics.gravity import gravity_torques
 from calib.geometry.installation import Installation, see
 from calib.robot.chain import Chain
@@ -80,9 +81,7 @@ def true_poses(cell: Cell, q: np.ndarray, hidden: bool = True) -> np.ndarray:
     return see(cell.truth, q, bases=bases if hidden else np.zeros_like(bases)).poses()
 
 
-def measure(
-    cell: Cell, q: np.ndarray, seed: int | np.random.Generator = 0, file: str = "simulated"
-) -> PoseMeasurements:
+def measure(cell: Cell, q: np.ndarray, seed: int | np.random.Generator = 0, file: str = "simulated") -> Positions:
     """Measure the poses q (m, n) [rad or m] once each, in their order.
 
     Args:
@@ -102,27 +101,21 @@ def measure(
         seen = invert(_noisy(np.broadcast_to(base, seen.shape), instrument, rng)) @ seen
         sigma, sigma_rotation = _stated(instrument, seen[:, :3, 3], frames=2)
     seen[:, :3, 3] += _gross_errors(instrument, len(q), rng)
-    full = instrument.orientation_sigma is not None
-    return PoseMeasurements(
-        "pose" if full else "position",
-        np.asarray(q) + rng.normal(0.0, instrument.encoder_sigma, np.shape(q)),
-        cell.nominal.joint_names,
-        position=seen[:, :3, 3],
-        quaternion=Rotation.from_matrix(seen[:, :3, :3]).as_quat(canonical=True) if full else None,
-        sigma=sigma,
-        sigma_rotation=sigma_rotation if full else None,
-        station=cell.truth.station_names[0],
-        tool_names=cell.truth.tool_names,
-        file=file,
-    )
+    common: dict[str, Any] = {
+        "sigma": sigma, "station": cell.truth.station_names[0], "tool_names": cell.truth.tool_names, "file": file,
+    }  # fmt: skip
+    q, names = np.asarray(q) + rng.normal(0.0, instrument.encoder_sigma, np.shape(q)), cell.nominal.joint_names
+    if instrument.orientation_sigma is None:
+        return Positions(q, names, seen[:, :3, 3], **common)
+    turns = Rotation.from_matrix(seen[:, :3, :3]).as_quat(canonical=True)
+    return Poses(q, names, seen[:, :3, 3], turns, sigma_rotation=sigma_rotation, **common)
 
 
-def wandering(measured: PoseMeasurements, drift: float, seed: int, begin: float = 0.0) -> PoseMeasurements:
+def wandering(measured: Positions, drift: float, seed: int, begin: float = 0.0) -> Positions:
     """Return positions as an instrument sees them that wanders by `drift` [m] from `begin` (0 to 1) to the series' end.
 
     The direction is the seed's, so that several series can share it.
     """
-    assert measured.position is not None
     direction = np.random.default_rng([seed, 5]).standard_normal(3)
     way = np.linspace(begin, 1.0, len(measured))[:, None] * direction / np.linalg.norm(direction)
     return replace(measured, position=measured.position + drift * way)

@@ -8,29 +8,28 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import Poses, Positions
 from calib.data.recordings.recording import Recording
 
 
-def write(measured: PoseMeasurements, path: str | Path, degrees: bool = True) -> Path:
+def write(measured: Positions, path: str | Path, degrees: bool = True) -> Path:
     """Write poses or positions as CSV: joints in deg, positions in mm, as controllers and instruments give them.
 
     Args:
-        measured: of kind ``pose`` or ``position``; one target; every joint revolute where `degrees`.
+        measured: positions or poses of one target; every joint revolute where `degrees`.
         path: of the file.
         degrees: False for SI units throughout.
     """
-    assert measured.position is not None
     angle, length, unit = (180.0 / np.pi, 1e3, ("deg", "mm")) if degrees else (1.0, 1.0, ("rad", "m"))
     columns = [angle * measured.q, length * measured.position]
     header = [f"{name} [{unit[0]}]" for name in measured.joint_names] + [f"{axis} [{unit[1]}]" for axis in "xyz"]
-    if measured.quaternion is not None:
+    if isinstance(measured, Poses):
         columns.append(measured.quaternion)
         header += ["qx", "qy", "qz", "qw"]
     if measured.sigma is not None:
         columns.append(length * measured.sigma)
         header += [f"sigma_{axis} [{unit[1]}]" for axis in "xyz"]
-    if measured.sigma_rotation is not None and measured.quaternion is not None:
+    if isinstance(measured, Poses) and measured.sigma_rotation is not None:
         columns.append(measured.sigma_rotation)
         header += [f"sigma_r{axis}" for axis in "xyz"]
     return files.write_table(path, header, np.hstack(columns).tolist())

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calib.data.poses.base_frame import relative_to_base
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import Poses
 from calib.data.poses.pose_files import read_measurements
 from calib.errors import MeasurementError
 from calib.transforms import from_quaternion, invert, to_quaternion
@@ -54,9 +54,9 @@ def test_stated_sigmas_hold_the_noise_of_both_frames():
         return result
 
     tool, frame = noisy(seen), noisy(base)
-    block = PoseMeasurements(
-        "pose", np.zeros((count, 1)), ("a",), tool[:, :3, 3], to_quaternion(tool), np.full((count, 3), sigma),
-        np.full((count, 3), sigma_rotation),
+    block = Poses(
+        np.zeros((count, 1)), ("a",), tool[:, :3, 3], to_quaternion(tool), 
+        sigma=np.full((count, 3), sigma), sigma_rotation=np.full((count, 3), sigma_rotation),
     )  # fmt: skip
     told = relative_to_base(block, frame[:, :3, 3], to_quaternion(frame))
     truth = invert(base) @ seen

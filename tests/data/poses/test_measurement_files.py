@@ -124,7 +124,7 @@ def test_distances_between_two_poses(write, good):
     assert block.kind == "distance" and block.group_names == tuple(f"p{i}" for i in range(5))
     assert block.group is not None and block.group.tolist() == [i // 2 for i in range(10)]
     np.testing.assert_allclose(block.distance, [row[3] for row in rows])
-    np.testing.assert_array_equal(block.sigma, np.full((10, 3), 2e-5))
+    np.testing.assert_array_equal(block.sigma, np.full(10, 2e-5))
 
 
 def test_distances_to_the_ends_of_bars(write, good):
@@ -132,12 +132,12 @@ def test_distances_to_the_ends_of_bars(write, good):
     block = read(write("q1,q2,q3,distance [mm],bar", rows), FileOptions(sigma=Sigma(distance=1e-5)))
     assert block.kind == "bar" and block.group_names == ("0", "1")
     np.testing.assert_allclose(block.distance, 0.5)
-    np.testing.assert_array_equal(block.sigma, np.full((10, 3), 1e-5))
+    np.testing.assert_array_equal(block.sigma, np.full(10, 1e-5))
 
 
 def test_points_on_planes(write, good):
     block = read(write("q1,q2,q3,plane", [[*row[:3], "table"] for row in good]))
-    assert block.kind == "plane" and block.group_names == ("table",) and block.position is None
+    assert block.kind == "plane" and block.group_names == ("table",) and not block.has_instrument
 
 
 SOCKETS = "q1,q2,q3,tool_position,socket"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import Planes
 from calib.data.poses.plans import check_against, read_poses, write_poses
 from calib.errors import CalibError, MeasurementError
 
@@ -18,7 +18,7 @@ def plan():
 
 
 def measured(q, rows=None):
-    return PoseMeasurements("plane", q, ("q1", "q2", "q3", "q4"), file="m.csv", rows=rows)
+    return Planes(q, ("q1", "q2", "q3", "q4"), file="m.csv", rows=rows)
 
 
 @pytest.mark.parametrize("unit", ["rad", "deg"])

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calib import cli
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import Poses, Positions
 from calib.geometry.checks import repeatability
 from calib.geometry.installation import Installation, see
 from calib.procedure.kinematic_stage import inputs
@@ -36,9 +36,7 @@ def repeated(poses: int = 4, cycles: int = 8, shift=(0.0, 0.0, 0.0), spread: flo
     noise = rng.normal(0.0, 1.0, (len(q), 3)) * spread
     points = seen[:, :3, 3] + (np.asarray(shift) + noise) @ STATION[:3, :3].T
     turns = Rotation.from_matrix(seen[:, :3, :3])
-    block = PoseMeasurements(
-        "pose", q + rng.uniform(-2e-5, 2e-5, q.shape), chain.joint_names, points, turns.as_quat(), file="a"
-    )
+    block = Poses(q + rng.uniform(-2e-5, 2e-5, q.shape), chain.joint_names, points, turns.as_quat(), file="a")
     return cell, block
 
 
@@ -65,7 +63,7 @@ def test_turns_are_counted_about_the_bases_axes():
     rng, base = np.random.default_rng(2), Rotation.from_matrix(STATION[:3, :3])
     small = Rotation.from_rotvec(rng.normal(0.0, [1e-4, 2e-4, 3e-4], (400, 3)) + np.array([5e-4, 0.0, 0.0]))
     turned = base * small * base.inv() * Rotation.from_quat(block.quaternion)
-    block = PoseMeasurements("pose", block.q, block.joint_names, block.position, turned.as_quat())
+    block = Poses(block.q, block.joint_names, block.position, turned.as_quat())
     found = repeatability.repeats(cell, [block])
     assert found is not None and found.turn_accuracy is not None and found.turn_repeatability is not None
     assert found.turn_accuracy[0] == pytest.approx([5e-4, 0.0, 0.0], abs=1e-4)
@@ -84,7 +82,7 @@ def test_what_depends_on_the_direction_of_approach_is_told():
     points = see(cell, q).point.T.copy()
     way = points[1::2] - points[0::2]
     points[1::2] -= 1e-4 * way / np.linalg.norm(way, axis=1, keepdims=True)
-    found = repeatability.repeats(cell, [PoseMeasurements("position", q, chain.joint_names, points)])
+    found = repeatability.repeats(cell, [Positions(q, chain.joint_names, points)])
     assert found is not None
     target = [k for k in range(3) if found.cycles[k] == 12]
     chord = np.linalg.norm(way[0] / np.linalg.norm(way[0]) - way[1] / np.linalg.norm(way[1]))
@@ -96,7 +94,7 @@ def test_copies_and_single_poses_are_no_repeats():
     cell, block = repeated(poses=3, cycles=1)
     assert repeatability.repeats(cell, [block]) is None
     copy = [0] * 9 + [1, 2]
-    block = PoseMeasurements("position", block.q[copy], block.joint_names, block.position[copy])
+    block = Positions(block.q[copy], block.joint_names, block.position[copy])
     assert repeatability.repeated_rows(block) == []
 
 

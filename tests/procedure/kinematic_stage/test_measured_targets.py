@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from calib import cli
+from calib.data.poses.measurements import Poses
 from calib.data.poses.target_files import Targets
 from calib.geometry import inverse
 from calib.geometry.inverse import Goal
@@ -39,7 +40,7 @@ def test_commands_for_measured_poses_are_the_joints_they_were_measured_at(
     assert cli.run([str(each) for each in arguments]) in (0, 1)
     unseen = inputs.gather(robot, [file], settings=FitSettings(holdout=share)).unseen[file.name].block
     fitted = compensation.read(tmp_path / "done")
-    turns = None if unseen.quaternion is None else from_quaternion(unseen.position, unseen.quaternion)[:, :3, :3]
+    turns = from_quaternion(unseen.position, unseen.quaternion)[:, :3, :3] if isinstance(unseen, Poses) else None
     targets = Targets(unseen.q, unseen.position, turns, file=file.name)
     found = compensation.compensate(
         fitted, targets, frame=unseen.station, tool=unseen.tool_names[0], tolerance=(1e-6, 1e-5)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.data.poses.measurements import PoseMeasurements, take
+from calib.data.poses.measurements import PoseMeasurements, Poses, Positions, Sockets, take
 from calib.geometry.accuracy import errors, summary
 from calib.geometry.checks.diagnosis import diagnose
 from calib.geometry.checks.explanation import explain
@@ -35,7 +35,7 @@ def ur5(data: Path):
     folder, q = data / "ur5_gts3800", [f"q{k}" for k in range(1, 7)]
     file = folder / "grid_800.csv"
     position = columns(file, ["x_meas", "y_meas", "z_meas"])
-    measured = PoseMeasurements("position", columns(file, q), tuple(q), position=position, file=file.name)
+    measured = Positions(columns(file, q), tuple(q), position=position, file=file.name)
     return urdf.read(folder / "model.urdf"), measured
 
 
@@ -45,9 +45,7 @@ def ur10(data: Path):
     quaternion = columns(file, ["qx_meas", "qy_meas", "qz_meas", "qw_meas"])
     quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
     position = columns(file, ["x_meas", "y_meas", "z_meas"])
-    measured = PoseMeasurements(
-        "pose", columns(file, q), tuple(q), position=position, quaternion=quaternion, file=file.name
-    )
+    measured = Poses(columns(file, q), tuple(q), position=position, quaternion=quaternion, file=file.name)
     return urdf.read(folder / "model.urdf"), measured
 
 
@@ -55,7 +53,7 @@ def motoman(data: Path, name: str):
     folder, q = data / "motoman_leica", ["q_E_external", *(f"q_{c}" for c in "SLURBT")]
     file = folder / name
     position = columns(file, ["x_meas", "y_meas", "z_meas"])
-    measured = PoseMeasurements("position", columns(file, q), tuple(q), position=position, file=name)
+    measured = Positions(columns(file, q), tuple(q), position=position, file=name)
     return urdf.read(folder / "model_right.urdf"), measured
 
 
@@ -67,8 +65,7 @@ def mukca(data: Path, name: str):
     places = list(dict.fromkeys(row["tool_position"] for row in rows))
     number = np.array([places.index(row["tool_position"]) for row in rows])
     group = 2 * number + np.array([int(row["socket"]) for row in rows])
-    measured = PoseMeasurements(
-        "sockets",
+    measured = Sockets(
         columns(folder / name, q),
         tuple(q),
         group=group,
@@ -146,8 +143,7 @@ def tiago(data: Path):
     file = folder / "mocap_35poses.csv"
     joints, seen = columns(file, q), columns(file, [f"{axis}{k}" for k in (1, 2, 3) for axis in "xyz"])
     m = len(joints)
-    measured = PoseMeasurements(
-        "position",
+    measured = Positions(
         np.repeat(joints, 3, axis=0),
         tuple(q),
         position=seen.reshape(-1, 3),
