@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import datetime
 from importlib import metadata
 
@@ -11,8 +12,10 @@ from calib.procedure.report.page import Page, Section, Table, Text
 
 EDITED = "edited by hand"
 SHORT = 12  # hexadecimal digits of a SHA-256 on the first sheet
-LISTED = 8  # files on the first sheet
-LONG = 96  # letters of a line of the setup on the first sheet
+LISTED = 6  # files on the first sheet
+LONG = 64  # letters of a line of the setup on the first sheet
+REASON = 560  # letters of a reason on the first sheet; the whole of a longer one stands behind it
+BEHIND = ("session made", "pose plan", "seed", "command")  # labels of the setup that the first sheet leaves out
 CONVENTIONS = (
     "Units: m, rad, s, kg, N·m in all files unless a header names another; this page prints mm, deg and mrad.",
     "Modified Denavit-Hartenberg rows (Khalil and Kleinfinger): Rot_x(alpha) Trans_x(d) Trans_z(r) Rot_z(theta + q).",
@@ -41,24 +44,44 @@ def certificate(
     """Return the page of a certificate.
 
     Args:
-        setup: label and value of what was calibrated, with what, when, by which command; shortened on the first sheet.
+        setup: label and value of what was calibrated, with what, when, by which command; shortened on the first sheet,
+            which leaves `BEHIND` out.
         sections: what was judged.
         files: name, role, bytes, SHA-256 of what it rests on; those of the first sheet come first.
         now: when it is made; this moment by default.
     """
-    behind = [*sections, Section("Setup", [Table("", ("what", "value"), [*setup])])]
+    behind = [*map(_fitting, sections), Section("Setup", [Table("", ("what", "value"), [*setup])])]
     if files:
         listed = Table("", ("file", "what it is", "bytes", "SHA-256"), files, numbers=(2,))
         behind.append(Section("Files", [listed]))
     behind.append(
         Section("Limitations and conventions", [Text("Limitations", LIMITATIONS), Text("Conventions", CONVENTIONS)])
     )
-    marks = [(name, role, digest[:SHORT]) for name, role, _, digest in files[:LISTED]]
+    filed = sorted(files, key=lambda row: row[1] != EDITED)  # what was edited by hand is not hidden among the rest
+    first: dict[str, str] = {}
+    for label, value in setup:
+        first.setdefault(label, shortened(value))
+    marks = [(name, role, digest[:SHORT]) for name, role, _, digest in filed[:LISTED]]
     if len(files) > LISTED:
         marks.append((f"and {len(files) - LISTED} more, see Files", "", ""))
     when = (now or datetime.now().astimezone()).strftime("%Y-%m-%d %H:%M %Z").strip()
     issued = f"{when}, armature-calib {metadata.version('armature-calib')}"
-    return Page(title, subtitle, issued, [(label, shortened(value)) for label, value in setup], behind, marks)
+    return Page(
+        title,
+        subtitle,
+        issued,
+        [(label, value) for label, value in first.items() if label not in BEHIND],
+        behind,
+        marks,
+    )
+
+
+def _fitting(section: Section) -> Section:
+    """Return a section whose reason fits the first sheet; the whole of a longer one comes first among its blocks."""
+    short = shortened(section.reason, REASON)
+    if short == section.reason:
+        return section
+    return replace(section, reason=short, blocks=[Text("Reason in full", [section.reason]), *section.blocks])
 
 
 def shortened(text: str, most: int = LONG) -> str:

@@ -121,6 +121,11 @@ class Page:
     marks: Sequence[tuple[str, str, str]] = ()
 
     @property
+    def tight(self) -> bool:
+        """Whether there is so much to say on the first sheet that it has to be set small."""
+        return sum(len(section.reason) for section in self.judged) + 60 * len(self.setup) > 1400
+
+    @property
     def judged(self) -> list[Section]:
         """The sections with a verdict."""
         return [section for section in self.sections if section.verdict]

@@ -153,14 +153,15 @@ def session_plan(session: Session) -> str:
 
 
 def listed(session: Session) -> list[tuple[str, str, str, str]]:
-    """Return the files the certificate rests on: name, what it is, bytes, SHA-256."""
-    wanted = [robot_file(session), *measured_files(session)[0], *measured_files(session)[1]]
-    wanted += session.fit.tables
+    """Return the files the certificate rests on, the ones to be filed first: name, what it is, bytes, SHA-256."""
+    exported = sorted(path for path in session.path(session.export).glob("*") if path.is_file())
+    exported.sort(key=lambda path: path.name != "robot.urdf")
+    wanted = [*exported[:1], robot_file(session), *measured_files(session)[0], *measured_files(session)[1]]
     if session.dynamic:
-        wanted += sorted(session.path("6-excitation").glob("*/trajectory.csv"))
         wanted += [path for paths in recordings(session) for path in paths if path.is_file()]
+        wanted += sorted(session.path("6-excitation").glob("*/trajectory.csv"))
         wanted += [*session.identification.tables, session.identification.model]
-    wanted += sorted(path for path in session.path(session.export).glob("*") if path.is_file())
+    wanted += [*session.fit.tables, *exported[1:]]
     made = {name: mark for step in read_state(session)["steps"].values() for name, mark in step["outputs"].items()}
     rows = []
     for path in wanted:
