@@ -95,6 +95,19 @@ def test_iv_is_right_where_noisy_positions_bias_least_squares(robot, tmp_path, c
     ]
 
 
+def test_didim_is_a_method_of_its_own(robot, tmp_path):
+    """Chosen by name it is what iv makes of instruments = 'didim', and no measured position blurs it."""
+    train = log(tmp_path, "train.csv", 1, noise=3e-3)
+    _, named = identify(robot, tmp_path, train, GAINS, "didim")
+    _, stated = identify(robot, tmp_path, train, GAINS + "instruments = 'didim'\n", "iv")
+    found = json.loads((named / "metrics.json").read_text())
+    assert (
+        found["method"] == found["loop"]["instruments"] == "didim" and "no measured position" in found["method_assumes"]
+    )
+    assert (named / "estimate.csv").read_text() == (stated / "estimate.csv").read_text()
+    assert friction_error(named) < 0.15
+
+
 def test_without_noise_in_the_positions_least_squares_stands(robot, tmp_path):
     """What the test still sees is small: no parameter is off by three sigma."""
     code, out = identify(robot, tmp_path, log(tmp_path, "train.csv", 1), GAINS, "wls")

@@ -1,0 +1,73 @@
+"""A method's failure is a status that says which; the error that says what to do is kept for who wants it raised."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import planted_motion as planted
+import pytest
+
+from calib.errors import CannotSimulate, Diverged, NotConverged, Unidentifiable, UsageError
+from calib.identification.identify import chain_states, common_decimator, find_base
+from calib.identification.methods.method import IdentificationProblem, Method, Status, attempted
+from calib.identification.methods.registry import METHODS, method_named
+from calib.identification.rows import observe
+from calib.identification.settings import IdentificationSettings, make_model
+
+
+@pytest.fixture(scope="module")
+def problem() -> IdentificationProblem:
+    settings, cases = IdentificationSettings(), [planted.case("a", 0)]
+    model, decimator = make_model(planted.arm(), settings), common_decimator(cases, settings)
+    base = find_base(model, cases, chain_states(planted.arm(), model))
+    rows = tuple(observe(model, base.kept, case, decimator) for case in cases)
+    terms = [None if k < model.inertial else model.columns[k - model.inertial] for k in base.kept]
+    return IdentificationProblem(model, base, cases, decimator, rows, tuple(terms), np.full(base.b, -1))
+
+
+@pytest.mark.parametrize("name", ["ols", "wls", "irls", "tls"])
+def test_an_estimate_says_how_it_came_about(problem, name):
+    method: Method = METHODS[name]
+    found = method.estimate(problem)
+    assert found.found and found.status is Status.FOUND and found.failure is None and found.method == name
+    assert found.iterations == 1 and found.simulations == 0 and found.seconds > 0.0
+    truth = problem.base.transform @ planted.truth()
+    assert np.sqrt(np.mean(((found.estimate.values - truth) / found.estimate.sigma) ** 2)) < 2.0
+
+
+@pytest.mark.parametrize("name", ["ols", "wls", "irls", "tls"])
+def test_dependent_columns_are_a_status(problem, name):
+    twice = tuple(
+        replace(part, matrix=part.matrix[:, :, [0, 0, *range(2, part.matrix.shape[2])]]) for part in problem.rows
+    )
+    found = METHODS[name].estimate(replace(problem, rows=twice))
+    assert found.status is Status.RANK_DEFICIENT and not found.found and found.solution is None
+    with pytest.raises(Unidentifiable):
+        _ = found.fit
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [
+        (Unidentifiable("x"), Status.RANK_DEFICIENT),
+        (CannotSimulate("x"), Status.CANNOT_BE_SIMULATED),
+        (Diverged("x"), Status.DIVERGED),
+        (NotConverged("x"), Status.NOT_CONVERGED),
+    ],
+)
+def test_every_way_to_fail_has_its_name(problem, error, status):
+    def fails():
+        raise error
+
+    found = attempted("some", problem, fails)
+    assert found.status is status and found.failure is error
+    with pytest.raises(type(error)):
+        _ = found.estimate
+
+
+def test_bad_input_is_no_status(problem):
+    with pytest.raises(UsageError, match="loop"):
+        METHODS["iv"].estimate(problem)
+    with pytest.raises(UsageError, match="'lms' is none of"):
+        method_named("lms")
