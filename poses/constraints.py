@@ -42,18 +42,27 @@ def reach(
     return PoseConstraint("reach", partial(_reach, tool, most, point), slope)
 
 
-def orientation(tool: Tool, camera: ArrayLike, roll: tuple[float, float], pitch: tuple[float, float]) -> PoseConstraint:
+def orientation(
+    tool: Tool,
+    camera: ArrayLike,
+    roll: tuple[float, float],
+    pitch: tuple[float, float],
+    jacobian: ToolJacobian | None = None,
+) -> PoseConstraint:
     """Keep roll and pitch of the tool seen from the camera within limits [rad].
 
     R_camera^T R = Rot_z(yaw) Rot_y(pitch) Rot_x(roll). The convention is our reading of Table 1, which does not state
-    it. Gradients are central differences. Not smooth where roll jumps by 2π, nor at a pitch of ±π/2.
+    it. Not smooth where roll jumps by 2π, nor at a pitch of ±π/2.
 
     Args:
         tool: forward kinematics.
         camera: (3, 3) orientation of the camera in the tool's reference frame.
         roll, pitch: (lowest, highest) [rad].
+        jacobian: for the exact gradient.
     """
-    return PoseConstraint("orientation", partial(_orientation, tool, np.asarray(camera, dtype=float), roll, pitch))
+    stand = np.asarray(camera, dtype=float)
+    slope = None if jacobian is None else partial(_orientation_gradient, tool, jacobian, stand)
+    return PoseConstraint("orientation", partial(_orientation, tool, stand, roll, pitch), slope)
 
 
 def line_of_sight(
@@ -106,6 +115,15 @@ def _orientation(tool, camera, roll, pitch, q):
     phi = np.arctan2(seen[:, 2, 1], seen[:, 2, 2])
     theta = np.arcsin(np.clip(-seen[:, 2, 0], -1, 1))
     return np.stack([roll[0] - phi, phi - roll[1], pitch[0] - theta, theta - pitch[1]], axis=1)
+
+
+def _orientation_gradient(tool, jacobian, camera, q):
+    x, y = (camera.T @ tool(q)[0])[:, :2, 0].T[:, :, None]  # cos θ cos ψ, cos θ sin ψ
+    turn = camera.T @ jacobian(q)[:, 3:]
+    cosine = np.maximum(np.hypot(x, y), 1e-9)
+    roll = (x * turn[:, 0] + y * turn[:, 1]) / cosine**2
+    pitch = (x * turn[:, 1] - y * turn[:, 0]) / cosine
+    return np.stack([-roll, roll, -pitch, pitch], axis=1)
 
 
 def _sight(tool, station, facing, half_angle, q):

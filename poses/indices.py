@@ -28,6 +28,7 @@ from numpy.typing import ArrayLike
 from poses.errors import BadInput
 
 Index = Literal["O1", "O2", "O3", "O4", "O5", "cond"]
+_POWERS = {"O2": (1.0, 1.0), "O3": (1.0, 0.0), "O4": (2.0, 1.0), "cond": (1.0, 1.0)}  # merit = a log sp − b log s1
 
 
 def observability(W: ArrayLike, index: Index = "O1", m: int | None = None) -> float:
@@ -67,11 +68,17 @@ def gradient(W: ArrayLike, index: Index = "O1", m: int | None = None) -> tuple[f
     return value, ((u * (value * log_slope(s, index))) @ vt).reshape(np.shape(W))
 
 
-def merit(W: np.ndarray, index: Index) -> tuple[float, np.ndarray]:
+def merit(W: np.ndarray, index: Index, sharpness: float = np.inf) -> tuple[float, np.ndarray]:
     """Return what the searches maximise, and its gradient: log O (−log cond), O1 with m = 1 poses.
+
+    O2, O3, O4 and cond have kinks where singular values meet, which is where their optima lie. A finite sharpness a
+    replaces log s1 by (1/a) log Σ s_i^a and log sp by −(1/a) log Σ s_i^−a: smooth, and at most log(p)/a too pessimistic
+    in each. The gradient is exact, too.
 
     Args:
         W: (rows in all, p) stacked observation matrix.
+        index: what is maximised.
+        sharpness: a; infinite for the index itself.
 
     Returns:
         The merit (−inf without full column rank) and its gradient (rows in all, p).
@@ -79,9 +86,14 @@ def merit(W: np.ndarray, index: Index) -> tuple[float, np.ndarray]:
     u, s, vt = np.linalg.svd(W, full_matrices=False)
     if len(s) < W.shape[1] or s[-1] <= 1e-14 * s[0]:
         return -np.inf, np.zeros_like(W)
-    sign = -1.0 if index == "cond" else 1.0
-    value = sign * float(np.log(index_of_singular_values(s, index, 1)))
-    return value, (u * (sign * log_slope(s, index))) @ vt
+    if index in ("O1", "O5") or not np.isfinite(sharpness):
+        sign = -1.0 if index == "cond" else 1.0
+        value = sign * float(np.log(index_of_singular_values(s, index, 1)))
+        return value, (u * (sign * log_slope(s, index))) @ vt
+    high, by_high = _soft_maximum(np.log(s), sharpness)
+    low, by_low = _soft_maximum(-np.log(s), sharpness)
+    below, above = _POWERS[index]
+    return -below * low - above * high, (u * ((below * by_low - above * by_high) / s)) @ vt
 
 
 def index_of_singular_values(s: np.ndarray, index: Index, m: int) -> np.ndarray:
@@ -111,6 +123,11 @@ def index_of_singular_values(s: np.ndarray, index: Index, m: int) -> np.ndarray:
     raise BadInput(f"index '{index}' is not known; take one of {', '.join(get_args(Index))}")
 
 
+def has_kinks(index: Index) -> bool:
+    """Return whether an index hangs on single singular values, so that searches need `merit`'s sharpness."""
+    return index in _POWERS
+
+
 def is_better(value: float, than: float, index: Index) -> bool:
     """Return whether `value` of the index beats `than`: larger, or smaller for cond."""
     return value < than if index == "cond" else value > than
@@ -123,10 +140,19 @@ def log_slope(s: np.ndarray, index: Index) -> np.ndarray:
         return 1.0 / (len(s) * s)
     if index == "O5":
         return s**-2.0 / (1.0 / s).sum()
-    slope[-1] = {"O2": 1.0, "O3": 1.0, "O4": 2.0, "cond": -1.0}[index] / s[-1]
-    if index != "O3":
-        slope[0] += (1.0 if index == "cond" else -1.0) / s[0]
+    below, above = _POWERS[index]
+    sign = -1.0 if index == "cond" else 1.0
+    slope[-1] = sign * below / s[-1]
+    slope[0] -= sign * above / s[0]
     return slope
+
+
+def _soft_maximum(values: np.ndarray, sharpness: float) -> tuple[float, np.ndarray]:
+    """Return (1/a) log Σ exp(a x) and its derivatives, which sum to 1."""
+    top = values.max()
+    weights = np.exp(sharpness * (values - top))
+    total = weights.sum()
+    return float(top + np.log(total) / sharpness), weights / total
 
 
 def _stacked(W: ArrayLike, index: Index, m: int | None) -> tuple[np.ndarray, int]:

@@ -1,18 +1,30 @@
-"""Deterministic local search over all m · n joint values at once, with exact gradients."""
+"""Deterministic local search over all m · n joint values at once, under constraints, with exact gradients.
+
+Sequential quadratic programming (SLSQP, Kraft 1988, in SciPy) on a smoothed index that is sharpened stage by stage (see
+`poses.indices.merit`), each stage ended by stagnation. An iterate may leave the constraints a little, so that every
+stage ends with a restoration: Newton steps of least norm back onto what is violated, pose by pose. What is handed back
+is the best restored set by the index itself, unsmoothed.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import nlopt
 import numpy as np
+from scipy.optimize import minimize
 
-from poses.indices import Index, merit
-from poses.space import SearchSpace, constraint_gradient, is_feasible, product
+from poses.indices import Index, has_kinks, merit
+from poses.space import SearchSpace, constraint_gradients, constraint_values, is_feasible, product
 
 LARGE = 300
-"""Above so many variables constrained searches use MMA, because SLSQP solves a dense problem that large every step."""
+"""Above so many variables the poses are searched in blocks, the others held: SLSQP's cost rises with their cube."""
+SHARPNESS = (16.0, 64.0, 256.0, 1024.0)
+"""The stages of a smoothed search. Our choice: at the last one the smoothing costs at most log(p)/1024 of the merit."""
+PATIENCE = 25
+"""Iterations over which a stage has to gain something. Our choice."""
+FEASIBLE = 1e-8
+"""What a constraint may be broken by in a result [its own unit]."""
 
 
 @dataclass(frozen=True)
@@ -20,9 +32,9 @@ class Improved:
     """What a local search ends with.
 
     Attributes:
-        q: (m, n) poses [rad or m]; never worse than the start, always feasible if the start was.
+        q: (m, n) poses [rad or m]; never worse than the start, feasible to `FEASIBLE` if the start was.
         merit: log O (−log cond; O1 without 1/√m).
-        history: merits of the improving iterates, rising.
+        history: merits of the start and of every stage that improved on it, rising.
         evaluations: of the index, with its gradient.
         interrupted: True after Ctrl-C; q is then the best so far.
     """
@@ -35,7 +47,7 @@ class Improved:
 
 
 def merit_of(
-    space: SearchSpace, q: np.ndarray, index: Index, existing: np.ndarray | None = None
+    space: SearchSpace, q: np.ndarray, index: Index, existing: np.ndarray | None = None, sharpness: float = np.inf
 ) -> tuple[float, np.ndarray]:
     """Return the merit log O of poses with those measured before, and its gradient with respect to q.
 
@@ -46,6 +58,7 @@ def merit_of(
         q: (m, n) poses [rad or m].
         index: "O1" ... "O5", "cond".
         existing: (k, rows, p) Jacobians (or stacked, (k rows, p)) that count but do not move.
+        sharpness: of the smoothing, see `poses.indices.merit`.
 
     Returns:
         The merit and its gradient (m, n).
@@ -54,7 +67,7 @@ def merit_of(
     stacked = jacobians.reshape(-1, jacobians.shape[2])
     if existing is not None and len(existing):
         stacked = np.concatenate([stacked, existing.reshape(-1, jacobians.shape[2])])
-    value, slope = merit(stacked, index)
+    value, slope = merit(stacked, index, sharpness)
     G = slope[: jacobians.shape[0] * jacobians.shape[1]].reshape(jacobians.shape)
     return value, product(space, q, G) if np.isfinite(value) else np.zeros_like(q)
 
@@ -65,115 +78,176 @@ def improved(
     index: Index = "O1",
     existing: np.ndarray | None = None,
     *,
-    evaluations: int = 300,
-    tolerance: float = 1e-6,
+    evaluations: int = 5000,
+    tolerance: float = 1e-5,
     report: Callable[[float], None] | None = None,
 ) -> Improved:
     """Improve a set of poses under limits and constraints, all joint values at once.
 
-    Box limits only: L-BFGS (Nocedal 1980); with constraints: SLSQP (Kraft 1988), MMA (Svanberg 2002) above `LARGE`
-    variables; all in NLopt. For O2, O3, O4 and cond the objective has kinks where singular values meet: the search may
-    stop at one. The best *feasible* iterate is returned. A predicate without gradient cannot steer the search: poses
-    that end where it says no go back to their start, and the others are searched again around them (our choice).
+    A predicate without gradient cannot steer the search: poses that end where it says no go back to their start, and
+    the others are searched again around them (our choice).
 
     Args:
         space: limits, constraints, Jacobian.
         q: (m, n) start [rad or m].
         index: what to improve.
         existing: (k, rows, p) Jacobians of poses already measured.
-        evaluations: most evaluations of index and gradient in one search.
-        tolerance: relative change of the merit to stop at.
+        evaluations: most evaluations of index and gradient; a search stops by itself long before.
+        tolerance: gain of the merit over `PATIENCE` iterations to stop at; ten times that in all stages but the last.
         report: called with every improved merit.
     """
     start = np.clip(np.asarray(q, dtype=float), space.lower, space.upper)
-    free = np.ones(len(start), dtype=bool)
-    run = _search(space, start, index, existing, evaluations, tolerance, report)
-    spent, history = run.evaluations, run.history
+    value = merit_of(space, start, index, existing)[0] if is_feasible(space, start, FEASIBLE).all() else -np.inf
+    found, free, spent, interrupted = start, np.ones(len(start), dtype=bool), 1, False
+    history = [value] if np.isfinite(value) else []
     for _ in range(3):
-        found = start.copy()
-        found[free] = run.q
-        bad = free & ~is_feasible(space, found, 1e-6)
-        if not bad.any() or run.interrupted:
+        held = _with_rows(space, found[~free], existing)
+        run = _search(space, found[free], index, held, evaluations - spent, tolerance)
+        trial, spent, interrupted = found.copy(), spent + run.evaluations, run.interrupted
+        trial[free] = run.q
+        bad = ~is_feasible(space, trial, FEASIBLE)
+        trial[bad] = start[bad]
+        now = merit_of(space, trial, index, existing)[0]
+        if now > value or (now == value and not bad.any()):
+            found, value = trial, now
+            history += [h for h in run.history if max(history, default=-np.inf) < h < value] + [value]
+            if report:
+                report(value)
+        if interrupted or not (bad & free).any() or spent >= evaluations:
             break
-        found[bad], free = start[bad], free & ~bad
+        free &= ~bad
         if not free.any():
             break
-        held = np.asarray(space.jacobian(found[~free]), dtype=float)
-        held = held.reshape(-1, held.shape[2])
-        fixed = held if existing is None else np.concatenate([held, existing.reshape(-1, held.shape[1])])
-        run = _search(space, found[free], index, fixed, evaluations, tolerance, None)
-        spent += run.evaluations
-    else:
-        found = start
-    bad = ~is_feasible(space, found, 1e-6)
-    found[bad] = start[bad]
-    value, before = (merit_of(space, x, index, existing)[0] for x in (found, start))
-    if value < before:
-        found, value = start, before
-    rising = tuple(h for h in history if h <= value)
-    return Improved(found, value, rising, spent + 2, run.interrupted)
+    return Improved(found, value, tuple(history), spent + 1, interrupted)
+
+
+class _Ended(Exception):
+    """A stage gains nothing more, or its evaluations are used up."""
 
 
 def _search(
+    space: SearchSpace, start: np.ndarray, index: Index, existing: np.ndarray | None, evaluations: int, tolerance: float
+) -> Improved:
+    """Run the stages from one start and return the best restored set; the predicate is not looked at."""
+    kept = bool(_keeps(space, start).all())
+    best, value = start, merit_of(space, start, index, existing)[0] if kept else -np.inf
+    history, spent, now, interrupted = [value], 0, start, False
+    stages = list(SHARPNESS if has_kinks(index) else (np.inf,))
+    blocks = -(-start.size // LARGE)
+    while stages and spent < evaluations and not interrupted:
+        sharpness = stages.pop(0)
+        for block in np.array_split(np.random.default_rng(len(history)).permutation(len(start)), blocks):
+            rest = np.setdiff1d(np.arange(len(start)), block)
+            held = _with_rows(space, now[rest], existing)
+            moved, steps, interrupted = _stage(
+                space, now[block], index, held, sharpness, evaluations - spent, tolerance * (10 if stages else 1)
+            )
+            now, spent = now.copy(), spent + steps
+            now[block] = moved
+            if interrupted or spent >= evaluations:
+                break
+        trial = restored(space, now)
+        if kept:
+            bad = ~_keeps(space, trial)
+            trial[bad] = best[bad]
+        reached, last = merit_of(space, trial, index, existing)[0], value
+        if reached > value:
+            best, value = trial, reached
+            history.append(value)
+        if (
+            not stages and 10 * tolerance < value - last < np.inf
+        ):  # blocks, and stages cut short by a failed line search
+            stages, now = [sharpness], best
+    return Improved(best, value, tuple(history), spent, interrupted)
+
+
+def _stage(
     space: SearchSpace,
     start: np.ndarray,
     index: Index,
     existing: np.ndarray | None,
+    sharpness: float,
     evaluations: int,
     tolerance: float,
-    report: Callable[[float], None] | None,
-) -> Improved:
-    """Run NLopt from one start and return the best iterate that keeps the constraints."""
+) -> tuple[np.ndarray, int, bool]:
+    """Run SLSQP on the smoothed index; return the last iterate, the evaluations, and whether Ctrl-C ended it."""
     m, n = start.shape
-    best: list = [start, -np.inf]
-    history, count = list[float](), 0
+    count, last, latest, merits = 0, start, 0.0, list[float]()
 
-    def objective(x: np.ndarray, slope: np.ndarray) -> float:
-        nonlocal count
+    def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
+        nonlocal count, latest
         count += 1
-        q = np.array(x).reshape(m, n)
-        value, gradient = merit_of(space, q, index, existing)
-        if slope.size:
-            slope[:] = gradient.ravel()
-        if value > best[1] and all((np.asarray(c.function(q)) <= 1e-6).all() for c in space.constraints):
-            best[:] = q, value
-            history.append(value)
-            if report:
-                report(value)
-        return value if np.isfinite(value) else -1e6
+        value, gradient = merit_of(space, x.reshape(m, n), index, existing, sharpness)
+        latest = value if np.isfinite(value) else -1e6
+        return -latest, -gradient.ravel()
 
-    algorithm = nlopt.LD_LBFGS
-    if space.constraints:
-        algorithm = nlopt.LD_SLSQP if m * n <= LARGE else nlopt.LD_MMA
-    solver = nlopt.opt(algorithm, m * n)
-    solver.set_max_objective(objective)
-    solver.set_lower_bounds(np.tile(space.lower, m))
-    solver.set_upper_bounds(np.tile(space.upper, m))
-    for constraint in space.constraints:
-        k = np.asarray(constraint.function(start)).shape[1]
-        solver.add_inequality_mconstraint(_blocks(constraint, m, n), np.full(m * k, 1e-8))
-    solver.set_ftol_rel(tolerance)
-    solver.set_maxeval(evaluations)
-    interrupted = False
+    def accepted(x: np.ndarray) -> None:
+        nonlocal last
+        last = x.reshape(m, n).copy()
+        merits.append(latest)
+        stalled = len(merits) > PATIENCE and merits[-1] - merits[-1 - PATIENCE] < tolerance
+        if stalled or count >= evaluations:
+            raise _Ended
+
+    def values(x: np.ndarray) -> np.ndarray:
+        return -constraint_values(space, x.reshape(m, n)).ravel()
+
+    def slopes(x: np.ndarray) -> np.ndarray:
+        blocks = constraint_gradients(space, x.reshape(m, n))
+        result = np.zeros((m, blocks.shape[1], m, n))
+        result[np.arange(m), :, np.arange(m)] = -blocks
+        return result.reshape(-1, m * n)
+
+    bounds = list(zip(np.tile(space.lower, m), np.tile(space.upper, m), strict=True))
+    kept = [{"type": "ineq", "fun": values, "jac": slopes}] if space.constraints else []
+    options = {"maxiter": evaluations, "ftol": 1e-2 * tolerance}
     try:
-        solver.optimize(start.ravel())
-    except KeyboardInterrupt:
-        interrupted = True
-    except (nlopt.RoundoffLimited, nlopt.runtime_error):  # the line search ran out of digits: the best iterate stands
+        run = minimize(
+            objective, start.ravel(), jac=True, method="SLSQP", bounds=bounds, constraints=kept, callback=accepted,
+            options=options,
+        )  # fmt: skip
+        last = np.asarray(run.x).reshape(m, n)
+    except _Ended:
         pass
-    return Improved(best[0], best[1], tuple(history), count, interrupted)
+    except KeyboardInterrupt:
+        return last, count, True
+    return np.clip(last, space.lower, space.upper), count, False
 
 
-def _blocks(constraint, m: int, n: int) -> Callable[[np.ndarray, np.ndarray, np.ndarray], None]:
-    """Return NLopt's form of a constraint: values (m k,) and the block-diagonal gradient (m k, m n)."""
+def restored(space: SearchSpace, q: np.ndarray, steps: int = 20) -> np.ndarray:
+    """Return poses (m, n) moved onto the constraints they break, by Newton steps of least norm within the limits.
 
-    def function(result: np.ndarray, x: np.ndarray, slope: np.ndarray) -> None:
-        q = np.array(x).reshape(m, n)
-        values = np.asarray(constraint.function(q), dtype=float)
-        result[:] = values.ravel()
-        if slope.size:
-            slope[:] = 0.0
-            rows = slope.reshape(m, values.shape[1], m, n)
-            rows[np.arange(m), :, np.arange(m), :] = constraint_gradient(constraint, q)
+    A pose that cannot be brought back in so many steps is returned where it got to.
+    """
+    q = np.clip(q, space.lower, space.upper)
+    for _ in range(steps if space.constraints else 0):
+        broken = np.flatnonzero((constraint_values(space, q) > 0.1 * FEASIBLE).any(1))
+        if not len(broken):
+            break
+        values, slopes = constraint_values(space, q[broken]), constraint_gradients(space, q[broken])
+        for pose, value, slope in zip(broken, values, slopes, strict=True):
+            near = value > -1e-6
+            free = np.ones(q.shape[1], dtype=bool)
+            for _ in range(q.shape[1]):
+                step = np.zeros(q.shape[1])
+                step[free] = np.linalg.lstsq(slope[near][:, free], -value[near] - 0.05 * FEASIBLE, rcond=1e-9)[0]
+                out = free & ((q[pose] + step < space.lower) | (q[pose] + step > space.upper))
+                if not out.any() or out.sum() == free.sum():
+                    break
+                free &= ~out
+            q[pose] = np.clip(q[pose] + step, space.lower, space.upper)
+    return q
 
-    return function
+
+def _keeps(space: SearchSpace, q: np.ndarray) -> np.ndarray:
+    """Return whether each pose keeps the constraints that have gradients (m,)."""
+    return (constraint_values(space, q) <= FEASIBLE).all(1)
+
+
+def _with_rows(space: SearchSpace, q: np.ndarray, existing: np.ndarray | None) -> np.ndarray | None:
+    """Return the rows of held poses after those measured before; `existing` itself without any."""
+    if not len(q):
+        return existing
+    rows = np.asarray(space.jacobian(q), dtype=float)
+    rows = rows.reshape(-1, rows.shape[2])
+    return rows if existing is None else np.concatenate([rows, existing.reshape(-1, rows.shape[1])])

@@ -23,7 +23,7 @@ def multistart_search(
     index: Index = "O1",
     existing: np.ndarray | None = None,
     *,
-    evaluations: int = 300,
+    evaluations: int = 5000,
     map: Callable = map,
     report: Callable[[int, Improved], None] | None = None,
 ) -> Improved:

@@ -102,7 +102,7 @@ def select_poses(
     seed: int = 0,
     kicks: int = 10,
     starts: int = 8,
-    evaluations: int = 300,
+    evaluations: int = 5000,
     rule: TabuRule = DEFAULT_RULE,
     map: Callable = map,
     progress: Progress | None = None,

@@ -78,6 +78,17 @@ def product(space: SearchSpace, q: np.ndarray, G: np.ndarray) -> np.ndarray:
     return np.einsum("mrp,mkrp->mk", G, central_difference(space.jacobian, q))
 
 
+def constraint_values(space: SearchSpace, q: np.ndarray) -> np.ndarray:
+    """Return all constraints of poses q (m, n), (m, k): kept where ≤ 0."""
+    return np.concatenate([np.zeros((len(q), 0)), *(np.asarray(c.function(q)) for c in space.constraints)], axis=1)
+
+
+def constraint_gradients(space: SearchSpace, q: np.ndarray) -> np.ndarray:
+    """Return the derivatives of `constraint_values` with respect to q, (m, k, n)."""
+    empty = np.zeros((len(q), 0, q.shape[1]))
+    return np.concatenate([empty, *(constraint_gradient(c, q) for c in space.constraints)], axis=1)
+
+
 def constraint_gradient(constraint: PoseConstraint, q: np.ndarray) -> np.ndarray:
     """Return ∂c/∂q (m, k, n)."""
     if constraint.gradient is not None:

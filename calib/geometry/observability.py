@@ -15,10 +15,10 @@ from calib.data.poses.measurements import Poses, Positions
 from calib.errors import Unidentifiable, UsageError
 from calib.geometry.identifiability import base_columns
 from calib.geometry.installation import Installation, see
-from calib.geometry.observation import Block, prepare, target_jacobian
+from calib.geometry.observation import prepare, target_jacobian
 from calib.geometry.parameters import layout
 from calib.robot.chain import Chain, random_joints
-from calib.robot.kinematics import element_jacobian, joint_jacobian
+from calib.robot.kinematics import element_jacobian, joint_jacobian, twist_product
 from calib.transforms import pose, to_quaternion
 
 KINDS = (Poses.kind, Positions.kind)
@@ -31,7 +31,7 @@ class Observation:
     """Whitened observation Jacobian in base columns: q (m, n) -> (m, rows, p).
 
     Attributes:
-        cell: the nominal arm, its base at the instrument's origin, with its targets.
+        cell: the nominal arm, its base at the instrument's origin, with its targets; rigid.
         full: whether orientations are seen, too: six rows per target, not three.
         free: (p,) the parameters that such measurements can tell, in the full vector.
         sigmas: of a position [m] and of an orientation [rad].
@@ -45,13 +45,34 @@ class Observation:
     def __call__(self, q: np.ndarray) -> np.ndarray:
         rows = []
         for number in range(len(self.cell.tools)):
-            seen = see(self.cell, q, 0, np.full(len(q), number))
-            block = Block(_measured(q, self.cell, number, self.full), 0, np.full(len(q), number))
-            jacobian = target_jacobian(self.cell, block, seen, self.free)
+            seen = see(self.cell, q, 0, number)
+            jacobian = target_jacobian(self.cell, seen, self.free, 0, np.full(len(q), number))
             rows.append(jacobian[:, :3] / self.sigmas[0])
             if self.full:
                 rows.append(jacobian[:, 3:] / self.sigmas[1])
         return np.concatenate(rows, axis=1).transpose(2, 1, 0)
+
+    def product(self, q: np.ndarray, G: np.ndarray) -> np.ndarray:
+        """Return Σ G[i] · ∂J[i]/∂q (m, n) for weights G (m, rows, p) of the whitened Jacobian; exact."""
+        chain, count = self.cell.chain, len(self.cell.chain.elements)
+        places = np.where(self.free < count, self.free, np.where(self._in_station, -1, count))
+        weights, result = G.transpose(2, 1, 0), np.zeros((chain.n, len(q)))
+        rows = 6 if self.full else 3
+        for number in range(len(self.cell.tools)):
+            seen = see(self.cell, q, 0, number)
+            columns = target_jacobian(self.cell, seen, self.free, 0, np.full(len(q), number))
+            weight = np.zeros(columns.shape)
+            for first, sigma in zip(range(0, rows, 3), self.sigmas):
+                at = rows * number + first
+                weight[:, first : first + 3] = weights[:, at : at + 3] / sigma
+            elements = element_jacobian(chain, seen.walked, seen.point)
+            result += twist_product(chain, elements, columns, places, weight)
+        return result.T
+
+    @property
+    def _in_station(self) -> np.ndarray:
+        """(p,) which of the parameters place the instrument, before the arm."""
+        return np.isin(self.free, layout(self.cell).station_index)
 
 
 @dataclass(frozen=True, eq=False)

@@ -71,11 +71,13 @@ def predict(cell: Installation, block: Block) -> Seen:
 def observe(cell: Installation, block: Block, free: np.ndarray) -> list[Part]:
     """Return the residual parts of a block with their Jacobian with respect to the parameters `free` (f,)."""
     seen = predict(cell, block)
-    return parts(block.measured, seen, target_jacobian(cell, block, seen, free))
+    return parts(block.measured, seen, target_jacobian(cell, seen, free, block.station, block.tool, block.bases))
 
 
-def target_jacobian(cell: Installation, block: Block, seen: Seen, free: np.ndarray) -> np.ndarray:
-    """Return [v; ω] of the targets per unit of each free parameter, (f, 6, m)."""
+def target_jacobian(
+    cell: Installation, seen: Seen, free: np.ndarray, station: int, tool: np.ndarray, bases: np.ndarray | None = None
+) -> np.ndarray:
+    """Return [v; ω] of the targets per unit of each free parameter, (f, 6, m); see `Block` for the last three."""
     arm, stations, tools, _ = layout_counts(cell)
     m = seen.point.shape[1]
     jacobian = np.zeros((len(free), 6, m))
@@ -87,20 +89,20 @@ def target_jacobian(cell: Installation, block: Block, seen: Seen, free: np.ndarr
         jacobian[in_arm] = element_jacobian(cell.chain, seen.walked, seen.point, free[in_arm])
     for place in np.flatnonzero(section == 1):
         number, axis = divmod(int(free[place]) - arm, 6)
-        if number == block.station:
+        if number == station:
             _station_column(jacobian[place], cell.stations[number], seen, axis)
     for place in np.flatnonzero(section == 2):
         number, axis = divmod(int(free[place]) - arm - stations, 6)
-        rows = block.tool == number
+        rows = tool == number
         jacobian[place][3 * (axis // 3) : 3 * (axis // 3) + 3] = np.where(rows, seen.rotation[axis % 3], 0.0)
     in_terms = np.flatnonzero(section == 3)
     if len(in_terms):
-        assert block.bases is not None
+        assert bases is not None
         numbers = free[in_terms] - arm - stations - tools
         targets = deflection.target_elements(cell.chain, cell.deflection)[numbers]
         unique, inverse = np.unique(targets, return_inverse=True)
         moved = element_jacobian(cell.chain, seen.walked, seen.point, unique)
-        jacobian[in_terms] = moved[inverse] * block.bases[numbers][:, None, :]
+        jacobian[in_terms] = moved[inverse] * bases[numbers][:, None, :]
     return jacobian
 
 

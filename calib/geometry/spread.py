@@ -54,6 +54,6 @@ def _sigmas(
     m = len(q)
     rows = PoseMeasurements(q, cell.chain.joint_names)
     block = Block(rows, station, np.full(m, tool), torque, evaluate(cell.deflection, q, torque))
-    jacobian = target_jacobian(cell, block, predict(cell, block), free)
+    jacobian = target_jacobian(cell, predict(cell, block), free, block.station, block.tool, block.bases)
     spread = (root.T @ jacobian.reshape(len(free), 6 * m)).reshape(-1, 6, m)
     return np.sqrt(np.stack([np.sum(spread[:, :3] ** 2, axis=(0, 1)), np.sum(spread[:, 3:] ** 2, axis=(0, 1))], axis=1))

@@ -49,13 +49,14 @@ class Obstacle:
 
 @dataclass(frozen=True)
 class Column:
-    """Where value + ratio · q of a joint goes in Pinocchio's configuration."""
+    """Where value + ratio · q of a joint goes in Pinocchio's configuration, and its rate in the velocity."""
 
     place: int
     joint: int
     ratio: float
     offset: float
     circular: bool
+    speed: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +87,36 @@ class Collision:
             pin.computeDistances(self._model, data, self._geometry, measured, configuration)
             row[:] = [found.min_distance for found in measured.distanceResults]
         return result
+
+    def gradients(self, q: np.ndarray) -> np.ndarray:
+        """Return the derivatives (m, pairs, n) of `distances` with respect to q (m, n).
+
+        With the normal u from the first shape's nearest point to the second's: d' = u · (velocity of the second point -
+        velocity of the first), the shapes' curvature being of second order. One-sided where nearest points jump.
+        """
+        pin, _ = _libraries()
+        q = shaped(q, (None, self._chain.n), f"joint values of '{self._chain.name}'")
+        data, measured = self._model.createData(), self._geometry.createData()
+        shapes, world = self._geometry.geometryObjects, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        ends = np.array([(shapes[pair.first].parentJoint, shapes[pair.second].parentJoint)
+                         for pair in self._geometry.collisionPairs], dtype=int).reshape(-1, 2)  # fmt: skip
+        normals, points = np.empty((len(q), len(ends), 1, 3)), np.empty((len(q), len(ends), 2, 3))
+        stands = np.empty((len(q), self._model.njoints, 3))
+        moved = np.zeros((len(q), self._model.njoints, 6, self._model.nv))
+        for i, configuration in enumerate(_configurations(self._model, self._columns, q)):
+            pin.computeDistances(self._model, data, self._geometry, measured, configuration)
+            pin.computeJointJacobians(self._model, data, configuration)
+            for joint in range(1, self._model.njoints):
+                moved[i, joint] = pin.getJointJacobian(self._model, data, joint, world)
+            stands[i] = [placement.translation for placement in data.oMi]
+            for k, found in enumerate(measured.distanceResults):
+                normals[i, k, 0], points[i, k] = found.normal, (found.getNearestPoint1(), found.getNearestPoint2())
+        wrench = np.concatenate(np.broadcast_arrays(normals, np.cross(points - stands[:, ends], normals)), axis=-1)
+        wrench[:, :, 0] *= -1.0
+        rates = np.zeros((self._model.nv, self._chain.n))
+        for column in self._columns:
+            rates[column.speed, column.joint] += column.ratio
+        return np.einsum("mkew,mkewv->mkv", wrench, moved[:, ends], optimize=True) @ rates
 
     def free(self, q: np.ndarray, margin: float = 0.0) -> np.ndarray:
         """Tell (m,) for which joint values q (m, n) every distance is larger than `margin` [m]."""
@@ -232,7 +263,7 @@ def _columns(model: Any, chain: Chain) -> tuple[Column, ...]:
     for element in chain.elements:
         if element.joint is not None:
             joint = model.joints[model.getJointId(element.name.removesuffix(".offset"))]
-            columns.append(Column(joint.idx_q, element.joint, element.ratio, element.value, joint.nq == 2))
+            columns.append(Column(joint.idx_q, element.joint, element.ratio, element.value, joint.nq == 2, joint.idx_v))
     return tuple(columns)
 
 

@@ -122,6 +122,52 @@ def jacobian(chain: Chain, q: np.ndarray) -> np.ndarray:
     return element_jacobian(chain, walked, walked.position).transpose(2, 1, 0)
 
 
+def jacobian_product(chain: Chain, q: np.ndarray, G: np.ndarray) -> np.ndarray:
+    """Return Σ G[i] · ∂J[i]/∂q (m, n) of the observation Jacobian J = `jacobian` (m, 6, K), G of its shape."""
+    walked = sweep(chain, q)
+    columns = element_jacobian(chain, walked, walked.position)
+    return twist_product(chain, columns, columns, np.arange(len(columns)), G.transpose(2, 1, 0)).T
+
+
+def twist_product(
+    chain: Chain, elements: np.ndarray, columns: np.ndarray, places: np.ndarray, G: np.ndarray
+) -> np.ndarray:
+    """Return Σ_k G_k · ∂J_k/∂q of columns J_k = [v; ω] that sit on the chain: the arm's Hessian times G.
+
+    A joint e turns every column behind it as a whole, and moves the point for every column before it (and its own):
+
+        ∂J_k = [ω_e × v_k; ω_e × ω_k]  for k behind e,   ∂J_k = [ω_k × v_e; 0]  otherwise
+
+    (Hourtash 2005, IJRA, with translations as ω = 0), so that two sums of cross products serve all joints.
+
+    Args:
+        chain: the arm.
+        elements: (K, 6, m) what `element_jacobian` returns for all elements, at the point of the columns.
+        columns: (p, 6, m) the J_k.
+        places: (p,) the element each belongs to; -1 before the arm, K behind it.
+        G: (p, 6, m) weights.
+
+    Returns:
+        (n, m).
+    """
+    moving = [k for k, element in enumerate(chain.elements) if element.joint is not None]
+    v, w = columns[:, :3], columns[:, 3:]
+    turned = _cross(v, G[:, :3]) + _cross(w, G[:, 3:])
+    moved = _cross(G[:, :3], w)
+    behind = (places > np.array(moving)[:, None]).astype(float)
+    shape = (len(moving), 3, G.shape[2])
+    about = (behind @ turned.reshape(len(G), -1)).reshape(shape)
+    along = ((1.0 - behind) @ moved.reshape(len(G), -1)).reshape(shape)
+    slopes = np.einsum("kim,kim->km", elements[moving, 3:], about) + np.einsum(
+        "kim,kim->km", elements[moving, :3], along
+    )
+    result = np.zeros((chain.n, G.shape[2]))
+    for k, slope in zip(moving, slopes, strict=True):
+        element = chain.elements[k]
+        result[element.joint] += element.ratio * slope
+    return result
+
+
 def joint_jacobian(chain: Chain, elements: np.ndarray) -> np.ndarray:
     """Gather an element Jacobian (K, rows, m) into the one of the joints (n, rows, m), mimic followers included."""
     result = np.zeros((chain.n, *elements.shape[1:]))
@@ -151,6 +197,18 @@ def joint_frames(chain: Chain, q: np.ndarray) -> np.ndarray:
             frames[first[k], :, :3, :3] = rotation.transpose(2, 1, 0)
             frames[first[k], :, :3, 3] = position.T
     return frames
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the cross products of (K, 3, m) arrays along their middle axis."""
+    return np.stack(
+        [
+            a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1],
+            a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2],
+            a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0],
+        ],
+        axis=1,
+    )
 
 
 def _start(base: np.ndarray | None, m: int) -> tuple[np.ndarray, np.ndarray]:

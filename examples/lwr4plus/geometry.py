@@ -26,7 +26,7 @@ from calib.geometry.installation import Installation, see
 from calib.geometry.observation import prepare
 from calib.robot import mdh
 from calib.robot.chain import Chain, element_index, random_joints
-from calib.robot.kinematics import jacobian
+from calib.robot.kinematics import jacobian, jacobian_product
 from calib.simulation.cells import lwr4plus
 from calib.simulation.cells.cell import SimulatedInstrument, measure, true_poses
 from calib.simulation.cells.virtual_cells import lwr4plus_cell, rigid
@@ -67,23 +67,37 @@ class BaseJacobian:
     def __call__(self, q: np.ndarray) -> np.ndarray:
         return jacobian(self.chain, q)[:, :, base_columns(self.chain)] / self.scale[:, None]
 
+    def product(self, q: np.ndarray, G: np.ndarray) -> np.ndarray:
+        """Return Σ G ∂J/∂q (m, 7)."""
+        full = np.zeros((len(q), 6, len(self.chain.elements)))
+        full[:, :, base_columns(self.chain)] = G / self.scale[:, None]
+        return jacobian_product(self.chain, q, full)
+
 
 @dataclass(frozen=True)
 class TableOne:
     """The paper's Table 1 in our reading (`lwr4plus.constraint_values`), as values that have to be <= 0."""
 
-    nominal: np.ndarray
+    chain: Chain
+    station: np.ndarray
+    tool: np.ndarray
 
     def __call__(self, q: np.ndarray) -> np.ndarray:
-        chain, station, tool = lwr4plus.nominal_chain(), lwr4plus.station(self.nominal), lwr4plus.tool(self.nominal)
-        return -lwr4plus.constraint_values(chain, station, tool, q)
+        return -lwr4plus.constraint_values(self.chain, self.station, self.tool, q)
+
+    def gradient(self, q: np.ndarray) -> np.ndarray:
+        """Return the derivatives (m, 6, 7)."""
+        return -lwr4plus.constraint_gradients(self.chain, self.station, self.tool, q)
 
 
 def search_space(nominal: np.ndarray, index: str) -> SearchSpace:
     """Return where poses may lie, and what they tell: metres and radians for cond, as the paper's; sigmas for O1."""
     scale = np.ones(6) if index == "cond" else SIGMAS
     jacobian_ = BaseJacobian(study_chain(nominal), scale)
-    return SearchSpace(jacobian_, -LIMITS, LIMITS, None, (PoseConstraint("Table 1", TableOne(nominal)),))
+    table = TableOne(lwr4plus.nominal_chain(), lwr4plus.station(nominal), lwr4plus.tool(nominal))
+    return SearchSpace(
+        jacobian_, -LIMITS, LIMITS, jacobian_.product, (PoseConstraint("Table 1", table, table.gradient),)
+    )
 
 
 def selections(nominal: np.ndarray, quick: bool, seed: int) -> tuple[list[dict[str, Any]], dict[str, Selection]]:

@@ -54,14 +54,18 @@ def test_target_positions_and_rotations(name):
         turn = Rotation.from_matrix(now.poses()[:, :3, :3] @ seen.poses()[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
         return np.concatenate([now.point, turn.T]).T  # (m, 6)
 
-    jacobian = target_jacobian(truth, block, seen, free)
+    jacobian = target_jacobian(truth, seen, free, block.station, block.tool, block.bases)
     check(moved, jacobian.transpose(2, 1, 0), np.zeros(len(free)), step=1e-5, tolerance=2e-9)
     east = layout(truth).find([f"east.{axis}" for axis in ("x", "rz")])
     assert np.all(jacobian[east] == 0.0)  # the other station sees nothing of it
     some = np.random.default_rng(0).permutation(free)[:15]
-    assert np.array_equal(target_jacobian(truth, block, seen, some), jacobian[some])  # any order, any subset
+    assert np.array_equal(
+        target_jacobian(truth, seen, some, block.station, block.tool, block.bases), jacobian[some]
+    )  # any order, any subset
     only_arm = np.array([3, 1, 4])
-    assert np.array_equal(target_jacobian(truth, block, seen, only_arm), jacobian[only_arm])
+    assert np.array_equal(
+        target_jacobian(truth, seen, only_arm, block.station, block.tool, block.bases), jacobian[only_arm]
+    )
 
 
 @pytest.mark.parametrize("effect", EFFECTS, ids=[effect.name for effect in EFFECTS])
@@ -75,7 +79,7 @@ def test_every_effect_of_the_ladder(effect, known):
     block = prepare(truth, [measured], [torques(measured.q)])[0]
     free = layout(truth).term_index
     seen = predict(truth, block)
-    jacobian = target_jacobian(truth, block, seen, free)
+    jacobian = target_jacobian(truth, seen, free, block.station, block.tool, block.bases)
     check(lambda x: predict(step(truth, free, x), block).point, jacobian[:, :3].transpose(1, 2, 0), np.zeros(len(free)),
           step=1e-6, tolerance=1e-7)  # fmt: skip
     assert np.abs(jacobian).max() > 0

@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 import planar
 import pytest
+from differences import check
 
 from poses import constraints
 from poses.errors import BadInput
+from poses.indices import merit
 from poses.local import improved, merit_of
 from poses.select import select_poses
 from poses.space import PoseConstraint, SearchSpace, central_difference, is_feasible
@@ -21,8 +23,23 @@ Q = np.random.default_rng(0).uniform(planar.LOWER, planar.UPPER, (200, 3))
 QUICK = TabuRule(candidates=30, patience=0.5, evaluations=20)
 
 
+def turned():
+    c, s = np.cos(0.7), np.sin(0.7)
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]) @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+
+
 def outside_the_wedge(q):
     return np.abs(q[:, 0]) > 0.3
+
+
+@pytest.mark.parametrize("index", ["O1", "O2", "O3", "O4", "O5", "cond"])
+def test_smoothed_merits_are_pessimistic_converge_and_have_exact_gradients(index):
+    W = planar.jacobian(Q[:6]).reshape(-1, 6)
+    sharp = merit(W, index)[0]
+    soft = np.array([merit(W, index, a)[0] for a in (4.0, 16.0, 64.0)])
+    assert (soft <= sharp + 1e-12).all() and (np.diff(soft) >= -1e-12).all()
+    assert sharp - soft[-1] <= 3 * np.log(6) / 64
+    check(lambda w: merit(w.reshape(W.shape), index, 16.0)[0], merit(W, index, 16.0)[1].ravel(), W.ravel())
 
 
 @pytest.mark.parametrize("index", ["O1", "O2", "O3", "O4", "O5", "cond"])
@@ -47,6 +64,7 @@ def test_gradient_in_joint_values_is_the_central_difference(index, exact):
         constraints.height(planar.tool, -0.3, 0.9, planar.tool_jacobian),
         constraints.axis_distance(planar.tool, 0.2, planar.tool_jacobian),
         constraints.reach(planar.tool, 0.9, (0.1, 0, 0.2), planar.tool_jacobian),
+        constraints.orientation(planar.tool, turned(), (-2.0, 2.5), (-1.0, 1.2), planar.tool_jacobian),
         constraints.line_of_sight(planar.tool, (2, 1, 1), (1, 0, 0.2), 0.6, planar.tool_jacobian),
     ],
     ids=lambda c: c.name,
@@ -54,7 +72,7 @@ def test_gradient_in_joint_values_is_the_central_difference(index, exact):
 def test_constraint_gradients(constraint):
     assert constraint.gradient is not None
     expected = central_difference(constraint.function, Q).transpose(0, 2, 1)
-    np.testing.assert_allclose(constraint.gradient(Q), expected, atol=1e-8)
+    np.testing.assert_allclose(constraint.gradient(Q), expected, atol=1e-8, rtol=1e-6)
     verdicts = (constraint.function(Q) <= 0).all(1)
     assert verdicts.any() and not verdicts.all()
     pickle.loads(pickle.dumps(constraint))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from differences import check
 from robot_oracle import axis, joint, robot
 
 from calib.errors import RobotError
@@ -55,6 +56,17 @@ def test_distances_by_hand(balls):
     distances = dict(zip(found.pairs, found.distances(q)[0], strict=True))
     assert distances["two", "ball"] == pytest.approx(-0.3)
     assert distances["one", "three"] == pytest.approx(np.hypot(1.5, 0.5) - 0.2)
+
+
+@pytest.mark.parametrize("arm", ["balls", "lwr4plus", "ur5"])
+def test_gradients_follow_the_witness_points(arm, balls):
+    box = Obstacle("box", "box", (0.3, 0.4, 0.5), pose(position=[0.5, 0.1, 0.4]))
+    if arm == "balls":  # a continuous joint, a joint about -z
+        found, q = collision.from_urdf(balls, floor=0.1, obstacles=[box]), random_joints(load("ur5"), 6, 1)[:, :3]
+    else:
+        found, q = collision.from_chain(load(arm), 0.05, -0.1, [box]), random_joints(load(arm), 6, 1)
+    for pose_ in q:
+        check(lambda x: found.distances(x[None])[0], lambda x: found.gradients(x[None])[0], pose_)
 
 
 def test_free_and_margin(balls):

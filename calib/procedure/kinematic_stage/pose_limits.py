@@ -29,7 +29,7 @@ TOML; every table is optional, a key that is none of these is refused. Lengths i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -52,11 +52,11 @@ from calib.config import (
 )  # fmt: skip
 from calib.errors import RobotError, UsageError
 from calib.geometry.installation import Installation
-from calib.geometry.observability import Target, TargetJacobian
+from calib.geometry.observability import Observation, Target, TargetJacobian
 from calib.robot.chain import sampling_limits
 from calib.robot.tables import placement
 from poses import constraints
-from poses.space import PoseConstraint
+from poses.space import PoseConstraint, SearchSpace
 
 MOTION = ("velocity", "acceleration", "jerk", "torque", "friction", "point", "frequency")  # `motion_limits` reads them
 MARGIN, RADIUS = 0.01, 0.05  # [m], where the file does not tell (our choice)
@@ -156,20 +156,35 @@ class ConstraintsFile:
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """Where poses may lie: joint limits (n,), smooth constraints, and what has no gradient.
+    """Where poses may lie: joint limits (n,), constraints of the target, and collisions.
 
     Attributes:
-        collision: the `calib.robot.collision.Collision` behind `feasible`; None without one.
+        collision: a `calib.robot.collision.Collision`; None without one.
         clearance: the least distance it asks for [m].
     """
 
     lower: np.ndarray
     upper: np.ndarray
     constraints: tuple[PoseConstraint, ...] = ()
-    feasible: Callable[[np.ndarray], np.ndarray] | None = None
     notes: tuple[str, ...] = field(default=())
     collision: Any = None
     clearance: float = MARGIN
+
+    def space(self, seen: Observation) -> SearchSpace:
+        """Return the continuous problem of choosing poses by what an instrument would see."""
+        kept = self.constraints
+        if self.collision is not None and self.collision.pairs:
+            slope = partial(_closing, self.collision)
+            kept = (*kept, PoseConstraint("collision", partial(_shortfall, self.collision, self.clearance), slope))
+        return SearchSpace(seen, self.lower, self.upper, seen.product, kept)
+
+
+def _shortfall(model: Any, clearance: float, q: np.ndarray) -> np.ndarray:
+    return clearance - model.distances(q)
+
+
+def _closing(model: Any, q: np.ndarray) -> np.ndarray:
+    return -model.gradients(q)
 
 
 def read_limits(path: Path | None, cell: Installation, source: Path | None = None) -> Limits:
@@ -201,7 +216,7 @@ def limits_of(
         model, margin, notes = _collision(stated, cell, source, where)
     except RobotError as error:
         raise UsageError(str(error)) from error
-    return Limits(lower, upper, found, partial(model.free, margin=margin), notes, model, margin)
+    return Limits(lower, upper, found, notes, model, margin)
 
 
 def _joints(spans: Mapping[str, Any], cell: Installation, where: str) -> tuple[np.ndarray, np.ndarray]:
@@ -254,7 +269,8 @@ def _instrument(stated: ConstraintsFile, cell: Installation, where: str) -> list
     if table.roll is not None or table.pitch is not None:
         roll = _span(table.roll or (-np.pi, np.pi), f"{where}.roll", "angle")
         pitch = _span(table.pitch or (-np.pi / 2, np.pi / 2), f"{where}.pitch", "angle")
-        result.append(constraints.orientation(Target(cell), stand[:3, :3], roll, pitch))
+        slope = TargetJacobian(cell)
+        result.append(constraints.orientation(Target(cell), stand[:3, :3], roll, pitch, slope))
     if table.sight is not None:
         facing, seen = np.array(stated.target.facing), Target(cell)
         result.append(constraints.line_of_sight(seen, stand[:3, 3], facing, table.sight, TargetJacobian(cell)))

@@ -16,7 +16,7 @@ from calib.procedure.kinematic_stage.pose_limits import read_limits
 from calib.robot.chain import Chain
 from poses.indices import observability
 from poses.select import Selection, select_poses
-from poses.space import SearchSpace, is_feasible
+from poses.space import is_feasible
 
 Progress = Callable[[int, int, str], None]
 
@@ -80,7 +80,7 @@ def choose(
     chain, source = load_robot(robot, existing, FitOptions(), base, tip)
     cell = targets_of(chain, tools)
     jacobian, limits = observation(cell, kind, sigmas, seed), read_limits(constraints, cell, source)
-    space = SearchSpace(jacobian, limits.lower, limits.upper, None, limits.constraints, limits.feasible)
+    space = limits.space(jacobian)
     before = value = None
     notes = list(limits.notes)
     if existing is not None:

@@ -14,7 +14,7 @@ from calib.procedure.kinematic_stage.pose_limits import read_limits
 from calib.procedure.session.folder import Session
 from calib.robot.chain import Chain
 from poses.candidates import draw_candidates
-from poses.space import SearchSpace, is_feasible
+from poses.space import is_feasible
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +71,6 @@ def _unseen(session: Session, robot_file: Any, chain: Chain, count: int) -> np.n
     cell = targets_of(chain, [session.settings.instrument.tool])
     limits = read_limits(session.path(name) if name else None, cell, robot_file)
     jacobian = observation(cell, session.settings.instrument.measures)
-    space = SearchSpace(jacobian, limits.lower, limits.upper, None, limits.constraints, limits.feasible)
+    space = limits.space(jacobian)
     stream = np.random.default_rng([session.settings.seed, 1])
     return draw_candidates(limits.lower, limits.upper, count, lambda q: is_feasible(space, q), seed=stream)

@@ -12,7 +12,7 @@ import numpy as np
 
 from calib.robot import description, library
 from calib.robot.chain import Chain
-from calib.robot.kinematics import forward
+from calib.robot.kinematics import element_jacobian, forward, joint_jacobian, sweep
 from calib.transforms import invert, pose
 
 COLUMNS = ("alpha", "d", "theta", "r")
@@ -74,6 +74,25 @@ def constraint_values(chain: Chain, station: np.ndarray, tool: np.ndarray, q: np
     return np.column_stack(
         [roll + 4 * np.pi / 9, 7 * np.pi / 18 - roll, pitch + np.pi / 4, np.pi / 4 - pitch, across - 0.2, height + 0.1]
     )
+
+
+def constraint_gradients(chain: Chain, station: np.ndarray, tool: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Return the derivatives of `constraint_values` with respect to q, (m, 6, 7).
+
+    With R = Rz(ψ) Ry(θ) Rx(φ) and the angular velocity ω in the camera's frame: φ' = (ω_x cos ψ + ω_y sin ψ) / cos θ,
+    θ' = ω_y cos ψ - ω_x sin ψ.
+    """
+    walked = sweep(chain, q)
+    fixture = walked.poses() @ tool
+    slope = joint_jacobian(chain, element_jacobian(chain, walked, fixture[:, :3, 3].T)).transpose(2, 1, 0)
+    across = fixture[:, :2, 3] / np.maximum(np.hypot(fixture[:, 0, 3], fixture[:, 1, 3]), 1e-9)[:, None]
+    turn = station[:3, :3] @ slope[:, 3:]
+    x, y = (station[:3, :3] @ fixture[:, :3, 0].T)[:2, :, None]
+    cosine = np.maximum(np.hypot(x, y), 1e-9)
+    roll = (x * turn[:, 0] + y * turn[:, 1]) / cosine**2
+    pitch = (x * turn[:, 1] - y * turn[:, 0]) / cosine
+    away = np.einsum("mi,min->mn", across, slope[:, :2])
+    return np.stack([roll, -roll, pitch, -pitch, away, slope[:, 2]], axis=1)
 
 
 def feasible(chain: Chain, station: np.ndarray, tool: np.ndarray, q: np.ndarray) -> np.ndarray:

@@ -24,6 +24,7 @@ reach = 0.9
 [instrument]
 xyz = [2.5, 0.0, 0.8]
 rpy = [0, "90 deg", 0]
+roll = ["-170 deg", "170 deg"]
 sight = "50 deg"
 [collision]
 radius = 0.04
@@ -84,9 +85,9 @@ def test_chosen_poses_keep_the_constraints(cell, calib):
     assert (np.abs(q[:, 0]) <= np.pi / 2).all()
     for constraint in limits.constraints:
         assert (constraint.function(q) <= 1e-8).all(), constraint.name
-    assert len(limits.constraints) == 4
-    assert limits.feasible is not None
-    assert limits.feasible(q).all()
+    assert len(limits.constraints) == 5
+    assert limits.collision is not None
+    assert (limits.collision.distances(q) >= limits.clearance - 1e-8).all()
     # and they do exclude something
     assert not all((constraint.function(np.zeros((1, 6))) <= 0).all() for constraint in limits.constraints)
 
@@ -97,12 +98,13 @@ def test_the_gradients_of_the_constraints_are_those_of_central_differences(cell)
     Path("c.toml").write_text(CONSTRAINTS)
     q = np.random.default_rng(0).uniform(-1.5, 1.5, (5, 6))
     checked = 0
-    for constraint in read_limits(Path("c.toml"), targets_of(load("ur5"), [(0.1, 0, 0.2)])).constraints:
-        if constraint.gradient is not None:
-            slope = np.asarray(constraint.gradient(q))
-            assert np.abs(slope - central_difference(constraint.function, q).transpose(0, 2, 1)).max() < 1e-7
-            checked += 1
-    assert checked == 4
+    arm = targets_of(load("ur5"), [(0.1, 0, 0.2)])
+    for constraint in read_limits(Path("c.toml"), arm).space(observation(arm)).constraints:
+        assert constraint.gradient is not None
+        slope = np.asarray(constraint.gradient(q))
+        assert np.abs(slope - central_difference(constraint.function, q).transpose(0, 2, 1)).max() < 1e-7
+        checked += 1
+    assert checked == 6  # height, axis, reach, orientation, sight, collision
 
 
 def test_existing_poses_count(cell, calib):
@@ -138,4 +140,4 @@ def test_what_is_sent_to_other_processes_pickles(cell):
     q = np.random.default_rng(0).uniform(-1, 1, (4, 6))
     copy, again = pickle.loads(pickle.dumps((limits, seen)))
     assert np.array_equal(again(q), seen(q))
-    assert np.array_equal(copy.feasible(q), limits.feasible(q))
+    assert np.array_equal(copy.collision.distances(q), limits.collision.distances(q))
