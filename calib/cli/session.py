@@ -155,7 +155,12 @@ def demo(
     if found.results:
         console.print(f"{found.seconds:.1f} s, {found.memory:.0f} MB. Look at", soft_wrap=True, markup=False)
     for words, name in found.results:
-        console.print(f"  {words:15} {found.session.folder / name}", soft_wrap=True, markup=False)
+        how = (
+            f"  (rerun {found.session.folder / name}, or calib view {found.session.folder})"
+            if words == "to play"
+            else ""
+        )
+        console.print(f"  {words:15} {found.session.folder / name}{how}", soft_wrap=True, markup=False)
     if found.verdict == "fail":
         raise typer.Exit(1)
 

@@ -7,6 +7,7 @@ All points are in the base of the arm that is drawn.
 from __future__ import annotations
 
 import csv
+import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -15,8 +16,10 @@ import numpy as np
 from calib.config import read_toml
 from calib.data.csv_table import read_table
 from calib.data.poses.plans import read_poses
+from calib.dynamics.torque_rows import MOTOR, ROWS
 from calib.errors import CalibError, UsageError
 from calib.geometry.installation import Installation, see
+from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.excitation import coefficients
 from calib.procedure.kinematic_stage import robot_file
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
@@ -39,6 +42,8 @@ class Measured:
         q: (m, n) [rad or m].
         seen, nominal, calibrated: (m, 3) [m].
         unseen: (m,) whether the row was kept from the fit.
+        turned: (m, 3) rotation vector from the calibrated arm's orientation to the one seen, as ``residuals.csv`` has
+            it [rad]; NaN where none was measured.
     """
 
     name: str
@@ -47,6 +52,7 @@ class Measured:
     nominal: np.ndarray
     calibrated: np.ndarray
     unseen: np.ndarray
+    turned: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,9 +67,15 @@ class Played:
 
 @dataclass(frozen=True, eq=False)
 class Torques:
-    """Measured and predicted torques (N, rows) of a recording, at times t (N,) [s], and its joints (N, n)."""
+    """Measured and predicted torques (N, rows) of a recording, at times t (N,) [s], and its joints (N, n).
+
+    Attributes:
+        rows, units: what each torque is, by joint and kind, and its unit.
+    """
 
     name: str
+    rows: tuple[str, ...]
+    units: tuple[str, ...]
     t: np.ndarray
     measured: np.ndarray
     predicted: np.ndarray
@@ -120,7 +132,7 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
         tuple(_joined(_measured(place), ValidationFolder(folder / VALIDATED).errors) for place in fits),
         tuple((path.stem, _chosen(path, chain)) for path in sorted(folder.glob("2-poses/*.csv"))) if chain else (),
         tuple(_played(path, folder) for path in motions),
-        tuple(_torques(path, folder) for path in torques),
+        tuple(_torques(path, folder, chain) for path in torques),
         tuple(notes),
     )
     if not (scene.measured or scene.chosen or scene.played or scene.torques):
@@ -188,7 +200,8 @@ def _measured(place: Path) -> Measured:
         there = _points(before, q[own], s, t) if known else _points(replace(after, chain=before.chain), q[own], s, t)
         nominal[own] = there @ base[:3, :3].T + base[:3, 3]
     unseen = np.array([row["set"] != "fit" for row in rows], dtype=bool)
-    return Measured("measured", q, seen, nominal, modelled, unseen)
+    turns = [[float(row.get(f"dr{axis} [deg]") or "nan") for axis in "xyz"] for row in rows]
+    return Measured("measured", q, seen, nominal, modelled, unseen, np.radians(turns).reshape(-1, 3))
 
 
 def _joined(fitted: Measured, errors: Path) -> Measured:
@@ -212,6 +225,7 @@ def _joined(fitted: Measured, errors: Path) -> Measured:
         np.vstack([fitted.nominal, triples[0] + triples[1]]),
         np.vstack([fitted.calibrated, triples[0] + triples[2]]),
         np.concatenate([fitted.unseen, np.ones(len(q), dtype=bool)]),
+        np.vstack([fitted.turned, np.full((len(q), 3), np.nan)]),
     )
 
 
@@ -241,12 +255,32 @@ def _played(path: Path, folder: Path) -> Played:
     return Played(_name(path, folder), table.numbers("t"), q, v)
 
 
-def _torques(path: Path, folder: Path) -> Torques:
+def _torques(path: Path, folder: Path, chain: Chain | None) -> Torques:
     table = read_table(path)
     measured, predicted = (_block(table, f"{what}_") for what in ("measured", "predicted"))
     assert measured is not None and predicted is not None
     t = table.cells[table.index("t")]
-    return Torques(_name(path, folder), np.asarray(t, dtype=float), measured, predicted, _block(table, "q"))
+    rows, units = _torque_rows(path.parent, chain, measured.shape[1])
+    return Torques(
+        _name(path, folder), rows, units, np.asarray(t, dtype=float), measured, predicted, _block(table, "q")
+    )
+
+
+def _torque_rows(place: Path, chain: Chain | None, count: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return what the torques of an identification's folder are, and their units."""
+    for folder in (IdentificationFolder(place), IdentificationFolder(place.parent)):
+        if chain is None or not folder.model.is_file():
+            continue
+        table = json.loads(folder.model.read_text(encoding="utf-8"))
+        rows, unit = ROWS.get(table.get("kind", ""), MOTOR), table.get("unit", "N m")
+        if rows.count(chain.n) == count:
+            kind = f"{' motor' if rows.motors_alone else ''} {'torque' if unit == 'N m' else 'current'}"
+            units = rows.units([joint.kind == "prismatic" for joint in chain.joints])
+            return tuple(title + kind for title in rows.titles(chain.joint_names)), (
+                units if unit == "N m" else (unit,) * count
+            )
+    names = chain.joint_names if chain is not None and chain.n == count else [f"row {k + 1}" for k in range(count)]
+    return tuple(f"{name} torque" for name in names), ("N m or N",) * count
 
 
 def _block(table, letter: str) -> np.ndarray | None:

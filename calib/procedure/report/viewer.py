@@ -1,4 +1,4 @@
-"""Show a scene in Rerun: the only home of rerun-sdk, an extra (`pip install armature-calib[view]`) of 170 MB.
+"""Show a scene in Rerun: the only home of rerun-sdk, which is loaded when something is shown, and never else.
 
 Everything plays on one clock, the timeline ``time``, in the order of the work: pose plans as they grow, measured poses
 one by one, motions, torques; poses last `EACH`, motions as long as they are. Poses have timelines of their own beside.
@@ -40,7 +40,8 @@ def _rerun() -> Any:
         import rerun
     except ImportError as error:
         raise UsageError(
-            "this needs Rerun, which is not installed (170 MB): pip install 'armature-calib[view]', or rerun-sdk"
+            "this needs Rerun, which is not installed here (there is none for Macs with Intel processors): "
+            "pip install rerun-sdk"
         ) from error
     return rerun
 
@@ -71,7 +72,7 @@ def write_beside(folder: str | Path) -> str:
     A recording is a convenience: neither a missing package nor a full disk stops what it belongs to.
     """
     if not available():
-        return f"no {FILE}: Rerun is not installed (pip install 'armature-calib[view]')"
+        return f"no {FILE}: Rerun is not installed (pip install rerun-sdk)"
     try:
         write(folder, Path(folder) / FILE)
     except Exception as error:  # whatever rerun may raise
@@ -130,10 +131,10 @@ def about(scene: Scene) -> str:
     return "\n\n".join([*lines, *(f"note: {note}" for note in scene.notes)])
 
 
-def _poses(name: str, count: int, start: float) -> list[Any]:
-    """Return the clock and a count of its own for `count` poses from `start` on [s]."""
+def _poses(name: str, count: int, start: float, some: np.ndarray | None = None) -> list[Any]:
+    """Return the clock and a count of its own for `count` poses, or `some` of them, from `start` on [s]."""
     rr = _rerun()
-    steps = np.arange(1, count + 1)
+    steps = np.arange(1, count + 1) if some is None else some + 1
     return [rr.TimeColumn("time", duration=start + EACH * steps), rr.TimeColumn(name, sequence=steps)]
 
 
@@ -152,6 +153,17 @@ def _measured(recording: Any, scene: Scene, measured: Measured, start: float) ->
         recording.log(f"world/tool/{name}", rr.Points3D(points, radii=0.006, colors=colour), static=True)
         size = 1e3 * np.linalg.norm(measured.seen - points, axis=1)
         _series(recording, f"errors/{name}", index, size, f"{name} [mm]", colour)
+    left = 1e3 * (measured.seen - measured.calibrated)
+    for k, axis in enumerate("xyz"):
+        _series(recording, f"axes/position/{axis}", index, left[:, k], f"{axis} in the arm's base [mm]")
+    known = np.flatnonzero(np.isfinite(measured.turned).all(axis=1))
+    if len(known):
+        some = _poses("pose", len(measured.q), start, known)
+        turned = 1e3 * measured.turned[known]
+        size = np.linalg.norm(turned, axis=1)
+        _series(recording, "turns/calibrated", some, size, "orientation, calibrated [mrad]", AFTER)
+        for k, axis in enumerate("xyz"):
+            _series(recording, f"axes/orientation/{axis}", some, turned[:, k], f"about {axis} [mrad]")
     if measured.unseen.any():
         kept = np.where(measured.unseen, 1.0, 0.0)
         _series(recording, "errors/unseen", index, kept, "1: unseen, 0: fitted", SEEN)
@@ -209,14 +221,11 @@ def _torques(recording: Any, scene: Scene, torques: Torques, start: float) -> fl
     rr = _rerun()
     t = start + torques.t - torques.t[0]
     index = [rr.TimeColumn("time", duration=t)]
-    rows = torques.measured.shape[1]
-    joints = scene.chain.joint_names if scene.chain is not None else ()
-    names = list(joints) if rows == len(joints) else [f"row {k + 1}" for k in range(rows)]
-    for j, name in enumerate(names):
+    for j, (name, unit) in enumerate(zip(torques.rows, torques.units)):
         measured, predicted = torques.measured[:, j], torques.predicted[:, j]
-        _series(recording, f"torques/{_part(name)}/measured", index, measured, "measured", BEFORE)
-        _series(recording, f"torques/{_part(name)}/predicted", index, predicted, "predicted", AFTER)
-        _series(recording, f"residuals/{_part(name)}", index, measured - predicted, name)
+        _series(recording, f"torques/{_part(name)}/measured", index, measured, f"measured [{unit}]", BEFORE)
+        _series(recording, f"torques/{_part(name)}/predicted", index, predicted, f"predicted [{unit}]", AFTER)
+        _series(recording, f"residuals/{_part(name)}", index, measured - predicted, f"{name} [{unit}]")
     if torques.q is not None:
         some = viewing.thinned(torques.t)
         _arm(recording, scene, [rr.TimeColumn("time", duration=t[some])], torques.q[some])
@@ -281,7 +290,12 @@ def blueprint(scene: Scene) -> Any:
     if scene.chosen:
         tabs.append(rrb.TimeSeriesView(origin="chosen", name="pose plans"))
     if scene.measured:
-        tabs.append(rrb.TimeSeriesView(origin="errors", name="error of each pose"))
+        sizes = [rrb.TimeSeriesView(origin="errors", name="position error [mm]")]
+        sides = [rrb.TimeSeriesView(origin="axes/position", name="what remains by axis [mm]")]
+        if any(np.isfinite(measured.turned).any() for measured in scene.measured):
+            sizes.append(rrb.TimeSeriesView(origin="turns", name="orientation error [mrad]"))
+            sides.append(rrb.TimeSeriesView(origin="axes/orientation", name="what remains about each axis [mrad]"))
+        tabs += [rrb.Vertical(*sizes, name="error of each pose"), rrb.Vertical(*sides, name="error by axis")]
     if scene.played:
         contents = [[f"+ /motion/{kind}/**", f"+ /limits/{kind}/**"] for kind in ("position", "velocity")]
         views = [
@@ -293,14 +307,11 @@ def blueprint(scene: Scene) -> Any:
         tabs.append(rrb.Vertical(*views, name="motion"))
     if scene.torques:
         each = _torque_names(scene)
-        plots = [
-            rrb.TimeSeriesView(origin=f"torques/{_part(name)}", name=f"torque, {name}", plot_legend=silent)
-            for name in each
-        ]
+        plots = [rrb.TimeSeriesView(origin=f"torques/{_part(name)}", name=name, plot_legend=silent) for name in each]
         rest = rrb.TimeSeriesView(origin="residuals", name="measured minus predicted")
         tabs.append(rrb.Vertical(rrb.Grid(*plots, grid_columns=2), rest, row_shares=[3, 1], name="torques"))
     picture = rrb.Spatial3DView(origin="world", name="robot, nominal orange, calibrated green")
-    right = rrb.Tabs(*tabs, active_tab="error of each pose" if scene.measured else 0)
+    right = rrb.Tabs(*tabs, active_tab=int(bool(scene.measured and scene.chosen)))
     text = rrb.TextDocumentView(origin="about", name="what is shown")
     return rrb.Blueprint(
         rrb.Horizontal(rrb.Vertical(picture, text, row_shares=[4, 1]), right, column_shares=[3, 2]),
@@ -312,6 +323,5 @@ def blueprint(scene: Scene) -> Any:
 
 
 def _torque_names(scene: Scene) -> list[str]:
-    rows = max(one.measured.shape[1] for one in scene.torques)
-    joints = scene.chain.joint_names if scene.chain is not None else ()
-    return list(joints) if rows == len(joints) else [f"row {k + 1}" for k in range(rows)]
+    """Return the names of all torque rows, each once."""
+    return list(dict.fromkeys(name for one in scene.torques for name in one.rows))

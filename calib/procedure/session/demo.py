@@ -14,6 +14,7 @@ import numpy as np
 from calib import files
 from calib.data.poses.plans import read_poses
 from calib.errors import SessionError, UsageError
+from calib.procedure.report import viewer
 from calib.procedure.session import dynamics_steps, steps
 from calib.procedure.session.commands import begin
 from calib.procedure.session.folder import MARK, Session, locked, open_session
@@ -121,6 +122,8 @@ def results(session: Session) -> tuple[tuple[str, str], ...]:
     ]
     if session.dynamic:
         found += [("motions", "6-excitation"), ("dynamics", "8-dynamics")]
+    if session.path(viewer.FILE).exists():
+        found.append(("to play", viewer.FILE))
     return (*found, ("the session", "session.toml"))
 
 

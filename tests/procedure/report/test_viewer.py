@@ -58,6 +58,7 @@ def session(fitted, tmp_path) -> Path:
     head = ["t", *(f"{letter}{k + 1}" for letter in "qva" for k in range(6))]
     table("6-excitation/training/trajectory.csv", head, np.hstack([t, wave, np.cos(t + np.arange(6)), -wave]))
     head = ["t [s]", *(f"{what}{k + 1}" for what in ("measured_", "predicted_", "q") for k in range(6))]
+    (here / "8-dynamics/dynamics.json").write_text('{"kind": "motor", "unit": "N m"}')
     table("8-dynamics/unseen/torques_1.csv", head, np.hstack([t + 0.5, wave, wave - 0.1, wave]))
     return here
 
@@ -83,7 +84,9 @@ def test_a_fit_shows_every_pose_as_both_arms_see_it(fitted, tmp_path):
     measured = scene.measured[0]
     assert (len(measured.q), int(measured.unseen.sum())) == (60, 15)
     found, still = rows(tmp_path / "a.rrd"), constant(tmp_path / "a.rrd")
-    for name in ("/errors/nominal", "/errors/calibrated", "/errors/unseen", "/world/pose", "/world/robot/lines"):
+    axes = [f"/axes/{nature}/{axis}" for nature in ("position", "orientation") for axis in "xyz"]
+    errors = ("/errors/nominal", "/errors/calibrated", "/errors/unseen", "/turns/calibrated")
+    for name in (*errors, *axes, "/world/pose", "/world/robot/lines"):
         assert found[name] == 60, name
     scale = viewing.arrow_scale(measured, scene.chain)
     assert {f"/world/errors_times_{scale:g}/{arm}" for arm in ("nominal", "calibrated")} <= still
@@ -97,6 +100,8 @@ def test_the_arrows_are_the_errors_that_the_fit_reports(fitted):
     for points, column in ((measured.calibrated, "size [mm]"), (measured.nominal, "nominal size [mm]")):
         sizes = 1e3 * np.linalg.norm(measured.seen - points, axis=1)
         assert sizes == pytest.approx([float(row[column]) for row in table], rel=1e-4)
+    turns = [[float(row[f"dr{axis} [deg]"]) for axis in "xyz"] for row in table]
+    assert np.degrees(measured.turned) == pytest.approx(np.array(turns))
     tool = robot_file.read(fitted).tools[0]
     at = (forward(load(fitted), measured.q) @ tool)[:, :3, 3]
     assert np.abs(at - measured.calibrated).max() < 1e-9  # in the base of the arm that is drawn
@@ -109,8 +114,10 @@ def test_a_session_plays_poses_motions_and_torques_on_one_clock(session, tmp_pat
     some = len(viewing.thinned(scene.played[0].t))
     assert some == 101  # 2 s at 50 Hz
     assert found["/world/chosen/poses"] == 7
+    elbow = r"elbow_joint\ motor\ torque"
+    assert scene.torques[0].rows[2] == "elbow_joint motor torque" and scene.torques[0].units == ("N m",) * 6
     assert found["/motion/position/elbow_joint"] == some and found["/limits/velocity/elbow_joint/upper"] == 2
-    assert found["/torques/elbow_joint/measured"] == found["/residuals/elbow_joint"] == 200
+    assert found[f"/torques/{elbow}/measured"] == found[f"/residuals/{elbow}"] == 200
     assert found["/world/robot/lines"] == 7 + 60 + 2 * some
     clocks = {}
     for chunk in chunks.RrdReader(str(tmp_path / "s.rrd")).store().stream():
@@ -150,7 +157,7 @@ def test_links_are_meshes_where_their_files_are_found(session, tmp_path):
 def test_without_rerun_the_command_says_what_to_install_and_a_session_goes_on(fitted, monkeypatch, capsys, tmp_path):
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert cli.run(["view", str(fitted), "--save", str(tmp_path / "x.rrd")]) == 2
-    assert "armature-calib[view]" in capsys.readouterr().err
+    assert "pip install rerun-sdk" in capsys.readouterr().err
     assert not (tmp_path / "x.rrd").exists()
     monkeypatch.setattr(viewer, "available", lambda: False)
     assert "not installed" in viewer.write_beside(fitted)
