@@ -189,7 +189,9 @@ def _correlated(names: Sequence[str], covariance: np.ndarray, most: int = 12) ->
 def _noise(blocks: Sequence[PoseMeasurements]) -> dict[str, float | None]:
     result: dict[str, float | None] = {}
     for nature, name in (("position", "sigma"), ("orientation", "sigma_rotation")):
-        stated = [sigma for block in blocks if (sigma := getattr(block, name)) is not None]
+        found = [(block, getattr(block, name, None)) for block in blocks]
+        # a kind with one number per row states it for each axis
+        stated = [np.broadcast_to(s.reshape(len(block), -1), (len(block), 3)) for block, s in found if s is not None]
         whole = len(stated) == len(blocks)
         result[nature] = float(np.sqrt(np.mean(np.sum(np.concatenate(stated) ** 2, axis=1)))) if whole else None
     return result
