@@ -21,7 +21,7 @@ HOMES = {
     "cv2": ["calib.data.camera"],
     "mcap": ["calib.data."],
     "rosbags": ["calib.data."],
-    "pandas": [],
+    "pandas": ["calib.api.rendering"],
     "rerun": ["calib.procedure.report.viewer"],
     "nlopt": ["poses.", "trajectories."],
     "toppra": ["trajectories."],

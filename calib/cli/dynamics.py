@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -31,31 +31,28 @@ def identify_dynamics(
     plots: Plots = True,
 ) -> None:
     """Identify the dynamics of ROBOT from recordings, and say how well it predicts other motion."""
-    from calib.identification.identify_options import read_options
-    from calib.procedure.dynamic_stage import folder, identify, inputs
+    from calib.api.dynamic import identify_dynamics as identified
+    from calib.procedure.dynamic_stage import folder
     from calib.procedure.report import console as shown
     from calib.procedure.report import dynamics_section
 
-    chosen = read_options(options)
     folder.check_identification_target(out, [options, *recordings, *(validate or [])])
     console = make_console()
+
+    def read(given: Any) -> None:
+        folder.check_identification_target(out, [given.source, given.source.parent])
+        for line in shown.rendered(dynamics_section.read_blocks(given)):
+            console.print(line, soft_wrap=True)
+
     with progress() as say:
-        found = inputs.gather(
-            robot, recordings, validate or [], options=chosen, method=method, friction=friction, base=base, tip=tip,
-            seed=seed, progress=say,
+        found = identified(
+            robot, recordings, validate=validate or (), method=method, friction=friction, options=options, base=base,
+            tip=tip, seed=seed, on_read=read, progress=say,
         )  # fmt: skip
-        folder.check_identification_target(out, [found.source, found.source.parent])
-    for line in shown.rendered(dynamics_section.read_blocks(found)):
-        console.print(line, soft_wrap=True)
-    with progress() as say:
-        outcome = identify.run(found, progress=say)
         say("writing")
-        draw = None
-        if plots:
-            from calib.procedure.report.identification_figures import write as draw
-        folder.write_folder(outcome, out, draw)
-    for line in shown.section(dynamics_section.outcome_section(outcome)):
+        found.save(out, plots=plots)
+    for line in found.renderables():
         console.print(line, soft_wrap=True)
     console.print(f"written to {out}", soft_wrap=True, markup=False)
-    if outcome.verdict.level == "fail":
+    if found.verdict.level == "fail":
         raise typer.Exit(1)

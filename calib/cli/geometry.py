@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -50,41 +49,35 @@ def fit(
     Pass means that on poses it has not seen the calibrated arm is better than the nominal one, or that there is nothing
     to gain; that it is good enough is said only with --tolerance.
     """
-    from calib.data.poses.fit_options import read_options
-    from calib.procedure.kinematic_stage import fit as fitting
-    from calib.procedure.kinematic_stage import folder as outputs
-    from calib.procedure.kinematic_stage import inputs
+    from calib.api.kinematic import fit_geometry
+    from calib.procedure.kinematic_stage import folder
     from calib.procedure.kinematic_stage.settings import FitSettings
     from calib.procedure.report import console as shown
-    from calib.procedure.report import fit_certificate, geometry_section
-    from calib.procedure.report.fit_report import fit_metrics
+    from calib.procedure.report import geometry_section
 
-    wanted = FitSettings(
-        model,
-        loss,
-        folds,
-        stations,
-        tools,
-        holdout,
-        refit_frames,
-        None if tolerance is None else 1e-3 * tolerance,
-        seed,
-    )
-    chosen = read_options(options)
-    outputs.check_fit_target(out, [options, *measured, *(validate or [])])
-    found = inputs.gather(robot, measured, validate or [], options=chosen, settings=wanted, base=base, tip=tip)
-    outputs.check_fit_target(out, [found.source])
+    settings = FitSettings(
+        model, loss, folds, stations, tools, holdout, refit_frames,
+        None if tolerance is None else 1e-3 * tolerance, seed,
+    )  # fmt: skip
+    folder.check_fit_target(out, [options, *measured, *(validate or [])])
     console = make_console()
-    for line in shown.rendered(geometry_section.read_blocks(found)):
-        console.print(line, soft_wrap=True)
+
+    def read(given: Any) -> None:
+        folder.check_fit_target(out, [given.source])
+        for line in shown.rendered(geometry_section.read_blocks(given)):
+            console.print(line, soft_wrap=True)
+
     with progress() as say:
-        outcome = fitting.run(found, chosen, wanted, say)
+        found = fit_geometry(
+            robot, measured, settings, validate=validate or (), options=options, base=base, tip=tip, on_read=read,
+            progress=say,
+        )  # fmt: skip
         say("writing")
-        outputs.write_folder(outcome, out, partial(fit_certificate.write, plots=plots))
-    for line in shown.section(geometry_section.outcome_section(fit_metrics(outcome))):
+        found.save(out, plots=plots)
+    for line in found.renderables():
         console.print(line, soft_wrap=True)
     console.print(f"written to {out}", soft_wrap=True, markup=False)
-    if outcome.verdict.level == "fail":
+    if found.verdict.level == "fail":
         raise typer.Exit(1)
 
 
@@ -111,24 +104,21 @@ def select(
     seed: Seed = 0,
 ) -> None:
     """Choose the poses at which the geometry of ROBOT shows best."""
-    from calib import workers as work
-    from calib.procedure.kinematic_stage import selection
+    from calib.api.kinematic import select_poses
+    from calib.procedure.kinematic_stage.settings import SelectionSettings
 
-    targets = [numbers(text, 3, "--tool") for text in tool or []]
+    targets = tuple(tuple(numbers(text, 3, "--tool")) for text in tool or [])
     sigmas = None if sigma is None else numbers(sigma, 2, "--sigma")
-    lost = []
-    with work.workers(workers) as crew, progress() as say:
-        chosen = selection.choose(
-            robot, m, kind=kind, tools=targets, index=index, method=method, constraints=constraints, existing=existing,
-            candidates=candidates, sigmas=(sigmas[0], sigmas[1]) if sigmas else None, base=base, tip=tip, seed=seed,
-            map=crew.map_without(lost), progress=lambda done, total, what: say(f"{what} ({done} of {total})"),
+    stated = None if sigmas is None else (sigmas[0], sigmas[1])
+    settings = SelectionSettings(kind, targets, index, method, candidates, stated, seed)
+    with progress() as say:
+        chosen = select_poses(
+            robot, m, settings, constraints=constraints, existing=existing, base=base, tip=tip, workers=workers,
+            progress=say,
         )  # fmt: skip
-    selection.write(chosen, out)
+    chosen.save(out)
     console = make_console()
-    for words, number in selection.table(chosen):
-        console.print(f"{words:38} {number}", soft_wrap=True, markup=False)
-    for note in (*chosen.notes, *lost):
-        console.print(f"note: {note}", soft_wrap=True, markup=False)
+    console.print(str(chosen), soft_wrap=True, markup=False)
     console.print(f"{m} poses written to {out}", soft_wrap=True, markup=False)
 
 
@@ -224,24 +214,20 @@ def compensate(
     seed: Seed = 0,
 ) -> None:
     """Turn nominal targets into the joint commands that put the real tool there."""
-    from calib.data.poses.target_files import read_targets
+    from calib.api import kinematic
     from calib.procedure.kinematic_stage import compensation, compensation_file
-    from calib.procedure.kinematic_stage.inputs import joint_kinds
 
-    fitted = compensation.read(folder)
-    chain = fitted.nominal.chain
-    given = read_targets(targets, chain.joint_names, kinds=joint_kinds(chain), limits=(chain.lower, chain.upper))
     may = numbers(tolerance, 2, "--tolerance")
+    fitted = compensation.read(folder)
     compensation_file.check_out(out, targets, fitted)
     with progress() as say:
-        found = compensation.compensate(
-            fitted, given, frame=frame, tool=tool, dof=dof, tolerance=(1e-3 * may[0], 1e-3 * may[1]), seed=seed,
-            start=numbers(start, chain.n, "--start") if start else None, progress=say,
+        found = kinematic.compensate(
+            fitted, targets, frame=frame, tool=tool, dof=dof, tolerance=(1e-3 * may[0], 1e-3 * may[1]), seed=seed,
+            start=numbers(start, fitted.nominal.chain.n, "--start") if start else None, progress=say,
         )  # fmt: skip
-    compensation_file.write(found, fitted, given, out, partial)
+    found.save(out, partial=partial)
     console = make_console()
-    for line in compensation_file.lines(found, given, fitted):
-        console.print(line, soft_wrap=True, markup=False)
+    console.print(str(found), soft_wrap=True, markup=False)
     console.print(
-        f"{int(found.reached.sum())} of {len(found.q)} commands written to {out}", soft_wrap=True, markup=False
+        f"{int(found.commands.reached.sum())} of {len(found.q)} commands written to {out}", soft_wrap=True, markup=False
     )

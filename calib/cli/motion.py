@@ -54,8 +54,8 @@ def excite(
     plots: Plots = True,
 ) -> None:
     """Design a motion that excites the dynamics of ROBOT within its limits."""
-    from calib import workers as work
-    from calib.procedure.excitation import design, folder
+    from calib.api.motions import design_excitation
+    from calib.procedure.excitation import folder
 
     settings = ExcitationSettings(
         goals=tuple(goal or ()), hard=tuple(hard or ()), period=period, harmonics=harmonics, family=family,
@@ -63,17 +63,13 @@ def excite(
         start=_stands(start), repeat=repeat, slower=slower, existing=tuple(existing or ()), lock=tuple(lock or ()),
     )  # fmt: skip
     folder.check_design_target(out, [robot, model, limits, *settings.existing])
-    lost = []
-    with work.workers(workers) as crew, progress() as say:
-        designed = design.excite(
-            robot, settings, model=model, limits=limits, base=base, tip=tip, map=crew.map_without(lost), progress=say
+    with progress() as say:
+        designed = design_excitation(
+            robot, settings, model=model, limits=limits, base=base, tip=tip, workers=workers, progress=say
         )
         say("writing")
-        draw = None
-        if plots:
-            from calib.procedure.report.motion_figures import write_design as draw
-        folder.write_design(designed, out, draw)
-    say_written([*folder.design_lines(designed), *(f"note: {note}" for note in lost)], out)
+        designed.save(out, plots=plots)
+    say_written(str(designed).splitlines(), out)
 
 
 @app.command()
@@ -114,7 +110,8 @@ def plan(
     plots: Plots = True,
 ) -> None:
     """Plan the fastest motion of ROBOT through waypoints, within its speeds and torques."""
-    from calib.procedure.excitation import folder, planning
+    from calib.api.motions import plan_motion
+    from calib.procedure.excitation import folder
 
     settings = PlanSettings(
         payloads=tuple(payload or ()), lines=line, rate=rate, shorten=shorten, stray=stray, start=_stands(start),
@@ -122,15 +119,12 @@ def plan(
     )  # fmt: skip
     folder.check_plan_target(out, [robot, waypoints, model, limits, drives])
     with progress() as say:
-        planned = planning.plan(
+        planned = plan_motion(
             robot, waypoints, settings, model=model, limits=limits, drives=drives, base=base, tip=tip, progress=say
         )
         say("writing")
-        draw = None
-        if plots:
-            from calib.procedure.report.motion_figures import write_plan as draw
-        folder.write_plan(planned, out, draw)
-    say_written(folder.plan_lines(planned), out)
+        planned.save(out, plots=plots)
+    say_written(str(planned).splitlines(), out)
 
 
 def _stands(start: str | None) -> tuple[float, ...] | None:

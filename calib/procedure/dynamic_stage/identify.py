@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -100,6 +100,11 @@ def run(inputs: IdentificationInputs, progress: Progress | None = None) -> Ident
     )  # fmt: skip
     result = assess(inputs, found.dynamics, findings, wrong, progress=say)
     return IdentificationOutcome(inputs, found, findings, result, carried, geometries, settings.seed)
+
+
+def assessed(outcome: IdentificationOutcome, inputs: IdentificationInputs) -> IdentificationOutcome:
+    """Return an outcome judged anew on the unseen recordings of `inputs`; nothing is identified."""
+    return replace(outcome, inputs=inputs, assessment=assess(inputs, outcome.found.dynamics, outcome.findings))
 
 
 def carry(

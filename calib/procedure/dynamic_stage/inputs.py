@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from calib.data.recordings.checks import check_recording
 from calib.data.recordings.recording import Joints, Recording
 from calib.data.recordings.recording_files import read_recording
 from calib.data.signals.decimation import SHARE
@@ -43,8 +44,7 @@ class IdentificationInputs:
         unseen: recordings to be predicted.
         options: the options file's content, the command's choices put in.
         notes: what a user should know about how the files were understood.
-        unit: of the torques.
-        gains: drive gains that were identified; None where none were.
+        currents: how currents become torques.
     """
 
     robot: CalibratedChain
@@ -52,9 +52,18 @@ class IdentificationInputs:
     cases: tuple[Case, ...]
     unseen: tuple[Case, ...]
     options: IdentifyOptions
-    notes: tuple[str, ...] = ()
-    unit: str = "N m"
-    gains: DriveGains | None = None
+    notes: tuple[str, ...]
+    currents: FoundGains
+
+    @property
+    def unit(self) -> str:
+        """Of the torques."""
+        return self.currents.unit
+
+    @property
+    def gains(self) -> DriveGains | None:
+        """Drive gains that were identified; None where none were."""
+        return self.currents.found
 
     @property
     def chain(self) -> Chain:
@@ -64,8 +73,8 @@ class IdentificationInputs:
 
 def gather(
     robot: str | Path | CalibratedChain,
-    recordings: Sequence[str],
-    validate: Sequence[str] = (),
+    recordings: Sequence[str | Path | Recording],
+    validate: Sequence[str | Path | Recording] = (),
     *,
     options: IdentifyOptions | None = None,
     method: str | None = None,
@@ -79,7 +88,7 @@ def gather(
 
     Args:
         robot: see `calib.robot.load`; or as a geometric fit returns it.
-        recordings, validate: paths, each with a cut if wanted (``log.npz@0:9.4``).
+        recordings, validate: paths, each with a cut if wanted (``log.npz@0:9.4``), or recordings in memory.
         options: the options file's content.
         method, friction: in place of the options'.
         base, tip: links of a URDF.
@@ -89,17 +98,18 @@ def gather(
     options = with_choices(options or IdentifyOptions(), method, friction, seed)
     if not recordings:
         raise UsageError("no recording given")
-    check_files(options, [*recordings, *validate])
+    given = [*recordings, *validate]
+    paths = [_path(each) for each in given]
+    check_files(options, paths)
     known = robot if isinstance(robot, CalibratedChain) else load_calibrated(robot, base, tip)
     source = Path(known.source or known.chain.name) if isinstance(robot, CalibratedChain) else resolve(robot)
     chain = known.chain
-    paths = [*map(str, recordings), *map(str, validate)]
     names = case_names(paths)
     motions: list[Motion] = []
-    for name, path in zip(names, paths):
+    for name, path, each in zip(names, paths, given):
         say(f"reading {name}")
         like = motions[0] if len(motions) >= len(recordings) else None
-        motion = read_motion(path, chain, file_settings(options, path), like)
+        motion = read_motion(each, chain, file_settings(options, path), like)
         motions.append(referred(motion, path, chain, options) if len(motions) < len(recordings) else motion)
     notes = [f"{name}: {note}" for name, motion in zip(names, motions) for note in motion.notes]
     count = len(recordings)
@@ -108,8 +118,32 @@ def gather(
     cases = [read_case(path, name, motion, options, found) for name, path, motion in zip(names, paths, motions)]
     return IdentificationInputs(
         without_corrections(known), source, tuple(cases[:count]), tuple(cases[count:]), options,
-        (*notes, *found.notes), found.unit, found.found,
+        (*notes, *found.notes), found,
     )  # fmt: skip
+
+
+def with_unseen(given: IdentificationInputs, validate: Sequence[str | Path | Recording]) -> IdentificationInputs:
+    """Return inputs with more recordings that were not learnt from.
+
+    Args:
+        given: robot, recordings and options.
+        validate: paths, each with a cut if wanted, or recordings in memory.
+    """
+    paths = [_path(each) for each in validate]
+    names = case_names([*(case.name for case in (*given.cases, *given.unseen)), *paths])[-len(paths) :]
+    cases, notes = [], []
+    for name, path, each in zip(names, paths, validate):
+        motion = read_motion(each, given.chain, file_settings(given.options, path), given.cases[0].motion)
+        cases.append(read_case(path, name, motion, given.options, given.currents))
+        notes += [f"{name}: {note}" for note in motion.notes]
+    return replace(given, unseen=(*given.unseen, *cases), notes=(*given.notes, *notes))
+
+
+def _path(each: str | Path | Recording) -> str:
+    """Return the path of a recording; of one in memory its file and span, so that two cuts of a file differ."""
+    if not isinstance(each, Recording):
+        return str(each)
+    return f"{each.file or 'recording'}@{each.t[0]:.6g}:{each.t[-1]:.6g}"
 
 
 def with_choices(options: IdentifyOptions, method: str | None, friction: str | None, seed: int) -> IdentifyOptions:
@@ -136,14 +170,18 @@ def read_case(path: str, name: str, motion: Motion, options: IdentifyOptions, fo
     )  # fmt: skip
 
 
-def read_motion(path: str, chain: Chain, own: FileSettings, like: Motion | None = None) -> Motion:
+def read_motion(given: str | Path | Recording, chain: Chain, own: FileSettings, like: Motion | None = None) -> Motion:
     """Return the motion of a recording, held against the robot's joints and limits.
 
     Args:
+        given: a path, with a cut if wanted, or the recording.
         like: a motion whose identification band it is judged in, where the options state none; how far its own
             positions need filtering, it says itself.
     """
-    recording = read_recording(path, joints_of(chain), own.recording)
+    if isinstance(given, Recording):
+        recording = check_recording(given, joints_of(chain))
+    else:
+        recording = read_recording(given, joints_of(chain), own.recording)
     sampled = sample(recording, own.filter)
     if like is not None and own.filter.band is None and like.band * np.median(np.diff(recording.t)) < 0.4:
         banded = replace(own.filter, band=like.band * (1.0 - 1e-9))

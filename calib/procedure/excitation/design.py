@@ -16,6 +16,7 @@ from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel, re
 from calib.procedure.excitation.limits import MotionLimits
 from calib.procedure.excitation.playback import Playback, check_playback, play
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, ExcitationSettings
+from calib.robot.calibrated import CalibratedChain
 from trajectories.basis import Family
 from trajectories.bspline import bspline_family
 from trajectories.constraints import MotionConstraint, TorqueLimit
@@ -76,7 +77,7 @@ class Designed:
 
 
 def excite(
-    robot: str | Path,
+    robot: str | Path | CalibratedChain,
     settings: ExcitationSettings = DEFAULT_DESIGN,
     *,
     model: Path | None = None,

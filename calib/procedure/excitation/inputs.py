@@ -26,6 +26,7 @@ from calib.procedure.excitation.limits import MotionLimits, read_motion_limits
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.procedure.kinematic_stage.inputs import load_robot
 from calib.robot import description
+from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, sampling_limits
 from trajectories.constraints import BoxLimit
 
@@ -107,7 +108,7 @@ class ExcitationInputs:
 
 
 def read_inputs(
-    robot: str | Path,
+    robot: str | Path | CalibratedChain,
     settings: ExcitationSettings,
     model: Path | None = None,
     limits: Path | None = None,

@@ -25,6 +25,7 @@ from calib.procedure.excitation.playback import approach_to, check_slower
 from calib.procedure.excitation.settings import DEFAULT_PLAN, PlanSettings
 from calib.procedure.excitation.waypoints import read_waypoints
 from calib.procedure.kinematic_stage.inputs import load_robot
+from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
 from calib.robot.kinematics import element_jacobian, forward, joint_jacobian, sweep
 from trajectories.basis import SampledMotion
@@ -100,7 +101,7 @@ class Planned:
 
 
 def plan(
-    robot: str | Path,
+    robot: str | Path | CalibratedChain,
     waypoints: Path,
     settings: PlanSettings = DEFAULT_PLAN,
     *,

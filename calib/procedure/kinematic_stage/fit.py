@@ -140,6 +140,17 @@ def run(
     return Outcome(inputs, found, rigid, named, tuple(explain(found.fit)), findings, result, seed, wanted.tolerance)
 
 
+def assessed(outcome: Outcome, inputs: Inputs, options: FitOptions, wanted: FitSettings) -> Outcome:
+    """Return an outcome judged anew on the unseen rows of `inputs`; nothing is fitted."""
+    settings = combine(Settings(), loss=wanted.loss or options.loss, loss_scale=options.loss_scale)
+    arms = Arms(outcome.climb.nominal.cell, outcome.climb.fit.cell, outcome.rigid.cell.chain)
+    asked = wanted.model or options.model
+    result = assess(
+        arms, inputs, outcome.findings, settings, asked=asked, tolerance=outcome.tolerance, seed=outcome.seed
+    )
+    return replace(outcome, inputs=inputs, assessment=result)
+
+
 def found_of(inputs: Inputs, found: Climb, named: Sequence[Outlier], notes: Sequence[str]) -> Findings:
     """Return what a fit says of itself, whatever rows it has not seen; `notes` are those of moved instruments etc."""
     long = reach(inputs.chain)

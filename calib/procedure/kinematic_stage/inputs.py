@@ -100,10 +100,10 @@ def gather(
         raise UsageError("no measurement file given")
     files = [_path(each) for each in measured]
     check_files(options, [*files, *map(_path, validate)])
+    chain, source = load_robot(robot, files[0], options, base, tip)
     if isinstance(robot, CalibratedChain):
-        chain, source, earlier = robot.complete, Path(robot.source or robot.chain.name), robot
+        earlier = robot
     else:
-        chain, source = load_robot(robot, files[0], options, base, tip)
         earlier = calibrated.read(source) if source.suffix == ".toml" else None
     blocks = _named(
         [(path, block) for path, each in zip(files, measured) for block in _blocks(each, chain, options)],
@@ -116,27 +116,50 @@ def gather(
         fit.append(kept)
         if aside is not None:
             unseen[_free_name(unseen, block.file)] = Unseen(aside, held_out=True)
-    notes: list[str] = []
+    given = with_unseen(Inputs(chain, source, tuple(fit), unseen, (), earlier), validate, options, settings)
+    if earlier is None or earlier.corrections is None:
+        return given
+    name, count = source if isinstance(robot, CalibratedChain) else robot, len(earlier.deflection.terms)
+    return replace(
+        given, notes=(*given.notes, f"{name} brings {count} deflection terms of an earlier fit; they stay as they are")
+    )
+
+
+def with_unseen(
+    given: Inputs, validate: Sequence[Path | PoseMeasurements], options: FitOptions, settings: FitSettings
+) -> Inputs:
+    """Return inputs with more rows that were not fitted on; copies of fitted rows are found and prove nothing.
+
+    Args:
+        given: robot, fitted rows, and unseen rows so far.
+        validate: files, or blocks in memory.
+        options: how files are read.
+        settings: whether they have frames of their own.
+    """
+    unseen, notes, fit = dict(given.unseen), list[str](), given.fit
+    files = {Path(block.file).resolve() for block in fit}
     for each in validate:
-        for block in _blocks(each, chain, options):
-            again = any(_path(each).resolve() == other.resolve() for other in files)
+        for block in _blocks(each, given.chain, options):
+            again = _path(each).resolve() in files
             if again:
                 notes.append(f"{block.file} is a fit file too: its errors there say nothing of unseen poses")
             shared = block if settings.refit_frames else _shared(block, fit, notes)
             unseen[_free_name(unseen, block.file)] = Unseen(shared, own_frames=settings.refit_frames, seen=again)
-    copied, told = repeated(fit, unseen)
-    notes += told
+    copied, remarks = repeated(fit, unseen)
     unseen = {name: replace(each, seen=each.seen or name in copied) for name, each in unseen.items()}
-    if earlier is not None and earlier.corrections is not None:
-        name, count = source if isinstance(robot, CalibratedChain) else robot, len(earlier.deflection.terms)
-        notes.append(f"{name} brings {count} deflection terms of an earlier fit; they stay as they are")
-    return Inputs(chain, source, tuple(fit), unseen, tuple(notes), earlier)
+    return replace(given, unseen=unseen, notes=(*given.notes, *notes, *remarks))
 
 
 def load_robot(
-    robot: str | Path, measured: Path | None, options: FitOptions, base: str | None = None, tip: str | None = None
+    robot: str | Path | CalibratedChain,
+    measured: Path | None,
+    options: FitOptions,
+    base: str | None = None,
+    tip: str | None = None,
 ) -> tuple[Chain, Path]:
-    """Return the chain `robot` names and its file; of a URDF, the chain of the joints that were measured."""
+    """Return the chain `robot` names (or is) and its file; of a URDF, the chain of the joints that were measured."""
+    if isinstance(robot, CalibratedChain):
+        return robot.complete, Path(robot.source or robot.chain.name)
     source = resolve(robot)
     if source.suffix != ".urdf":
         if base is None and tip is None and not options.beta:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.plans import read_poses, write_poses
@@ -13,6 +13,8 @@ from calib.errors import UsageError
 from calib.geometry.observability import observation, targets_of
 from calib.procedure.kinematic_stage.inputs import joint_kinds, load_robot
 from calib.procedure.kinematic_stage.pose_limits import read_limits
+from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
+from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
 from poses.indices import observability
 from poses.select import Selection, select_poses
@@ -41,20 +43,14 @@ class Chosen:
 
 
 def choose(
-    robot: str | Path,
+    robot: str | Path | CalibratedChain,
     m: int,
+    settings: SelectionSettings = DEFAULT_SELECTION,
     *,
-    kind: str = "pose",
-    tools: Sequence[Sequence[float]] = (),
-    index: Any = "O1",
-    method: Any = "detmax",
     constraints: Path | None = None,
     existing: Path | None = None,
-    candidates: int = 2000,
-    sigmas: tuple[float, float] | None = None,
     base: str | None = None,
     tip: str | None = None,
-    seed: int = 0,
     map: Callable = map,
     progress: Progress | None = None,
 ) -> Chosen:
@@ -63,24 +59,21 @@ def choose(
     Args:
         robot: see `calib.robot.load`.
         m: how many.
-        kind: what will be measured, ``pose`` or ``position``.
-        tools: places of the targets in the tip's frame [m].
-        index, method: see `poses.select.select_poses`.
+        settings: what is measured, index, method, seed.
         constraints: see `calib.procedure.kinematic_stage.pose_limits`.
         existing: CSV of poses measured before, which count.
-        candidates: poses to draw.
-        sigmas: of a position [m] and an orientation [rad].
         base, tip: links of a URDF.
-        seed: of everything random.
         map: where parallel work runs (`calib.workers`).
         progress: called with (done, total, what).
     """
     if m < 1:
         raise UsageError(f"-m {m}: at least one pose has to be chosen")
     chain, source = load_robot(robot, existing, FitOptions(), base, tip)
-    cell = targets_of(chain, tools)
-    jacobian, limits = observation(cell, kind, sigmas, seed), read_limits(constraints, cell, source)
+    cell = targets_of(chain, settings.tools)
+    jacobian = observation(cell, settings.kind, settings.sigmas, settings.seed)
+    limits = read_limits(constraints, cell, source)
     space = limits.space(jacobian)
+    index, method = cast(Any, settings.index), cast(Any, settings.method)  # checked by `select_poses`
     before = value = None
     notes = list(limits.notes)
     if existing is not None:
@@ -90,7 +83,8 @@ def choose(
         if not is_feasible(space, q).all():
             notes.append(f"{int((~is_feasible(space, q)).sum())} of the {len(q)} existing poses break the constraints")
     found = select_poses(
-        None, m, space=space, index=index, method=method, existing=before, count=candidates, seed=seed, map=map,
+        None, m, space=space, index=index, method=method, existing=before, count=settings.candidates,
+        seed=settings.seed, map=map,
         progress=progress,
     )  # fmt: skip
     return Chosen(chain, found, len(jacobian.free), value, tuple(notes))

@@ -1,4 +1,4 @@
-"""How a geometry is fitted and judged: one value for the command, the guided run and scripts."""
+"""How poses are chosen and a geometry is fitted and judged: one value for command, guided run and scripts."""
 
 from __future__ import annotations
 
@@ -47,3 +47,29 @@ class FitSettings:
             raise UsageError(f"--tolerance {1e3 * self.tolerance:g}: expected a length above 0, in mm")
         if self.seed < 0:
             raise UsageError(f"--seed {self.seed}: expected a whole number from 0")
+
+
+@dataclass(frozen=True)
+class SelectionSettings:
+    """How poses to measure are chosen.
+
+    Attributes:
+        kind: what will be measured, ``pose`` or ``position``.
+        tools: places of the targets in the tip's frame [m]; the tip itself where none is given.
+        index: ``O1`` to ``O5``, or ``cond``, see `poses.indices`.
+        method: see `poses.select.select_poses`.
+        candidates: poses to draw.
+        sigmas: of a position [m] and an orientation [rad]; None for equal ones of our choice.
+        seed: of everything random.
+    """
+
+    kind: str = "pose"
+    tools: tuple[tuple[float, ...], ...] = ()
+    index: str = "O1"
+    method: str = "detmax"
+    candidates: int = 2000
+    sigmas: tuple[float, float] | None = None
+    seed: int = 0
+
+
+DEFAULT_SELECTION = SelectionSettings()

@@ -12,17 +12,20 @@ from calib.dynamics.shapes import Joined
 from calib.identification.cases import Case
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.report import dynamics_figures, uncertainty_figures
-from calib.procedure.report.style import save
+from calib.procedure.report.style import save_all
 
 
 def write(outcome: IdentificationOutcome, folder: Path) -> None:
     """Write ``plot_torque_<n>.png`` of every file, ``plot_residuals.png``, ``plot_friction.png`` and more."""
-    cases = (*outcome.inputs.cases, *outcome.inputs.unseen)
-    for number, case in enumerate(cases, start=1):
-        save(torques(case, outcome.predictions[case.name], outcome), folder / f"plot_torque_{number}.png")
-    save(autocorrelations(outcome), folder / "plot_residuals.png")
-    save(friction(outcome), folder / "plot_friction.png")
+    save_all(figures(outcome), folder)
     uncertainty_figures.write(folder)
+
+
+def figures(outcome: IdentificationOutcome) -> dict[str, Figure]:
+    """Return the figures of an identification by name: torques of every file, residuals, friction."""
+    cases = enumerate((*outcome.inputs.cases, *outcome.inputs.unseen), start=1)
+    drawn = {f"torque_{number}": torques(case, outcome.predictions[case.name], outcome) for number, case in cases}
+    return drawn | {"residuals": autocorrelations(outcome), "friction": friction(outcome)}
 
 
 def torques(case: Case, predicted: np.ndarray, outcome: IdentificationOutcome) -> Figure:

@@ -19,7 +19,7 @@ from calib.procedure.report.style import (
     legend,
     motion_units,
     room,
-    save,
+    save_all,
     sheet,
     styled,
     thinned,
@@ -163,19 +163,31 @@ def _limits(designed: Designed, order: int) -> tuple[np.ndarray, np.ndarray]:
     return -none, none
 
 
-def write_design(designed: Designed, folder: Path) -> None:
-    """Write the figures of a designed motion into its folder: motion, tool path, search, and front if any."""
-    save(motion_figure(designed), folder / "plot_motion.png")
-    save(path_figure(designed), folder / "plot_path.png")
-    save(history_figure(designed), folder / "plot_history.png")
+def design_figures(designed: Designed) -> dict[str, Figure]:
+    """Return the figures of a designed motion by name: motion, tool path, search, and front if any."""
+    figures = {
+        "motion": motion_figure(designed),
+        "path": path_figure(designed),
+        "history": history_figure(designed),
+    }
     if designed.front is not None and len(designed.front.values):
-        save(front_figure(designed.front), folder / "plot_front.png")
+        figures["front"] = front_figure(designed.front)
+    return figures
+
+
+def plan_figures(planned: Planned) -> dict[str, Figure]:
+    """Return the figures of a planned motion by name: motion and speed profile."""
+    return {"motion": plan_figure(planned), "profile": profile_figure(planned)}
+
+
+def write_design(designed: Designed, folder: Path) -> None:
+    """Write the figures of a designed motion into its folder."""
+    save_all(design_figures(designed), folder)
 
 
 def write_plan(planned: Planned, folder: Path) -> None:
-    """Write the figures of a planned motion into its folder: motion and speed profile."""
-    save(plan_figure(planned), folder / "plot_motion.png")
-    save(profile_figure(planned), folder / "plot_profile.png")
+    """Write the figures of a planned motion into its folder."""
+    save_all(plan_figures(planned), folder)
 
 
 def plan_figure(planned: Planned) -> Figure:

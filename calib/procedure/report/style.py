@@ -8,7 +8,7 @@ that a ``$`` in a name is a ``$``.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -189,6 +189,12 @@ def png(figure: Figure, dpi: float = DPI) -> bytes:
 def save(figure: Figure, path: str | Path, dpi: float = DPI) -> Path:
     """Write a figure as PNG, whole or not at all."""
     return files.write(path, png(figure, dpi))
+
+
+def save_all(figures: Mapping[str, Figure], folder: Path) -> None:
+    """Write figures into a folder, as ``plot_<name>.png``."""
+    for name, figure in figures.items():
+        save(figure, folder / f"plot_{name}.png")
 
 
 def picture(figure: Figure, caption: str, wide: bool = False) -> Picture:

@@ -11,6 +11,7 @@ import numpy as np
 from calib.geometry.observability import observation, targets_of
 from calib.procedure.kinematic_stage import selection
 from calib.procedure.kinematic_stage.pose_limits import read_limits
+from calib.procedure.kinematic_stage.settings import SelectionSettings
 from calib.procedure.session.folder import Session
 from calib.robot.chain import Chain
 from poses.candidates import draw_candidates
@@ -34,10 +35,13 @@ def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], N
     constraints = session.path(wanted.constraints) if wanted.constraints else None
     links = (chain.base, chain.tip) if robot_file.suffix == ".urdf" else (None, None)
     stated = (instrument.sigma_position, instrument.sigma_orientation)
+    choice = SelectionSettings(
+        kind=instrument.measures, tools=(tuple(instrument.tool),), index=wanted.index, method=wanted.method,
+        sigmas=stated if all(stated) else None, seed=settings.seed,
+    )  # fmt: skip
     chosen = selection.choose(
-        robot_file, wanted.fit, kind=instrument.measures, tools=[instrument.tool], index=wanted.index,
-        method=wanted.method, constraints=constraints, sigmas=stated if all(stated) else None, base=links[0],
-        tip=links[1], seed=settings.seed, progress=lambda done, total, what: say(f"choosing poses: {what}"),
+        robot_file, wanted.fit, choice, constraints=constraints, base=links[0], tip=links[1],
+        progress=lambda done, total, what: say(f"choosing poses: {what}"),
     )  # fmt: skip
     found = chosen.selection
     assert found.q is not None

@@ -12,6 +12,7 @@ import pytest
 from calib.geometry.observability import observation, targets_of
 from calib.procedure.kinematic_stage import selection
 from calib.procedure.kinematic_stage.pose_limits import read_limits
+from calib.procedure.kinematic_stage.settings import SelectionSettings
 from calib.robot.load import load
 
 CONSTRAINTS = """
@@ -42,7 +43,7 @@ def read_poses(path: str) -> np.ndarray:
 def test_better_than_chance_and_near_the_bound(cell, calib):
     code, out, err = calib("select", "ur5", "-m", "12", "--candidates", "300", "--out", "p.csv", "--seed", "2")
     assert code == 0, err
-    found = selection.choose("ur5", 12, candidates=300, seed=2)
+    found = selection.choose("ur5", 12, SelectionSettings(candidates=300, seed=2))
     assert found.parameters == 30
     assert found.selection.random_baseline < found.selection.value
     assert 0.95 < found.selection.efficiency <= 1.0 + 1e-9

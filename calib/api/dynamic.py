@@ -1,0 +1,130 @@
+"""The dynamic half in Python: identify a robot's dynamics on its calibrated geometry."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from calib.api.reading import listed, optional
+from calib.api.rendering import as_text, data_frame
+from calib.data.recordings.recording import Recording
+from calib.estimation.estimate import Estimate
+from calib.identification.identify_options import IdentifyOptions, read_options
+from calib.procedure.dynamic_stage import folder, identify, inputs
+from calib.procedure.kinematic_stage.verdict import Verdict
+from calib.robot.calibrated import CalibratedChain
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Recorded = str | Path | Recording
+
+
+@dataclass(frozen=True, eq=False)
+class DynamicsModel:
+    """Identified dynamics and how far to trust them. ``print`` shows errors on other motion, friction and verdict.
+
+    Attributes:
+        outcome: all that the identification found.
+    """
+
+    outcome: identify.IdentificationOutcome
+
+    @property
+    def robot(self) -> CalibratedChain:
+        """The robot whose dynamics these are."""
+        return self.outcome.inputs.robot
+
+    @property
+    def verdict(self) -> Verdict:
+        """Pass, marginal or fail, with the reason."""
+        return self.outcome.verdict
+
+    @property
+    def estimate(self) -> Estimate:
+        """The base parameters with their covariance, the geometry's share in it where that is known."""
+        found, carried = self.outcome.found.fitted.estimate, self.outcome.carried
+        return found if carried is None else replace(found, covariance=carried.covariance)
+
+    def torques(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        """Return the torques (N, rows) [N m or N] of a motion q, v, a (N, n) [rad or m, and per s, s²]."""
+        dynamics = self.outcome.found.dynamics
+        return dynamics.model.regressor(q, v, a) @ dynamics.values
+
+    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+        """Write the folder that `calib identify --out` writes."""
+        from calib.procedure.report import identification_figures
+
+        return folder.write_folder(self.outcome, Path(out), identification_figures.write if plots else None)
+
+    def plot(self) -> dict[str, Figure]:
+        """Return the figures by name: measured and predicted torques, autocorrelations, friction."""
+        from calib.procedure.report import identification_figures
+
+        return identification_figures.figures(self.outcome)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the metrics as ``metrics.json`` holds them."""
+        return folder.metrics(self.outcome)
+
+    def to_dataframe(self) -> Any:
+        """Return the base parameters as a pandas DataFrame: name, unit, value, sigma."""
+        found = self.estimate
+        rows = zip(found.names, found.units, found.values.tolist(), found.sigma.tolist())
+        return data_frame(rows, ["name", "unit", "value", "sigma"])
+
+    def renderables(self) -> Iterator[Any]:
+        """Yield what ``print`` shows, for a rich console."""
+        from calib.procedure.report import console, dynamics_section
+
+        yield from console.section(dynamics_section.outcome_section(self.outcome))
+
+    def __str__(self) -> str:
+        return as_text(self.renderables())
+
+
+def identify_dynamics(
+    robot: str | Path | CalibratedChain,
+    recordings: Recorded | Sequence[Recorded],
+    *,
+    validate: Recorded | Sequence[Recorded] = (),
+    method: str | None = None,
+    friction: str | None = None,
+    options: IdentifyOptions | str | Path | None = None,
+    base: str | None = None,
+    tip: str | None = None,
+    seed: int = 0,
+    on_read: Callable[[inputs.IdentificationInputs], None] | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> DynamicsModel:
+    """Identify a robot's dynamics on its geometry, and judge them on motion they have not seen.
+
+    A robot that comes from a fit (``fit.robot``) brings the covariance of its geometry, which is added to that of the
+    estimate: Σ = Σ_torque + S Σ_geometry Sᵀ.
+
+    Args:
+        robot, base, tip: as of `calib.load`; or what it returned; or ``fit.robot``.
+        recordings: logs of q and torque (or current): files, ``log.npz@0:9.4`` cut, or what `read_recording` returned.
+        validate: the same of other motion.
+        method, friction: in place of the options'; see ``calib identify --help``.
+        options: drives, payloads, gains, filters, closed loop (``calib formats identify-options``).
+        seed: of everything random.
+        on_read: called with what was read, before the identification begins.
+        progress: called with a few words now and then.
+
+    Raises:
+        MeasurementError: for logs that cannot be right, naming row and column.
+        Unidentifiable: where the motion tells no parameter.
+    """
+    chosen = options if isinstance(options, IdentifyOptions) else read_options(optional(options))
+    given = inputs.gather(
+        robot, listed(recordings), listed(validate), options=chosen, method=method, friction=friction, base=base,
+        tip=tip, seed=seed, progress=progress,
+    )  # fmt: skip
+    if on_read is not None:
+        on_read(given)
+    return DynamicsModel(identify.run(given, progress))

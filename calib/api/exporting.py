@@ -1,0 +1,46 @@
+"""What leaves the toolkit: calibrated geometry and identified dynamics in the forms other programs read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from calib.api.dynamic import DynamicsModel
+from calib.api.kinematic import GeometryFit
+from calib.api.reading import optional, saved
+from calib.procedure.export import delivery, dynamics
+from calib.robot.load import resolve
+
+
+def export(
+    result: GeometryFit | DynamicsModel | str | Path, into: str | Path, *, urdf: str | Path | None = None
+) -> tuple[str, ...]:
+    """Write a calibrated robot, with its dynamics where they were identified, for other programs.
+
+    Of a fit: robot.urdf, joint_offsets.csv, ur_kinematics.yaml of a UR arm, joint corrections where there are any. Of
+    an identification also masses and friction, as URDF, MJCF, drives.csv and parameters.json. Each file is read back by
+    an independent reader before it is put in place.
+
+    Args:
+        result: a fit, an identification, or the folder of one.
+        into: folder for the files.
+        urdf: description of the nominal robot to edit, everything else in it kept; by default the fit's own source.
+
+    Returns:
+        What was written and what to know of it, in words.
+
+    Raises:
+        RobotError: where a file does not read back as the robot; it is not written.
+    """
+    into = Path(into)
+    with saved(result) as place:
+        if dynamics.is_identified(place):
+            return tuple(dynamics.deliver_dynamics(place, optional(urdf), into))
+        into.mkdir(parents=True, exist_ok=True)
+        return tuple(delivery.deliver(place, source_of(place) if urdf is None else Path(urdf), into))
+
+
+def source_of(place: Path) -> Path:
+    """Return the description that a fit's folder says it was made from."""
+    from calib.robot.calibrated import read
+
+    return resolve(read(place).source)

@@ -1,0 +1,263 @@
+"""The kinematic half in Python: choose poses, fit, compensate."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from calib.api.reading import listed, optional, saved
+from calib.api.rendering import as_text, data_frame
+from calib.data.poses.fit_options import FitOptions, read_options
+from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.target_files import Targets, read_targets
+from calib.estimation.estimate import Estimate
+from calib.procedure.kinematic_stage import compensation, compensation_file, fit, folder, inputs, selection
+from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSettings, SelectionSettings
+from calib.procedure.kinematic_stage.verdict import Verdict
+from calib.procedure.report.fit_report import fit_metrics
+from calib.robot.calibrated import CalibratedChain
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Progress = Callable[[str], None]
+Measured = str | Path | PoseMeasurements
+
+
+@dataclass(frozen=True, eq=False)
+class PoseSelection:
+    """Poses at which a robot's geometry shows best. ``print`` shows index, bound and what random poses reach.
+
+    Attributes:
+        chosen: the selection with its bound, baseline and history (`poses.select.Selection`).
+    """
+
+    chosen: selection.Chosen
+
+    @property
+    def q(self) -> np.ndarray:
+        """(m, n) joint values [rad or m]."""
+        return np.asarray(self.chosen.selection.q)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the poses as CSV under the joints' names [rad or m]."""
+        return selection.write(self.chosen, Path(path))
+
+    def to_dict(self) -> dict[str, str]:
+        """Return what the selection came to, in words and numbers."""
+        return dict(selection.table(self.chosen))
+
+    def to_dataframe(self) -> Any:
+        """Return the joint values as a pandas DataFrame, a row per pose."""
+        return data_frame(self.q.tolist(), list(self.chosen.chain.joint_names))
+
+    def __str__(self) -> str:
+        lines = [f"{words:38} {number}" for words, number in selection.table(self.chosen)]
+        return "\n".join([*lines, *(f"note: {note}" for note in self.chosen.notes)])
+
+
+@dataclass(frozen=True, eq=False)
+class GeometryFit:
+    """A fitted geometry and how far to trust it. ``print`` shows the ladder, errors on unseen poses and the verdict.
+
+    Attributes:
+        outcome: all that the fit found.
+        options, settings: what was asked for.
+    """
+
+    outcome: fit.Outcome
+    options: FitOptions
+    settings: FitSettings
+
+    @property
+    def robot(self) -> CalibratedChain:
+        """The calibrated robot with covariance and corrections: what identification, excitation and export take."""
+        return self.outcome.calibrated
+
+    @property
+    def verdict(self) -> Verdict:
+        """Pass, marginal or fail, with the reason."""
+        return self.outcome.verdict
+
+    @property
+    def estimate(self) -> Estimate:
+        """The fitted parameters [m, rad] with their covariance."""
+        return self.outcome.climb.fit.estimate
+
+    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+        """Write the folder that `calib fit --out` writes: robot.toml, URDF, estimate, residuals, certificate."""
+        from calib.procedure.report import fit_certificate
+
+        return folder.write_folder(self.outcome, Path(out), partial(fit_certificate.write, plots=plots))
+
+    def plot(self) -> dict[str, Figure]:
+        """Return the figures of the certificate by name."""
+        from calib.procedure.report import figures
+        from calib.procedure.report.fit_report import collect
+
+        return {name: drawn.figure for name, drawn in figures.captioned(collect(self.outcome)).items()}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the metrics as ``metrics.json`` holds them."""
+        return folder.metrics(self.outcome)
+
+    def to_dataframe(self) -> Any:
+        """Return the fitted parameters as a pandas DataFrame: name, unit, nominal, value, sigma, RSD [%]."""
+        from calib.procedure.kinematic_stage.tables import HEADER, estimate_table
+
+        return data_frame(estimate_table(self.outcome.climb.fit, self.outcome.climb.nominal.cell).rows(), list(HEADER))
+
+    def renderables(self) -> Iterator[Any]:
+        """Yield what ``print`` shows, for a rich console."""
+        from calib.procedure.report import console, geometry_section
+
+        yield from console.section(geometry_section.outcome_section(fit_metrics(self.outcome)))
+
+    def __str__(self) -> str:
+        return as_text(self.renderables())
+
+
+@dataclass(frozen=True, eq=False)
+class JointCommands:
+    """Joint commands that put the real tool on nominal targets. ``print`` says what is reached and how well.
+
+    Attributes:
+        commands: joint values, what they leave, their sigma, and why a target is out of reach.
+        targets: what was asked for.
+        fitted: the robot in its cell.
+    """
+
+    commands: compensation.Commands
+    targets: Targets
+    fitted: compensation.Fitted
+
+    @property
+    def q(self) -> np.ndarray:
+        """(m, n) joint values to send [rad or m]."""
+        return self.commands.q
+
+    def save(self, path: str | Path, *, partial: bool = False) -> Path:
+        """Write the commands as CSV; `partial` writes what is reached, even where some targets are not."""
+        return compensation_file.write(self.commands, self.fitted, self.targets, Path(path), partial)
+
+    def __str__(self) -> str:
+        return "\n".join(compensation_file.lines(self.commands, self.targets, self.fitted))
+
+
+def select_poses(
+    robot: str | Path | CalibratedChain,
+    count: int = 30,
+    settings: SelectionSettings = DEFAULT_SELECTION,
+    *,
+    constraints: str | Path | None = None,
+    existing: str | Path | None = None,
+    base: str | None = None,
+    tip: str | None = None,
+    workers: str | int = 1,
+    progress: Progress | None = None,
+) -> PoseSelection:
+    """Choose the poses at which a robot's geometry shows best, within its limits and free of collisions.
+
+    Args:
+        robot, base, tip: as of `calib.load`; or what it returned.
+        count: how many poses.
+        settings: what is measured, targets, index, method, sigmas, seed.
+        constraints: TOML file of what the poses keep beside joint limits (``calib formats constraints``).
+        existing: CSV of poses measured before, which count.
+        workers: local processes, or the address of a Dask scheduler.
+        progress: called with a few words now and then.
+
+    Raises:
+        UsageError, RobotError: for input that cannot be right.
+    """
+    from calib.workers import workers as opened
+
+    say, lost = progress or (lambda words: None), []
+    with opened(workers) as crew:
+        chosen = selection.choose(
+            robot, count, settings, constraints=optional(constraints), existing=optional(existing), base=base, tip=tip,
+            map=crew.map_without(lost), progress=lambda done, total, what: say(f"{what} ({done} of {total})"),
+        )  # fmt: skip
+    return PoseSelection(replace(chosen, notes=(*chosen.notes, *map(str, lost))))
+
+
+def fit_geometry(
+    robot: str | Path | CalibratedChain,
+    measured: Measured | Sequence[Measured],
+    settings: FitSettings | None = None,
+    *,
+    validate: Measured | Sequence[Measured] = (),
+    options: FitOptions | str | Path | None = None,
+    base: str | None = None,
+    tip: str | None = None,
+    on_read: Callable[[inputs.Inputs], None] | None = None,
+    progress: Progress | None = None,
+) -> GeometryFit:
+    """Fit a robot's geometry to measured poses, and judge it on poses it has not seen.
+
+    Args:
+        robot, base, tip: the nominal robot, as of `calib.load`; or what it returned.
+        measured: CSV files, or what `read_poses` returned.
+        settings: model, loss, folds, stations, tools, rows to hold out, tolerance, seed.
+        validate: unseen poses, like `measured`.
+        options: what the files' headers do not say, priors, fixed parameters (``calib formats options``).
+        on_read: called with what was read, before the fit begins.
+        progress: called with a few words now and then.
+
+    Raises:
+        MeasurementError: for files that cannot be right, naming row and column.
+        Unidentifiable: where the poses tell no parameter.
+        NotConverged: where the fit did not come to an end.
+    """
+    chosen = options if isinstance(options, FitOptions) else read_options(optional(options))
+    given = inputs.gather(
+        robot, listed(measured), listed(validate), options=chosen, settings=settings, base=base, tip=tip
+    )
+    if on_read is not None:
+        on_read(given)
+    wanted = settings or FitSettings()
+    return GeometryFit(fit.run(given, chosen, wanted, progress), chosen, wanted)
+
+
+def compensate(
+    fitted: GeometryFit | compensation.Fitted | str | Path,
+    targets: Targets | str | Path,
+    *,
+    frame: str = "base",
+    tool: str = "flange",
+    dof: int | None = None,
+    start: Sequence[float] | None = None,
+    tolerance: tuple[float, float] = compensation.TOLERANCE,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> JointCommands:
+    """Turn nominal targets into the joint commands that put the real tool there.
+
+    Args:
+        fitted: a fit, the folder of one, or what was read of it.
+        targets: CSV file (``calib formats targets``) or targets in memory.
+        frame: what the targets are in: ``base`` of the calibrated robot, ``nominal``, or a station's name.
+        tool: what stands there: ``flange``, a tool of the fit, or ``x,y,z[,roll,pitch,yaw]`` [m, rad].
+        dof: how much counts: 6; 5, free to turn about the tool's z; 3, position only; None: as the targets say.
+        start: (n,) joint values [rad or m] near which targets without joints are sought.
+        tolerance: what a command may leave by the calibrated model [m], [rad].
+        seed: of the starts for targets without joints.
+    """
+    if isinstance(fitted, compensation.Fitted):
+        found = fitted
+    else:
+        with saved(fitted) as place:
+            found = compensation.read(place)
+    chain = found.nominal.chain
+    if not isinstance(targets, Targets):
+        limits = (chain.lower, chain.upper)
+        targets = read_targets(Path(targets), chain.joint_names, kinds=inputs.joint_kinds(chain), limits=limits)
+    commands = compensation.compensate(
+        found, targets, frame=frame, tool=tool, dof=dof, start=start, tolerance=tolerance, seed=seed, progress=progress
+    )
+    return JointCommands(commands, targets, found)

@@ -1,0 +1,152 @@
+"""Motions in Python: design exciting ones, plan time-optimal ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from calib.api.dynamic import DynamicsModel
+from calib.api.reading import optional, saved
+from calib.procedure.excitation import design, folder, planning
+from calib.procedure.excitation.settings import DEFAULT_DESIGN, DEFAULT_PLAN, ExcitationSettings, PlanSettings
+from calib.robot.calibrated import CalibratedChain
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class ExcitationDesign:
+    """A motion that shows a robot's dynamics, proved to keep its limits. ``print`` shows condition numbers and margins.
+
+    Attributes:
+        designed: the motion, its proof, goals and search history.
+    """
+
+    designed: design.Designed
+
+    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+        """Write the folder that `calib excite --out` writes: trajectory.csv, ROS 2 messages, metrics, figures."""
+        from calib.procedure.report import motion_figures
+
+        return folder.write_design(self.designed, Path(out), motion_figures.write_design if plots else None)
+
+    def plot(self) -> dict[str, Figure]:
+        """Return the figures by name: motion, tool path, search, front."""
+        from calib.procedure.report import motion_figures
+
+        return motion_figures.design_figures(self.designed)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the metrics as ``metrics.json`` holds them."""
+        return folder.design_metrics(self.designed)
+
+    def __str__(self) -> str:
+        return "\n".join(folder.design_lines(self.designed))
+
+
+@dataclass(frozen=True, eq=False)
+class MotionPlan:
+    """The fastest motion through waypoints, within speeds and torques. ``print`` shows duration and margins.
+
+    Attributes:
+        planned: track, margins, and how it was found.
+    """
+
+    planned: planning.Planned
+
+    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+        """Write the folder that `calib plan --out` writes."""
+        from calib.procedure.report import motion_figures
+
+        return folder.write_plan(self.planned, Path(out), motion_figures.write_plan if plots else None)
+
+    def plot(self) -> dict[str, Figure]:
+        """Return the figures by name: motion and speed profile."""
+        from calib.procedure.report import motion_figures
+
+        return motion_figures.plan_figures(self.planned)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the metrics as ``metrics.json`` holds them."""
+        return folder.plan_metrics(self.planned)
+
+    def __str__(self) -> str:
+        return "\n".join(folder.plan_lines(self.planned))
+
+
+def design_excitation(
+    robot: str | Path | CalibratedChain,
+    settings: ExcitationSettings = DEFAULT_DESIGN,
+    *,
+    model: DynamicsModel | str | Path | None = None,
+    limits: str | Path | None = None,
+    base: str | None = None,
+    tip: str | None = None,
+    workers: str | int = 1,
+    progress: Progress | None = None,
+) -> ExcitationDesign:
+    """Design a motion that excites a robot's dynamics within its limits.
+
+    Args:
+        robot, base, tip: as of `calib.load`; or what it returned; or ``fit.robot``.
+        settings: period, harmonics, goals, effort of the search, playback, seed.
+        model: identified dynamics, in memory or in a folder: they predict the torques.
+        limits: TOML file of speeds, torques, workspace, collision (``calib formats limits``).
+        workers: local processes, or the address of a Dask scheduler.
+        progress: called with a few words now and then.
+
+    Raises:
+        UsageError: for limits and goals that cannot be.
+        NothingFeasible: where no motion keeps the limits, naming the constraint.
+    """
+    from calib.workers import workers as opened
+
+    lost = []
+    with ExitStack() as stack:
+        place = None if model is None else stack.enter_context(saved(model))
+        crew = stack.enter_context(opened(workers))
+        designed = design.excite(
+            robot, settings, model=place, limits=optional(limits), base=base, tip=tip, map=crew.map_without(lost),
+            progress=progress,
+        )  # fmt: skip
+    return ExcitationDesign(replace(designed, notes=(*designed.notes, *map(str, lost))))
+
+
+def plan_motion(
+    robot: str | Path | CalibratedChain,
+    waypoints: str | Path,
+    settings: PlanSettings = DEFAULT_PLAN,
+    *,
+    model: DynamicsModel | str | Path | None = None,
+    limits: str | Path | None = None,
+    drives: str | Path | None = None,
+    base: str | None = None,
+    tip: str | None = None,
+    progress: Progress | None = None,
+) -> MotionPlan:
+    """Plan the fastest motion through waypoints, within a robot's speeds and torques.
+
+    Args:
+        robot, base, tip: as of `calib.load`; or what it returned; or ``fit.robot``.
+        waypoints: CSV of joint values, or of places of the tip.
+        settings: payloads, straight lines, rate, shaping, approach.
+        model: identified dynamics, in memory or in a folder, to plan with.
+        limits: TOML file (``calib formats limits``); drives: TOML file of Ia, Fv, Fc, off, where there is no model.
+        progress: called with a few words now and then.
+
+    Raises:
+        UsageError: for waypoints that cannot be reached, and limits that cannot be kept.
+    """
+    with ExitStack() as stack:
+        place = None if model is None else stack.enter_context(saved(model))
+        planned = planning.plan(
+            robot, Path(waypoints), settings, model=place, limits=optional(limits), drives=optional(drives), base=base,
+            tip=tip, progress=progress,
+        )  # fmt: skip
+    return MotionPlan(planned)

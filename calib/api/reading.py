@@ -1,0 +1,91 @@
+"""Robots and measurements from files, as the verbs of `calib` take them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from calib.data.poses.fit_options import FitOptions
+from calib.data.poses.measurements import PoseMeasurements
+from calib.data.recordings.recording import Recording
+from calib.data.recordings.recording_files import read_recording as read_file
+from calib.data.recordings.recording_options import RecordingOptions
+from calib.procedure.dynamic_stage.inputs import joints_of
+from calib.procedure.kinematic_stage import inputs
+from calib.robot.calibrated import CalibratedChain
+from calib.robot.load import load_calibrated
+
+
+def load(robot: str | Path, *, base: str | None = None, tip: str | None = None) -> CalibratedChain:
+    """Load a robot from a file, a folder or the library.
+
+    Args:
+        robot: a ``.urdf``, an MDH table in TOML, a library name (``lwr4plus tx40 rv2sq ur5 ur10 ur10e panda iiwa14``),
+            or the folder of an earlier fit, whose nominal robot, covariance and joint corrections come along.
+        base, tip: links of a URDF between which the arm runs; by default the longest chain without gripper.
+
+    Returns:
+        The robot; without a fit behind it, its ``nominal``, ``covariance`` and ``corrections`` are None.
+
+    Raises:
+        RobotError: where nothing of this kind is found, or the file is wrong: with place and advice.
+    """
+    return load_calibrated(robot, base, tip)
+
+
+def read_poses(
+    path: str | Path, robot: CalibratedChain, *, options: FitOptions | None = None
+) -> tuple[PoseMeasurements, ...]:
+    """Read measured poses, positions, distances, sockets or planes of a robot from a CSV file.
+
+    Args:
+        path: the file; its columns and units: ``calib formats measurements``.
+        robot: whose joints the columns name.
+        options: what the header does not say (`calib formats options`).
+
+    Returns:
+        One block per kind of measurement and station, joints [rad, m], lengths [m].
+
+    Raises:
+        MeasurementError: naming file, row, column and the likely cause.
+    """
+    return tuple(inputs.read_file(Path(path), robot.complete, options or FitOptions()))
+
+
+def read_recording(path: str | Path, robot: CalibratedChain, *, options: RecordingOptions | None = None) -> Recording:
+    """Read a log of joint positions and torques (or currents) from npz, CSV, a ROS bag or MCAP.
+
+    Args:
+        path: the file; ``log.npz@0:9.4`` cuts out seconds 0 to 9.4.
+        robot: whose joints are logged.
+        options: what the file does not say (`calib formats recordings`).
+
+    Raises:
+        MeasurementError: naming file, row, column and the likely cause.
+    """
+    return read_file(path, joints_of(robot.chain), options or RecordingOptions())
+
+
+def listed(given: object | Sequence[object]) -> list:
+    """Return what was given, one or several, as a list."""
+    if isinstance(given, (str, Path)) or not isinstance(given, Sequence):
+        return [given]
+    return list(given)
+
+
+def optional(path: str | Path | None) -> Path | None:
+    """Return a path that may be missing."""
+    return None if path is None else Path(path)
+
+
+@contextmanager
+def saved(result: Any) -> Iterator[Path]:
+    """Yield the folder of a result: a path as it is, a result in memory written for as long as it is needed."""
+    if isinstance(result, (str, Path)):
+        yield Path(result)
+    else:
+        with TemporaryDirectory() as place:
+            yield result.save(Path(place) / "result", plots=False)

@@ -1,0 +1,138 @@
+"""The Python API: few names, each documented; what it returns is what the commands write."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from pathlib import Path
+
+import numpy as np
+import planted_motion as planted
+import pytest
+
+import calib
+from calib import cli
+from calib.robot import description
+from calib.simulation.cells import measured_files
+from calib.simulation.cells.cell import measure
+from calib.simulation.cells.virtual_cells import perturbed_cell
+
+
+@pytest.fixture(scope="module")
+def cell(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with poses of a UR5 that is a little off."""
+    folder = tmp_path_factory.mktemp("cell")
+    made = perturbed_cell(calib.load("ur5").chain, seed=1)
+    for name, count, seed in (("measured", 60, 0), ("other", 30, 5)):
+        q = np.random.default_rng(seed).uniform(-2.0, 2.0, (count, 6))
+        measured_files.write(measure(made, q, seed=seed + 1), folder / f"{name}.csv")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def fitted(cell: Path) -> calib.GeometryFit:
+    settings = calib.FitSettings(model="geometry", holdout=0.25)
+    return calib.fit_geometry("ur5", cell / "measured.csv", settings)
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A planted arm and two logs of it."""
+    folder = tmp_path_factory.mktemp("logs")
+    description.write(folder / "robot.toml", planted.arm())
+    for name, seed in (("train", 0), ("other", 7)):
+        np.savez(folder / f"{name}.npz", **planted.series(seed, noise=0.02))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def model(logs: Path) -> calib.DynamicsModel:
+    train, other = logs / "train.npz", logs / "other.npz"
+    return calib.identify_dynamics(logs / "robot.toml", train, validate=other, friction="standard")
+
+
+def test_at_most_25_names_all_documented():
+    assert len(calib.__all__) <= 25 and set(calib.__all__) <= set(dir(calib))
+    for name in calib.__all__:
+        found = getattr(calib, name)
+        assert (found.__doc__ or "").strip(), name
+        if inspect.isfunction(found):
+            named = set(inspect.signature(found).parameters)
+            assert all(parameter in found.__doc__ for parameter in named), name
+    with pytest.raises(AttributeError):
+        calib.no_such_name  # noqa: B018
+
+
+def test_a_fit_is_what_the_command_writes(fitted, cell, tmp_path, capsys):
+    command = ["fit", "ur5", str(cell / "measured.csv"), "--model", "geometry", "--holdout", "0.25", "--no-plots"]
+    assert cli.run([*command, "--out", str(tmp_path / "command")]) == 0
+    said = capsys.readouterr().out
+    fitted.save(tmp_path / "script", plots=False)
+    for name in ("estimate.csv", "covariance.csv", "robot.toml", "chain_covariance.csv", "metrics.json"):
+        assert (tmp_path / "script" / name).read_bytes() == (tmp_path / "command" / name).read_bytes(), name
+    assert fitted.to_dict() == json.loads((tmp_path / "script/metrics.json").read_text())
+    assert all(line.strip() in " ".join(said.split()) for line in [f"verdict: {fitted.verdict.level}"])
+
+
+def test_measurements_and_robots_in_memory_are_the_same(fitted, cell):
+    robot = calib.load("ur5")
+    again = calib.fit_geometry(robot, calib.read_poses(cell / "measured.csv", robot), fitted.settings)
+    np.testing.assert_array_equal(again.estimate.values, fitted.estimate.values)
+    np.testing.assert_array_equal(again.robot.covariance, fitted.robot.covariance)
+
+
+def test_validation_afterwards_is_validation_at_once(fitted, cell):
+    robot, other = "ur5", cell / "other.csv"
+    at_once = calib.fit_geometry(robot, cell / "measured.csv", fitted.settings, validate=other)
+    later = calib.validate(fitted, other)
+    assert later.to_dict() == at_once.to_dict()
+    assert "other.csv" in later.to_dict()["validation"] and "other.csv" not in fitted.to_dict()["validation"]
+
+
+def test_results_print_ladder_errors_and_verdict(fitted, model):
+    shown = str(fitted)
+    assert fitted.verdict.reason.split(";")[0] in " ".join(shown.split()) and "nominal" in shown
+    assert model.verdict.level in str(model) and "other.npz" in str(model)
+    assert set(fitted.plot()) >= {"position", "parameters"} and set(model.plot()) >= {"torque_1", "friction"}
+
+
+def test_the_geometrys_covariance_reaches_the_dynamics_in_memory(logs):
+    """Σ = Σ_torque + S Σ_geometry Sᵀ, without a file between fit and identification."""
+    chain = description.read(logs / "robot.toml")
+    exact = calib.identify_dynamics(calib.CalibratedChain(chain), logs / "train.npz", friction="standard")
+    moved = np.diag(np.full(len(chain.elements), 1e-3**2))
+    robot = calib.CalibratedChain(chain, covariance=moved)
+    unsure = calib.identify_dynamics(robot, logs / "train.npz", friction="standard")
+    np.testing.assert_array_equal(unsure.estimate.values, exact.estimate.values)
+    added = unsure.estimate.covariance - exact.estimate.covariance
+    assert np.linalg.eigvalsh(added).min() > -1e-9 * np.linalg.norm(added)
+    assert (unsure.estimate.sigma > 1.01 * exact.estimate.sigma).any()
+
+
+def test_recordings_in_memory_and_later_validation(model, logs):
+    robot = calib.load(logs / "robot.toml")
+    log, other = (calib.read_recording(logs / f"{name}.npz", robot) for name in ("train", "other"))
+    again = calib.identify_dynamics(robot, log, friction="standard")
+    np.testing.assert_array_equal(again.estimate.values, model.estimate.values)
+    judged = calib.validate(again, other)
+    (score,), (before,) = judged.outcome.validation.values(), model.outcome.validation.values()
+    assert score.raw.total == before.raw.total
+    assert judged.verdict.level == model.verdict.level
+
+
+def test_export_and_compensation_take_results_in_memory(fitted, model, cell, logs, tmp_path):
+    written = calib.export(fitted, tmp_path / "geometry")
+    assert (tmp_path / "geometry/robot.urdf").is_file() and any("robot.urdf" in line for line in written)
+    calib.export(model, tmp_path / "dynamics")
+    assert (tmp_path / "dynamics/robot.xml").is_file()
+    (tmp_path / "targets.csv").write_text("q1,q2,q3,q4,q5,q6\n0.3,-1.2,1.6,-1.1,-1.4,0.5\n")
+    commands = calib.compensate(fitted, tmp_path / "targets.csv")
+    assert commands.commands.reached.all() and "1 of 1" not in str(commands)
+    assert commands.save(tmp_path / "commands.csv").is_file()
+
+
+def test_wrong_settings_are_refused_where_they_are_made():
+    with pytest.raises(calib.CalibError, match="holdout 1.5"):
+        calib.FitSettings(holdout=1.5)
+    with pytest.raises(calib.CalibError, match="--model geometri"):
+        calib.FitSettings(model="geometri")
