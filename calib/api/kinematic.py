@@ -247,6 +247,7 @@ def compensate(
         start: (n,) joint values [rad or m] near which targets without joints are sought.
         tolerance: what a command may leave by the calibrated model [m], [rad].
         seed: of the starts for targets without joints.
+        progress: called with a few words now and then.
     """
     if isinstance(fitted, compensation.Fitted):
         found = fitted
