@@ -27,7 +27,7 @@ HOMES = {
     "toppra": ["trajectories."],
     "ruckig": ["trajectories."],
     "cvxpy": ["calib.estimation.", "calib.dynamics.", "calib.identification.", "poses.", "trajectories."],
-    "matplotlib": ["calib.procedure."],
+    "matplotlib": ["calib.procedure.", "calib.api."],
     "jinja2": ["calib.procedure."],
     "dask": ["calib.workers.cluster"],
     "distributed": ["calib.workers.cluster"],
@@ -35,7 +35,7 @@ HOMES = {
     "threadpoolctl": ["calib.workers.cluster"],
     "typer": ["calib.cli", "calib.cli."],
     "click": ["calib.cli", "calib.cli."],
-    "rich": ["calib.cli", "calib.cli.", "calib.procedure."],
+    "rich": ["calib.cli", "calib.cli.", "calib.api.rendering", "calib.procedure."],
 }
 
 
