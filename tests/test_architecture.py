@@ -17,7 +17,7 @@ HOMES = {
     "pinocchio": ["calib.dynamics.model", "calib.robot.collision", "calib.robot.formats.readback"],
     "coal": ["calib.robot.collision"],
     "numba": ["calib.dynamics.kernels", "calib.simulation.loop.loop_kernels"],
-    "yourdfpy": ["calib.robot.formats.urdf"],
+    "yourdfpy": ["calib.robot.formats.readback"],
     "cv2": ["calib.data.camera"],
     "mcap": ["calib.data."],
     "rosbags": ["calib.data."],

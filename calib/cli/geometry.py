@@ -165,10 +165,10 @@ def export(
     geometry.check_targets(urdf, [path for path in (out, ur_kinematics, offsets) if path])
     console = make_console()
     if urdf and out:
-        geometry.export_urdf(found, urdf, out, for_corrections)
+        read = geometry.export_urdf(found, urdf, out, for_corrections)
         console.print(
             f"{out}: joint origins of {urdf} calibrated, all else kept; base link and flange stay where the source has "
-            "them; Pinocchio reads the same poses to 1e-9", soft_wrap=True, markup=False,
+            f"them; {read}", soft_wrap=True, markup=False,
         )  # fmt: skip
     if ur_kinematics:
         geometry.export_ur_kinematics(found, ur_kinematics)

@@ -35,17 +35,18 @@ def deliver(fit: Path, source: Path, out: Path) -> list[str]:
         urdfs["robot_for_corrections.urdf"] = found.corrections.chain
     else:
         (out / "robot_for_corrections.urdf").unlink(missing_ok=True)
+    read = ""
     for name, chain in urdfs.items():
         if given:
-            geometry.export_urdf(found, source, out / name, for_corrections=name != "robot.urdf")
+            read = geometry.export_urdf(found, source, out / name, for_corrections=name != "robot.urdf")
         else:
             written = (fit / name).read_text(encoding="utf-8")
-            geometry.check_readback(written, name, chain)
+            read = geometry.check_readback(written, name, chain)
             files.write(out / name, written)
     made = (
         "the given URDF with calibrated joint origins, all else kept" if given else "written from the calibrated table"
     )
-    notes = [f"robot.urdf: {made}; Pinocchio reads the same poses to 1e-9"]
+    notes = [f"robot.urdf: {made}; {read}"]
     geometry.export_offsets(found, out / "joint_offsets.csv")
     notes.append("robot.toml, joint_offsets.csv")
     try:

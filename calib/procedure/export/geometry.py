@@ -16,7 +16,7 @@ from calib.robot.calibrated import CalibratedChain, nominal_of
 from calib.robot.chain import AXES, Chain, random_joints
 from calib.robot.formats import urdf, urdf_write
 from calib.robot.formats.markup import text
-from calib.robot.formats.readback import tip_poses
+from calib.robot.formats.readback import link_poses, tip_poses
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.kinematics import forward, joint_frames
 from calib.transforms import invert, to_xyz_rpy
@@ -75,8 +75,8 @@ def _same_file(one: Path, other: Path) -> bool:
     return one.resolve() == other.resolve() or (one.exists() and other.exists() and one.samefile(other))
 
 
-def export_urdf(robot: CalibratedChain, source: Path, out: Path, for_corrections: bool = False) -> Path:
-    """Put the calibrated geometry into the XML of `source`, have Pinocchio read it back, and write it to `out`.
+def export_urdf(robot: CalibratedChain, source: Path, out: Path, for_corrections: bool = False) -> str:
+    """Put the calibrated geometry into the XML of `source`, have others read it back, and write it to `out`.
 
     Only the origins of the arm's joints change. The base link stays where the nominal robot has its base, and the fixed
     joints behind the last moving one stay as they are: the choice of base and flange is the source's.
@@ -86,16 +86,24 @@ def export_urdf(robot: CalibratedChain, source: Path, out: Path, for_corrections
         source: a URDF of the nominal robot.
         out: the file to write.
         for_corrections: take the geometry that the joint corrections belong to, which is worse without them.
+
+    Returns:
+        Who has read it back.
     """
     chain = robot.complete if for_corrections else robot.chain
     content, encoding = text(source)
     edited = urdf_write.edit(content, nominal_of(robot), chain, str(source))
-    check_readback(edited, str(source), chain)
-    return files.write(out, edited.encode(encoding))
+    read = check_readback(edited, str(source), chain)
+    files.write(out, edited.encode(encoding))
+    return read
 
 
-def check_readback(edited: str, where: str, chain: Chain) -> None:
-    """Refuse a URDF text in which Pinocchio sees other poses than this toolkit does (`SAME`)."""
+def check_readback(edited: str, where: str, chain: Chain) -> str:
+    """Refuse a URDF text in which Pinocchio or yourdfpy sees other poses than this toolkit does (`SAME`).
+
+    Returns:
+        Who has read it; a text that yourdfpy cannot read is not refused, and why is said.
+    """
     tree = read_tree(edited, where)
     named = chain.joint_names if chain.joint_names[0] in tree.joints else None
     tip = chain.tip if chain.tip in tree.bodies else None
@@ -104,6 +112,15 @@ def check_readback(edited: str, where: str, chain: Chain) -> None:
     error = float(np.abs(tip_poses(edited, own, q) - forward(own, q)).max())
     if error > SAME:
         raise RobotError(f"{where}: Pinocchio reads the calibrated URDF otherwise, by {error:.2g}; nothing was written")
+    few = q[:5]
+    try:
+        seen = link_poses(edited, (*own.links, own.tip), own.base, own.joint_names, few)
+    except RobotError as error:
+        return f"Pinocchio reads the same poses to 1e-9; not read a second time: {error}"
+    error = float(np.abs(seen - np.concatenate([joint_frames(own, few), forward(own, few)[None]])).max())
+    if error > SAME:
+        raise RobotError(f"{where}: yourdfpy reads the calibrated URDF otherwise, by {error:.2g}; nothing was written")
+    return "Pinocchio and yourdfpy read the same poses to 1e-9"
 
 
 def export_offsets(robot: CalibratedChain, out: Path) -> Path:

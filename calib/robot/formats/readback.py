@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import tempfile
+import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -109,3 +112,30 @@ def _from_mjcf(pin: Any, source: str) -> Any:
         path = Path(folder) / "robot.xml"
         path.write_text(source, encoding="utf-8")
         return pin.buildModelFromMJCF(str(path))
+
+
+def link_poses(source: str, links: Sequence[str], base: str, joints: Sequence[str], q: np.ndarray) -> np.ndarray:
+    """Return where yourdfpy puts links of the URDF text `source`, in the link `base` (links, m, 4, 4).
+
+    Args:
+        source: URDF text; meshes are not looked for.
+        links, base: names of links.
+        joints: names of the joints that q (m, n) belongs to [rad or m]; others stand at zero, followers follow.
+
+    Raises:
+        RobotError: where yourdfpy cannot read the text.
+    """
+    import yourdfpy  # and trimesh with it: a second to load
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            model = yourdfpy.URDF.load(io.BytesIO(source.encode()), load_meshes=False, load_collision_meshes=False)
+        result = np.empty((len(links), len(q), 4, 4))
+        for m, row in enumerate(q):
+            model.update_cfg(dict(zip(joints, map(float, row), strict=True)))
+            for k, link in enumerate(links):
+                result[k, m] = model.get_transform(link, base)
+    except Exception as error:  # whatever it and its parsers raise
+        raise RobotError(f"yourdfpy cannot read the URDF: {type(error).__name__}: {error}") from error
+    return result
