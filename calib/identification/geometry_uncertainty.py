@@ -36,6 +36,7 @@ from calib.dynamics import base as bases
 from calib.dynamics import rigid_body
 from calib.dynamics.bodies import Bodies
 from calib.dynamics.torque_rows import BODIES
+from calib.estimation.triangles import retriangulate
 from calib.identification.cases import Case
 from calib.identification.identify import Identification, common_decimator
 from calib.identification.reweighted import cut, estimator, inverted, stacked, weights
@@ -169,9 +170,10 @@ def sensitivity(
     matrix, scale = (np.concatenate(x) for x in zip(*[(stacked(part), weights(how, part)) for part in used]))
     change = np.concatenate([x.reshape(-1, count) for x in changes])
     share = float(np.count_nonzero(scale) / sum(np.count_nonzero(part.present) for part in found.rows))
-    white = matrix * scale[:, None]
-    inverse = inverted(white.T @ white + share * how.prior)
-    solved = inverse @ (pulled - white.T @ (change * scale[:, None]))
+    known = np.sqrt(share) * np.hstack([how.beforehand, np.zeros((len(how.beforehand), count))])
+    factor = retriangulate(np.vstack([known, np.hstack([matrix, change]) * scale[:, None]]))
+    inverse = inverted(factor[:p, :p])
+    solved = inverse @ (inverse.T @ pulled - factor[:p, p:])
     seen = scale > 0.0
     after = change + matrix @ solved
     return solved, _rms(change[seen]), _rms(after[seen])

@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.linalg
 
 from calib.data.signals.motion import moving
+from calib.estimation.triangles import retriangulate
 from calib.identification.cases import Case
 from calib.identification.identify import Identification, common_decimator
 from calib.identification.rows import ObservationRows, observe, thinned
@@ -17,16 +19,16 @@ from calib.robot.chain import Chain
 
 @dataclass(frozen=True, eq=False)
 class Estimator:
-    """An estimate as a function of its rows: A φ = Wᵀ R⁻¹ y + pull, A = Wᵀ R⁻¹ W + prior.
+    """An estimate as a function of its rows: A φ = Wᵀ R⁻¹ y + pull, A = Wᵀ R⁻¹ W + LᵀL.
 
     Attributes:
         deviation: (rows,) R = diag(deviation²).
-        prior: (p, p) information of what was known beforehand; zero for none.
+        beforehand: (k, p) L, what was known beforehand, as whitened rows; (0, p) for nothing.
         pull: (p,) that information times its mean; what keeps parameters within bounds is part of it.
     """
 
     deviation: np.ndarray
-    prior: np.ndarray
+    beforehand: np.ndarray
     pull: np.ndarray
 
 
@@ -35,25 +37,24 @@ def estimator(found: Identification) -> Estimator:
     fitted = found.fitted
     p = fitted.pooled.parameters
     deviation = np.array(fitted.std) if fitted.weighted else np.ones(len(fitted.std))
-    if not fitted.drawn:
-        return Estimator(deviation, np.zeros((p, p)), np.zeros(p))
+    if fitted.beforehand is None:
+        return Estimator(deviation, np.zeros((0, p)), np.zeros(p))
     deviation = deviation * np.sqrt(fitted.inflation)
     factors = (fitted.pooled.factors / deviation[:, None, None]).reshape(-1, p + 1)
-    own = factors.T @ factors
-    posterior = inverted(fitted.estimate.covariance)
-    return Estimator(deviation, posterior - own[:p, :p], posterior @ fitted.estimate.values - own[:p, p])
+    known, values = fitted.beforehand, fitted.estimate.values
+    pull = factors[:, :p].T @ (factors[:, :p] @ values - factors[:, p]) + known.T @ (known @ values)
+    return Estimator(deviation, known, pull)
 
 
 def estimate(how: Estimator, all_rows: Sequence[ObservationRows]) -> tuple[np.ndarray, np.ndarray]:
-    """Return φ (p,) from rows, and A⁻¹ (p, p)."""
-    normal, right = np.array(how.prior), np.array(how.pull)
+    """Return φ (p,) from rows, and A⁻¹ (p, p); by QR of the whitened rows."""
+    p = len(how.pull)
+    factor = np.hstack([how.beforehand, np.zeros((len(how.beforehand), 1))])
     for part in all_rows:
-        scale = weights(how, part)
-        white = stacked(part) * scale[:, None]
-        normal += white.T @ white
-        right += white.T @ (part.target.ravel() * scale)
-    inverse = inverted(normal)
-    return inverse @ right, inverse
+        white = np.column_stack([stacked(part), part.target.ravel()]) * weights(how, part)[:, None]
+        factor = retriangulate(np.vstack([factor, white]))
+    inverse, solution = inverted(factor[:p, :p]), factor[:p, p]
+    return inverse @ (solution + inverse.T @ how.pull), inverse @ inverse.T
 
 
 def rows_on(found: Identification, chain: Chain, cases: Sequence[Case]) -> list[ObservationRows]:
@@ -84,10 +85,10 @@ def cut(rows: ObservationRows, own: slice) -> ObservationRows:
     )
 
 
-def inverted(matrix: np.ndarray) -> np.ndarray:
-    """Return the inverse of a positive definite matrix whose rows have units of their own."""
-    unit = 1.0 / np.sqrt(np.diag(matrix))
-    return np.linalg.inv(matrix * np.outer(unit, unit)) * np.outer(unit, unit)
+def inverted(upper: np.ndarray) -> np.ndarray:
+    """Return the inverse of an upper triangle (p, p) whose columns have units of their own."""
+    unit = np.linalg.norm(upper, axis=0)
+    return np.asarray(scipy.linalg.solve_triangular(upper / unit, np.eye(len(unit)))) / unit[:, None]
 
 
 def stacked(rows: ObservationRows) -> np.ndarray:

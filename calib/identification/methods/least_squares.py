@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
+import scipy.linalg
 
 from calib.estimation.linear import LinearFit, ols, ridge, settled_std, wls
 from calib.estimation.samples import irls, stack
@@ -57,12 +58,12 @@ class LeastSquares:
         if prior is None:
             std, tau = _weighing(problem)
             fit = self.solve(problem, std, tau)
-            drawn = self.takes_prior and bool((problem.groups >= 0).any())
-            fit = _drawn(problem, None, std, tau) if drawn else fit
+            ridges = self.takes_prior and bool((problem.groups >= 0).any())
+            fit, known = _drawn(problem, None, std, tau) if ridges else (fit, None)
         else:  # what the data leave open, the prior decides
             std, tau = _least_norm_weighing(problem)
-            fit, drawn = _drawn(problem, prior, std, tau), True
-        return MethodEstimate(self.name, Status.FOUND, fit, problem.pooled, std, tau, self.weighted, drawn)
+            fit, known = _drawn(problem, prior, std, tau)
+        return MethodEstimate(self.name, Status.FOUND, fit, problem.pooled, std, tau, self.weighted, known)
 
 
 def scaled(noise: np.ndarray | None, std: np.ndarray, counts: np.ndarray) -> np.ndarray:
@@ -123,10 +124,13 @@ def _least_norm_weighing(problem: IdentificationProblem) -> tuple[np.ndarray, np
     return std, residual_inflation(problem.rows, values)
 
 
-def _drawn(problem: IdentificationProblem, prior: Prior | None, std: np.ndarray, tau: np.ndarray) -> LinearFit:
+def _drawn(
+    problem: IdentificationProblem, prior: Prior | None, std: np.ndarray, tau: np.ndarray
+) -> tuple[LinearFit, np.ndarray]:
     """Return WLS with ridges of richer friction as strong as the evidence says, and with a prior of the base columns.
 
-    With a prior, drive parameters are kept from being negative; the covariance is that without these bounds.
+    Beside it the rows (k, p) that say both, whitened. With a prior, drive parameters are kept from being negative; the
+    covariance is that without these bounds.
     """
     pooled, group = problem.pooled, problem.groups
     own, more = problem.base.b, pooled.parameters - problem.base.b
@@ -137,10 +141,14 @@ def _drawn(problem: IdentificationProblem, prior: Prior | None, std: np.ndarray,
     if prior is not None:
         covariance[:own, :own], mean[:own] = prior.covariance, prior.mean
     fit = ridge(pooled, mean, covariance, std * np.sqrt(tau))
+    finite = np.isfinite(np.diag(covariance))
+    rows = np.zeros((int(finite.sum()), len(mean)))
+    root = np.linalg.cholesky(covariance[np.ix_(finite, finite)])
+    rows[:, np.flatnonzero(finite)] = scipy.linalg.solve_triangular(root, np.eye(len(root)), lower=True)
     if prior is None:
-        return fit
+        return fit, rows
     values = _bounded(pooled, std * np.sqrt(tau), mean, covariance, problem.nonnegative)
-    return replace(fit, estimate=replace(fit.estimate, values=values))
+    return replace(fit, estimate=replace(fit.estimate, values=values)), rows
 
 
 def _bounded(

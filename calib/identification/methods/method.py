@@ -112,7 +112,7 @@ class MethodEstimate:
         std: (rows,) standard deviation that each row is weighed with: that of its residuals, unless stated.
         inflation: (rows,) how many rows count as one, from the residuals' autocorrelation.
         weighted: whether the rows were weighed with `std` (all but OLS).
-        drawn: whether a prior or ridges took part.
+        beforehand: (k, p) rows L that a prior and ridges add to the whitened ones; None where there are none.
         iterations: rounds of simulation and estimation; 1 for a method that needs none.
         simulations: runs of the closed loop.
         seconds: that it took.
@@ -128,7 +128,7 @@ class MethodEstimate:
     std: np.ndarray
     inflation: np.ndarray
     weighted: bool = True
-    drawn: bool = False
+    beforehand: np.ndarray | None = None
     iterations: int = 1
     simulations: int = 0
     seconds: float = 0.0

@@ -67,7 +67,7 @@ class Simulated:
         )  # fmt: skip
         return replace(
             plain, method=self.name, solution=found.fit, std=found.std, iterations=len(found.rounds),
-            simulations=len(loops.pairs) * sum(1 + one.retreats for one in found.rounds), drawn=False,
+            simulations=len(loops.pairs) * sum(1 + one.retreats for one in found.rounds), beforehand=None,
             instrumental=found, loops=loops,
         )  # fmt: skip
 
