@@ -50,7 +50,7 @@ def fit(
         settings: see `Settings`.
         torques: gravity torques (m, n) per block [N m], for compliance terms.
         drawn: keep all independent parameters, drawn to their nominal as strongly as the data themselves say
-            (`drawn_fit`), in place of sending the untold ones back.
+            (`shrunk_fit`), in place of sending the untold ones back.
         prior: standard deviations of the whole parameter vector about its present values, where something is known
             beforehand; infinite elsewhere. Parameters with a prior always take part.
 
@@ -66,8 +66,8 @@ def fit(
     _enough(cell, blocks, len(free))
     stated = np.full(len(table.names), np.inf) if prior is None else prior
     if drawn:
-        free = np.setdiff1d(free, yardstick(cell, split, candidates))
-        return replace(drawn_fit(cell, blocks, free, settings, stated[free]), split=split, candidates=candidates)
+        free = np.setdiff1d(free, scale_reference(cell, split, candidates))
+        return replace(shrunk_fit(cell, blocks, free, settings, stated[free]), split=split, candidates=candidates)
     start, found = cell, None
     for attempt in range(1 + RETRIES):
         plausible = np.where(np.isfinite(stated[free]), np.inf, plausible_deviation(cell, free))
@@ -77,7 +77,7 @@ def fit(
         own = np.minimum(stated[free], plausible) if wide else stated[free]
         once = replace(settings, passes=1) if wide else settings
         found = fit_with_prior(start, blocks, free, own, settings=once, nominal=cell)
-        told = told_columns(found, plausible)
+        told = identifiable_columns(found, plausible)
         if not wide and len(told) == len(free):
             break
         start, free = _back_to_nominal(found.cell, cell, candidates, free[told]), free[told]
@@ -98,7 +98,7 @@ def _enough(cell: Installation, blocks: list[Block], unknowns: int) -> None:
         )
 
 
-def yardstick(cell: Installation, split: ColumnSplit, candidates: np.ndarray) -> np.ndarray:
+def scale_reference(cell: Installation, split: ColumnSplit, candidates: np.ndarray) -> np.ndarray:
     """Return the position of the arm's longest length among the base columns, as an array of one (or none).
 
     Sockets and planes are as well explained by a smaller arm, in the limit by none at all, so that the scale has to
@@ -114,7 +114,7 @@ def yardstick(cell: Installation, split: ColumnSplit, candidates: np.ndarray) ->
     return candidates[split.kept[[int(np.argmax(total))]]] if total.max(initial=0.0) > 0.0 else candidates[:0]
 
 
-def drawn_fit(
+def shrunk_fit(
     cell: Installation, blocks: list[Block], free: np.ndarray, settings: Settings, stated: np.ndarray
 ) -> GeometricFit:
     """Fit with a prior about the nominal whose widths are the most probable ones (evidence; MacKay 1992).
@@ -195,7 +195,7 @@ def plausible_deviation(cell: Installation, columns: np.ndarray) -> np.ndarray:
     return np.array([PLAUSIBLE[table.units[k]] if k < table.arm else np.inf for k in columns])
 
 
-def told_columns(found: GeometricFit, plausible: np.ndarray) -> np.ndarray:
+def identifiable_columns(found: GeometricFit, plausible: np.ndarray) -> np.ndarray:
     """Return which of the fitted parameters the data tell (indices): σ below half the plausible deviation.
 
     Backward elimination: the worst told parameter goes back to its nominal, which changes the covariance C of the

@@ -17,7 +17,7 @@ from calib.transforms import displace
 
 
 @dataclass(frozen=True)
-class Layout:
+class ParameterLayout:
     """Where each kind of parameter stands in the full vector.
 
     Attributes:
@@ -70,13 +70,13 @@ class Layout:
         return np.array([table[name] for name in names], dtype=int)
 
 
-def layout(cell: Installation) -> Layout:
+def layout(cell: Installation) -> ParameterLayout:
     """Return the layout of an installation's parameters."""
     units = ("m", "m", "m", "rad", "rad", "rad")
     frames = [f"{name}.{axis}" for name in (*cell.station_names, *cell.tool_names) for axis in FRAME_AXES]
     terms = cell.deflection.terms
     element_units = dict(zip(cell.chain.names, cell.chain.units))
-    return Layout(
+    return ParameterLayout(
         names=(*cell.chain.names, *frames, *deflection.names(cell.deflection, cell.chain)),
         units=(*cell.chain.units, *(units * (len(frames) // 6)), *(_unit(element_units, term) for term in terms)),
         arm=len(cell.chain.elements),

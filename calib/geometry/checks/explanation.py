@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.geometry.parameters import Layout, layout
+from calib.geometry.parameters import ParameterLayout, layout
 from calib.geometry.result import GeometricFit
 from calib.robot.kinematics import forward
 
@@ -17,7 +17,7 @@ LOOSE = 2e-3  # [m] a placement known no better than this is worth a word (our c
 
 def explain(found: GeometricFit) -> list[str]:
     """Return sentences on rank, merged parameters, parameters left at nominal and loose placements."""
-    return [*_rank(found), *_merged(found), *_untold(found), *_loose(found)]
+    return [*_rank(found), *_merged(found), *_unidentifiable(found), *_loose(found)]
 
 
 def _rank(found: GeometricFit) -> list[str]:
@@ -57,7 +57,7 @@ def _merged(found: GeometricFit) -> list[str]:
     return lines
 
 
-def _kin(table: Layout, partners: Sequence[int] | np.ndarray) -> str:
+def _kin(table: ParameterLayout, partners: Sequence[int] | np.ndarray) -> str:
     """Say what a dropped parameter merges with."""
     groups = {table.group(int(k)) for k in partners}
     arm = [table.names[k] for k in partners if table.group(int(k)) == "arm"]
@@ -71,7 +71,7 @@ def _kin(table: Layout, partners: Sequence[int] | np.ndarray) -> str:
     return " and ".join(places)
 
 
-def _untold(found: GeometricFit) -> list[str]:
+def _unidentifiable(found: GeometricFit) -> list[str]:
     """Name arm parameters that are independent but told no better than they are known beforehand."""
     if found.split is None:
         return []

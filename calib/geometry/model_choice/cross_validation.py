@@ -28,7 +28,7 @@ METRES = ("position", "consistency", "distance", "plane")
 
 
 @dataclass(frozen=True, eq=False)
-class Unseen:
+class UnseenErrors:
     """Errors on held-out rows.
 
     Attributes:
@@ -44,13 +44,13 @@ class Unseen:
         """Root mean square of the error's norm over all rows [m]."""
         return float(np.sqrt(max(self.squares.sum(), 0.0) / max(self.rows.sum(), 1)))
 
-    def wins(self, other: Unseen) -> bool:
+    def wins(self, other: UnseenErrors) -> bool:
         """Say whether this is better than `other` in at least half of the folds."""
         return bool(np.sum(self.squares < other.squares) * 2 >= len(self.squares))
 
 
 @dataclass(frozen=True, eq=False)
-class Judge:
+class FoldStatistics:
     """Statistics of every fold for the columns [free geometry, terms].
 
     Attributes:
@@ -83,7 +83,7 @@ class Judge:
         sizes = np.concatenate([np.ones(self.rigid), self.sizes[terms]])
         return Gram(square, data.cross[index], data.total, data.rows), groups, sizes
 
-    def error(self, terms: np.ndarray) -> Unseen:
+    def error(self, terms: np.ndarray) -> UnseenErrors:
         """Return the error on held-out rows of geometry + terms."""
         index = np.concatenate([np.arange(self.rigid), self.rigid + terms])
         squares = []
@@ -91,7 +91,7 @@ class Judge:
             x = relevance(*self.problem(terms, fold), iterations=8).values
             square = held.square[np.ix_(index, index)]
             squares.append(held.total - 2.0 * x @ held.cross[index] + x @ square @ x)
-        return Unseen(np.array(squares), self.rows)
+        return UnseenErrors(np.array(squares), self.rows)
 
     def error_rigid(self) -> float:
         """Return the rms error on held-out rows of the geometry alone [m]."""
@@ -103,7 +103,7 @@ class Judge:
         return int(np.sum(ridge > 0.0))
 
 
-def judge(
+def fold_statistics(
     found: GeometricFit,
     measured: Sequence[PoseMeasurements],
     terms: tuple[Term, ...],
@@ -112,7 +112,7 @@ def judge(
     reference: Chain,
     folds: Folds,
     torques: Sequence[np.ndarray | None] | None = None,
-) -> Judge:
+) -> FoldStatistics:
     """Gather the statistics of every fold at a fitted model, for its free parameters and `terms`.
 
     Args:
@@ -154,7 +154,7 @@ def judge(
         )
     wide = plausible_deviation(found.cell, found.free) if found.prior is None else found.prior
     plausible = np.where(np.isfinite(wide), wide, 10.0)
-    return Judge(rigid, groups, sizes, plausible, training, held_out, np.array(rows), total)
+    return FoldStatistics(rigid, groups, sizes, plausible, training, held_out, np.array(rows), total)
 
 
 def _without(total: Gram, part: Gram) -> Gram:

@@ -6,7 +6,7 @@ Every rung is judged on rows it was not fitted to (`calib.geometry.model_choice.
 lowers that
 error most is taken up, then the one that pays most beside it, until none pays: sag may show only once gear errors are
 gone. Without an instrument (sockets, planes, distances) the geometry is drawn to its nominal as strongly as the data
-say (`calib.geometry.fit.drawn_fit`).
+say (`calib.geometry.fit.shrunk_fit`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from calib.errors import UsageError
 from calib.estimation.relevance import relevance
 from calib.geometry.fit import fit, fit_with_prior, polish_frames
 from calib.geometry.installation import Installation
-from calib.geometry.model_choice.cross_validation import Judge, judge
+from calib.geometry.model_choice.cross_validation import FoldStatistics, fold_statistics
 from calib.geometry.model_choice.effects import EFFECTS, MODELS, Effect, term_groups, term_sizes
 from calib.geometry.model_choice.folds import Folds, transfer_folds
 from calib.geometry.observation import prepare
@@ -39,7 +39,7 @@ Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True)
-class Rung:
+class ModelStep:
     """One model tried.
 
     Attributes:
@@ -58,7 +58,7 @@ class Rung:
 
 
 @dataclass(frozen=True, eq=False)
-class Climb:
+class ModelSelection:
     """Where the ladder ended.
 
     Attributes:
@@ -75,7 +75,7 @@ class Climb:
     fit: GeometricFit
     nominal: GeometricFit
     rigid: GeometricFit
-    rungs: tuple[Rung, ...]
+    rungs: tuple[ModelStep, ...]
     chosen: str
     folds: Folds
     loss: str = "none"
@@ -93,7 +93,7 @@ def climb(
     seed: int = 0,
     folds: Folds | None = None,
     progress: Progress | None = None,
-) -> Climb:
+) -> ModelSelection:
     """Fit the model the data support, or the one asked for by name.
 
     Args:
@@ -168,10 +168,12 @@ class _Climber:
                 self.nominal.cell, self.measured, candidates, settings=self.settings, torques=self.torques,
                 drawn=self.drawn, prior=self.prior,
             )  # fmt: skip
-            unseen = self._judge(found, ()).error_rigid()
+            unseen = self._statistics(found, ()).error_rigid()
             better = unseen < error * (1.0 - GAIN)
             wanted = better if model == "auto" else name == last
-            self.rungs.append(Rung(name, len(found.free), unseen, wanted, "" if better else "no better on unseen rows"))
+            self.rungs.append(
+                ModelStep(name, len(found.free), unseen, wanted, "" if better else "no better on unseen rows")
+            )
             if wanted:
                 self.best, self.chosen, error = found, name, unseen
             elif model != "auto" and name != last:
@@ -187,39 +189,43 @@ class _Climber:
         offered = {effect.name: self._terms(effect) for effect in EFFECTS}
         everything = tuple(term for terms in offered.values() for term in terms)
         self._tick("observation matrix")
-        bench = self._judge(self.best, everything)
+        statistics = self._statistics(self.best, everything)
         place = _places(offered)
         names = [effect.name for effect in EFFECTS]
         if model == "auto":
-            kept = self._greedy(bench, offered, place)
+            kept = self._greedy(statistics, offered, place)
         else:
             kept = names[: names.index(model) + 1]
             where = np.concatenate([place[name] for name in kept])
             self._tick(model)
-            self.rungs.append(self._rung(bench, f"+ {model}", where, True, ""))
+            self.rungs.append(self._rung(statistics, f"+ {model}", where, True, ""))
         if kept:
             self._tick("final fit")
-            self.best = self._final(bench, [term for name in kept for term in offered[name]], [place[n] for n in kept])
+            self.best = self._final(
+                statistics, [term for name in kept for term in offered[name]], [place[n] for n in kept]
+            )
             self.chosen = " + ".join(["geometry", *kept])
             last = max(k for k, rung in enumerate(self.rungs) if rung.kept)
             self.rungs[last] = replace(self.rungs[last], parameters=len(self.best.free))
 
-    def _greedy(self, bench: Judge, offered: dict[str, list[Term]], place: dict[str, np.ndarray]) -> list[str]:
+    def _greedy(
+        self, statistics: FoldStatistics, offered: dict[str, list[Term]], place: dict[str, np.ndarray]
+    ) -> list[str]:
         """Return the effects that pay on unseen rows, in the order they were taken up: each time the best one."""
         kept: list[str] = []
-        error = bench.error(np.array([], dtype=int))
+        error = statistics.error(np.array([], dtype=int))
         waiting = [name for name in offered if offered[name]]
         while waiting:
             tried = {}
             for name in waiting:
                 self._tick(name)
-                tried[name] = bench.error(np.concatenate([place[other] for other in [*kept, name]]))
+                tried[name] = statistics.error(np.concatenate([place[other] for other in [*kept, name]]))
             best = min(waiting, key=lambda name: tried[name].rms)
             pays = tried[best].rms < error.rms * (1.0 - GAIN) and tried[best].wins(error)
             for name in waiting if not pays else [best]:
                 note = "" if name == best and pays else "no better on unseen rows: left out"
                 where = np.concatenate([place[other] for other in [*kept, name]])
-                self.rungs.append(self._rung(bench, f"+ {name}", where, not note, note, tried[name].rms))
+                self.rungs.append(self._rung(statistics, f"+ {name}", where, not note, note, tried[name].rms))
             if not pays:
                 break
             kept.append(best)
@@ -228,15 +234,15 @@ class _Climber:
         return kept
 
     def _rung(
-        self, bench: Judge, name: str, where: np.ndarray, kept: bool, note: str, rms: float | None = None
-    ) -> Rung:
-        rms = bench.error(where).rms if rms is None else rms
-        return Rung(name, bench.rigid + bench.alive(where), rms, kept, note)
+        self, statistics: FoldStatistics, name: str, where: np.ndarray, kept: bool, note: str, rms: float | None = None
+    ) -> ModelStep:
+        rms = statistics.error(where).rms if rms is None else rms
+        return ModelStep(name, statistics.rigid + statistics.alive(where), rms, kept, note)
 
-    def _final(self, bench: Judge, terms: list[Term], places: list[np.ndarray]) -> GeometricFit:
+    def _final(self, statistics: FoldStatistics, terms: list[Term], places: list[np.ndarray]) -> GeometricFit:
         """Fit geometry and effects to all rows, each term with the ridge the data chose; terms without effect go."""
-        chosen = relevance(*bench.problem(np.concatenate(places)))
-        ridge = chosen.ridge[bench.rigid :]
+        chosen = relevance(*statistics.problem(np.concatenate(places)))
+        ridge = chosen.ridge[statistics.rigid :]
         alive = np.flatnonzero(ridge > 0.0)
         picked = tuple(terms[k] for k in alive)
         cell = replace(
@@ -257,8 +263,8 @@ class _Climber:
         terms = effect.terms(self.nominal.cell.chain, known)
         return [term for term in terms if term.basis not in ("cos", "sin") or term.order <= highest]
 
-    def _judge(self, found: GeometricFit, terms: tuple[Term, ...]) -> Judge:
-        return judge(
+    def _statistics(self, found: GeometricFit, terms: tuple[Term, ...]) -> FoldStatistics:
+        return fold_statistics(
             found, self.measured, terms, term_groups(terms), term_sizes(terms), self.nominal.cell.chain, self.folds,
             self.torques,
         )  # fmt: skip
@@ -267,9 +273,9 @@ class _Climber:
         self.steps += 1
         self.tell(self.steps, 2 * len(MODELS), what)
 
-    def result(self) -> Climb:
+    def result(self) -> ModelSelection:
         loss = "none" if self.settings.loss == "auto" else self.settings.loss
-        return Climb(self.best, self.nominal, self.stiff, tuple(self.rungs), self.chosen, self.folds, loss)
+        return ModelSelection(self.best, self.nominal, self.stiff, tuple(self.rungs), self.chosen, self.folds, loss)
 
 
 def _places(offered: dict[str, list[Term]]) -> dict[str, np.ndarray]:

@@ -46,7 +46,7 @@ from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import mjcf, urdf, urdf_inertials, urdf_write
 from calib.robot.formats.markup import text
 from calib.robot.formats.readback import motion_torques
-from calib.robot.formats.urdf_tree import Tree, transform_body
+from calib.robot.formats.urdf_tree import UrdfTree, transform_body
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.transforms import invert
 
@@ -262,7 +262,7 @@ def _columns(names: Sequence[str], units: Sequence[str], values: np.ndarray) -> 
     return {"names": list(names), "units": list(units), "values": np.asarray(values).tolist()}
 
 
-def _own_chain(tree: Tree, chain: Chain) -> Chain:
+def _own_chain(tree: UrdfTree, chain: Chain) -> Chain:
     """Return the chain as the URDF has it, in the frames of its links, under the identified chain's gravity."""
     named = chain.joint_names if chain.joint_names[0] in tree.joints else None
     base = chain.base if chain.base in tree.bodies else None
@@ -270,7 +270,7 @@ def _own_chain(tree: Tree, chain: Chain) -> Chain:
     return replace(own, gravity=chain.gravity)
 
 
-def _link_bodies(given: Exported, tree: Tree, own: Chain) -> tuple[dict[str, np.ndarray], list[str]]:
+def _link_bodies(given: Exported, tree: UrdfTree, own: Chain) -> tuple[dict[str, np.ndarray], list[str]]:
     """Return the inertials to write by link, about the links' frames, and notes."""
     path = [joint for joint in tree.path(own.base, own.tip) if joint.moves]
     zero = np.zeros((1, own.n))
@@ -302,7 +302,7 @@ def _link_bodies(given: Exported, tree: Tree, own: Chain) -> tuple[dict[str, np.
     return links, notes
 
 
-def _sum(tree: Tree, placed: Mapping[str, np.ndarray]) -> np.ndarray:
+def _sum(tree: UrdfTree, placed: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return the standard parameters (10,) of links together, as the URDF has them."""
     found = [(tree.bodies[name], pose) for name, pose in placed.items()]
     return sum((transform_body(body, pose) for body, pose in found if body is not None), np.zeros(10))

@@ -17,7 +17,7 @@ from calib.geometry.first_guess import install
 from calib.geometry.fit import fit, polish_frames
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.folds import folds_by_name
-from calib.geometry.model_choice.ladder import Climb, climb
+from calib.geometry.model_choice.ladder import ModelSelection, climb
 from calib.geometry.parameters import layout
 from calib.geometry.result import GeometricFit, calibrated_chain
 from calib.geometry.weighing import Settings, combine
@@ -56,7 +56,7 @@ class Outcome:
     """
 
     inputs: Inputs
-    climb: Climb
+    climb: ModelSelection
     rigid: GeometricFit
     outliers: Sequence[Outlier]
     unclear: tuple[str, ...]
@@ -151,7 +151,7 @@ def assessed(outcome: Outcome, inputs: Inputs, options: FitOptions, wanted: FitS
     return replace(outcome, inputs=inputs, assessment=result)
 
 
-def found_of(inputs: Inputs, found: Climb, named: Sequence[Outlier], notes: Sequence[str]) -> Findings:
+def found_of(inputs: Inputs, found: ModelSelection, named: Sequence[Outlier], notes: Sequence[str]) -> Findings:
     """Return what a fit says of itself, whatever rows it has not seen; `notes` are those of moved instruments etc."""
     long = reach(inputs.chain)
     said = plateau(found, long)
@@ -167,7 +167,7 @@ def found_of(inputs: Inputs, found: Climb, named: Sequence[Outlier], notes: Sequ
     )
 
 
-def rigid_fit(found: Climb, measured: Sequence[PoseMeasurements], settings: Settings) -> GeometricFit:
+def rigid_fit(found: ModelSelection, measured: Sequence[PoseMeasurements], settings: Settings) -> GeometricFit:
     """Return the best fit without any corrections, those that came with the robot included: for a URDF."""
     if not found.rigid.cell.known.terms:
         return found.rigid
@@ -200,7 +200,7 @@ def stated_prior(start: Installation, options: FitOptions) -> np.ndarray | None:
     return prior
 
 
-def cross_validated(found: Climb) -> float:
+def cross_validated(found: ModelSelection) -> float:
     """Return the error of the chosen model on rows left out [m]: that of the last rung kept."""
     return [rung.cross_validated for rung in found.rungs if rung.kept][-1]
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements
 from calib.geometry.accuracy import NATURE
-from calib.geometry.model_choice.ladder import Climb
+from calib.geometry.model_choice.ladder import ModelSelection
 from calib.geometry.observation import observe
 from calib.geometry.result import GeometricFit, outliers
 
@@ -46,7 +46,7 @@ def named_outliers(found: GeometricFit) -> list[Outlier]:
     return list(result.values())
 
 
-def plateau(found: Climb, reach: float) -> str:
+def plateau(found: ModelSelection, reach: float) -> str:
     """Say that no rigid geometry explains the measurements, where the full one leaves more than `FLOOR` of the reach.
 
     Args:
@@ -69,7 +69,7 @@ def plateau(found: Climb, reach: float) -> str:
     )
 
 
-def remains(found: Climb, reach: float) -> bool:
+def remains(found: ModelSelection, reach: float) -> bool:
     """Say whether the chosen model, joint corrections included, leaves more than `FLOOR` of the reach on rows left out.
 
     Where it does not, that no rigid geometry explains the measurements is a remark, and no ground to doubt the model.

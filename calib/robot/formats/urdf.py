@@ -23,7 +23,7 @@ import numpy as np
 from calib.errors import RobotError, suggestion
 from calib.robot.chain import AXES, Chain, Element
 from calib.robot.formats.markup import text
-from calib.robot.formats.urdf_tree import JointTag, Mimic, Tree, transform_body
+from calib.robot.formats.urdf_tree import JointTag, Mimic, UrdfTree, transform_body
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.transforms import invert, pose
 
@@ -61,7 +61,7 @@ def parse(
 
 
 def ends(
-    tree: Tree, base: str | None = None, tip: str | None = None, joint_names: Sequence[str] | None = None
+    tree: UrdfTree, base: str | None = None, tip: str | None = None, joint_names: Sequence[str] | None = None
 ) -> tuple[str, str]:
     """Choose the links between which the chain runs.
 
@@ -86,7 +86,7 @@ def ends(
     return base, tip
 
 
-def build(tree: Tree, base: str, tip: str) -> Chain:
+def build(tree: UrdfTree, base: str, tip: str) -> Chain:
     """Return the chain between two links of a checked tree."""
     path = tree.path(base, tip)
     actuated = [joint for joint in path if joint.actuated]
@@ -142,7 +142,7 @@ def _elements(
     return [*elements, Element(f"{joint.name}.offset", moving, offset, owner, mover, ratio, sign)]
 
 
-def drive(tree: Tree, joint: JointTag) -> tuple[str, float, float]:
+def drive(tree: UrdfTree, joint: JointTag) -> tuple[str, float, float]:
     """Return the actuated joint that moves `joint`, the ratio and the offset; followers of followers are resolved."""
     ratio, offset, name = 1.0, 0.0, joint.name
     seen = {name}
@@ -159,7 +159,7 @@ def drive(tree: Tree, joint: JointTag) -> tuple[str, float, float]:
     return name, ratio, offset
 
 
-def _check_path(tree: Tree, path: list[JointTag], base: str, tip: str, joint_names: Sequence[str] | None) -> None:
+def _check_path(tree: UrdfTree, path: list[JointTag], base: str, tip: str, joint_names: Sequence[str] | None) -> None:
     """Refuse paths that are no serial arm, or not the arm the measurements were taken with."""
     actuated = [joint.name for joint in path if joint.actuated]
     if not actuated:
@@ -191,7 +191,7 @@ def _check_path(tree: Tree, path: list[JointTag], base: str, tip: str, joint_nam
         )
 
 
-def _longest(tree: Tree, base: str) -> str:
+def _longest(tree: UrdfTree, base: str) -> str:
     """Return the last moving link of the chain with most actuated joints."""
     if not any(joint.actuated for joint in tree.joints.values()):
         raise RobotError(f"{tree.where}: no actuated joint (revolute, continuous or prismatic) found")
@@ -219,7 +219,7 @@ def _longest(tree: Tree, base: str) -> str:
     return found[0]
 
 
-def _gripper_joints(tree: Tree) -> set[str]:
+def _gripper_joints(tree: UrdfTree) -> set[str]:
     """Return mimic joints whose leader is in another branch, and such leaders where no actuated joint hangs on them."""
     found: set[str] = set()
     for joint in tree.joints.values():
@@ -232,11 +232,11 @@ def _gripper_joints(tree: Tree) -> set[str]:
     return found
 
 
-def _hangs(tree: Tree, link: str, on: str) -> bool:
+def _hangs(tree: UrdfTree, link: str, on: str) -> bool:
     return any(joint.parent == on for joint in tree.ancestry(link))
 
 
-def _last_named(tree: Tree, base: str, joint_names: Sequence[str]) -> str:
+def _last_named(tree: UrdfTree, base: str, joint_names: Sequence[str]) -> str:
     """Return the child link of the named joint farthest from the base."""
     for name in joint_names:
         if name not in tree.joints:
@@ -245,12 +245,12 @@ def _last_named(tree: Tree, base: str, joint_names: Sequence[str]) -> str:
     return max((tree.joints[name].child for name in joint_names), key=lambda link: len(tree.ancestry(link)))
 
 
-def _leaf(tree: Tree, link: str) -> str:
+def _leaf(tree: UrdfTree, link: str) -> str:
     leaves = [name for name, _ in tree.rigid(link) if not any(joint.kind == "fixed" for joint in tree.below[name])]
     return leaves[0] if len(leaves) == 1 else link
 
 
-def _inertias(tree: Tree, path: list[JointTag]) -> np.ndarray | None:
+def _inertias(tree: UrdfTree, path: list[JointTag]) -> np.ndarray | None:
     """Return (n, 10) about the frames behind the moving elements; None without masses.
 
     Also None where the body behind a mimic follower has mass: it would need a row of its own.

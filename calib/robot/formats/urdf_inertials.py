@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from calib.robot.formats.markup import Node, edited, insert_child, parse, set_attributes
-from calib.robot.formats.urdf_tree import JointTag, Tree
+from calib.robot.formats.urdf_tree import JointTag, UrdfTree
 
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 ZERO = "0 0 0"
@@ -35,7 +35,7 @@ def put(
     return edited(source, changes)
 
 
-def hanging(tree: Tree, path: list[JointTag], link: str) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+def hanging(tree: UrdfTree, path: list[JointTag], link: str) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Return what moves with a link of a path: links fixed to it, and links on other joints that stand at zero.
 
     Each by name with its pose (4, 4) in the frame of `link`, which is among the first.

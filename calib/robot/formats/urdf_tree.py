@@ -63,7 +63,7 @@ class JointTag:
 
 
 @dataclass(frozen=True, eq=False)
-class Tree:
+class UrdfTree:
     """A checked URDF: every link has one parent joint or none.
 
     Attributes:
@@ -131,7 +131,7 @@ class Tree:
         return result
 
 
-def read(source: str, where: str) -> Tree:
+def read(source: str, where: str) -> UrdfTree:
     """Read the text of a URDF; `where` names it in messages.
 
     Raises:
@@ -159,7 +159,7 @@ def read(source: str, where: str) -> Tree:
             raise RobotError(f"{place}: link '{joint.child}' has two parents, joints {both}; a URDF is a tree")
         above[joint.child] = joint
         below[joint.parent].append(joint)
-    tree = Tree(root.attributes.get("name", "robot"), where, bodies, joints, above, below)
+    tree = UrdfTree(root.attributes.get("name", "robot"), where, bodies, joints, above, below)
     _check_loops(tree)
     return tree
 
@@ -324,7 +324,7 @@ def _expand(found: str | None) -> str:
     return f"; this is a xacro file, {XACRO}" if found and "${" in found else ""
 
 
-def _check_loops(tree: Tree) -> None:
+def _check_loops(tree: UrdfTree) -> None:
     """Refuse links that hang on themselves."""
     reached: set[str] = set()
     todo = tree.roots

@@ -27,7 +27,7 @@ from calib.errors import RobotError
 from calib.robot.chain import AXES, Chain, Element, random_joints
 from calib.robot.formats.markup import edited, insert_child, set_attributes, text
 from calib.robot.formats.urdf import drive, ends
-from calib.robot.formats.urdf_tree import UNLIMITED, JointTag, Tree
+from calib.robot.formats.urdf_tree import UNLIMITED, JointTag, UrdfTree
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.kinematics import forward
 from calib.transforms import invert, pose, to_xyz_rpy
@@ -127,7 +127,7 @@ def moving_frames(chain: Chain, q: np.ndarray) -> np.ndarray:
     return np.array(frames)
 
 
-def link_frames(tree: Tree, path: Sequence[JointTag], chain: Chain, q: np.ndarray) -> np.ndarray:
+def link_frames(tree: UrdfTree, path: Sequence[JointTag], chain: Chain, q: np.ndarray) -> np.ndarray:
     """Return the frames of the links behind the moving joints of a path, (moving, m, 4, 4), in the path's first link.
 
     Args:
@@ -171,7 +171,7 @@ def _check_pair(nominal: Chain, calibrated: Chain) -> None:
         )
 
 
-def _matching_path(tree: Tree, nominal: Chain) -> list[JointTag]:
+def _matching_path(tree: UrdfTree, nominal: Chain) -> list[JointTag]:
     """Return the URDF's joints from the one link before the first moving joint to the tip, matching the chain's.
 
     Joints are matched by name, or, where the URDF has none of the names, in the order of its longest chain.
@@ -197,7 +197,9 @@ def _matching_path(tree: Tree, nominal: Chain) -> list[JointTag]:
     return path
 
 
-def _base_offset(tree: Tree, path: list[JointTag], nominal: Chain, frames: np.ndarray, links: np.ndarray) -> np.ndarray:
+def _base_offset(
+    tree: UrdfTree, path: list[JointTag], nominal: Chain, frames: np.ndarray, links: np.ndarray
+) -> np.ndarray:
     """Return the pose (4, 4) of the path's first link in the chain's base, checking that the robots are the same.
 
     The chain's base is the link of that name where there is one; else whichever link fixed to the foot fits best.
@@ -226,7 +228,7 @@ def _base_offset(tree: Tree, path: list[JointTag], nominal: Chain, frames: np.nd
     return best
 
 
-def _origins(tree: Tree, path: list[JointTag], wanted: np.ndarray) -> dict[str, np.ndarray]:
+def _origins(tree: UrdfTree, path: list[JointTag], wanted: np.ndarray) -> dict[str, np.ndarray]:
     """Return the new origins (4, 4) by joint name; `wanted` (moving, 4, 4) are the links' frames at q = 0."""
     frame, origins, k = np.eye(4), {}, 0
     for joint in path:
@@ -241,7 +243,7 @@ def _origins(tree: Tree, path: list[JointTag], wanted: np.ndarray) -> dict[str, 
 
 
 def _tip_origin(
-    tree: Tree, path: list[JointTag], nominal: Chain, calibrated: Chain, last: np.ndarray, wanted: np.ndarray
+    tree: UrdfTree, path: list[JointTag], nominal: Chain, calibrated: Chain, last: np.ndarray, wanted: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Return the new origin of the first fixed joint behind the last moving one, where the chain changed there.
 

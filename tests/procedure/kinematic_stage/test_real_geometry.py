@@ -13,7 +13,7 @@ from calib.geometry.accuracy import errors, summary
 from calib.geometry.checks.diagnosis import diagnose
 from calib.geometry.checks.explanation import explain
 from calib.geometry.first_guess import install
-from calib.geometry.model_choice.ladder import Climb, climb
+from calib.geometry.model_choice.ladder import ModelSelection, climb
 from calib.geometry.result import outliers
 from calib.geometry.weighing import Settings
 from calib.robot.formats import urdf
@@ -77,14 +77,16 @@ def mukca(data: Path, name: str):
     return urdf.read(folder / "panda.urdf"), take(measured, first), take(measured, np.flatnonzero(number > 0))
 
 
-def judged(chain, fitted: PoseMeasurements, unseen: PoseMeasurements) -> tuple[Climb, dict, dict]:
+def judged(chain, fitted: PoseMeasurements, unseen: PoseMeasurements) -> tuple[ModelSelection, dict, dict]:
     """Return the climb, and the errors on unseen rows of the nominal and the calibrated arm."""
     found = climb(install(chain, [fitted]), [fitted])
     assert found.fit.solution.status.good
     return found, *(summary(errors(cell, [unseen])) for cell in (found.nominal.cell, found.fit.cell))
 
 
-def report(capsys, name: str, found: Climb, nominal: dict, calibrated: dict, quantity: str, goal: float) -> None:
+def report(
+    capsys, name: str, found: ModelSelection, nominal: dict, calibrated: dict, quantity: str, goal: float
+) -> None:
     with capsys.disabled():
         print(
             f"\n  {name}: {nominal['position_mm'][quantity]:.3f} -> {calibrated['position_mm'][quantity]:.4f} mm "
