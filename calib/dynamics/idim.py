@@ -266,15 +266,6 @@ def with_terms(model: IdentificationModel, *terms: DriveTerm) -> IdentificationM
     return replace(model, terms=(*model.terms, *terms))
 
 
-def stacked(regressor: np.ndarray) -> np.ndarray:
-    """Return the observation matrix (rows · N, p) of a regressor (N, rows, p): all samples of row 1, of row 2, ….
-
-    Column-major without a copy for what `IdentificationModel.regressor` returns; torques stack as ``tau.T.ravel()``.
-    """
-    samples, rows, p = regressor.shape
-    return regressor.transpose(2, 1, 0).reshape(p, rows * samples).T
-
-
 def with_load(model: IdentificationModel) -> tuple[str, ...]:
     """Return the names of the terms that need `load`."""
     return tuple(one.name for one in model.columns if one.form.loaded)

@@ -104,20 +104,3 @@ def _pick(scaled: np.ndarray, groups: list[np.ndarray], silent: np.ndarray, tole
         kept.extend(candidates[order[:count]])
         basis = np.hstack([basis, q[:, :count]])
     return np.array(sorted(kept), dtype=int)
-
-
-def weak_directions(matrix: np.ndarray, threshold: float = 1e-3) -> tuple[np.ndarray, np.ndarray]:
-    """Return the singular values below `threshold` of the largest and their right vectors, for unit-norm columns.
-
-    Args:
-        matrix: (rows, b), full column rank.
-
-    Returns:
-        ratios (w,), falling, and directions (w, b) in the scaled columns' coordinates.
-    """
-    factor = np.linalg.qr(matrix, mode="r")
-    scaled = factor / np.linalg.norm(factor, axis=0)
-    _, values, vt = np.linalg.svd(scaled)
-    ratios = values / values[0]
-    weak = ratios < threshold
-    return ratios[weak], vt[weak]

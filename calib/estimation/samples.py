@@ -16,7 +16,7 @@ import scipy.linalg
 
 from calib.arrays import frozen, shaped
 from calib.errors import CalibError, NotConverged
-from calib.estimation import multivariate, robust
+from calib.estimation import robust
 from calib.estimation.estimate import Estimate
 from calib.estimation.linear import LinearFit, leverage, wls
 from calib.estimation.triangles import Triangles, absorb, combine, empty, solve_triangle
@@ -109,7 +109,7 @@ def irls(
     """Estimate x and S by iteratively reweighted least squares over whole samples (Maronna 1976), with a gate.
 
     Starts from a row-wise Cauchy fit with median spreads, because a covariance estimated from all samples would hide
-    the outliers that made it. The covariance of x is that of the M-estimator, `multivariate.variance_factor`.
+    the outliers that made it. The covariance of x is that of the M-estimator, `robust.variance_factor`.
 
     Args:
         data, noise, inflation: as in `gls`.
@@ -169,7 +169,7 @@ def _iterate(
     for _ in range(ROUNDS):
         residual = np.where(data.present, data.target - data.matrix @ values, 0.0) / left
         size = sizes(residual, covariance, data.present)
-        weights = multivariate.weigh(size, data.joints, loss, gate)
+        weights = robust.weigh(size, data.joints, loss, gate)
         if not how.stated:
             covariance = _scatter(data, residual, weights * _consistent(data, how), weights)
         factor, last = _factor(data, covariance, weights), values
@@ -185,7 +185,7 @@ def _pack(
 ) -> SampleFit:  # fmt: skip
     """Return the fit with the covariance of its kind of estimator."""
     _, inverse, conditions = solve_triangle(factor, data.names)
-    variance = multivariate.variance_factor(size, data.joints, how.loss, how.gate) if how.robust else 1.0
+    variance = robust.variance_factor(size, data.joints, how.loss, how.gate) if how.robust else 1.0
     squares = np.sum(weights * _consistent(data, how) * size**2)
     dof = int(data.joints[weights > 0.0].sum() / inflation) - len(values)
     residual_std = float(np.sqrt(squares / np.sum(weights * data.joints)))
@@ -258,7 +258,7 @@ def _share_left(data: Samples, std: np.ndarray) -> np.ndarray:
 
 def _consistent(data: Samples, how: _Weighing) -> np.ndarray:
     """Return the factor (N,) that makes the weighted scatter one for normal residuals."""
-    each = [multivariate.consistency(n, how.loss, how.gate) if n else 0.0 for n in range(data.target.shape[1] + 1)]
+    each = [robust.consistency(n, how.loss, how.gate) if n else 0.0 for n in range(data.target.shape[1] + 1)]
     return np.array(each)[data.joints]
 
 

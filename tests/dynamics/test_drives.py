@@ -7,7 +7,7 @@ from differences import check
 
 from calib.dynamics import drives, friction
 from calib.dynamics.bodies import bodies_of
-from calib.dynamics.idim import IdentificationModel, friction_states, from_chain, stacked, with_load, with_terms
+from calib.dynamics.idim import IdentificationModel, friction_states, from_chain, with_load, with_terms
 from calib.dynamics.torque_rows import BOTH, DRIVE, LINK, MOTOR, torque_rows
 from calib.errors import CalibError
 from calib.robot.load import load
@@ -22,6 +22,15 @@ SMOOTH = (
     + friction.stribeck(3, 0.4, 2.0, 0.5)
     + friction.ripple(4, [3.0, 5.0], 0.7)
 )
+
+
+def stacked(regressor: np.ndarray) -> np.ndarray:
+    """Return the observation matrix (rows · N, p) of a regressor (N, rows, p): all samples of row 1, of row 2, ….
+
+    Column-major without a copy for what `IdentificationModel.regressor` returns; torques stack as ``tau.T.ravel()``.
+    """
+    samples, rows, p = regressor.shape
+    return regressor.transpose(2, 1, 0).reshape(p, rows * samples).T
 
 
 def column(model, name, *motion, **more):

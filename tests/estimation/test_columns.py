@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.estimation.base_columns import split_columns, weak_directions
+from calib.estimation.base_columns import split_columns
 
 
 def dependent(seed: int, rows: int = 60, rank: int = 8, p: int = 13) -> np.ndarray:
@@ -88,6 +88,23 @@ def test_the_tolerance_decides_on_a_nearly_dependent_column():
     matrix = np.column_stack([matrix, matrix @ rng.normal(size=4) + 1e-4 * rng.normal(size=50)])
     assert split_columns(matrix, tolerance=1e-6).rank == 5
     assert split_columns(matrix, tolerance=1e-2).rank == 4
+
+
+def weak_directions(matrix: np.ndarray, threshold: float = 1e-3) -> tuple[np.ndarray, np.ndarray]:
+    """Return the singular values below `threshold` of the largest and their right vectors, for unit-norm columns.
+
+    Args:
+        matrix: (rows, b), full column rank.
+
+    Returns:
+        ratios (w,), falling, and directions (w, b) in the scaled columns' coordinates.
+    """
+    factor = np.linalg.qr(matrix, mode="r")
+    scaled = factor / np.linalg.norm(factor, axis=0)
+    _, values, vt = np.linalg.svd(scaled)
+    ratios = values / values[0]
+    weak = ratios < threshold
+    return ratios[weak], vt[weak]
 
 
 def test_weak_directions_name_the_two_columns_that_nearly_merge():

@@ -7,7 +7,7 @@ import pytest
 
 from calib.errors import CalibError
 from calib.estimation.linear import wls
-from calib.estimation.multivariate import tuning
+from calib.estimation.robust import tuning
 from calib.estimation.samples import by_joint, gls, irls, row_irls, stack
 from calib.estimation.triangles import collect
 

@@ -1,10 +1,10 @@
-"""A ladder of friction, climbed joint by joint as far as unseen time rewards it.
+"""A ladder of friction, a forward selection, joint by joint, as far as unseen time rewards it.
 
     standard → + load → + presliding → + stribeck → + asymmetric → + root → + cubic → + ripple
 
-Every rung is tried on top of those taken: all joints get its terms, every time block is predicted by a fit to the
-others, and the terms stay at the joints whose error on unseen time falls by `GAIN`. Terms of a rung have a ridge per
-joint, chosen by evidence, so that a rich rung (ripple) may offer more than the data can tell.
+Every step is tried on top of those taken: all joints get its terms, every time block is predicted by a fit to the
+others, and the terms stay at the joints whose error on unseen time falls by `GAIN`. Terms of a step have a ridge per
+joint, chosen by evidence, so that a rich step (ripple) may offer more than the data can tell.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from calib.identification.cases import Case
 from calib.identification.friction.time_folds import CrossValidation
 from calib.identification.rows import ObservationRows, extend, observe_terms, triangulate
 
-GAIN = 0.02  # a rung has to lower a joint's rms error on unseen time by this share (our choice)
+GAIN = 0.02  # a step has to lower a joint's rms error on unseen time by this share (our choice)
 WIDTHS = (0.0005, 0.002, 0.008, 0.03)  # of presliding, shares of a joint's travel (our choice)
 WINS = 0.6  # and on this share of the blocks
-RUNGS = ("load", "presliding", "stribeck", "asymmetric", "root", "cubic")
-NAMES = ("auto", "standard", *RUNGS, "ripple")
+STEPS = ("load", "presliding", "stribeck", "asymmetric", "root", "cubic")
+NAMES = ("auto", "standard", *STEPS, "ripple")
 
 Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class FrictionStep:
-    """One rung tried.
+    """One step of the ladder, tried.
 
     Attributes:
         model: e.g. ``standard`` or ``+ load``.
@@ -58,7 +58,7 @@ class FrictionStep:
 
 @dataclass(frozen=True, eq=False)
 class FrictionSelection:
-    """Where the ladder ended: the terms taken, their ridge groups, and the rungs."""
+    """Where forward selection ended: the terms taken, their ridge groups, and the steps tried."""
 
     terms: tuple[DriveTerm, ...]
     groups: tuple[int, ...]
@@ -66,12 +66,12 @@ class FrictionSelection:
 
     @property
     def chosen(self) -> str:
-        return " + ".join(["standard", *(rung.model[2:] for rung in self.steps if rung.kept and rung.model[0] == "+")])
+        return " + ".join(["standard", *(step.model[2:] for step in self.steps if step.kept and step.model[0] == "+")])
 
 
 @dataclass(frozen=True, eq=False)
 class FrictionCandidates:
-    """What a climb stands on.
+    """What forward selection of friction starts from.
 
     Attributes:
         cases: recordings to learn from.
@@ -100,26 +100,26 @@ class FrictionCandidates:
 
 
 def select_friction(
-    ground: FrictionCandidates, wanted: str = "auto", progress: Progress | None = None
+    candidates: FrictionCandidates, wanted: str = "auto", progress: Progress | None = None
 ) -> FrictionSelection:
-    """Return the friction terms that unseen time rewards, or those of a rung by name.
+    """Return the friction terms that unseen time rewards, or those of a step by name.
 
     Args:
         wanted: ``auto``; ``standard`` (or ``ripple``, found later by `calib.identification.friction.ripple`): none;
-            a rung's name: that rung at all joints, nothing else.
+            a step's name: that step at all joints, nothing else.
     """
     say = progress or (lambda words: None)
     if wanted not in NAMES:
         raise UsageError(f"friction '{wanted}' is none of {', '.join(NAMES)}")
     say("friction: columns")
-    offered = {name: _terms(ground, name) for name in RUNGS if wanted in ("auto", name)}
+    offered = {name: _terms(candidates, name) for name in STEPS if wanted in ("auto", name)}
     every = [one for terms in offered.values() for one in terms]
-    bench, place = _bench(ground, offered, every)
-    base = np.arange(bench.data.parameters - len(every))
+    validation, place = _cross_validation(candidates, offered, every)
+    base = np.arange(validation.data.parameters - len(every))
     say("friction: standard")
-    size = _sizes(ground, bench)
-    error = bench.errors(base)
-    steps = [_step("standard", len(base), error, size, tuple(range(ground.n)))]
+    size = _sizes(candidates, validation)
+    error = validation.errors(base)
+    steps = [_step("standard", len(base), error, size, tuple(range(candidates.n)))]
     taken: list[int] = []
     waiting = list(offered)
     for second in (False, True):
@@ -127,9 +127,9 @@ def select_friction(
         for name in waiting:
             say(f"friction: {name}")
             columns = [k for k in place[name] if k not in taken]
-            found, new, at = _try(bench, base, taken, columns, every, error, wanted != "auto")
+            found, new, at = _try(validation, base, taken, columns, every, error, wanted != "auto")
             note = "" if at else "no better on unseen time: left out"
-            shown = new if found else bench.errors(np.array([*base, *taken, *columns]))
+            shown = new if found else validation.errors(np.array([*base, *taken, *columns]))
             steps.append(_step(f"+ {name}", len(base) + len(taken) + len(found or columns), shown, size, at, note))
             if found:
                 taken, error = [*taken, *found], new
@@ -138,12 +138,12 @@ def select_friction(
         if second or not taken or not refused:
             break
         waiting = [name for name in refused if any(at > place[name][0] for at in taken)]
-    groups = bench.group[taken]
+    groups = validation.group[taken]
     return FrictionSelection(tuple(every[k - len(base)] for k in taken), tuple(int(g) for g in groups), tuple(steps))
 
 
 def _try(
-    bench: CrossValidation,
+    validation: CrossValidation,
     base: np.ndarray,
     taken: list[int],
     columns: list[int],
@@ -154,7 +154,7 @@ def _try(
     """Return the columns that stay, the errors with them, and their joints."""
     joint = {k: every[k - len(base)].acts[0][0] for k in columns}
     everyone = tuple(sorted(set(joint.values())))
-    new = bench.errors(np.array([*base, *taken, *columns]))
+    new = validation.errors(np.array([*base, *taken, *columns]))
     if forced:
         return columns, new, everyone
     at = tuple(j for j in everyone if _pays(error[:, j], new[:, j]))
@@ -162,10 +162,10 @@ def _try(
         return [], error, ()
     some = [k for k in columns if joint[k] in at]
     if len(some) < len(columns):
-        new = bench.errors(np.array([*base, *taken, *some]))
+        new = validation.errors(np.array([*base, *taken, *some]))
         at = tuple(j for j in at if _pays(error[:, j], new[:, j]))
         some = [k for k in some if joint[k] in at]
-        new = bench.errors(np.array([*base, *taken, *some])) if some else error
+        new = validation.errors(np.array([*base, *taken, *some])) if some else error
     return some, new, at
 
 
@@ -178,16 +178,16 @@ def _pays(before: np.ndarray, after: np.ndarray) -> bool:
     return bool(after.sum() < (1.0 - GAIN) ** 2 * before.sum() and lower >= WINS)
 
 
-def _terms(ground: FrictionCandidates, name: str) -> list[DriveTerm]:
-    """Return a rung's terms of all joints."""
+def _terms(candidates: FrictionCandidates, name: str) -> list[DriveTerm]:
+    """Return a step's terms of all joints."""
     found: list[DriveTerm] = []
-    for j in range(ground.n):
-        v = np.concatenate([np.abs(case.motion.v[:, j]) for case in ground.cases])
+    for j in range(candidates.n):
+        v = np.concatenate([np.abs(case.motion.v[:, j]) for case in candidates.cases])
         peak = float(np.quantile(v, 0.98))
         if peak <= 0.0:
             continue
-        travel = float(np.ptp(np.concatenate([case.motion.q[:, j] for case in ground.cases])))
-        v0 = float(ground.v0[j])
+        travel = float(np.ptp(np.concatenate([case.motion.q[:, j] for case in candidates.cases])))
+        v0 = float(candidates.v0[j])
         terms = {
             "load": lambda: friction.load_dependent(j, v0, viscous=True),  # noqa: B023
             "presliding": lambda: friction.presliding(j, [travel * x for x in WIDTHS], v0),  # noqa: B023
@@ -199,17 +199,17 @@ def _terms(ground: FrictionCandidates, name: str) -> list[DriveTerm]:
             "root": lambda: friction.root(j, v0),  # noqa: B023
             "cubic": lambda: friction.cubic(j),  # noqa: B023
         }[name]()
-        found += [replace(one, linear=bool(ground.linear[j])) for one in terms]
+        found += [replace(one, linear=bool(candidates.linear[j])) for one in terms]
     return found
 
 
-def _bench(
-    ground: FrictionCandidates, offered: dict[str, list[DriveTerm]], every: list[DriveTerm]
+def _cross_validation(
+    candidates: FrictionCandidates, offered: dict[str, list[DriveTerm]], every: list[DriveTerm]
 ) -> tuple[CrossValidation, dict[str, list[int]]]:
-    """Return the bench with all offered columns behind the base's, and where each rung's stand."""
+    """Return the validation with all offered columns behind the base's, and where each step's stand."""
     rows = [
-        extend(part, every, observe_terms(every, case, ground.decimator, load))
-        for part, case, load in zip(ground.rows, ground.cases, ground.loads)
+        extend(part, every, observe_terms(every, case, candidates.decimator, load))
+        for part, case, load in zip(candidates.rows, candidates.cases, candidates.loads)
     ]
     data = triangulate(rows)
     base = data.parameters - len(every)
@@ -224,7 +224,13 @@ def _bench(
         number += 1
     blocks = 1 + max(int(part.block.max(initial=-1)) for part in rows)
     return CrossValidation(
-        data, rows[0].target.shape[1], blocks, ground.std, ground.inflation, group, _padded(ground.prior, len(every))
+        data,
+        rows[0].target.shape[1],
+        blocks,
+        candidates.std,
+        candidates.inflation,
+        group,
+        _padded(candidates.prior, len(every)),
     ), place
 
 
@@ -235,10 +241,10 @@ def _padded(prior: np.ndarray | None, more: int) -> np.ndarray | None:
     return np.hstack([prior[:, :-1], np.zeros((len(prior), more)), prior[:, -1:]])
 
 
-def _sizes(ground: FrictionCandidates, bench: CrossValidation) -> np.ndarray:
+def _sizes(candidates: FrictionCandidates, validation: CrossValidation) -> np.ndarray:
     """Return Σ τ² per row over the judged blocks (rows,)."""
-    squares = bench.data.factors[:, :, -1] ** 2
-    return squares.sum(axis=1).reshape(-1, bench.rows)[: bench.blocks].sum(axis=0)
+    squares = validation.data.factors[:, :, -1] ** 2
+    return squares.sum(axis=1).reshape(-1, validation.rows)[: validation.blocks].sum(axis=0)
 
 
 def _step(
