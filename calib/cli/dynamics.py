@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from calib.cli.shared import Base, Plots, Robot, Seed, Tip, make_console, progress
+from calib.cli.shared import Base, Plots, Robot, Seed, Tip, progress, say, say_written
 
 app = typer.Typer()
 
@@ -37,22 +37,16 @@ def identify_dynamics(
     from calib.procedure.report import dynamics_section
 
     folder.check_identification_target(out, [options, *recordings, *(validate or [])])
-    console = make_console()
 
     def read(given: Any) -> None:
         folder.check_identification_target(out, [given.source, given.source.parent])
-        for line in shown.rendered(dynamics_section.read_blocks(given)):
-            console.print(line, soft_wrap=True)
+        say(*shown.rendered(dynamics_section.read_blocks(given)))
 
-    with progress() as say:
+    with progress() as show:
         found = identified(
             robot, recordings, validate=validate or (), method=method, friction=friction, options=options, base=base,
-            tip=tip, seed=seed, on_read=read, progress=say,
+            tip=tip, seed=seed, on_read=read, progress=show,
         )  # fmt: skip
-        say("writing")
+        show("writing")
         found.save(out, plots=plots)
-    for line in found.renderables():
-        console.print(line, soft_wrap=True)
-    console.print(f"written to {out}", soft_wrap=True, markup=False)
-    if found.verdict.level == "fail":
-        raise typer.Exit(1)
+    say_written(found.renderables(), out, found.verdict.level)

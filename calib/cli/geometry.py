@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from calib.cli.shared import Base, Plots, Robot, Seed, Tip, make_console, numbers, progress
+from calib.cli.shared import Base, Plots, Robot, Seed, Tip, numbers, progress, say, say_written
 
 app = typer.Typer()
 
@@ -60,25 +60,19 @@ def fit(
         None if tolerance is None else 1e-3 * tolerance, seed,
     )  # fmt: skip
     folder.check_fit_target(out, [options, *measured, *(validate or [])])
-    console = make_console()
 
     def read(given: Any) -> None:
         folder.check_fit_target(out, [given.source])
-        for line in shown.rendered(geometry_section.read_blocks(given)):
-            console.print(line, soft_wrap=True)
+        say(*shown.rendered(geometry_section.read_blocks(given)))
 
-    with progress() as say:
+    with progress() as show:
         found = fit_geometry(
             robot, measured, settings, validate=validate or (), options=options, base=base, tip=tip, on_read=read,
-            progress=say,
+            progress=show,
         )  # fmt: skip
-        say("writing")
+        show("writing")
         found.save(out, plots=plots)
-    for line in found.renderables():
-        console.print(line, soft_wrap=True)
-    console.print(f"written to {out}", soft_wrap=True, markup=False)
-    if found.verdict.level == "fail":
-        raise typer.Exit(1)
+    say_written(found.renderables(), out, found.verdict.level)
 
 
 @app.command()
@@ -111,15 +105,14 @@ def select(
     sigmas = None if sigma is None else numbers(sigma, 2, "--sigma")
     stated = None if sigmas is None else (sigmas[0], sigmas[1])
     settings = SelectionSettings(kind, targets, index, method, candidates, stated, seed)
-    with progress() as say:
+    with progress() as show:
         chosen = select_poses(
             robot, m, settings, constraints=constraints, existing=existing, base=base, tip=tip, workers=workers,
-            progress=say,
+            progress=show,
         )  # fmt: skip
     chosen.save(out)
-    console = make_console()
-    console.print(str(chosen), soft_wrap=True, markup=False)
-    console.print(f"{m} poses written to {out}", soft_wrap=True, markup=False)
+    say(str(chosen))
+    say(f"{m} poses written to {out}")
 
 
 @app.command()
@@ -149,13 +142,10 @@ def export(
             raise UsageError("--into writes all files into one folder; leave --out, --ur-kinematics and --offsets out")
         dynamics.check_identified(folder)
         geometry.check_targets(urdf, [into / name for name in dynamics.WRITTEN])
-        console = make_console()
-        with progress() as say:
-            say("all parameters, and each file read back")
+        with progress() as show:
+            show("all parameters, and each file read back")
             lines = dynamics.deliver_dynamics(folder, urdf, into)
-        for line in lines:
-            console.print(line, soft_wrap=True, markup=False)
-        console.print(f"written to {into}", soft_wrap=True, markup=False)
+        say_written(lines, into)
         return
     if (urdf is None) != (out is None) or not (urdf or ur_kinematics or offsets):
         raise UsageError(
@@ -163,29 +153,23 @@ def export(
         )
     found = geometry.read(folder)
     geometry.check_targets(urdf, [path for path in (out, ur_kinematics, offsets) if path])
-    console = make_console()
     if urdf and out:
         read = geometry.export_urdf(found, urdf, out, for_corrections)
-        console.print(
-            f"{out}: joint origins of {urdf} calibrated, all else kept; base link and flange stay where the source has "
-            f"them; {read}", soft_wrap=True, markup=False,
-        )  # fmt: skip
+        say(f"{out}: joint origins of {urdf} calibrated, all else kept; base link and flange stay where the source has "
+            f"them; {read}")  # fmt: skip
     if ur_kinematics:
         geometry.export_ur_kinematics(found, ur_kinematics)
-        console.print(f"{ur_kinematics}: for kinematics_params_file of ur_description", soft_wrap=True, markup=False)
+        say(f"{ur_kinematics}: for kinematics_params_file of ur_description")
         if note := geometry.flange_note(found):
-            console.print(f"note: {note}", soft_wrap=True, markup=False)
+            say(f"note: {note}")
     if offsets:
         geometry.export_offsets(found, offsets)
-        console.print(
-            f"{offsets}: offset of each joint, the rest of the geometry left out; --model offsets fits the best ones",
-            soft_wrap=True, markup=False,
-        )  # fmt: skip
+        say(f"{offsets}: offset of each joint, the rest of the geometry left out; --model offsets fits the best ones")
     if found.corrections is not None:
         note = f"note: the corrections in {folder}/joint_corrections.csv are in none of these files"
         left = geometry.without_corrections(folder)
         note += f": {left}" if left else ""
-        console.print(note, soft_wrap=True, markup=False)
+        say(note)
 
 
 @app.command()
@@ -220,14 +204,11 @@ def compensate(
     may = numbers(tolerance, 2, "--tolerance")
     fitted = compensation.read(folder)
     compensation_file.check_out(out, targets, fitted)
-    with progress() as say:
+    with progress() as show:
         found = kinematic.compensate(
             fitted, targets, frame=frame, tool=tool, dof=dof, tolerance=(1e-3 * may[0], 1e-3 * may[1]), seed=seed,
-            start=numbers(start, fitted.nominal.chain.n, "--start") if start else None, progress=say,
+            start=numbers(start, fitted.nominal.chain.n, "--start") if start else None, progress=show,
         )  # fmt: skip
     found.save(out, partial=partial)
-    console = make_console()
-    console.print(str(found), soft_wrap=True, markup=False)
-    console.print(
-        f"{int(found.commands.reached.sum())} of {len(found.q)} commands written to {out}", soft_wrap=True, markup=False
-    )
+    say(str(found))
+    say(f"{int(found.commands.reached.sum())} of {len(found.q)} commands written to {out}")

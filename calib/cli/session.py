@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calib.cli.shared import Base, Plots, Seed, Tip, make_console, told
+from calib.cli.shared import Base, Plots, Seed, Tip, exit_failed, make_console, say, told
 
 if TYPE_CHECKING:
     from calib.procedure.session.questions import Answers
@@ -58,7 +58,7 @@ def new(
     made = commands.begin(
         folder, poses=poses, validation=validation, base=base or "", tip=tip or "", seed=seed, **checked(given)
     )
-    make_console().print(f"made {made.folder}; next: calib next {made.folder}", soft_wrap=True, markup=False)
+    say(f"made {made.folder}; next: calib next {made.folder}")
 
 
 def _asked(given: Answers) -> Answers:
@@ -143,26 +143,24 @@ def demo(
     """Calibrate a simulated robot with simulated instruments, and compare with the hidden truth."""
     from calib.procedure.session import demo as demonstration
 
-    with told() as (console, say, progress):
+    with told() as (say, progress):
         if bring is not None:
             demonstration.bring_what_waits(bring, say)
             return
         found = demonstration.run(
             out, robot, seed, say, progress, dynamics=not geometry_only, guided=guided, plots=plots,
         )  # fmt: skip
-    for line in ("", *found.asks):
-        console.print(line, soft_wrap=True, markup=False)
+    say("", *found.asks)
     if found.results:
-        console.print(f"{found.seconds:.1f} s, {found.memory:.0f} MB. Look at", soft_wrap=True, markup=False)
+        say(f"{found.seconds:.1f} s, {found.memory:.0f} MB. Look at")
     for words, name in found.results:
         how = (
             f"  (rerun {found.session.folder / name}, or calib view {found.session.folder})"
             if words == "to play"
             else ""
         )
-        console.print(f"  {words:15} {found.session.folder / name}{how}", soft_wrap=True, markup=False)
-    if found.verdict == "fail":
-        raise typer.Exit(1)
+        say(f"  {words:15} {found.session.folder / name}{how}")
+    exit_failed(found.verdict)
 
 
 @app.command("run")
@@ -181,7 +179,7 @@ def run_sessions(
     from calib.procedure.session import fleet
 
     folders, started, outcomes = fleet.folders_of(sessions), time.perf_counter(), []
-    with told() as (console, say, progress), work.workers(workers) as crew:
+    with told() as (say, progress), work.workers(workers) as crew:
         progress(f"running {len(folders)} sessions")
         for outcome in fleet.run(folders, crew, f"calib run --workers {workers}", plots):
             outcomes.append(outcome)
@@ -189,10 +187,9 @@ def run_sessions(
             progress(f"{len(outcomes)} of {len(folders)} sessions")
     places = [str(folder) for folder in folders]
     outcomes.sort(key=lambda one: places.index(one.folder))
-    console.print(fleet.table(outcomes))
-    for line in fleet.remarks(outcomes):
-        console.print(line, soft_wrap=True, markup=False)
-    console.print(fleet.summary(outcomes, time.perf_counter() - started), soft_wrap=True, markup=False)
+    say(fleet.table(outcomes))
+    say(*fleet.remarks(outcomes))
+    say(fleet.summary(outcomes, time.perf_counter() - started))
     if code := fleet.worst_code(outcomes):
         raise typer.Exit(code)
 
@@ -200,12 +197,10 @@ def run_sessions(
 def _go_on(folder: Path, command: str, again: str = "", plots: bool = True) -> None:
     from calib.procedure.session import commands
 
-    with told() as (console, say, progress):
+    with told() as (say, progress):
         stop = commands.go_on(folder, say, progress, command, again, plots)
-    for line in stop.lines:
-        console.print(line, soft_wrap=True, markup=False)
-    if stop.verdict == "fail":
-        raise typer.Exit(1)
+    say(*stop.lines)
+    exit_failed(stop.verdict)
 
 
 @app.command()
@@ -223,12 +218,11 @@ def view(
 
     if save is None and spawn is False:
         raise UsageError("nothing to do: give --save FILE.rrd, or leave --no-spawn out")
-    console = make_console()
     scene = viewer.write(folder, save, robot) if save else None
     if save:
         size = f"{1e-6 * save.stat().st_size:.1f} MB"
-        console.print(f"{save}: {size}; rerun {save} shows it", soft_wrap=True, markup=False)
+        say(f"{save}: {size}; rerun {save} shows it")
     if spawn or (spawn is None and save is None):
         scene = viewer.spawn(folder, robot)
     for note in scene.notes if scene else ():
-        console.print(f"note: {note}", soft_wrap=True, markup=False)
+        say(f"note: {note}")

@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any
@@ -30,11 +31,27 @@ def make_console(**options: Any) -> Any:
     return Console(highlight=False, **options)
 
 
-def say_written(lines: Iterable[str], out: Path) -> None:
-    """Print lines as they are, and where the results lie."""
-    console = make_console()
-    for words in (*lines, f"written to {out}"):
-        console.print(words, soft_wrap=True, markup=False)
+def say(*lines: Any, console: Any = None) -> None:
+    """Print lines of text as they are, and what rich renders."""
+    console = console or make_console()
+    for line in lines:
+        console.print(line, soft_wrap=True, markup=False)
+
+
+def say_written(lines: Iterable[Any], out: Path, verdict: str = "") -> None:
+    """Print lines, and where the results lie.
+
+    Raises:
+        typer.Exit: with code 1 where the verdict is fail.
+    """
+    say(*lines, f"written to {out}")
+    exit_failed(verdict)
+
+
+def exit_failed(verdict: str) -> None:
+    """Exit with code 1 where the verdict is fail."""
+    if verdict == "fail":
+        raise typer.Exit(1)
 
 
 @contextmanager
@@ -46,14 +63,13 @@ def progress() -> Iterator[Any]:
 
 
 @contextmanager
-def told() -> Iterator[tuple[Any, Any, Any]]:
-    """Yield a console, and two functions on it: for lines that stay, and for words that show while work goes on."""
+def told() -> Iterator[tuple[Any, Any]]:
+    """Yield two functions: for lines that stay, and for words that show while work goes on."""
     from rich.markup import escape
 
     console = make_console()
     with console.status("") as status:
-        say = lambda words: console.print(words, soft_wrap=True, markup=False)  # noqa: E731
-        yield console, say, lambda words: status.update(escape(words))
+        yield partial(say, console=console), lambda words: status.update(escape(words))
 
 
 def numbers(text: str, count: int, option: str, finite: bool = True) -> list[float]:

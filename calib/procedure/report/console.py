@@ -8,6 +8,7 @@ from rich import box
 from rich.console import RenderableType
 from rich.markup import escape
 from rich.table import Table as RichTable
+from rich.text import Text as RichText
 
 from calib.procedure.report.page import Block, Section, Table, Text
 
@@ -20,8 +21,8 @@ def rendered(blocks: Iterable[Block]) -> Iterator[RenderableType]:
         if isinstance(block, Table):
             yield rich_table(block)
         elif isinstance(block, Text):
-            label = f"[yellow]{escape(block.label)}[/]: " if block.label else ""
-            yield from (f"{label}{escape(line)}" for line in block.lines)
+            label = [(block.label, "yellow"), ": "] if block.label else []
+            yield from (RichText.assemble(*label, line) for line in block.lines)
 
 
 def rich_table(table: Table) -> RichTable:
@@ -47,4 +48,4 @@ def section(shown: Section) -> Iterator[RenderableType]:
     """Yield the blocks of a section, and its verdict with the reason."""
     yield from rendered(shown.blocks)
     if shown.verdict:
-        yield f"verdict: [bold {COLOURS[shown.verdict]}]{shown.verdict}[/]: {escape(shown.reason)}"
+        yield RichText.assemble("verdict: ", (shown.verdict, f"bold {COLOURS[shown.verdict]}"), f": {shown.reason}")

@@ -43,7 +43,7 @@ def test_names_in_brackets_reach_the_console():
     rms = {key: (1e-3,) * 3 for key in ("feedback", "cad", "model", "floor")}
     one = ReplayMetrics(rms, 30.0, True, ReplayController(True), (0.0,) * 3)
     *_, last = console.rendered(dynamics_section.tracking_blocks({"log.npz": one}))
-    assert isinstance(last, str) and "the controller of [loop];" in Text.from_markup(last).plain
+    assert isinstance(last, Text) and "the controller of [loop];" in last.plain
 
 
 def test_figures_have_units_at_their_axes():
