@@ -15,7 +15,7 @@ def as_text(renderables: Iterable[Any]) -> str:
 
     console = Console(file=io.StringIO(), width=WIDTH, highlight=False, color_system=None)
     for each in renderables:
-        console.print(each, soft_wrap=isinstance(each, str))
+        console.print(each, soft_wrap=True)
     return console.file.getvalue().rstrip()  # type: ignore[attr-defined]
 
 
