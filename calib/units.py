@@ -1,12 +1,12 @@
-"""Units: every one that is read from a file or printed, with its factor to SI.
+"""Units: those of files that are read, with their factor to SI; those that are printed, with their factor from SI.
 
-`QUANTITIES` says which units a quantity is read in; `of` the SI unit of a joint's coordinate and its derivatives.
+SI stands in every file that we write, unless a header or a key names another.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 DEG = math.pi / 180
 ANGLES = {"rad": 1.0, "deg": DEG, "mrad": 1e-3, "°": DEG, "degrees": DEG}
@@ -29,3 +29,42 @@ QUANTITIES: Mapping[str, Mapping[str, float]] = {
     "frequency": {"rad/s": 1.0, "Hz": 2 * math.pi},
 }
 """Quantity → unit → factor to SI; what is said of a unit that is none of them begins with the first."""
+
+ERRORS: Mapping[str, tuple[float, str]] = {
+    "position": (1e3, "mm"),
+    "orientation": (1 / DEG, "deg"),
+    "distance": (1e3, "mm"),
+}
+"""Nature of a residual → factor from SI and unit in which its size is printed."""
+
+SMALL: Mapping[str, tuple[float, str]] = {"m": (1e3, "mm"), "rad": (1e3, "mrad")}
+"""SI unit of a parameter → factor and unit in which its small changes and standard deviations are printed."""
+
+JOINT: Mapping[str, tuple[float, str]] = {"revolute": (1 / DEG, "deg"), "prismatic": (1e3, "mm")}
+"""Kind of a joint → factor from SI and unit in which its coordinate is printed."""
+
+TORQUE = "N m"
+
+
+def small(value: float, unit: str, digits: int = 3) -> str:
+    """Return a small change or a standard deviation of a parameter [m or rad] as it is printed."""
+    factor, printed = SMALL[unit]
+    return f"{factor * value:.{digits}g} {printed}"
+
+
+def motion_units(kinds: Iterable[str]) -> tuple[str, str, str, str]:
+    """Return the SI units of position, velocity, acceleration and torque of joints of these kinds."""
+    found = set(kinds)
+    first = "rad" if "prismatic" not in found else "m" if found == {"prismatic"} else "rad, m"
+    torque = {"rad": TORQUE, "m": "N"}.get(first, f"{TORQUE}, N")
+    return first, f"{first}/s", f"{first}/s²", torque
+
+
+def per_ampere(own: str, unit: str) -> str:
+    """Return a parameter's unit in a model whose torques are in `unit`: of amperes, all are divided by a gain [N m/A].
+
+    ``N m s/rad`` becomes ``A s/rad``, ``kg m²`` becomes ``kg m² A/(N m)``.
+    """
+    if unit == TORQUE:
+        return own
+    return own.replace(TORQUE, "A") if TORQUE in own else f"{own} A/({TORQUE})"

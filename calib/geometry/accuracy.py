@@ -20,6 +20,7 @@ import numpy as np
 from calib.data.poses.measurements import PoseMeasurements, Positions, Sockets
 from calib.geometry.installation import Installation
 from calib.geometry.observation import observe, predict, prepare
+from calib.units import ERRORS
 
 NATURE = {
     "position": "position",
@@ -79,8 +80,8 @@ def summary(found: Errors) -> dict[str, dict[str, float] | None]:
     Each holds mean, rms, p95 and max; None where nothing of the kind was measured.
     """
     result: dict[str, dict[str, float] | None] = {
-        "position_mm": statistics(found.position, 1e3),
-        "orientation_deg": statistics(found.orientation, np.degrees(1.0)),
+        "position_mm": statistics(found.position, ERRORS["position"][0]),
+        "orientation_deg": statistics(found.orientation, ERRORS["orientation"][0]),
     }
     if found.distance is not None:
         result["distance_mm"] = statistics(found.distance, 1e3)

@@ -48,8 +48,8 @@ from calib.identification.prediction import Dynamics
 from calib.robot import description
 from calib.robot.calibrated import ROBOT
 from calib.robot.chain import Chain
+from calib.units import TORQUE, per_ampere
 
-TORQUE = "N m"
 MODEL = "dynamics.json"
 NOTE = "regrouped parameters hold base values, the others are zero: torques are right, single ones need not be"
 
@@ -132,7 +132,7 @@ def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, An
                 "side": one.side,
                 "linear": one.linear,
                 "value": float(value),
-                "unit": in_unit(one.unit, unit),
+                "unit": per_ampere(one.unit, unit),
             }
             for one, value in zip(model.columns, dynamics.values[bodies:])
         ],
@@ -141,16 +141,6 @@ def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, An
         "covariance": estimate_files.COVARIANCE,
         "note": NOTE,
     }
-
-
-def in_unit(own: str, unit: str) -> str:
-    """Return a parameter's unit in a model whose torques are in `unit`: of amperes, all are divided by a gain [N m/A].
-
-    ``N m s/rad`` becomes ``A s/rad``, ``kg m²`` becomes ``kg m² A/(N m)``.
-    """
-    if unit == TORQUE:
-        return own
-    return own.replace("N m", "A") if "N m" in own else f"{own} A/(N m)"
 
 
 def regrouping(base: Base) -> dict[str, dict[str, float]]:

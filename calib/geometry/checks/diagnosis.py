@@ -12,6 +12,7 @@ from calib.geometry.observation import Block
 from calib.geometry.parameters import layout
 from calib.geometry.residuals import Part
 from calib.geometry.result import GeometricFit
+from calib.units import small
 
 FEWEST = 30  # rows below which no pattern is looked for (our choice)
 WORSE = 1.6  # a set-up's errors over the rest's from which on it is worth a word (our choice)
@@ -32,7 +33,7 @@ def implausible(found: GeometricFit) -> list[str]:
     """Name arm parameters that a fit moved further than any sound arm is off: what was fitted is not this robot."""
     table, before, after = layout(found.start), found.start.chain.values, found.cell.chain.values
     far = [
-        f"{table.names[k]} by {1e3 * (after[k] - before[k]):.3g} {'mm' if table.units[k] == 'm' else 'mrad'}"
+        f"{table.names[k]} by {small(after[k] - before[k], table.units[k])}"
         for k in range(table.arm)
         if abs(after[k] - before[k]) > FAR * PLAUSIBLE[table.units[k]]
     ]

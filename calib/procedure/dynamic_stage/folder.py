@@ -18,7 +18,7 @@ from calib.folders import METRICS, check_target, write_staged
 from calib.identification.cases import Case
 from calib.identification.gains import DriveGains
 from calib.identification.methods.registry import METHODS
-from calib.identification.model_file import MODEL, in_unit, read_dynamics, to_table
+from calib.identification.model_file import MODEL, read_dynamics, to_table
 from calib.identification.possible import information
 from calib.identification.prediction import Dynamics
 from calib.identification.scores import Score, TorqueErrors
@@ -32,6 +32,7 @@ from calib.procedure.dynamic_stage.verdict import Resting
 from calib.records import read_record
 from calib.robot import calibrated
 from calib.simulation.loop.controllers import Controller
+from calib.units import per_ampere
 
 T = TypeVar("T")
 OURS = (
@@ -258,7 +259,7 @@ def estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:
         (
             name,
             expression,
-            in_unit(unit, outcome.inputs.unit),
+            per_ampere(unit, outcome.inputs.unit),
             float(value),
             None if name in off else float(sigma),
             None if name in off else _finite(rsd),

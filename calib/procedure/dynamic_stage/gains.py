@@ -16,10 +16,10 @@ from calib.identification.cases import Case, make_case
 from calib.identification.gains import DriveGains, identify_gains
 from calib.identification.identify import chain_states, common_decimator, find_base, first_fit
 from calib.identification.identify_options import FileSettings, IdentifyOptions, file_settings
-from calib.identification.model_file import TORQUE
 from calib.identification.rows import observe, pool, triangulate, with_blocks
 from calib.identification.settings import IdentificationSettings, make_model
 from calib.robot.chain import Chain
+from calib.units import TORQUE
 
 
 @dataclass(frozen=True, eq=False)

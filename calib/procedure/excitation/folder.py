@@ -18,6 +18,7 @@ from calib.procedure.excitation.coefficients import Periodic
 from calib.procedure.excitation.design import INSTANTS, Designed
 from calib.procedure.excitation.planning import Planned
 from calib.robot.tables import dumps
+from calib.units import motion_units
 from trajectories.design.verify import dense_motion
 from trajectories.messages import joint_trajectory, to_json, to_yaml
 from trajectories.setpoints import Setpoints
@@ -30,7 +31,6 @@ REHEARSAL = "rehearsal.csv"
 ALL = (*DESIGN, *PLAN[1:], "run.csv", "front.csv", "approach.csv", REHEARSAL)
 """Files of an earlier run that a new one replaces; besides plots, ``plot_*.png``."""
 MESSAGES = 100.0  # points per second of the ROS message, whose controllers interpolate (our choice)
-UNITS = {"velocity": "rad/s", "acceleration": "rad/s²", "torque": "N m"}
 
 
 def check_design_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
@@ -260,7 +260,7 @@ def _margin(planned: Planned, name: str, used: np.ndarray) -> dict[str, Any]:
     share = 1.0 - used.max(axis=0)
     j = int(np.argmin(share))
     joint = planned.chain.joints[j]
-    unit = UNITS[name] if joint.kind == "revolute" else UNITS[name].replace("rad", "m").replace("N m", "N")
+    unit = motion_units([joint.kind])[("position", "velocity", "acceleration", "torque").index(name)]
     return {
         "margin": float(share[j] * size[j]), "unit": unit, "at": joint.name, "share": float(share[j]),
         "joints": share.tolist(),

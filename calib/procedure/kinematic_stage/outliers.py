@@ -12,6 +12,7 @@ from calib.geometry.accuracy import NATURE
 from calib.geometry.model_choice.ladder import ModelSelection
 from calib.geometry.observation import observe
 from calib.geometry.result import GeometricFit, outliers
+from calib.units import ERRORS
 
 FLOOR = 4e-4  # rms per metre of reach: more is not left by a rigid geometry of a sound arm (our choice)
 
@@ -28,8 +29,8 @@ class Outlier:
 
     @property
     def words(self) -> str:
-        amount = f"{np.degrees(self.size):.3g} deg" if self.nature == "orientation" else f"{1e3 * self.size:.3g} mm"
-        return f"{Path(self.file).name} row {self.row} ({amount}, {self.sigmas:.1f} sigma)"
+        factor, unit = ERRORS[self.nature]
+        return f"{Path(self.file).name} row {self.row} ({factor * self.size:.3g} {unit}, {self.sigmas:.1f} sigma)"
 
 
 def named_outliers(found: GeometricFit) -> list[Outlier]:

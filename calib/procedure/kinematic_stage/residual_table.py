@@ -12,6 +12,7 @@ from calib.geometry.accuracy import NATURE
 from calib.geometry.observation import observe, prepare
 from calib.procedure.kinematic_stage.comparison import Comparison
 from calib.procedure.kinematic_stage.fit import Outcome
+from calib.units import ERRORS
 
 _NONE = np.array([], dtype=int)
 COMPONENTS = {
@@ -63,8 +64,7 @@ def _residual_rows(label: str, comparison: Comparison, named: set, weights: dict
         columns = {nature: np.full((len(names), m), np.nan) for nature, names in COMPONENTS.items()}
         for part in observe(cell, block, _NONE):
             nature = NATURE[part.label]
-            factor = np.degrees(1.0) if nature == "orientation" else 1e3
-            columns[nature][: len(part.value), part.index] = factor * part.value
+            columns[nature][: len(part.value), part.index] = ERRORS[nature][0] * part.value
         first = np.full(m, np.nan)
         for part in observe(nominal, before, _NONE):
             if NATURE[part.label] == "position" or np.isnan(first[part.index]).all():

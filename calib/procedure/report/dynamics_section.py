@@ -34,6 +34,7 @@ from calib.procedure.dynamic_stage.tracking import KEYS
 from calib.procedure.report.geometry_section import relative_sigma
 from calib.procedure.report.page import Block, KeyFigure, Pictures, Section, Table, Text
 from calib.records import read_record, read_rows, typed_rows
+from calib.units import small
 
 TOLD = 50.0  # RSD [%] from which on a parameter is not told from zero: two sigmas
 WORDS = 46  # letters of what a parameter holds that are printed
@@ -279,7 +280,7 @@ def geometry_blocks(metrics: ModelMetrics, effects: Sequence[GeometricEffect]) -
         )
     rows = [
         (
-            one.element, f"{1e3 * one.sigma:.3g} {'mm' if one.unit == 'm' else 'mrad'}", one.parameter,
+            one.element, small(one.sigma, one.unit), one.parameter,
             f"{one.shift_sigma:.2f}", str(one.parameters_moved), f"{one.torque_rms or 0.0:.2g}",
         )
         for one in effects

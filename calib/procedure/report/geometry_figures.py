@@ -28,8 +28,8 @@ from calib.procedure.report.style import (
     sheet,
     styled,
 )
+from calib.units import ERRORS
 
-UNITS = {"position": (1e3, "mm"), "orientation": (180.0 / np.pi, "deg"), "distance": (1e3, "mm")}
 PALE = "#c3ccd6"  # of what is not told from zero
 
 
@@ -43,7 +43,7 @@ def error_histogram(
         nature: ``position``, ``orientation`` or ``distance``.
         noise: rms of the instrument's own error, in the same unit.
     """
-    factor, unit = UNITS[nature]
+    factor, unit = ERRORS[nature]
     one, two = factor * np.asarray(before), factor * np.asarray(after)
     top = max(one.max(), two.max(), 1e-9) * 1.02
     apart = np.median(two) < np.median(one) / 6.0  # then equal bins would show one bar of the smaller errors
@@ -96,7 +96,7 @@ def residuals_by_joint(
         prismatic: (n,) which joints are.
         nature: as in `error_histogram`.
     """
-    factor, unit = UNITS[nature]
+    factor, unit = ERRORS[nature]
     n = q.shape[1]
     columns = n if n < 4 else 4 if n in (4, 7, 8) else -(-n // 2) if n < 7 else 4
     rows = -(-n // columns)

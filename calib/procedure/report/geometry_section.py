@@ -13,12 +13,9 @@ from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import ComparedRows, ErrorStatistics, FitMetrics, OutlierRow, RepeatedPose
 from calib.procedure.report.fit_report import Report
 from calib.procedure.report.page import Block, KeyFigure, Picture, Pictures, Section, Table, Text
+from calib.units import ERRORS, SMALL
 
-KINDS = {
-    "position_mm": ("position", "mm"),
-    "orientation_deg": ("orientation", "deg"),
-    "distance_mm": ("distance", "mm"),
-}
+KINDS = {f"{nature}_{unit}": (nature, unit) for nature, (_, unit) in ERRORS.items()}
 ARMS = {"nominal": "nominal", "calibrated": "calibrated", "urdf_alone": "its URDF alone"}
 MOST_ROWS = 60  # parameters beyond which joint corrections are not listed
 MOST_POSES = 30  # repeated poses that are listed
@@ -96,7 +93,7 @@ def key_figures(report: Report) -> list[KeyFigure]:
         before, after = (_errors(proof, arm, key) for arm in ("nominal", "calibrated"))
         if before is None or after is None:
             continue
-        factor = 1e3 if unit == "mm" else float(np.degrees(1.0))
+        factor = ERRORS[label][0]
         sizes = None if own is None else own.calibrated.get(label)
         sigma = np.nan if sizes is None else factor * rms_sigma(np.array(sizes))
         spread = f"± {sigma:.2g} {unit}" if np.isfinite(sigma) else ""
@@ -171,7 +168,7 @@ def parameter_table(report: Report) -> Table:
     shown = [row for row in report.parameters if len(report.parameters) <= MOST_ROWS or row.group != "deflection"]
     rows = []
     for row in shown:
-        factor, printed = {"m": (1e3, "mm"), "rad": (1e3, "mrad")}.get(row.unit, (1.0, row.unit))
+        factor, printed = SMALL.get(row.unit, (1.0, row.unit))
         digits = ".3f" if factor > 1 else ".4g"
         numbers = [f"{factor * number:{digits}}" for number in (row.nominal, row.value)]
         change = f"{factor * (row.value - row.nominal):+{digits}}"

@@ -17,7 +17,6 @@ from calib.procedure.report.style import (
     QUIET,
     WIDE,
     legend,
-    motion_units,
     room,
     save_all,
     sheet,
@@ -25,6 +24,7 @@ from calib.procedure.report.style import (
     thinned,
 )
 from calib.robot.kinematics import sweep
+from calib.units import motion_units
 from trajectories.constraints import BoxLimit
 from trajectories.design.pareto import Front
 from trajectories.design.verify import dense_motion

@@ -162,14 +162,6 @@ def thinned(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return t[kept], values[kept]
 
 
-def motion_units(kinds: Iterable[str]) -> tuple[str, str, str, str]:
-    """Return the units of position, velocity, acceleration and torque of joints of these kinds."""
-    found = set(kinds)
-    first = "rad" if "prismatic" not in found else "m" if found == {"prismatic"} else "rad, m"
-    torque = {"rad": "N m", "m": "N"}.get(first, "N m, N")
-    return first, f"{first}/s", f"{first}/s²", torque
-
-
 def png(figure: Figure, dpi: float = DPI) -> bytes:
     """Draw a figure and return it as PNG."""
     with styled():

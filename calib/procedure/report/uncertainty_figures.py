@@ -18,6 +18,7 @@ from calib import files
 from calib.procedure.dynamic_stage.geometry_tables import EFFECTS, GEOMETRIES, LEAST
 from calib.procedure.report.page import Picture
 from calib.procedure.report.style import AFTER, BEFORE, MARK, QUIET, WIDE, legend, number, picture, room, sheet, styled
+from calib.units import small
 
 TOP = 15  # elements in the ranked figure
 Row = Mapping[str, str]
@@ -120,7 +121,7 @@ def effects(rows: Sequence[Row]) -> Figure:
 
 
 def _milli(row: Row) -> str:
-    return f"{1e3 * float(row['sigma']):.2g} {'mm' if row['unit'] == 'm' else 'mrad'}"
+    return small(float(row["sigma"]), row["unit"], digits=2)
 
 
 def _read(path: Path) -> list[Row]:

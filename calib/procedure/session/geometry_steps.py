@@ -26,6 +26,7 @@ from calib.procedure.session import arrival
 from calib.procedure.session.folder import Session
 from calib.procedure.session.outcome import mark_failed
 from calib.robot.chain import Chain
+from calib.units import JOINT
 
 Say = Callable[[str], None]
 
@@ -82,7 +83,7 @@ def describe(session: Session, say: Say) -> list[str]:
     chain = chain_of(session)
     lines = [f"{chain.name}: {chain.base} to {chain.tip}, {chain.n} joints, {len(chain.elements)} elements", ""]
     for joint in chain.joints:
-        factor, unit = (180.0 / np.pi, "deg") if joint.kind == "revolute" else (1e3, "mm")
+        factor, unit = JOINT[joint.kind]
         lines.append(f"{joint.name}: {joint.kind}, {factor * joint.lower:g} to {factor * joint.upper:g} {unit}")
     lines += ["", "elements, base to tip [m, rad]"]
     lines += [f"  {element.name:<24} {element.axis}  {element.value:.9g}" for element in chain.elements]

@@ -19,7 +19,7 @@ from calib.errors import UsageError
 from calib.identification.scores import TorqueErrors
 from calib.procedure.dynamic_stage.metrics import ReplayController, ReplayMetrics
 from calib.procedure.report import console, dynamics_section, identification_figures
-from calib.procedure.report.style import motion_units
+from calib.units import motion_units
 
 
 def test_a_pipe_gets_tables_of_full_width(monkeypatch):
