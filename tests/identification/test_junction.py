@@ -19,6 +19,7 @@ from calib.procedure.dynamic_stage.inputs import gather
 from calib.procedure.kinematic_stage import fit as kinematic
 from calib.procedure.kinematic_stage import folder as fitted
 from calib.procedure.kinematic_stage.inputs import Inputs
+from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.robot import calibrated
 from calib.robot.chain import random_joints
 from calib.robot.load import load_calibrated
@@ -30,7 +31,7 @@ def geometry(model: str) -> kinematic.Outcome:
     """Return a fit of the planted arm, whose joints deflect."""
     cell = perturbed_cell(planted.arm(), 1, hidden=1.0)
     block: PoseMeasurements = measure(cell, random_joints(cell.nominal, 60, 1), 2)
-    return kinematic.run(Inputs(cell.nominal, Path("planted.toml"), (block,)), model=model)
+    return kinematic.run(Inputs(cell.nominal, Path("planted.toml"), (block,)), wanted=FitSettings(model=model))
 
 
 @pytest.mark.parametrize("model", ["geometry", "harmonics"])
