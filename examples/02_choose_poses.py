@@ -7,13 +7,15 @@ import sys
 from pathlib import Path
 
 from calib.procedure.kinematic_stage import selection
+from calib.procedure.kinematic_stage.settings import SelectionSettings
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "example-02")
 folder.mkdir(parents=True, exist_ok=True)
 
 # from a tracker that sees one reflector at a time: three of them on the tool tell its orientation, too
 targets = [[0.05, 0.0, 0.1], [-0.05, 0.0, 0.1], [0.0, 0.05, 0.15]]
-chosen = selection.choose("ur5", 20, kind="position", tools=targets, index="O1", candidates=500, seed=0)
+settings = SelectionSettings(kind="position", tools=targets, candidates=500)
+chosen = selection.choose("ur5", 20, settings)
 
 for words, number in selection.table(chosen):
     print(f"{words:38} {number}")

@@ -28,6 +28,35 @@ Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True)
+class SearchSettings:
+    """How poses are searched for.
+
+    Attributes:
+        index: "O1" ... "O5", "cond". O1 is the default because its ranking of sets does not depend on the units of the
+            parameters.
+        method: see `select_poses`.
+        count: candidates to draw where none are given.
+        seed: of every random draw; the same seed gives the same selection.
+        kicks: random restarts of detmax around its best set; left out where at most 0.5 % can be won.
+        starts: sets of multistart.
+        evaluations: most evaluations of one local search.
+        rule: numbers of the tabu search.
+    """
+
+    index: Index = "O1"
+    method: Method = "detmax"
+    count: int = 2000
+    seed: int = 0
+    kicks: int = 10
+    starts: int = 8
+    evaluations: int = 5000
+    rule: TabuRule = DEFAULT_RULE
+
+
+DEFAULT_SEARCH = SearchSettings()
+
+
+@dataclass(frozen=True)
 class Selection:
     """Chosen poses and how good they are.
 
@@ -92,18 +121,11 @@ class _Request:
 def select_poses(
     jacobians: ArrayLike | None,
     m: int,
+    settings: SearchSettings = DEFAULT_SEARCH,
     *,
     q: ArrayLike | None = None,
     space: SearchSpace | None = None,
-    index: Index = "O1",
-    method: Method = "detmax",
     existing: ArrayLike | None = None,
-    count: int = 2000,
-    seed: int = 0,
-    kicks: int = 10,
-    starts: int = 8,
-    evaluations: int = 5000,
-    rule: TabuRule = DEFAULT_RULE,
     map: Callable = map,
     progress: Progress | None = None,
 ) -> Selection:
@@ -115,23 +137,14 @@ def select_poses(
     * ``multistart`` does that from the detmax set and `starts` − 1 random sets (`poses.multistart`).
     * ``tabu`` is IMHATR, the two-stage meta-heuristic (`poses.tabu`).
 
-    O1 is the default because its ranking of sets does not depend on the units of the parameters.
-
     Args:
         jacobians: (N, rows, p) whitened observation Jacobians of the candidates in base columns; None takes them at q,
-            or at `count` feasible Sobol poses of the space where q is None too.
+            or at feasible Sobol poses of the space where q is None too.
         m: number of poses to choose; none is taken twice by detmax.
+        settings: index, method and effort.
         q: (N, n) joint values of the candidates [rad or m].
         space: needed by local, multistart and tabu.
-        index: "O1" ... "O5", "cond".
-        method: see above.
         existing: (k, rows, p) whitened Jacobians of poses already measured; their information counts.
-        count: candidates to draw where none are given.
-        seed: of every random draw; the same seed gives the same selection.
-        kicks: random restarts of detmax around its best set; left out where at most 0.5 % can be won.
-        starts: sets of multistart.
-        evaluations: most evaluations of one local search.
-        rule: numbers of the tabu search.
         map: where multistart spreads its starts.
         progress: called with (done, total, message).
 
@@ -139,11 +152,12 @@ def select_poses(
         BadInput, TooFewCandidates, NothingFeasible, NotIdentifiable
     """
     began = time.perf_counter()
+    method, index, seed = settings.method, settings.index, settings.seed
     if method not in get_args(Method):
         raise BadInput(f"method '{method}' is not known; take one of {', '.join(get_args(Method))}")
     if method != "detmax" and space is None:
         raise BadInput(f"method '{method}' leaves the candidates: give space, with limits and a Jacobian")
-    array, joints = _candidates(jacobians, q, space, count, seed)
+    array, joints = _candidates(jacobians, q, space, settings.count, seed)
     before = None if existing is None else checked(existing, "existing")
     report = progress or (lambda done, total, message: None)
     report(0, 1, "convex bound")
@@ -151,11 +165,12 @@ def select_poses(
     task = _Request(array, joints, candidates, relaxed(candidates, m), m, index, seed, before, space, report)
     baseline = random_baseline(array, m, index, before, seed=seed)
     if method == "tabu":
-        chosen = _tabu(task, rule)
+        chosen = _tabu(task, settings.rule)
     else:
-        chosen = _exchange(task, kicks)
+        chosen = _exchange(task, settings.kicks)
         if method != "detmax" and not chosen.interrupted:
-            chosen = _continuous(task, chosen, starts if method == "multistart" else 1, evaluations, map)
+            starts = settings.starts if method == "multistart" else 1
+            chosen = _continuous(task, chosen, starts, settings.evaluations, map)
     return _selection(task, chosen, method, baseline, began)
 
 

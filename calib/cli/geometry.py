@@ -99,8 +99,10 @@ def select(
 ) -> None:
     """Choose the poses at which the geometry of ROBOT shows best."""
     from calib.api.kinematic import select_poses
+    from calib.procedure.kinematic_stage import selection
     from calib.procedure.kinematic_stage.settings import SelectionSettings
 
+    selection.check_target(out, [robot, existing, constraints])
     targets = tuple(tuple(numbers(text, 3, "--tool")) for text in tool or [])
     sigmas = None if sigma is None else numbers(sigma, 2, "--sigma")
     stated = None if sigmas is None else (sigmas[0], sigmas[1])

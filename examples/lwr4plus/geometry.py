@@ -33,7 +33,7 @@ from calib.simulation.cells.virtual_cells import lwr4plus_cell, rigid
 from calib.transforms import invert
 from poses.candidates import draw_candidates
 from poses.indices import observability
-from poses.select import Selection, random_baseline, select_poses
+from poses.select import SearchSettings, Selection, random_baseline, select_poses
 from poses.space import PoseConstraint, SearchSpace, is_feasible
 
 LIMITS = np.deg2rad([170.0, 120.0, 170.0, 120.0, 170.0, 90.0, 170.0])
@@ -110,9 +110,8 @@ def selections(nominal: np.ndarray, quick: bool, seed: int) -> tuple[list[dict[s
         )
         array = space.jacobian(candidates)
         for method in METHODS[:1] if quick else METHODS:
-            found = select_poses(
-                array, lwr4plus.POSES, q=candidates, space=space, index=index, method=method, seed=seed, starts=4
-            )  # fmt: skip
+            effort = SearchSettings(index=index, method=method, seed=seed, starts=4)
+            found = select_poses(array, lwr4plus.POSES, effort, q=candidates, space=space)
             gain = found.random_baseline / found.value if index == "cond" else found.value / found.random_baseline
             rows.append(
                 {

@@ -13,7 +13,7 @@ from poses import constraints
 from poses.errors import BadInput
 from poses.indices import merit
 from poses.local import improved, merit_of
-from poses.select import select_poses
+from poses.select import SearchSettings, select_poses
 from poses.space import PoseConstraint, SearchSpace, central_difference, is_feasible
 from poses.tabu import TabuRule
 
@@ -117,7 +117,9 @@ def test_a_predicate_is_kept_where_the_gradient_leads_into_it():
 def test_methods_keep_constraints_repeat_by_seed_and_beat_random_sets(method):
     space = replace(SPACE, constraints=(LOW,), feasible=outside_the_wedge)
     runs = [
-        select_poses(None, 6, space=space, method=method, count=300, seed=4, starts=3, evaluations=60, rule=QUICK)
+        select_poses(
+            None, 6, SearchSettings(method=method, count=300, seed=4, starts=3, evaluations=60, rule=QUICK), space=space
+        )
         for _ in range(2)
     ]
     assert (runs[0].q == runs[1].q).all() and runs[0].value == runs[1].value
@@ -129,16 +131,16 @@ def test_methods_keep_constraints_repeat_by_seed_and_beat_random_sets(method):
 
 def test_leaving_the_candidates_beats_staying_among_few():
     kept = select_poses(planar.jacobian(Q[:40]), 5, q=Q[:40])
-    moved = select_poses(None, 5, q=Q[:40], space=SPACE, method="local")
-    spread = select_poses(None, 5, q=Q[:40], space=SPACE, method="multistart", starts=4)
+    moved = select_poses(None, 5, SearchSettings(method="local"), q=Q[:40], space=SPACE)
+    spread = select_poses(None, 5, SearchSettings(method="multistart", starts=4), q=Q[:40], space=SPACE)
     assert kept.value < moved.value <= spread.value
     assert kept.efficiency <= 1
 
 
 def test_multistart_on_other_processes_gives_the_same_poses():
-    here = select_poses(None, 5, q=Q, space=SPACE, method="multistart", starts=3)
+    here = select_poses(None, 5, SearchSettings(method="multistart", starts=3), q=Q, space=SPACE)
     with ProcessPoolExecutor(2) as pool:
-        there = select_poses(None, 5, q=Q, space=SPACE, method="multistart", starts=3, map=pool.map)
+        there = select_poses(None, 5, SearchSettings(method="multistart", starts=3), q=Q, space=SPACE, map=pool.map)
     assert (here.q == there.q).all()
 
 
@@ -158,7 +160,7 @@ def test_interrupted_local_search_returns_the_best_so_far():
 
 def test_existing_rows_of_another_instrument_count():
     position = planar.jacobian(Q[50:60])[:, :1]
-    chosen = select_poses(None, 3, q=Q, space=SPACE, method="tabu", rule=QUICK, existing=position)
+    chosen = select_poses(None, 3, SearchSettings(method="tabu", rule=QUICK), q=Q, space=SPACE, existing=position)
     assert chosen.q.shape == (3, 3) and chosen.value > chosen.random_baseline
 
 

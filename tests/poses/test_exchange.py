@@ -13,7 +13,7 @@ from poses.errors import BadInput, NothingFeasible, NotIdentifiable, TooFewCandi
 from poses.exchange import detmax, exchanged, greedy
 from poses.indices import observability
 from poses.information import prepared
-from poses.select import random_baseline, select_poses
+from poses.select import SearchSettings, random_baseline, select_poses
 
 ARM = poses_arm.jacobian(poses_arm.random_poses(400, 0))
 
@@ -27,7 +27,7 @@ def log_det_of(jacobians):
 @pytest.mark.parametrize("m", [17, 30])
 def test_sandwich(function, m):
     jacobians = function(poses_arm.random_poses(600, 2))
-    chosen = select_poses(jacobians, m, seed=1)
+    chosen = select_poses(jacobians, m, SearchSettings(seed=1))
     assert chosen.random_baseline < chosen.value
     p = jacobians.shape[2]
     assert log_det_of(jacobians[chosen.indices]) <= chosen.bound.log_upper
@@ -80,7 +80,7 @@ def test_detmax_finds_the_best_of_all_sets():
     for seed in range(6):
         jacobians = np.random.default_rng(seed).normal(size=(11, 2, 4))
         best = max(combinations(range(11), 4), key=lambda s: log_det_of(jacobians[list(s)]))
-        assert tuple(select_poses(jacobians, 4, seed=seed).indices) == best
+        assert tuple(select_poses(jacobians, 4, SearchSettings(seed=seed)).indices) == best
 
 
 def test_exchange_ends_where_no_single_exchange_helps():
@@ -99,7 +99,7 @@ def test_exchange_ends_where_no_single_exchange_helps():
 @pytest.mark.parametrize("index", ["O2", "O3", "O4", "O5", "cond"])
 def test_other_indices_improve_on_the_d_optimal_and_on_random_sets(index):
     start = observability(ARM[select_poses(ARM, 17).indices], index)
-    chosen = select_poses(ARM, 17, index=index)
+    chosen = select_poses(ARM, 17, SearchSettings(index=index))
     assert chosen.value == pytest.approx(observability(ARM[chosen.indices], index))
     if index == "cond":
         assert chosen.value <= start and chosen.value < chosen.random_baseline
@@ -133,7 +133,7 @@ def test_choosing_all_candidates_is_allowed():
 
 
 def test_the_seed_repeats_every_bit():
-    one, two = select_poses(ARM, 17, seed=5), select_poses(ARM, 17, seed=5)
+    one, two = select_poses(ARM, 17, SearchSettings(seed=5)), select_poses(ARM, 17, SearchSettings(seed=5))
     assert (one.indices == two.indices).all() and one.value == two.value
     assert (one.history == two.history).all() and one.random_baseline == two.random_baseline
     assert random_baseline(ARM, 17, seed=6) != one.random_baseline
@@ -164,7 +164,7 @@ def test_errors_say_what_and_why():
     with pytest.raises(BadInput, match="pose 7"):
         select_poses(np.where(np.arange(400)[:, None, None] == 7, np.nan, ARM), 17)
     with pytest.raises(BadInput, match="give space"):
-        select_poses(ARM, 17, method="tabu")
+        select_poses(ARM, 17, SearchSettings(method="tabu"))
 
 
 def test_candidates_keep_limits_and_predicate():

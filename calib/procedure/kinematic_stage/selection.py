@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
+from calib import files
 from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.plans import read_poses, write_poses
 from calib.errors import UsageError
@@ -17,7 +18,7 @@ from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, Selectio
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
 from poses.indices import observability
-from poses.select import Selection, select_poses
+from poses.select import SearchSettings, Selection, select_poses
 from poses.space import is_feasible
 
 Progress = Callable[[int, int, str], None]
@@ -82,12 +83,16 @@ def choose(
         value = observability(before, index) or None
         if not is_feasible(space, q).all():
             notes.append(f"{int((~is_feasible(space, q)).sum())} of the {len(q)} existing poses break the constraints")
-    found = select_poses(
-        None, m, space=space, index=index, method=method, existing=before, count=settings.candidates,
-        seed=settings.seed, map=map,
-        progress=progress,
-    )  # fmt: skip
+    search = SearchSettings(index, method, settings.candidates, settings.seed)
+    found = select_poses(None, m, search, space=space, existing=before, map=map, progress=progress)
     return Chosen(chain, found, len(jacobian.free), value, tuple(notes))
+
+
+def check_target(out: Path, inputs: Sequence[object]) -> None:
+    """Refuse, before any work is done, a folder, or a file that is read (of the inputs only names and paths count)."""
+    if out.is_dir():
+        raise UsageError(f"{out} is a folder; --out needs a file")
+    files.check_not_input([out], [one for one in inputs if isinstance(one, str | Path)])
 
 
 def write(chosen: Chosen, path: Path) -> Path:

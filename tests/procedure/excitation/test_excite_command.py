@@ -202,6 +202,32 @@ def test_bad_recalls(earlier, cell, calib, options, words):
     assert (code, words in err) == (2, True), err
 
 
+def test_recall_never_writes_onto_its_log(earlier, cell, calib):
+    np.savez("log.npz", t=np.arange(10.0))
+    kept = Path("log.npz").read_bytes()
+    for log in ("log.npz", "log.npz@0:9"):
+        code, _, err = calib("recall", earlier, log, "--out", "./log.npz")
+        assert (code, "is read" in err) == (2, True), err
+    assert Path("log.npz").read_bytes() == kept
+
+
+def test_a_motion_folder_is_written_whole(tmp_path):
+    """A disk that fills in the middle leaves what was there: nothing, or the motion of before."""
+    designed = design.excite("lwr4plus", SHORT)
+
+    def full(designed: design.Designed, folder: Path) -> None:
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError):
+        motion_folder.write_design(designed, tmp_path / "e", full)
+    assert list(tmp_path.iterdir()) == []
+    motion_folder.write_design(designed, tmp_path / "e")
+    before = {path.name: path.read_bytes() for path in (tmp_path / "e").iterdir()}
+    with pytest.raises(OSError):
+        motion_folder.write_design(replace(designed, condition={"raw": 1.0}), tmp_path / "e", full)
+    assert {path.name: path.read_bytes() for path in (tmp_path / "e").iterdir()} == before
+
+
 def test_ctrl_c_keeps_the_best_motion_so_far(cell, calib, monkeypatch):
     """An interrupt in the middle of the search: the folder is written, verified, and says so."""
     remember = StartSearch._remember

@@ -142,3 +142,14 @@ def test_what_is_sent_to_other_processes_pickles(cell):
     copy, again = pickle.loads(pickle.dumps((limits, seen)))
     assert np.array_equal(again(q), seen(q))
     assert np.array_equal(copy.collision.distances(q), limits.collision.distances(q))
+
+
+@pytest.mark.parametrize(("out", "words"), [("before.csv", "is read"), ("rules.toml", "is read"), (".", "is a folder")])
+def test_nothing_is_written_onto_what_is_read(cell, calib, out, words):
+    Path("rules.toml").write_text("[target]\nreach = 0.9\n")
+    assert calib("select", "ur5", "-m", 8, "--candidates", 100, "--out", "before.csv")[0] == 0
+    kept = {name: Path(name).read_bytes() for name in ("before.csv", "rules.toml")}
+    given = ("--existing", "before.csv", "--constraints", "rules.toml")
+    code, _, err = calib("select", "ur5", "-m", 8, "--candidates", 100, *given, "--out", out)
+    assert (code, words in err) == (2, True), err
+    assert kept == {name: Path(name).read_bytes() for name in kept}
