@@ -14,7 +14,7 @@ from calib.identification.rows import segments
 
 
 @dataclass(frozen=True, eq=False)
-class TorqueErrors:
+class PredictionErrors:
     """Errors on one set of samples.
 
     Attributes:
@@ -46,10 +46,10 @@ class Score:
         motion_share: part of the rows that move; where it is small, little but friction at rest was tested.
     """
 
-    raw: TorqueErrors
-    filtered: TorqueErrors
-    moving: TorqueErrors
-    standing: TorqueErrors
+    raw: PredictionErrors
+    filtered: PredictionErrors
+    moving: PredictionErrors
+    standing: PredictionErrors
     above: np.ndarray
     r_squared: np.ndarray
     whiteness: tuple[Whiteness | None, ...]
@@ -135,14 +135,16 @@ def _sums(target: np.ndarray, residual: np.ndarray, used: np.ndarray) -> tuple[f
     return float(np.sum(residual[used] ** 2)), float(np.sum(target[used] ** 2)), float(used.sum())
 
 
-def _together(sums: Sequence[np.ndarray]) -> TorqueErrors:
+def _together(sums: Sequence[np.ndarray]) -> PredictionErrors:
     """Return the errors of all rows from their sums, each (3,)."""
     square, size, count = np.array(sums).T
     with np.errstate(divide="ignore", invalid="ignore"):
         joints = 100.0 * np.sqrt(square / size)
         rms = np.sqrt(square / count)
         total = float(100.0 * np.sqrt(square.sum() / size.sum()))
-    return TorqueErrors(total, np.where(size > 0.0, joints, np.nan), np.where(count > 0, rms, np.nan), int(count.sum()))
+    return PredictionErrors(
+        total, np.where(size > 0.0, joints, np.nan), np.where(count > 0, rms, np.nan), int(count.sum())
+    )
 
 
 def _whiteness(residual: np.ndarray, segment: np.ndarray) -> tuple[Whiteness | None, ...]:

@@ -32,7 +32,7 @@ Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class FrictionStep:
+class FrictionTrial:
     """One step of the ladder, tried.
 
     Attributes:
@@ -62,7 +62,7 @@ class FrictionSelection:
 
     terms: tuple[DriveTerm, ...]
     groups: tuple[int, ...]
-    steps: tuple[FrictionStep, ...]
+    steps: tuple[FrictionTrial, ...]
 
     @property
     def chosen(self) -> str:
@@ -249,8 +249,8 @@ def _sizes(candidates: FrictionCandidates, validation: CrossValidation) -> np.nd
 
 def _step(
     name: str, parameters: int, error: np.ndarray, size: np.ndarray, at: tuple[int, ...], note: str = ""
-) -> FrictionStep:
+) -> FrictionTrial:
     with np.errstate(divide="ignore", invalid="ignore"):
         joints = 100.0 * np.sqrt(error.sum(axis=0) / size)
     total = float(100.0 * np.sqrt(error.sum() / size.sum()))
-    return FrictionStep(name, parameters, total, tuple(float(x) for x in np.nan_to_num(joints)), at, note)
+    return FrictionTrial(name, parameters, total, tuple(float(x) for x in np.nan_to_num(joints)), at, note)

@@ -15,7 +15,7 @@ from calib.estimation.total import tls
 from calib.estimation.triangles import Triangles, combine, residual_squares, retriangulate
 from calib.estimation.whiteness import inflation
 from calib.identification.friction.time_folds import estimate
-from calib.identification.methods.method import IdentificationProblem, MethodEstimate, Status, attempted
+from calib.identification.methods.method import EstimateStatus, IdentificationProblem, MethodEstimate, attempted
 from calib.identification.prior import Prior, bounded
 from calib.identification.rows import ObservationRows
 
@@ -63,7 +63,7 @@ class LeastSquares:
         else:  # what the data leave open, the prior decides
             std, tau = _least_norm_weighing(problem)
             fit, known = _drawn(problem, prior, std, tau)
-        return MethodEstimate(self.name, Status.FOUND, fit, problem.pooled, std, tau, self.weighted, known)
+        return MethodEstimate(self.name, EstimateStatus.FOUND, fit, problem.pooled, std, tau, self.weighted, known)
 
 
 def scaled(noise: np.ndarray | None, std: np.ndarray, counts: np.ndarray) -> np.ndarray:

@@ -33,7 +33,7 @@ from calib.identification.prior import Prior
 from calib.identification.rows import ObservationRows, pool, triangulate
 
 
-class Status(Enum):
+class EstimateStatus(Enum):
     """How an estimation ended."""
 
     FOUND = "found"
@@ -44,10 +44,10 @@ class Status(Enum):
 
 
 _STATUS = (
-    (Unidentifiable, Status.RANK_DEFICIENT),
-    (CannotSimulate, Status.CANNOT_BE_SIMULATED),
-    (Diverged, Status.DIVERGED),
-    (NotConverged, Status.NOT_CONVERGED),
+    (Unidentifiable, EstimateStatus.RANK_DEFICIENT),
+    (CannotSimulate, EstimateStatus.CANNOT_BE_SIMULATED),
+    (Diverged, EstimateStatus.DIVERGED),
+    (NotConverged, EstimateStatus.NOT_CONVERGED),
 )
 
 
@@ -122,7 +122,7 @@ class MethodEstimate:
     """
 
     method: str
-    status: Status
+    status: EstimateStatus
     solution: LinearFit | None
     pooled: Triangles
     std: np.ndarray
@@ -138,7 +138,7 @@ class MethodEstimate:
 
     @property
     def found(self) -> bool:
-        return self.status is Status.FOUND
+        return self.status is EstimateStatus.FOUND
 
     @property
     def fit(self) -> LinearFit:

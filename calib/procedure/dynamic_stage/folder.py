@@ -21,7 +21,7 @@ from calib.identification.methods.registry import METHODS
 from calib.identification.model_file import MODEL, read_dynamics, to_table
 from calib.identification.possible import information
 from calib.identification.prediction import Dynamics
-from calib.identification.scores import Score, TorqueErrors
+from calib.identification.scores import PredictionErrors, Score
 from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
@@ -377,7 +377,7 @@ def score_table(found: Score) -> dict[str, Any]:
     }
 
 
-def part_table(part: TorqueErrors) -> dict[str, Any]:
+def part_table(part: PredictionErrors) -> dict[str, Any]:
     relative = {"total": _finite(part.total), "joints": [_finite(x) for x in part.joints]}
     return {"relative_error_percent": relative, "rms": [_finite(x) for x in part.rms], "samples": part.samples}
 

@@ -10,7 +10,7 @@ import pytest
 
 from calib.errors import CannotSimulate, Diverged, NotConverged, Unidentifiable, UsageError
 from calib.identification.identify import chain_states, common_decimator, find_base
-from calib.identification.methods.method import IdentificationProblem, Method, Status, attempted
+from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, attempted
 from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.rows import observe
 from calib.identification.settings import IdentificationSettings, make_model
@@ -30,7 +30,7 @@ def problem() -> IdentificationProblem:
 def test_an_estimate_says_how_it_came_about(problem, name):
     method: Method = METHODS[name]
     found = method.estimate(problem)
-    assert found.found and found.status is Status.FOUND and found.failure is None and found.method == name
+    assert found.found and found.status is EstimateStatus.FOUND and found.failure is None and found.method == name
     assert found.iterations == 1 and found.simulations == 0 and found.seconds > 0.0
     truth = problem.base.transform @ planted.truth()
     assert np.sqrt(np.mean(((found.estimate.values - truth) / found.estimate.sigma) ** 2)) < 2.0
@@ -42,7 +42,7 @@ def test_dependent_columns_are_a_status(problem, name):
         replace(part, matrix=part.matrix[:, :, [0, 0, *range(2, part.matrix.shape[2])]]) for part in problem.rows
     )
     found = METHODS[name].estimate(replace(problem, rows=twice))
-    assert found.status is Status.RANK_DEFICIENT and not found.found and found.solution is None
+    assert found.status is EstimateStatus.RANK_DEFICIENT and not found.found and found.solution is None
     with pytest.raises(Unidentifiable):
         _ = found.fit
 
@@ -50,10 +50,10 @@ def test_dependent_columns_are_a_status(problem, name):
 @pytest.mark.parametrize(
     ("error", "status"),
     [
-        (Unidentifiable("x"), Status.RANK_DEFICIENT),
-        (CannotSimulate("x"), Status.CANNOT_BE_SIMULATED),
-        (Diverged("x"), Status.DIVERGED),
-        (NotConverged("x"), Status.NOT_CONVERGED),
+        (Unidentifiable("x"), EstimateStatus.RANK_DEFICIENT),
+        (CannotSimulate("x"), EstimateStatus.CANNOT_BE_SIMULATED),
+        (Diverged("x"), EstimateStatus.DIVERGED),
+        (NotConverged("x"), EstimateStatus.NOT_CONVERGED),
     ],
 )
 def test_every_way_to_fail_has_its_name(problem, error, status):

@@ -16,7 +16,7 @@ from calib.cli.shared import make_console
 from calib.config import check_keys
 from calib.dynamics.torque_rows import MOTOR
 from calib.errors import UsageError
-from calib.identification.scores import TorqueErrors
+from calib.identification.scores import PredictionErrors
 from calib.procedure.dynamic_stage.metrics import ReplayController, ReplayMetrics
 from calib.procedure.report import console, dynamics_section, identification_figures
 from calib.units import motion_units
@@ -50,7 +50,7 @@ def test_figures_have_units_at_their_axes():
     one = planted.case("train", 0)
     joints = (replace(planted.arm().joints[0], kind="prismatic"), *planted.arm().joints[1:])
     outcome: Any = SimpleNamespace(
-        fit={"train": SimpleNamespace(raw=TorqueErrors(5.0, np.full(3, 5.0), np.zeros(3), 1))}, validation={},
+        fit={"train": SimpleNamespace(raw=PredictionErrors(5.0, np.full(3, 5.0), np.zeros(3), 1))}, validation={},
         repeated={}, found=SimpleNamespace(settings=SimpleNamespace(torque_rows=MOTOR)),
         inputs=SimpleNamespace(unit="N m", chain=replace(planted.arm(), joints=joints)),
     )  # fmt: skip

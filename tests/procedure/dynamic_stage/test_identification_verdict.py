@@ -9,7 +9,7 @@ import planted_motion as planted
 import pytest
 
 from calib.data.signals.persistency import report_excitation
-from calib.identification.scores import Score, TorqueErrors
+from calib.identification.scores import PredictionErrors, Score
 from calib.procedure.dynamic_stage import verdict
 from calib.procedure.dynamic_stage.verdict import Resting, judge, with_prior
 from calib.procedure.kinematic_stage.verdict import Verdict
@@ -20,7 +20,7 @@ TORQUE = np.array([10.0, 100.0, 0.5])  # rms of each joint: the third does not m
 def scored(joints, moving=None, total=5.0, share=1.0) -> Score:
     """Return a score of which `joints` [%] are unexplained in the band."""
     joints = np.asarray(joints, dtype=float)
-    part = TorqueErrors(total, joints, joints * TORQUE / 100.0, 300)
+    part = PredictionErrors(total, joints, joints * TORQUE / 100.0, 300)
     moved = part if moving is None else replace(part, joints=np.asarray(moving, dtype=float))
     return Score(part, part, moved, part, 0.0 * joints, 1.0 - joints / 100.0, (None,) * 3, 20.0, share)
 
