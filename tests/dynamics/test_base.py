@@ -7,7 +7,8 @@ import pytest
 from arms import motley, physical, states
 from differences import check
 
-from calib.dynamics import base, drives, friction, model, rigid_body
+from calib.dynamics import base, drives, model, rigid_body
+from calib.dynamics import drives as friction
 from calib.dynamics.bodies import bodies_of, standard_parameters, with_gravity, with_payload
 from calib.dynamics.idim import IdentificationModel, from_chain
 from calib.dynamics.torque_rows import BOTH, DRIVE, LINK, MODELS, MOTOR

@@ -5,7 +5,7 @@ import pytest
 from arms import motley, states
 from differences import check
 
-from calib.dynamics import drives, friction
+from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of
 from calib.dynamics.idim import IdentificationModel, friction_states, from_chain, with_load, with_terms
 from calib.dynamics.torque_rows import BOTH, DRIVE, LINK, MOTOR, torque_rows
@@ -16,11 +16,11 @@ TX40 = load("tx40")
 SMOOTH = (
     drives.standard(["Ia Fv Fc off"] * 6, v0=0.5)
     + drives.coupled(4, 5, v0=0.5)
-    + friction.asymmetric(0)
-    + friction.cubic(1)
-    + friction.root(2, 0.3)
-    + friction.stribeck(3, 0.4, 2.0, 0.5)
-    + friction.ripple(4, [3.0, 5.0], 0.7)
+    + drives.asymmetric(0)
+    + drives.cubic(1)
+    + drives.root(2, 0.3)
+    + drives.stribeck(3, 0.4, 2.0, 0.5)
+    + drives.ripple(4, [3.0, 5.0], 0.7)
 )
 
 
@@ -93,7 +93,7 @@ def test_gradient_of_every_smooth_term():
 
 def test_terms_that_depend_on_more_say_so():
     q, v, a = states(6)
-    model = with_terms(IdentificationModel(bodies_of(TX40)), *friction.load_dependent(1, viscous=True))
+    model = with_terms(IdentificationModel(bodies_of(TX40)), *drives.load_dependent(1, viscous=True))
     assert with_load(model) == ("Ft2", "Fvt2")
     with pytest.raises(CalibError, match="'Ft2' needs the transmitted torque"):
         model.regressor(q, v, a)
@@ -106,7 +106,7 @@ def test_terms_that_depend_on_more_say_so():
 
 def test_stop_operator_is_coulomb_in_motion_and_a_spring_at_rest():
     """Stiff within a width of the turning point, ±1 beyond; the loop closes and remembers its side."""
-    model = IdentificationModel(bodies_of(TX40), friction.presliding(2, [0.1]))
+    model = IdentificationModel(bodies_of(TX40), drives.presliding(2, [0.1]))
     x = np.concatenate([np.linspace(0, 1, 101), np.linspace(1, 0.95, 6)[1:], np.linspace(0.95, 0, 96)[1:]])
     q = np.zeros((len(x), 6))
     q[:, 2] = x
@@ -118,13 +118,13 @@ def test_stop_operator_is_coulomb_in_motion_and_a_spring_at_rest():
     assert np.array_equal(whole, state) and np.array_equal(later, state[150:])
     v = np.gradient(q, axis=0)
     sliding = np.abs(state) == 1.0
-    off = column(IdentificationModel(bodies_of(TX40), friction.presliding(2, [0.1], 0.0)), "Fp3.1", q, v, 0 * q)[:, 2]
+    off = column(IdentificationModel(bodies_of(TX40), drives.presliding(2, [0.1], 0.0)), "Fp3.1", q, v, 0 * q)[:, 2]
     assert np.array_equal(off, state - np.sign(v[:, 2])) and np.all(off[sliding & (np.abs(v[:, 2]) > 0)] == 0.0)
 
 
 def test_ripple_fades_with_speed():
     q, v, a = states(6)
-    model = IdentificationModel(bodies_of(TX40), friction.ripple(0, [241.0], 0.5))
+    model = IdentificationModel(bodies_of(TX40), drives.ripple(0, [241.0], 0.5))
     assert model.names[-2:] == ("Rs1.241", "Rc1.241")
     wanted = np.sin(241 * q[:, 0]) / (1 + (v[:, 0] / 0.5) ** 2)
     assert np.allclose(column(model, "Rs1.241", q, v, a)[:, 0], wanted, rtol=0, atol=1e-14)

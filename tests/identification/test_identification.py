@@ -6,7 +6,7 @@ import numpy as np
 import planted_motion as planted
 import pytest
 
-from calib.dynamics import friction
+from calib.dynamics import drives as friction
 from calib.dynamics.drives import term
 from calib.errors import CalibError, MeasurementError, UsageError
 from calib.identification.friction.friction_ladder import FrictionCandidates, select_friction

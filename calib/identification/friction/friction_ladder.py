@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.data.signals.decimation import Decimator
-from calib.dynamics import friction
+from calib.dynamics import drives
 from calib.dynamics.drives import DriveTerm
 from calib.errors import UsageError
 from calib.identification.cases import Case
@@ -189,15 +189,15 @@ def _terms(candidates: FrictionCandidates, name: str) -> list[DriveTerm]:
         travel = float(np.ptp(np.concatenate([case.motion.q[:, j] for case in candidates.cases])))
         v0 = float(candidates.v0[j])
         terms = {
-            "load": lambda: friction.load_dependent(j, v0, viscous=True),  # noqa: B023
-            "presliding": lambda: friction.presliding(j, [travel * x for x in WIDTHS], v0),  # noqa: B023
+            "load": lambda: drives.load_dependent(j, v0, viscous=True),  # noqa: B023
+            "presliding": lambda: drives.presliding(j, [travel * x for x in WIDTHS], v0),  # noqa: B023
             "stribeck": lambda: (
-                *friction.stribeck(j, 0.05 * peak, v0=v0),  # noqa: B023
-                replace(friction.stribeck(j, 0.2 * peak, v0=v0)[0], name=f"Fs{j + 1}.2"),  # noqa: B023
+                *drives.stribeck(j, 0.05 * peak, v0=v0),  # noqa: B023
+                replace(drives.stribeck(j, 0.2 * peak, v0=v0)[0], name=f"Fs{j + 1}.2"),  # noqa: B023
             ),
-            "asymmetric": lambda: friction.asymmetric(j),  # noqa: B023
-            "root": lambda: friction.root(j, v0),  # noqa: B023
-            "cubic": lambda: friction.cubic(j),  # noqa: B023
+            "asymmetric": lambda: drives.asymmetric(j),  # noqa: B023
+            "root": lambda: drives.root(j, v0),  # noqa: B023
+            "cubic": lambda: drives.cubic(j),  # noqa: B023
         }[name]()
         found += [replace(one, linear=bool(candidates.linear[j])) for one in terms]
     return found

@@ -11,10 +11,9 @@ import numpy as np
 from calib.data.poses.fit_options import FitOptions
 from calib.dynamics import base as base_parameters
 from calib.dynamics import drives
-from calib.dynamics.base import BaseModel
+from calib.dynamics.base import BaseModel, columns_at_rest, information
 from calib.dynamics.bodies import bodies_of, standard_parameters, with_gravity
 from calib.dynamics.drives import DriveTerm
-from calib.dynamics.identifiability import columns_at_rest, information
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.shapes import V0
 from calib.errors import UsageError

@@ -27,12 +27,11 @@ import numpy as np
 
 from calib.data.poses.target_files import Targets
 from calib.errors import UsageError
-from calib.geometry import inverse
+from calib.geometry import installation_file, inverse
 from calib.geometry.installation import Installation, see
 from calib.geometry.inverse import Goal
 from calib.geometry.parameters import layout
 from calib.geometry.spread import pose_sigmas
-from calib.procedure.kinematic_stage import robot_file
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.kinematic_stage.tables import read_covariance
 from calib.robot.chain import Chain, sampling_limits
@@ -106,7 +105,7 @@ def read(folder: str | Path) -> Fitted:
     fit = inside if inside.robot.is_file() and not fit.robot.is_file() else fit
     if not fit.robot.is_file():
         raise UsageError(f"{fit.path} holds no robot.toml; give the folder that `calib fit --out` has written")
-    cell, nominal = robot_file.read(fit.path), robot_file.nominal(fit.path)
+    cell, nominal = installation_file.read(fit.path), installation_file.nominal(fit.path)
     free, covariance = read_covariance(fit.path, cell)
     own = fit.metrics()
     judged = proof.metrics() if proof.judged.is_file() else own

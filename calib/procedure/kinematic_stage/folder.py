@@ -17,13 +17,12 @@ from calib import files
 from calib.errors import UsageError
 from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
 from calib.folders import METRICS, check_target, write_staged
+from calib.geometry import installation_file
 from calib.geometry.weighing import Settings, combine
-from calib.procedure.kinematic_stage import robot_file
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import Findings, FitMetrics, ValidationMetrics
-from calib.procedure.kinematic_stage.residual_table import write_residuals
-from calib.procedure.kinematic_stage.tables import HEADER, estimate_table
+from calib.procedure.kinematic_stage.tables import HEADER, estimate_table, write_residuals
 from calib.procedure.kinematic_stage.validation import Arms, Assessment, nominal_arm, write_errors
 from calib.records import read_record
 from calib.robot import calibrated
@@ -108,7 +107,7 @@ class FitFolder:
     def arms(self, inputs: Inputs, settings: Settings) -> Arms:
         """Read both arms; the nominal one's frames are fitted to the fit's rows again."""
         chosen = combine(settings, loss=self.findings().loss or settings.loss)
-        return Arms(nominal_arm(inputs, chosen), robot_file.read(self.path), calibrated.read(self.path).chain)
+        return Arms(nominal_arm(inputs, chosen), installation_file.read(self.path), calibrated.read(self.path).chain)
 
 
 @dataclass(frozen=True)
@@ -192,7 +191,7 @@ def write_folder(outcome: Outcome, out: Path, plots: Callable[[Outcome, Path], N
 def _write_all(outcome: Outcome, folder: Path) -> None:
     fit, chain = outcome.climb.fit, outcome.inputs.chain
     robot, origin = outcome.calibrated, f"calibrated from {outcome.inputs.source}"
-    calibrated.write(folder, robot, robot_file.frame_tables(fit.cell), _record(outcome), origin)
+    calibrated.write(folder, robot, installation_file.frame_tables(fit.cell), _record(outcome), origin)
     urdfs = {"robot.urdf": robot.chain}
     if robot.corrections is not None:
         urdfs["robot_for_corrections.urdf"] = robot.corrections.chain
@@ -252,7 +251,7 @@ def _record(outcome: Outcome) -> dict[str, object]:
     """Return what the provenance says of how the robot was calibrated, besides from what."""
     inputs = outcome.inputs
     again = inputs.earlier is not None and inputs.earlier.nominal is not None
-    frames = {} if again else robot_file.frame_tables(outcome.climb.nominal.cell)
+    frames = {} if again else installation_file.frame_tables(outcome.climb.nominal.cell)
     return {
         **{f"nominal_{kind}": table for kind, table in frames.items()},
         "files": [block.file for block in inputs.fit],

@@ -12,10 +12,10 @@ from calib.data.poses.fit_options import FitOptions, check_files
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.data.poses.pose_files import joint_columns, read_measurements
 from calib.errors import MeasurementError, UsageError
+from calib.geometry.checks.copied_rows import repeated
 from calib.geometry.checks.orientations import check_orientations
 from calib.geometry.checks.repeatability import repeated_rows
 from calib.geometry.first_guess import check_scale
-from calib.procedure.kinematic_stage.copied_rows import repeated
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.robot import calibrated, description
 from calib.robot.calibrated import CalibratedChain

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.geometry.accuracy import rms_sigma
-from calib.procedure.kinematic_stage import iso9283
+from calib.procedure.kinematic_stage.comparison import iso9283_sentence
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import ComparedRows, ErrorStatistics, FitMetrics, OutlierRow, RepeatedPose
 from calib.procedure.report.fit_report import Report
@@ -247,7 +247,7 @@ def _pictures(title: str, drawn: Mapping[str, Picture], names: Sequence[str]) ->
 def repeated_sentences(metrics: FitMetrics) -> list[str]:
     """Return for each set of rows with repeated poses what they tell."""
     sets = {"fitted": metrics.fit, **metrics.validation}
-    return [f"{name}: {iso9283.sentence(found.iso9283)}" for name, found in sets.items() if found.iso9283]
+    return [f"{name}: {iso9283_sentence(found.iso9283)}" for name, found in sets.items() if found.iso9283]
 
 
 def iso9283_tables(metrics: FitMetrics) -> list[Table]:
@@ -258,7 +258,7 @@ def iso9283_tables(metrics: FitMetrics) -> list[Table]:
             rows = [_iso_row(number, each) for number, each in enumerate(iso.each[:MOST_POSES], 1)]
             if len(iso.each) > MOST_POSES:
                 rows.append(("…", f"{len(iso.each) - MOST_POSES} more in metrics.json", *[""] * 6))
-            title = f"Accuracy and repeatability, {name} ({iso9283.sentence(iso)})"
+            title = f"Accuracy and repeatability, {name} ({iso9283_sentence(iso)})"
             result.append(Table(title, ISO_HEADER, rows, ISO_NOTE, numbers=range(1, 8)))
     return result
 

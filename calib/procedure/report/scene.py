@@ -18,10 +18,10 @@ from calib.data.csv_table import read_table
 from calib.data.poses.plans import read_poses
 from calib.dynamics.torque_rows import MOTOR, ROWS
 from calib.errors import CalibError, UsageError
+from calib.geometry import installation_file
 from calib.geometry.installation import Installation, see
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.excitation import coefficients
-from calib.procedure.kinematic_stage import robot_file
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.robot import calibrated, library
 from calib.robot.chain import Chain
@@ -185,7 +185,7 @@ def _chosen(path: Path, chain: Chain) -> np.ndarray:
 
 def _measured(place: Path) -> Measured:
     """Return the rows of ``residuals.csv`` whose position was measured, as both arms see them."""
-    after, before = robot_file.read(place), robot_file.nominal(place)
+    after, before = installation_file.read(place), installation_file.nominal(place)
     with FitFolder(place).residuals.open(encoding="utf-8", newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["dx [mm]"] and row["station"] in after.station_names]
     joints = [f"{joint.name} [{joint.unit}]" for joint in after.chain.joints]

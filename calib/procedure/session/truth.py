@@ -13,12 +13,12 @@ from calib.dynamics.gravity import gravity_torques
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.rigid_body import inverse_dynamics
 from calib.estimate_files import read_estimate
+from calib.geometry import installation_file
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation, see
 from calib.identification.model_file import read_dynamics
 from calib.identification.prediction import Dynamics
-from calib.procedure.kinematic_stage import robot_file
 from calib.procedure.session.folder import Session
 from calib.robot import calibrated
 from calib.robot.chain import random_joints, sampling_limits
@@ -43,7 +43,7 @@ def against_truth(session: Session, cell: Cell) -> tuple[float, float, float]:
     block = Poses(q, cell.nominal.joint_names, points, to_quaternion(true))
     rigid = calibrated.read(session.fit.path).chain
     nominal, alone = (polish_frames(install(chain, [block]), [block]).cell for chain in (cell.nominal, rigid))
-    found = robot_file.read(session.fit.path)
+    found = installation_file.read(session.fit.path)
     before, after, bare = (_rms(arm, q, points) for arm in (nominal, found, alone))
     return before, after, bare
 

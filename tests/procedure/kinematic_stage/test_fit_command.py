@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.procedure.kinematic_stage import robot_file
+from calib.geometry import installation_file
 from calib.robot import calibrated
 from calib.robot.formats import urdf
 from calib.robot.formats.urdf_write import write_new
@@ -51,7 +51,7 @@ def test_the_files_of_a_fit_hold_the_same_robot(cell, calib):
     file = cell.write("day1.csv", cell.measure(60))
     assert calib("fit", "ur5", file, "--model", "geometry", "--out", "done")[0] == 0
     q = np.random.default_rng(0).uniform(-2, 2, (20, 6))
-    installation = robot_file.read("done")
+    installation = installation_file.read("done")
     poses = installation.stations[0] @ forward(installation.chain, q) @ installation.tools[0]
     rows = cell.measure(60)
     seen = np.array([[row[axis] for axis in "xyz"] for row in rows])
@@ -130,11 +130,11 @@ def test_a_pose_file_from_another_station_needs_refitted_frames(cell, calib):
 def test_two_files_have_two_stations_unless_one_is_asked_for(cell, calib):
     file, other = cell.write("a.csv", cell.measure(40)), cell.write("b.csv", cell.measure(40, 1))
     assert calib("fit", "ur5", file, other, "--model", "geometry", "--out", "each")[0] == 0
-    assert robot_file.read("each").station_names == ("a", "b")
+    assert installation_file.read("each").station_names == ("a", "b")
     assert calib("fit", "ur5", file, other, "--stations", "one", "--model", "geometry", "--out", "one")[0] == 0
-    assert robot_file.read("one").station_names == ("station",)
+    assert installation_file.read("one").station_names == ("station",)
     assert calib("fit", "ur5", file, other, "--tools", "each", "--model", "geometry", "--out", "tools")[0] == 0
-    assert robot_file.read("tools").tool_names == ("a tool", "b tool")
+    assert installation_file.read("tools").tool_names == ("a tool", "b tool")
 
 
 def test_one_station_for_an_instrument_that_was_moved_is_said(cell, calib):
@@ -200,7 +200,7 @@ def test_a_calibrated_folder_is_a_robot_and_a_worse_arm_fails(cell, calib):
 def test_deflections_go_out_as_a_table_with_its_formula_and_come_back(cell, calib):
     file = cell.write("a.csv", cell.measure(90))
     assert calib("fit", "ur5", file, "--model", "coupling", "--out", "done")[0] in (0, 1)
-    installation = robot_file.read("done")
+    installation = installation_file.read("done")
     rows = read_rows(Path("done/joint_corrections.csv"))
     assert len(rows) == len(installation.deflection.terms) > 0
     assert "coefficient * b(q)" in Path("done/joint_corrections.txt").read_text()
