@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -84,7 +85,15 @@ def detmax(pool: Pool, design: Design, report: Report | None = None, *, longest:
 
 
 def kicked(
-    pool: Pool, design: Design, rounds: int, seed: int, report: Report | None = None, *, size: int = 3, weights=None
+    pool: Pool,
+    design: Design,
+    rounds: int,
+    seed: int,
+    report: Report | None = None,
+    *,
+    size: int = 3,
+    weights=None,
+    seconds: float = np.inf,
 ) -> Design:
     """Leave local optima by kicks: swap `size` random members for random candidates, exchange, keep the better.
 
@@ -99,12 +108,16 @@ def kicked(
         report: called with every improved design.
         size: members replaced by one kick.
         weights: (N,) relaxed weights, None for equal ones.
+        seconds: of processor time, after which no further kick begins.
     """
+    deadline = time.process_time() + seconds
     generator = np.random.default_rng(seed)
     m, count = len(design.members), len(pool.z)
     share = np.full(count, 1.0) if weights is None else weights + 1e-3 * m / count
     size = min(size, m, count - m)
     for _ in range(rounds if size > 0 else 0):
+        if time.process_time() > deadline:
+            break
         leaving = set(generator.choice(design.members, size, replace=False).tolist())
         free = np.flatnonzero(~design.taken)
         coming = generator.choice(free, size, replace=False, p=share[free] / share[free].sum())

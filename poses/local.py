@@ -8,14 +8,18 @@ is the best restored set by the index itself, unsmoothed.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.optimize import minimize
 
 from poses.indices import Index, has_kinks, merit
 from poses.space import SearchSpace, constraint_gradients, constraint_values, is_feasible, product
+
+Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
 
 LARGE = 300
 """Above so many variables the poses are searched in blocks, the others held: SLSQP's cost rises with their cube."""
@@ -80,6 +84,8 @@ def improved(
     *,
     evaluations: int = 5000,
     tolerance: float = 1e-5,
+    seconds: float = np.inf,
+    sharpness: Sequence[float] = SHARPNESS,
     report: Callable[[float], None] | None = None,
 ) -> Improved:
     """Improve a set of poses under limits and constraints, all joint values at once.
@@ -94,15 +100,18 @@ def improved(
         existing: (k, rows, p) Jacobians of poses already measured.
         evaluations: most evaluations of index and gradient; a search stops by itself long before.
         tolerance: gain of the merit over `PATIENCE` iterations to stop at; ten times that in all stages but the last.
+        seconds: of processor time to end after, whatever was reached by then.
+        sharpness: of the stages, for indices with kinks.
         report: called with every improved merit.
     """
+    deadline = time.process_time() + seconds
     start = np.clip(np.asarray(q, dtype=float), space.lower, space.upper)
     value = merit_of(space, start, index, existing)[0] if is_feasible(space, start, FEASIBLE).all() else -np.inf
     found, free, spent, interrupted = start, np.ones(len(start), dtype=bool), 1, False
     history = [value] if np.isfinite(value) else []
     for _ in range(3):
         held = _with_rows(space, found[~free], existing)
-        run = _search(space, found[free], index, held, evaluations - spent, tolerance)
+        run = _search(space, found[free], index, held, evaluations - spent, tolerance, sharpness, deadline)
         trial, spent, interrupted = found.copy(), spent + run.evaluations, run.interrupted
         trial[free] = run.q
         bad = ~is_feasible(space, trial, FEASIBLE)
@@ -113,7 +122,7 @@ def improved(
             history += [h for h in run.history if max(history, default=-np.inf) < h < value] + [value]
             if report:
                 report(value)
-        if interrupted or not (bad & free).any() or spent >= evaluations:
+        if interrupted or not (bad & free).any() or spent >= evaluations or time.process_time() > deadline:
             break
         free &= ~bad
         if not free.any():
@@ -121,30 +130,43 @@ def improved(
     return Improved(found, value, tuple(history), spent + 1, interrupted)
 
 
+def _objective(
+    space: SearchSpace, index: Index, existing: np.ndarray | None, sharpness: float, q: np.ndarray
+) -> tuple[float, np.ndarray]:
+    return merit_of(space, q, index, existing, sharpness)
+
+
 class _Ended(Exception):
     """A stage gains nothing more, or its evaluations are used up."""
 
 
 def _search(
-    space: SearchSpace, start: np.ndarray, index: Index, existing: np.ndarray | None, evaluations: int, tolerance: float
+    space: SearchSpace,
+    start: np.ndarray,
+    index: Index,
+    existing: np.ndarray | None,
+    evaluations: int,
+    tolerance: float,
+    sharpness: Sequence[float],
+    deadline: float,
 ) -> Improved:
     """Run the stages from one start and return the best restored set; the predicate is not looked at."""
     kept = bool(_keeps(space, start).all())
     best, value = start, merit_of(space, start, index, existing)[0] if kept else -np.inf
     history, spent, now, interrupted = [value], 0, start, False
-    stages = list(SHARPNESS if has_kinks(index) else (np.inf,))
+    stages = list(sharpness if has_kinks(index) else (np.inf,))
     blocks = -(-start.size // LARGE)
-    while stages and spent < evaluations and not interrupted:
-        sharpness = stages.pop(0)
+    while stages and spent < evaluations and time.process_time() < deadline and not interrupted:
+        sharp = stages.pop(0)
         for block in np.array_split(np.random.default_rng(len(history)).permutation(len(start)), blocks):
             rest = np.setdiff1d(np.arange(len(start)), block)
             held = _with_rows(space, now[rest], existing)
-            moved, steps, interrupted = _stage(
-                space, now[block], index, held, sharpness, evaluations - spent, tolerance * (10 if stages else 1)
-            )
+            objective = partial(_objective, space, index, held, sharp)
+            patient = tolerance * (10 if stages else 1)
+            moved, steps, interrupted = climb(space, now[block], objective, evaluations - spent, patient, deadline)
             now, spent = now.copy(), spent + steps
             now[block] = moved
-            if interrupted or spent >= evaluations:
+            if interrupted or spent >= evaluations or time.process_time() > deadline:
                 break
         trial = restored(space, now)
         if kept:
@@ -157,27 +179,39 @@ def _search(
         if (
             not stages and 10 * tolerance < value - last < np.inf
         ):  # blocks, and stages cut short by a failed line search
-            stages, now = [sharpness], best
+            stages, now = [sharp], best
     return Improved(best, value, tuple(history), spent, interrupted)
 
 
-def _stage(
+def climb(
     space: SearchSpace,
     start: np.ndarray,
-    index: Index,
-    existing: np.ndarray | None,
-    sharpness: float,
+    objective: Objective,
     evaluations: int,
     tolerance: float,
+    deadline: float = np.inf,
 ) -> tuple[np.ndarray, int, bool]:
-    """Run SLSQP on the smoothed index; return the last iterate, the evaluations, and whether Ctrl-C ended it."""
+    """Maximise a smooth function of poses by SLSQP, until it gains less than `tolerance` over `PATIENCE` iterations.
+
+    Args:
+        space: limits and constraints; its Jacobian and predicate are not looked at.
+        start: (m, n) [rad or m].
+        objective: (m, n) -> value and gradient (m, n).
+        evaluations: most calls of the objective.
+        tolerance: see above.
+        deadline: `time.process_time` at which to end.
+
+    Returns:
+        The last iterate (m, n), which may break constraints a little (see `restored`), the calls, and whether Ctrl-C
+        ended the search.
+    """
     m, n = start.shape
     count, last, latest, merits = 0, start, 0.0, list[float]()
 
-    def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
+    def negative(x: np.ndarray) -> tuple[float, np.ndarray]:
         nonlocal count, latest
         count += 1
-        value, gradient = merit_of(space, x.reshape(m, n), index, existing, sharpness)
+        value, gradient = objective(x.reshape(m, n))
         latest = value if np.isfinite(value) else -1e6
         return -latest, -gradient.ravel()
 
@@ -186,7 +220,7 @@ def _stage(
         last = x.reshape(m, n).copy()
         merits.append(latest)
         stalled = len(merits) > PATIENCE and merits[-1] - merits[-1 - PATIENCE] < tolerance
-        if stalled or count >= evaluations:
+        if stalled or count >= evaluations or time.process_time() > deadline:
             raise _Ended
 
     def values(x: np.ndarray) -> np.ndarray:
@@ -203,7 +237,7 @@ def _stage(
     options = {"maxiter": evaluations, "ftol": 1e-2 * tolerance}
     try:
         run = minimize(
-            objective, start.ravel(), jac=True, method="SLSQP", bounds=bounds, constraints=kept, callback=accepted,
+            negative, start.ravel(), jac=True, method="SLSQP", bounds=bounds, constraints=kept, callback=accepted,
             options=options,
         )  # fmt: skip
         last = np.asarray(run.x).reshape(m, n)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 import numpy as np
@@ -24,6 +25,7 @@ def multistart_search(
     existing: np.ndarray | None = None,
     *,
     evaluations: int = 5000,
+    seconds: float = np.inf,
     map: Callable = map,
     report: Callable[[int, Improved], None] | None = None,
 ) -> Improved:
@@ -35,13 +37,16 @@ def multistart_search(
         index: what to improve.
         existing: (k, rows, p) Jacobians of poses already measured.
         evaluations: most evaluations per start.
+        seconds: of processor time; where it is finite the starts run here, one after another, until it is used up.
         map: the builtin, or one that spreads the work; results in order.
         report: called after each start with its number and result.
     """
     best, spent, history, interrupted = None, 0, list[float](), False
     work = partial(_one, space, index, existing, evaluations)
+    deadline = time.process_time() + seconds
+    runs = map(work, starts) if np.isinf(seconds) else _in_time(work, starts, deadline)
     try:
-        for number, run in enumerate(map(work, starts)):
+        for number, run in enumerate(runs):
             spent += run.evaluations
             if best is None or run.merit > best.merit:
                 best = run
@@ -61,6 +66,19 @@ def multistart_search(
 
 
 def _one(
-    space: SearchSpace, index: Index, existing: np.ndarray | None, evaluations: int, start: np.ndarray
+    space: SearchSpace,
+    index: Index,
+    existing: np.ndarray | None,
+    evaluations: int,
+    start: np.ndarray,
+    seconds: float = np.inf,
 ) -> Improved:
-    return improved(space, start, index, existing, evaluations=evaluations)
+    return improved(space, start, index, existing, evaluations=evaluations, seconds=seconds)
+
+
+def _in_time(work: Callable[..., Improved], starts: Sequence[np.ndarray], deadline: float) -> Iterator[Improved]:
+    """Yield the searches that fit into the time, the first one in any case."""
+    for number, start in enumerate(starts):
+        if number and time.process_time() >= deadline:
+            return
+        yield work(start, seconds=deadline - time.process_time())

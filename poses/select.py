@@ -22,8 +22,9 @@ from poses.local import Improved, improved
 from poses.multistart import multistart_search, random_starts
 from poses.space import SearchSpace, is_feasible
 from poses.tabu import DEFAULT_RULE, TabuRule, tabu_search
+from poses.whole_space import Ceiling, bound_over_space
 
-Method = Literal["detmax", "local", "multistart", "tabu"]
+Method = Literal["detmax", "polish", "local", "multistart", "tabu"]
 Progress = Callable[[int, int, str], None]
 
 
@@ -41,6 +42,9 @@ class SearchSettings:
         starts: sets of multistart.
         evaluations: most evaluations of one local search.
         rule: numbers of the tabu search.
+        seconds: of processor time for the search, whatever it has reached by then; bounds and baseline not counted.
+        climbs: local searches for poses that break the bound, see `poses.whole_space`; 0: the bound covers the
+            candidates and the chosen poses only.
     """
 
     index: Index = "O1"
@@ -51,6 +55,8 @@ class SearchSettings:
     starts: int = 8
     evaluations: int = 5000
     rule: TabuRule = DEFAULT_RULE
+    seconds: float = np.inf
+    climbs: int = 0
 
 
 DEFAULT_SEARCH = SearchSettings()
@@ -66,9 +72,10 @@ class Selection:
         index: name of the index the search improved.
         value: that index of the chosen poses together with the poses measured before (m counts both).
         history: values of the index as the search improved it; the last is `value`.
-        efficiency: det(WᵀW)^(1/p) over the certified bound of the *candidates*. At most 1 for detmax; methods that
-            leave the candidates may exceed 1.
-        bound: the convex relaxation with its certificate.
+        efficiency: det(WᵀW)^(1/p) over the ceiling, at most 1.
+        bound: the convex relaxation over the candidates with its certificate; poses from elsewhere may exceed it.
+        ceiling: the bound that the efficiency is taken against: over all feasible poses where `climbs` were asked for,
+            else over the candidates and the chosen poses.
         random_baseline: best value of the index among 1000 random sets of the candidates.
         seconds: wall-clock time, bound and baseline included.
         evaluations: designs accepted (detmax) or evaluations of the index (the others).
@@ -83,6 +90,7 @@ class Selection:
     history: np.ndarray
     efficiency: float
     bound: Bound
+    ceiling: Ceiling
     random_baseline: float
     seconds: float
     evaluations: int
@@ -116,6 +124,8 @@ class _Request:
     before: np.ndarray | None
     space: SearchSpace | None
     progress: Progress
+    settings: SearchSettings
+    map: Callable
 
 
 def select_poses(
@@ -133,8 +143,9 @@ def select_poses(
 
     * ``detmax`` chooses among the candidates: rounded relaxation and greedy start, pair exchange, DETMAX excursions,
       kicks (`poses.exchange`); other indices than O1 go on from there by `poses.by_index`.
-    * ``local`` moves all joint values of the detmax set at once (`poses.local`).
-    * ``multistart`` does that from the detmax set and `starts` − 1 random sets (`poses.multistart`).
+    * ``polish`` moves all joint values of that set at once (`poses.local`).
+    * ``local`` does so from one random set of the candidates, ``multistart`` from `starts` of them
+      (`poses.multistart`): the study's deterministic search and its remedy.
     * ``tabu`` is IMHATR, the two-stage meta-heuristic (`poses.tabu`).
 
     Args:
@@ -143,7 +154,7 @@ def select_poses(
         m: number of poses to choose; none is taken twice by detmax.
         settings: index, method and effort.
         q: (N, n) joint values of the candidates [rad or m].
-        space: needed by local, multistart and tabu.
+        space: needed by all methods but detmax.
         existing: (k, rows, p) whitened Jacobians of poses already measured; their information counts.
         map: where multistart spreads its starts.
         progress: called with (done, total, message).
@@ -162,16 +173,19 @@ def select_poses(
     report = progress or (lambda done, total, message: None)
     report(0, 1, "convex bound")
     candidates = prepared(array, m, before)
-    task = _Request(array, joints, candidates, relaxed(candidates, m), m, index, seed, before, space, report)
+    bound = relaxed(candidates, m)
+    task = _Request(array, joints, candidates, bound, m, index, seed, before, space, report, settings, map)
     baseline = random_baseline(array, m, index, before, seed=seed)
-    if method == "tabu":
-        chosen = _tabu(task, settings.rule)
-    else:
-        chosen = _exchange(task, settings.kicks)
-        if method != "detmax" and not chosen.interrupted:
-            starts = settings.starts if method == "multistart" else 1
-            chosen = _continuous(task, chosen, starts, settings.evaluations, map)
-    return _selection(task, chosen, method, baseline, began)
+    match method:
+        case "detmax":
+            chosen = _exchange(task)
+        case "polish":
+            chosen = _polished(task)
+        case "local" | "multistart":
+            chosen = _multistart(task, settings.starts if method == "multistart" else 1)
+        case "tabu":
+            chosen = _tabu(task)
+    return _selection(task, chosen, baseline, began)
 
 
 def random_baseline(
@@ -217,7 +231,7 @@ def _candidates(
     return array, joints
 
 
-def _exchange(task: _Request, kicks: int) -> _Chosen:
+def _exchange(task: _Request) -> _Chosen:
     """Choose among the candidates; after Ctrl-C return the best so far."""
     candidates, m, p = task.candidates, task.m, task.jacobians.shape[2]
     whole = Pool(candidates.z, candidates.known)
@@ -234,7 +248,7 @@ def _exchange(task: _Request, kicks: int) -> _Chosen:
     def stage(number: int, message: str) -> None:
         task.progress(number, 5, message)
 
-    interrupted = False
+    interrupted, began = False, time.process_time()
     try:
         stage(1, "exchange from the rounded relaxation")
         rounded = design_of(pool, tuple(int(i) for i in np.argsort(-weights, kind="stable")[:m]))
@@ -246,7 +260,15 @@ def _exchange(task: _Request, kicks: int) -> _Chosen:
         design = detmax(pool, max(designs, key=lambda d: d.logdet), keep)
         # Kicks are skipped where the certificate leaves less than half a percent to win.
         left = (task.bound.log_upper - candidates.shift - design.logdet) / p
-        design = kicked(pool, design, kicks if left > 0.005 else 0, task.seed, keep, weights=weights)
+        design = kicked(
+            pool,
+            design,
+            task.settings.kicks if left > 0.005 else 0,
+            task.seed,
+            keep,
+            weights=weights,
+            seconds=task.settings.seconds - (time.process_time() - began),
+        )
         keep(design)
         stage(4, "exchange among all candidates")
         polished = exchanged(whole, design_of(whole, best[-1][0]), lambda d: keep(d, np.arange(len(candidates.z))))
@@ -278,40 +300,56 @@ def _by_index(task: _Request, members: tuple[int, ...]) -> _Chosen:
     return _Chosen(best[-1][0], None, tuple(value for _, value in best), len(best), interrupted)
 
 
-def _continuous(task: _Request, chosen: _Chosen, starts: int, evaluations: int, map: Callable) -> _Chosen:
-    """Improve the exchanged set, and random ones beside it, over all joint values."""
-    space, joints = task.space, task.q
-    if space is None or joints is None:
-        raise BadInput("local and multistart move joint values: give q with jacobians, or leave jacobians out")
-    sets = [joints[sorted(chosen.members or ())], *random_starts(joints, task.m, starts - 1, task.seed)]
-    if starts == 1:
-        run = improved(space, sets[0], task.index, task.before, evaluations=evaluations)
-    else:
-        done = [0]
-
-        def report(number: int, _: Improved) -> None:
-            done[0] = number + 1
-            task.progress(number + 1, starts, "local searches")
-
-        run = multistart_search(space, sets, task.index, task.before, evaluations=evaluations, map=map, report=report)
-    return _of(run)
+def _polished(task: _Request) -> _Chosen:
+    """Choose among the candidates, then move all joint values."""
+    began = time.process_time()
+    chosen = _exchange(task)
+    if chosen.interrupted:
+        return chosen
+    space, joints = _movable(task)
+    start = joints[sorted(chosen.members or ())]
+    left = task.settings.seconds - (time.process_time() - began)
+    task.progress(0, 1, "local search")
+    return _of(improved(space, start, task.index, task.before, evaluations=task.settings.evaluations, seconds=left))
 
 
-def _tabu(task: _Request, rule: TabuRule) -> _Chosen:
+def _multistart(task: _Request, starts: int) -> _Chosen:
+    """Search from random sets of the candidates."""
+    space, joints = _movable(task)
+
+    def report(number: int, _: Improved) -> None:
+        task.progress(number + 1, starts, "local searches")
+
+    return _of(
+        multistart_search(
+            space, random_starts(joints, task.m, starts, task.seed), task.index, task.before,
+            evaluations=task.settings.evaluations, seconds=task.settings.seconds, map=task.map, report=report,
+        )
+    )  # fmt: skip
+
+
+def _movable(task: _Request) -> tuple[SearchSpace, np.ndarray]:
+    if task.space is None or task.q is None:
+        raise BadInput("polish, local and multistart move joint values: give space, and q with jacobians")
+    return task.space, task.q
+
+
+def _tabu(task: _Request) -> _Chosen:
     if task.space is None:
         raise BadInput("tabu draws its own poses: give space")
 
     def report(chosen: int, _: float) -> None:
         task.progress(chosen, task.m, "poses constructed")
 
-    return _of(tabu_search(task.space, task.m, task.index, task.before, seed=task.seed, rule=rule, report=report))
+    return _of(tabu_search(task.space, task.m, task.index, task.before, seed=task.seed, rule=task.settings.rule,
+                           seconds=task.settings.seconds, report=report))  # fmt: skip
 
 
 def _of(run: Improved) -> _Chosen:
     return _Chosen(None, run.q, run.history, run.evaluations, run.interrupted)
 
 
-def _selection(task: _Request, chosen: _Chosen, method: Method, baseline: float, began: float) -> Selection:
+def _selection(task: _Request, chosen: _Chosen, baseline: float, began: float) -> Selection:
     indices, q = None, chosen.q
     if q is None:
         indices = np.array(sorted(chosen.members or ()))
@@ -325,16 +363,29 @@ def _selection(task: _Request, chosen: _Chosen, method: Method, baseline: float,
             "poses"
         )
     poses = task.m + (0 if task.before is None else len(task.before))
-    o1 = _value(jacobians, task.before, "O1")
-    efficiency = o1**2 * poses / task.bound.upper
+    ceiling = _ceiling(task, q, 0 if chosen.interrupted else task.settings.climbs)
+    efficiency = _value(jacobians, task.before, "O1") ** 2 * poses / ceiling.upper
     history = np.exp(np.array(chosen.merits) * (-1.0 if task.index == "cond" else 1.0))
     history = history / np.sqrt(poses) if task.index == "O1" else history
     history = np.append(history[:-1], value)
     out = Selection(
-        q, indices, task.index, value, history, efficiency, task.bound, baseline, 0.0, chosen.evaluations, task.seed,
-        method, chosen.interrupted,
+        q, indices, task.index, value, history, efficiency, task.bound, ceiling, baseline, 0.0, chosen.evaluations,
+        task.seed, task.settings.method, chosen.interrupted,
     )  # fmt: skip
     return replace(out, seconds=time.perf_counter() - began)
+
+
+def _ceiling(task: _Request, q: np.ndarray | None, climbs: int) -> Ceiling:
+    """Return the bound over candidates and chosen poses, and over all feasible ones where climbs are asked for."""
+    space, joints = task.space, task.q
+    if space is None or joints is None or q is None or (not climbs and np.isin(q, joints).all()):
+        return Ceiling(task.bound.upper, task.bound.gap, 0, 0.0, np.zeros((0, 0)), 0)
+
+    def report(number: int, gap: float) -> None:
+        task.progress(number, number + 1, f"bound over all feasible poses, loose by {100 * gap:.2g} %")
+
+    both = np.concatenate([joints, q])
+    return bound_over_space(space, both, task.m, task.before, climbs=climbs, seed=task.seed, report=report)
 
 
 def _value(jacobians: np.ndarray, existing: np.ndarray | None, index: Index) -> float:

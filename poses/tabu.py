@@ -13,6 +13,7 @@ are ours:
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -55,6 +56,7 @@ def tabu_search(
     *,
     seed: int = 0,
     rule: TabuRule = DEFAULT_RULE,
+    seconds: float = np.inf,
     report: Callable[[int, float], None] | None = None,
 ) -> Improved:
     """Choose m poses by IMHATR; see the head of this module.
@@ -66,10 +68,12 @@ def tabu_search(
         existing: (k, rows, p) Jacobians of poses already measured.
         seed: of all draws.
         rule: its numbers.
+        seconds: of processor time, after which no pose is exchanged any more.
         report: called after every step with the poses chosen so far and the merit.
     """
     generator = np.random.default_rng(seed)
     listed: deque[np.ndarray] = deque(maxlen=rule.length)
+    deadline = time.process_time() + seconds
     chosen, history, spent, interrupted = list[np.ndarray](), list[float](), 0, False
     try:
         while len(chosen) < m:
@@ -80,7 +84,7 @@ def tabu_search(
             if report:
                 report(len(chosen), history[-1])
         spared, failures = set[int](), 0
-        while failures < rule.patience * m:
+        while failures < rule.patience * m and time.process_time() < deadline:
             out = _least_useful(space, np.array(chosen), index, existing, spared)
             rest = chosen[:out] + chosen[out + 1 :]
             pose, evaluations = _newcomer(space, rest, index, existing, generator, listed, rule)
@@ -129,7 +133,7 @@ def _newcomer(
         listed.append(pose)
         return pose, len(draws)
     start = draws[int(values.argmax())]
-    run = improved(space, start[None], index, fixed, evaluations=rule.evaluations, tolerance=1e-4)
+    run = improved(space, start[None], index, fixed, evaluations=rule.evaluations, tolerance=1e-4, sharpness=(128.0,))
     if run.interrupted:
         raise KeyboardInterrupt
     listed.extend([start, run.q[0]])

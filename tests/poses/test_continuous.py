@@ -16,6 +16,7 @@ from poses.local import improved, merit_of
 from poses.select import SearchSettings, select_poses
 from poses.space import PoseConstraint, SearchSpace, central_difference, is_feasible
 from poses.tabu import TabuRule
+from poses.whole_space import bound_over_space
 
 SPACE = SearchSpace(planar.jacobian, planar.LOWER, planar.UPPER, planar.product)
 LOW = PoseConstraint("height", planar.height, planar.height_gradient)
@@ -113,7 +114,7 @@ def test_a_predicate_is_kept_where_the_gradient_leads_into_it():
     assert run.merit > merit_of(space, start, "O1")[0]
 
 
-@pytest.mark.parametrize("method", ["local", "multistart", "tabu"])
+@pytest.mark.parametrize("method", ["polish", "local", "multistart", "tabu"])
 def test_methods_keep_constraints_repeat_by_seed_and_beat_random_sets(method):
     space = replace(SPACE, constraints=(LOW,), feasible=outside_the_wedge)
     runs = [
@@ -130,11 +131,32 @@ def test_methods_keep_constraints_repeat_by_seed_and_beat_random_sets(method):
 
 
 def test_leaving_the_candidates_beats_staying_among_few():
-    kept = select_poses(planar.jacobian(Q[:40]), 5, q=Q[:40])
-    moved = select_poses(None, 5, SearchSettings(method="local"), q=Q[:40], space=SPACE)
-    spread = select_poses(None, 5, SearchSettings(method="multistart", starts=4), q=Q[:40], space=SPACE)
-    assert kept.value < moved.value <= spread.value
-    assert kept.efficiency <= 1
+    kept = select_poses(planar.jacobian(Q[:12]), 5, q=Q[:12])
+    moved = select_poses(None, 5, q=Q[:12], settings=SearchSettings(method="polish"), space=SPACE)
+    assert kept.value < moved.value
+    assert kept.efficiency <= 1 and moved.efficiency <= 1
+    assert moved.value**2 * 5 > kept.bound.upper  # above what any five of the candidates can reach
+
+
+def test_more_starts_are_no_worse_than_the_first_and_time_ends_them():
+    one = select_poses(None, 5, q=Q[:40], settings=SearchSettings(method="local"), space=SPACE)
+    more = select_poses(None, 5, q=Q[:40], settings=SearchSettings(method="multistart", starts=4), space=SPACE)
+    none = select_poses(
+        None, 5, q=Q[:40], settings=SearchSettings(method="multistart", starts=4, seconds=0.0), space=SPACE
+    )
+    assert one.value <= more.value and none.evaluations < one.evaluations < more.evaluations
+
+
+@pytest.mark.parametrize("bound", [(), (LOW,)], ids=["box", "constrained"])
+def test_the_bound_over_the_whole_space_holds_the_searches_between_chance_and_itself(bound):
+    space = replace(SPACE, constraints=bound)
+    few = Q[is_feasible(space, Q)][:12]
+    ceiling = bound_over_space(space, few, 6)
+    best = select_poses(None, 6, q=few, settings=SearchSettings(method="multistart", starts=4), space=space)
+    assert best.random_baseline < best.value
+    assert 0.9 * ceiling.upper < best.value**2 * 6 <= ceiling.upper
+    assert ceiling.climbs == 32 and ceiling.excess < 0.01 and is_feasible(space, ceiling.support).all()
+    assert bound_over_space(space, few, 6, climbs=0).upper < best.value**2 * 6  # the candidates' bound does not hold
 
 
 def test_multistart_on_other_processes_gives_the_same_poses():

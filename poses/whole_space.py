@@ -1,0 +1,152 @@
+"""An upper bound on what any poses within limits and constraints can reach, not only those among the candidates.
+
+The relaxation of `poses.convex`, with poses allowed to repeat, over all feasible poses: a design is a measure ξ of mass
+m. By the general equivalence theorem (Kiefer & Wolfowitz 1960), for any M = M_known + ∫ JᵀJ dξ ≻ 0 and any m poses
+
+    det M(q_1 ... q_m)^(1/p)  ≤  det M^(1/p) · (tr(M⁻¹ M_known) + m max_q d(q)) / p,    d(q) = tr(J(q) M⁻¹ J(q)ᵀ),
+
+the maximum over all feasible q. Candidates are the first support. Then, in rounds (Wynn 1970 added one pose, here all
+local maxima that are found), single poses climb d from the best poses known and from random ones under the constraints,
+with exact gradients, join the support, and the relaxation is solved again.
+
+**What is certain.** The formula holds for every pose that was looked at: the candidates, the chosen poses, all ends of
+climbs. That none outside lies higher rests on the climbs having found the global maximum of d, which starts at random
+make likely and do not prove; `climbs` says how many tried in vain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from poses.candidates import draw_candidates
+from poses.convex import information_of, relaxed, scores_of
+from poses.information import log_det, prepared
+from poses.local import climb, restored
+from poses.space import SearchSpace, is_feasible, product
+
+BLOCK = 8
+"""Poses that climb together: few enough for SLSQP to be quick, enough for the Jacobian to pay. Our choice."""
+
+
+@dataclass(frozen=True)
+class Ceiling:
+    """An upper bound on det(WᵀW)^(1/p) of any m feasible poses together with those measured before.
+
+    Attributes:
+        upper: the bound.
+        gap: what it may at most be loose against the relaxed optimum: upper / det M^(1/p) − 1.
+        climbs: local searches for a pose that breaks the bound in the last round, all in vain; 0: the bound covers the
+            candidates and the chosen poses only.
+        excess: by what the best pose they found exceeds the largest d of the support, relative; 0 where none does.
+        support: (K, n) poses that carry the relaxed design.
+        evaluations: of d in all climbs, poses one by one.
+    """
+
+    upper: float
+    gap: float
+    climbs: int
+    excess: float
+    support: np.ndarray
+    evaluations: int
+
+
+def bound_over_space(
+    space: SearchSpace,
+    q: np.ndarray,
+    m: int,
+    existing: np.ndarray | None = None,
+    *,
+    climbs: int = 32,
+    rounds: int = 16,
+    tolerance: float = 1e-2,
+    seed: int = 0,
+    report: Callable[[int, float], None] | None = None,
+) -> Ceiling:
+    """Bound det(WᵀW)^(1/p) of any m feasible poses from above; see the head of this module.
+
+    Args:
+        space: limits, constraints, Jacobian.
+        q: (N, n) feasible poses to begin with: the candidates, and the chosen poses, which the bound then covers.
+        m: number of poses.
+        existing: (k, rows, p) Jacobians of poses already measured.
+        climbs: local searches of the last round, half from the highest d, half from random poses; 0: none.
+        rounds: most rounds.
+        tolerance: excess of d to stop at, relative.
+        seed: of the random poses.
+        report: called with each round's number and the gap.
+    """
+    generator = np.random.default_rng([seed, 5])
+    jacobians, tried, excess, spent = np.asarray(space.jacobian(q), dtype=float), 0, 0.0, 0
+    p = jacobians.shape[2]
+    for number in range(max(rounds, 1)):
+        candidates = prepared(jacobians, m, existing)
+        weights = relaxed(candidates, m, capped=False, tolerance=0.1 * tolerance).weights
+        matrix = information_of(candidates.z, candidates.known, weights)
+        scores = scores_of(candidates.z, matrix)
+        known = float(np.trace(np.linalg.solve(matrix, candidates.known)))
+        logdet, highest = float(log_det(matrix)) + candidates.shift, float(scores.max())
+        if not climbs:
+            break
+        root = candidates.transform @ np.linalg.inv(np.linalg.cholesky(matrix)).T
+        tried = BLOCK if number < rounds - 1 and tried < climbs and (number == 0 or excess > tolerance) else climbs
+        starts = _starts(space, q, scores, tried, generator)
+        found, steps = _climbed(space, starts, root)
+        spent += steps
+        heights = scores_of(np.asarray(space.jacobian(found), dtype=float) @ root, np.eye(p)) if len(found) else scores
+        excess = max(float(heights.max()) / highest - 1.0, 0.0)
+        highest = max(highest, float(heights.max()))
+        if report:
+            report(number, (known + m * highest) / p - 1.0)
+        if excess <= tolerance and tried == climbs:
+            break
+        if len(found):
+            better = found[heights > float(scores.max()) * (1.0 + 0.1 * tolerance)]
+            q = np.concatenate([q, _apart(better)])
+            jacobians = np.concatenate([jacobians, np.asarray(space.jacobian(q[len(jacobians) :]), dtype=float)])
+    total = known + m * highest
+    upper = float(np.exp(logdet / p)) * total / p
+    return Ceiling(upper, total / p - 1.0, tried if climbs else 0, excess, q[weights[: len(q)].nonzero()[0]], spent)
+
+
+def _climbed(space: SearchSpace, starts: np.ndarray, root: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return the feasible local maxima (K, n) of d(q) = ‖J(q) root‖² that poses climb to, and the evaluations."""
+
+    def objective(q: np.ndarray) -> tuple[float, np.ndarray]:
+        spread = np.asarray(space.jacobian(q), dtype=float) @ root
+        height = (spread**2).sum((1, 2))
+        slope = product(space, q, 2.0 * (spread / height[:, None, None]) @ root.T)
+        return float(np.log(height).sum()), slope
+
+    ends, spent = [], 0
+    for block in np.array_split(starts, -(-len(starts) // BLOCK)):
+        end, steps, interrupted = climb(space, block, objective, 100, 1e-3)
+        if interrupted:
+            raise KeyboardInterrupt
+        ends.append(restored(space, end))
+        spent += steps * len(block)
+    found = np.concatenate(ends)
+    return found[is_feasible(space, found)], spent
+
+
+def _starts(
+    space: SearchSpace, q: np.ndarray, scores: np.ndarray, count: int, generator: np.random.Generator
+) -> np.ndarray:
+    """Return half of the poses from the highest d, pairwise apart, and half at random."""
+    ranked = _apart(q[np.argsort(-scores, kind="stable")[: 20 * count]])[: count - count // 2]
+    rest = count - len(ranked)
+    return np.concatenate([
+        ranked, draw_candidates(space.lower, space.upper, rest, lambda x: is_feasible(space, x), seed=generator,
+                                block=256),
+    ])  # fmt: skip
+
+
+def _apart(q: np.ndarray, least: float = 0.1) -> np.ndarray:
+    """Return the poses that differ from all kept before by `least` [rad or m] in some joint; our choice."""
+    kept = np.zeros((0, q.shape[1]))
+    for pose in q:
+        if not len(kept) or (np.abs(kept - pose).max(1) > least).all():
+            kept = np.concatenate([kept, pose[None]])
+    return kept
