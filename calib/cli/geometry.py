@@ -85,7 +85,13 @@ def select(
         list[str] | None, typer.Option(help="x,y,z of a target in the tip's frame [m]; may be repeated")
     ] = None,
     index: Annotated[str, typer.Option(help="O1 to O5, or cond")] = "O1",
-    method: Annotated[str, typer.Option(help="detmax, multistart, tabu or local")] = "detmax",
+    method: Annotated[str, typer.Option(help="detmax, polish, local, multistart or tabu")] = "detmax",
+    starts: Annotated[int, typer.Option(help="random sets that multistart begins at")] = 8,
+    evaluations: Annotated[int, typer.Option(help="most evaluations of the index in one local search")] = 5000,
+    seconds: Annotated[float | None, typer.Option(help="processor time for the search; without: to its end")] = None,
+    climbs: Annotated[
+        int, typer.Option(help="searches for feasible poses beyond the bound; 0: it covers the candidates only")
+    ] = 0,
     constraints: Annotated[Path | None, typer.Option(help="TOML, see calib formats constraints")] = None,
     candidates: Annotated[int, typer.Option(help="poses to choose from")] = 2000,
     existing: Annotated[Path | None, typer.Option(help="CSV of poses measured before, which count")] = None,
@@ -106,7 +112,9 @@ def select(
     targets = tuple(tuple(numbers(text, 3, "--tool")) for text in tool or [])
     sigmas = None if sigma is None else numbers(sigma, 2, "--sigma")
     stated = None if sigmas is None else (sigmas[0], sigmas[1])
-    settings = SelectionSettings(kind, targets, index, method, candidates, stated, seed)
+    settings = SelectionSettings(
+        kind, targets, index, method, candidates, stated, seed, starts, evaluations, seconds, climbs
+    )
     with progress() as show:
         chosen = select_poses(
             robot, m, settings, constraints=constraints, existing=existing, base=base, tip=tip, workers=workers,

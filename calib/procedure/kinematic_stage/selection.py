@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
+
 from calib import files
 from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.plans import read_poses, write_poses
@@ -83,7 +85,10 @@ def choose(
         value = observability(before, index) or None
         if not is_feasible(space, q).all():
             notes.append(f"{int((~is_feasible(space, q)).sum())} of the {len(q)} existing poses break the constraints")
-    search = SearchSettings(index, method, settings.candidates, settings.seed)
+    search = SearchSettings(
+        index, method, settings.candidates, settings.seed, starts=settings.starts, evaluations=settings.evaluations,
+        seconds=np.inf if settings.seconds is None else settings.seconds, climbs=settings.climbs,
+    )  # fmt: skip
     found = select_poses(None, m, search, space=space, existing=before, map=map, progress=progress)
     return Chosen(chain, found, len(jacobian.free), value, tuple(notes))
 
@@ -101,6 +106,14 @@ def write(chosen: Chosen, path: Path) -> Path:
     return write_poses(path, chosen.selection.q, chosen.chain.joint_names, kinds=joint_kinds(chosen.chain))
 
 
+def bound_words(found: Selection) -> str:
+    """Return what the bound behind an efficiency covers, and how sure that is."""
+    climbs, gap = found.ceiling.climbs, 100 * found.ceiling.gap
+    if not climbs:
+        return f"of the candidates{' and these poses' if found.indices is None else ''}, not of all feasible poses"
+    return f"of all feasible poses, as far as {climbs} searches for better ones can tell; loose by at most {gap:.2g} %"
+
+
 def table(chosen: Chosen) -> list[tuple[str, str]]:
     """Return what the selection came to, as pairs of words and numbers."""
     found = chosen.selection
@@ -114,7 +127,7 @@ def table(chosen: Chosen) -> list[tuple[str, str]]:
     rows += [
         ("start of the search", f"{float(found.history[0]):.6g}"),
         ("chosen poses", f"{found.value:.6g}"),
-        ("efficiency against the convex bound", f"{found.efficiency:.4f} (det^(1/p) over the candidates' bound)"),
+        ("efficiency against the convex bound", f"{found.efficiency:.4f} (det^(1/p); {bound_words(found)})"),
         ("seconds", f"{found.seconds:.2f}"),
     ]
     return rows

@@ -61,6 +61,10 @@ class SelectionSettings:
         candidates: poses to draw.
         sigmas: of a position [m] and an orientation [rad]; None for equal ones of our choice.
         seed: of everything random.
+        starts: random sets of multistart.
+        evaluations: most evaluations of the index in one local search.
+        seconds: of processor time for the search; None lets it end by itself.
+        climbs: searches for feasible poses beyond the bound; 0 bounds the candidates and the chosen poses only.
     """
 
     kind: str = "pose"
@@ -70,6 +74,17 @@ class SelectionSettings:
     candidates: int = 2000
     sigmas: tuple[float, float] | None = None
     seed: int = 0
+    starts: int = 8
+    evaluations: int = 5000
+    seconds: float | None = None
+    climbs: int = 0
+
+    def __post_init__(self) -> None:
+        for option, least in (("starts", 1), ("evaluations", 1), ("climbs", 0)):
+            if (value := getattr(self, option)) < least:
+                raise UsageError(f"--{option} {value}: expected at least {least}")
+        if self.seconds is not None and not self.seconds > 0.0:
+            raise UsageError(f"--seconds {self.seconds:g}: expected a time above 0")
 
 
 DEFAULT_SELECTION = SelectionSettings()

@@ -50,7 +50,7 @@ def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], N
     gain = found.random_baseline / found.value if found.index == "cond" else found.value / found.random_baseline
     words = (
         f"{len(found.q)} poses by {found.method}, {found.index} = {found.value:.4g}, {gain:.2f} times the best of 1000 "
-        f"random sets, {100 * found.efficiency:.1f} % of the convex bound"
+        f"random sets, {100 * found.efficiency:.1f} % of the convex bound ({selection.bound_words(found)})"
     )
     record = {
         "words": words,
