@@ -57,15 +57,15 @@ class DynamicsModel:
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write the folder that `calib identify --out` writes."""
-        from calib.procedure.report import identification_figures
+        from calib.procedure.report import dynamics_figures
 
-        return folder.write_folder(self.outcome, Path(out), identification_figures.write if plots else None)
+        return folder.write_folder(self.outcome, Path(out), dynamics_figures.write if plots else None)
 
     def plot(self) -> dict[str, Figure]:
         """Return the figures by name: measured and predicted torques, autocorrelations, friction."""
-        from calib.procedure.report import identification_figures
+        from calib.procedure.report import dynamics_figures
 
-        return identification_figures.figures(self.outcome)
+        return dynamics_figures.figures(self.outcome)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as ``metrics.json`` holds them."""

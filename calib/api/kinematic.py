@@ -91,9 +91,9 @@ class GeometryFit:
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write the folder that `calib fit --out` writes: robot.toml, URDF, estimate, residuals, certificate."""
-        from calib.procedure.report import fit_certificate
+        from calib.procedure.report import certificate
 
-        return folder.write_folder(self.outcome, Path(out), partial(fit_certificate.write, plots=plots))
+        return folder.write_folder(self.outcome, Path(out), partial(certificate.write_fit, plots=plots))
 
     def plot(self) -> dict[str, Figure]:
         """Return the figures of the certificate by name."""

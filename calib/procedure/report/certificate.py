@@ -1,15 +1,27 @@
-"""The certificate: a first sheet to be filed, the sections it sums up, and what every certificate says besides."""
+"""The certificate: a first sheet to be filed, the sections it sums up, and what every certificate says besides.
+
+It is written as HTML, one file without any outside reference, for the screen and for paper.
+"""
 
 from __future__ import annotations
 
+import base64
 import platform
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
-from importlib import metadata
+from importlib import metadata, resources
+from pathlib import Path
 
-from calib.procedure.report.page import Page, Section, Table, Text
+from calib import files
+from calib.procedure.kinematic_stage.fit import Outcome
+from calib.procedure.kinematic_stage.folder import FitFolder
+from calib.procedure.report import fit_report, geometry_section
+from calib.procedure.report.fit_report import Report
+from calib.procedure.report.page import Page, Picture, Section, Table, Text
 
+NAME = "certificate.html"
+WORDS = {"pass": "PASS", "marginal": "MARGINAL", "fail": "FAIL"}
 EDITED = "edited by hand"
 SHORT = 12  # hexadecimal digits of a SHA-256 on the first sheet
 LISTED = 6  # files on the first sheet
@@ -101,3 +113,49 @@ def versions() -> str:
     names = ("armature-calib", "numpy", "scipy")
     known = ", ".join(f"{name} {metadata.version(name)}" for name in names)
     return f"{known}, Python {platform.python_version()}"
+
+
+def render(page: Page) -> str:
+    """Return the page as HTML."""
+    import jinja2  # slow to load, and not needed to write the rest
+
+    here = resources.files("calib.procedure.report")
+    source = here.joinpath(NAME).read_text(encoding="utf-8")
+    style = here.joinpath("certificate.css").read_text(encoding="utf-8")
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    environment.filters["data_uri"] = lambda png: f"data:image/png;base64,{base64.b64encode(png).decode()}"
+    return environment.from_string(source).render(page=page, style=style, words=WORDS)
+
+
+def write_fit(outcome: Outcome, folder: Path, plots: bool = True) -> None:
+    """Write ``report.json``, the figures, and a certificate of the fit alone into a fit's folder.
+
+    Args:
+        plots: whether there are to be figures; the certificate is written without them, too.
+    """
+    report = fit_report.collect(outcome)
+    fit_report.write(report, FitFolder(folder).report)
+    drawn = draw(report) if plots else {}
+    for name, figure in drawn.items():
+        files.write(folder / f"plot_{name}.png", figure.png)
+    files.write(folder / NAME, render(of_fit(report, drawn)))
+
+
+def draw(report: Report) -> Mapping[str, Picture]:
+    """Return the figures by name; matplotlib is loaded here."""
+    from calib.procedure.report import figures
+
+    return figures.draw(report)
+
+
+def of_fit(report: Report, drawn: Mapping[str, Picture]) -> Page:
+    """Return the certificate of a fit alone, without a session around it."""
+    given = (
+        ("robot", f"{report.robot}, {report.base} to {report.tip}, {len(report.joints)} joints"),
+        ("model", report.metrics.model),
+        ("tolerance", tolerance(report.metrics.tolerance_mm)),
+        ("seed", str(report.metrics.seed)),
+        ("toolkit", versions()),
+    )
+    section = geometry_section.certificate_section(report, drawn)
+    return certificate(f"Calibration of {report.robot}", "Geometry", given, [section])

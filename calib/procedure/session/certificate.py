@@ -10,7 +10,7 @@ from pathlib import Path
 
 from calib import files
 from calib.procedure.kinematic_stage.folder import SCHEMA
-from calib.procedure.report import certificate, fit_report, html, viewer
+from calib.procedure.report import certificate, fit_report, viewer
 from calib.procedure.report.fit_report import RowErrors
 from calib.procedure.report.page import Section, Text
 from calib.procedure.session.dynamics_steps import recordings
@@ -28,11 +28,11 @@ ROLES = {
 
 def certify(session: Session, say: Say) -> list[str]:
     """Print the certificate."""
-    from calib.procedure.report import dynamics_section, fit_certificate, geometry_section
+    from calib.procedure.report import dynamics_section, geometry_section
 
     say("drawing" if session.plots else "writing")
     whole = whole_report(session)
-    section = geometry_section.certificate_section(whole, fit_certificate.draw(whole) if session.plots else {})
+    section = geometry_section.certificate_section(whole, certificate.draw(whole) if session.plots else {})
     judged = [with_arrival(section, noticed(session, "3-measured", "validate"))]
     notes = [f"geometry {section.verdict}: {section.reason}"]
     if session.dynamic:
@@ -55,7 +55,7 @@ def certify(session: Session, say: Say) -> list[str]:
         judged,
         listed(session),
     )
-    files.write(session.path("certificate.html"), html.render(page))
+    files.write(session.path("certificate.html"), certificate.render(page))
     recording = [viewer.write_beside(session.folder)] if session.plots else []
     return [*notes, "certificate.html", *recording]
 

@@ -172,7 +172,7 @@ def identify(session: Session, say: Say) -> list[str]:
 
     draw = None
     if session.plots:
-        from calib.procedure.report.identification_figures import write as draw
+        from calib.procedure.report.dynamics_figures import write as draw
     cuts = json.loads(session.path("7-recorded/cuts.json").read_text(encoding="utf-8"))
     given = inputs.gather(
         session.fit.path, cut_paths(recordings(session)[0], cuts), options=options_of(session),

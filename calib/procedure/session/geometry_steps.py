@@ -21,7 +21,7 @@ from calib.procedure.kinematic_stage import folder as outputs
 from calib.procedure.kinematic_stage import inputs
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import assess
-from calib.procedure.report import fit_certificate, fit_report
+from calib.procedure.report import certificate, fit_report
 from calib.procedure.session import arrival
 from calib.procedure.session.folder import Session
 from calib.procedure.session.outcome import mark_failed
@@ -184,7 +184,7 @@ def fit(session: Session, say: Say) -> list[str]:
     """Fit the geometry to the measured files; validation files are not looked at."""
     settings = session.settings
     outcome = fitting.run(gathered(session), options_of(session), fit_settings(session), say)
-    outputs.write_folder(outcome, session.fit.path, partial(fit_certificate.write, plots=session.plots))
+    outputs.write_folder(outcome, session.fit.path, partial(certificate.write_fit, plots=session.plots))
     count = len(outcome.climb.fit.free)
     notes = [f"model {outcome.climb.chosen}, {count} parameters on {outcome.fit.poses} poses", *outcome.warnings]
     if outcome.outliers:

@@ -18,7 +18,7 @@ from calib.dynamics.torque_rows import MOTOR
 from calib.errors import UsageError
 from calib.identification.scores import PredictionErrors
 from calib.procedure.dynamic_stage.metrics import ReplayController, ReplayMetrics
-from calib.procedure.report import console, dynamics_section, identification_figures
+from calib.procedure.report import console, dynamics_figures, dynamics_section
 from calib.units import motion_units
 
 
@@ -54,7 +54,7 @@ def test_figures_have_units_at_their_axes():
         repeated={}, found=SimpleNamespace(settings=SimpleNamespace(torque_rows=MOTOR)),
         inputs=SimpleNamespace(unit="N m", chain=replace(planted.arm(), joints=joints)),
     )  # fmt: skip
-    figure = identification_figures.torques(one, np.asarray(one.target), outcome)
+    figure = dynamics_figures.file_torques(one, np.asarray(one.target), outcome)
     units = [f"{joint.name} [{unit}]: 5 % left" for joint, unit in zip(joints, ("N", "N m", "N m"))]
     assert [axis.get_title(loc="left") for axis in figure.axes] == units
     assert not any(axis.get_legend() for axis in figure.axes), "a legend inside would cover the curve"

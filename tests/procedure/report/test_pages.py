@@ -10,7 +10,7 @@ from io import StringIO
 import pytest
 from rich.console import Console
 
-from calib.procedure.report import certificate, console, html
+from calib.procedure.report import certificate, console
 from calib.procedure.report.page import KeyFigure, Picture, Pictures, Section, Table, Text
 
 HOSTILE = "[bold]<script>alert(1)</script> & \"quoted\" 'one'[/]"
@@ -59,7 +59,7 @@ def judged(verdict: str = "pass", reason: str = "rms 0.1 mm", blocks=()) -> Sect
 
 
 def test_a_table_has_the_same_cells_on_the_console_and_on_the_page():
-    written = html.render(page_of(judged(blocks=[TABLE])))
+    written = certificate.render(page_of(judged(blocks=[TABLE])))
     tables = [one for one in re.findall(r"<table>.*?</table>", written, re.DOTALL) if "rms" in one and "arm" in one]
     assert len(tables) == 1
     rows = re.findall(r"<tr.*?</tr>", tables[0], re.DOTALL)
@@ -74,7 +74,7 @@ def test_every_text_is_escaped_for_both():
     section = Section(HOSTILE, blocks, "fail", HOSTILE, [KeyFigure(*[HOSTILE] * 6)])
     setup, files = [(HOSTILE, HOSTILE)], [(HOSTILE, HOSTILE, "1", HOSTILE)]
     made = certificate.certificate(HOSTILE, HOSTILE, setup, [section], files)
-    assert "<script>" not in html.render(made)
+    assert "<script>" not in certificate.render(made)
     assert HOSTILE in printed(Text("", [HOSTILE])) and HOSTILE in printed(TABLE)
 
 
@@ -85,8 +85,17 @@ def sheet(written: str) -> str:
 @pytest.mark.parametrize("verdict", ["pass", "marginal", "fail"])
 def test_the_first_sheet_stands_alone(verdict):
     files = [(f"file{k}.csv", "measured", "10", f"{k:064x}") for k in range(20)]
-    first = sheet(html.render(page_of(judged(verdict, "because", [TABLE]), files=files)))
-    wanted = ("Calibration of x", html.WORDS[verdict], "Because.", "1.1 mm", "0.12 mm", "± 0.01 mm", "20 unseen poses")
+    first = sheet(certificate.render(page_of(judged(verdict, "because", [TABLE]), files=files)))
+    word = certificate.WORDS[verdict]
+    wanted = (
+        "Calibration of x",
+        word,
+        "Because.",
+        "1.1 mm",
+        "0.12 mm",
+        "± 0.01 mm",
+        "20 unseen poses",
+    )
     for words in (
         *wanted,
         "0.2 mm",
@@ -102,7 +111,7 @@ def test_the_first_sheet_stands_alone(verdict):
 
 
 def test_what_stands_behind_the_first_sheet_folds_on_screen_and_prints_unfolded():
-    written = html.render(page_of(judged(blocks=[TABLE])))
+    written = certificate.render(page_of(judged(blocks=[TABLE])))
     behind = written[written.index("</article>") :]
     assert re.findall(r"<summary>([^<]*)", behind) == ["Geometry", "Setup", "Limitations and conventions"]
     assert "how to read" in behind and "<details open" not in behind
@@ -111,12 +120,12 @@ def test_what_stands_behind_the_first_sheet_folds_on_screen_and_prints_unfolded(
 
 def test_a_long_line_of_the_setup_is_cut_on_the_first_sheet_and_whole_behind_it():
     long = " ".join(f"measured{k}.csv," for k in range(80))
-    written = html.render(page_of(judged(), setup=[("measurements", long)]))
+    written = certificate.render(page_of(judged(), setup=[("measurements", long)]))
     assert long not in sheet(written) and "measured0.csv" in sheet(written) and long in written
 
 
 def test_blocks_with_nothing_in_them_are_left_out():
     section = judged(blocks=[Text("Nothing here", []), Pictures("Nor here", []), Text("This", ["line"])])
-    written = html.render(page_of(section))
+    written = certificate.render(page_of(section))
     assert "Nothing here" not in written and "Nor here" not in written and "This" in written
     assert printed(*section.blocks) == "line\n"

@@ -18,7 +18,7 @@ from PIL import Image
 from sessions import go_on
 
 from calib.errors import CalibError
-from calib.procedure.report import figures, fit_certificate, fit_report, geometry_figures, html, style
+from calib.procedure.report import certificate, figures, fit_report, geometry_figures, style
 from calib.procedure.session.folder import Session
 
 
@@ -58,7 +58,7 @@ def test_it_says_what_a_professional_signs(page: str, finished_folder: Path) -> 
     found.feed(page)
     text = " ".join(" ".join(found.text).split())
     metrics = json.loads((finished_folder / "5-validation/metrics.json").read_text())
-    assert html.WORDS[metrics["verdict"]] in text and metrics["reason"][1:] in text
+    assert certificate.WORDS[metrics["verdict"]] in text and metrics["reason"][1:] in text
     rms = metrics["validation"]["validation.csv"]["calibrated"]["position_mm"]["rms"]
     assert f"{rms:.3f}" in text
     for words in ("lwr4plus", "optical CMM", "60 µm", "seed", "numpy", "3-measured/measured.csv", "Limitations"):
@@ -104,7 +104,7 @@ def test_numbers_of_the_report_are_those_of_the_fit(finished_folder: Path) -> No
 
 def test_hostile_names_do_not_become_markup(finished_folder: Path) -> None:
     found = replace(fit_report.read(finished_folder / "4-fit/report.json"), robot="<script>alert(1)</script>")
-    written = html.render(fit_certificate.of_fit(found, {}))
+    written = certificate.render(certificate.of_fit(found, {}))
     assert "<script>" not in written and "&lt;script&gt;" in written
 
 
