@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from without_figures import words
 
 from calib import cli
 from calib.robot.chain import Chain
@@ -60,7 +61,7 @@ def cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cell:
 
 @pytest.fixture
 def figures() -> bool:
-    """Say whether fits draw figures, which takes them a second; a test that wants them overrides this."""
+    """Say whether commands draw figures, which takes a second; a test that wants them overrides this."""
     return False
 
 
@@ -69,8 +70,7 @@ def calib(capsys: pytest.CaptureFixture[str], figures: bool):
     """Return a function that runs a command: its exit code, and what it said on stdout and stderr."""
 
     def run(*arguments: object) -> tuple[int, str, str]:
-        bare = ["--no-plots"] if arguments[0] == "fit" and not figures and "--no-plots" not in arguments else []
-        code = cli.run([*(str(argument) for argument in arguments), *bare])
+        code = cli.run([str(argument) for argument in arguments] if figures else words(*arguments))
         said = capsys.readouterr()
         return code, said.out, said.err
 

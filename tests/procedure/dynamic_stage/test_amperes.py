@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import planted_motion as planted
 import pytest
-
-from calib import cli
+from without_figures import run
 
 GAINS = np.array([10.0, 12.0, 8.0])
 
@@ -23,10 +22,6 @@ def currents(folder: Path, name: str, seed: int, payload: bool = False) -> Path:
     path = folder / name
     np.savez(path, t=t, q=q, i=(tau + 0.02 * rng.normal(size=tau.shape)) / GAINS)
     return path
-
-
-def run(*arguments: object) -> int:
-    return cli.run([str(argument) for argument in arguments])
 
 
 @pytest.fixture(scope="module")

@@ -9,21 +9,20 @@ from pathlib import Path
 import numpy as np
 import planted_motion as planted
 import pytest
+import without_figures
 
-from calib import cli
 from calib.errors import CalibError
 
 
 def run(*arguments: object) -> int:
-    return cli.run(["identify", *map(str, arguments)])
+    return without_figures.run("identify", *arguments)
 
 
 def test_the_folder_keeps_its_contract(robot, tmp_path, capsys):
     train, other = planted.write(tmp_path, "train.npz", 0), planted.write(tmp_path, "other.npz", 1)
     out = tmp_path / "out"
-    assert (
-        run(robot, f"{train}@0:18", "--validate", other, f"{train}@18.5:", "--out", out, "--friction", "standard") == 0
-    )
+    drawn = ("--out", out, "--friction", "standard", "--plots")
+    assert run(robot, f"{train}@0:18", "--validate", other, f"{train}@18.5:", *drawn) == 0
     found = json.loads((out / "metrics.json").read_text())
     assert list(found["identification"]) == ["train.npz@0:18"]
     assert list(found["validation"]) == ["other.npz", "train.npz@18.5:"]
@@ -53,7 +52,7 @@ def test_the_folder_keeps_its_contract(robot, tmp_path, capsys):
         path.name for path in out.iterdir()
     }
     assert "verdict: pass" in capsys.readouterr().out
-    assert run(robot, train, "--out", out, "--friction", "standard") == 0, "an own folder may be written again"
+    assert run(robot, train, *drawn) == 0, "an own folder may be written again"
     assert not (out / "plot_torque_3.png").exists(), "plots of the earlier run are gone"
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from without_figures import run
 
-from calib import cli
 from calib.identification.identify_options import parse_options
 from calib.procedure.dynamic_stage.gains import find_gains
 from calib.procedure.dynamic_stage.inputs import read_motion
@@ -18,13 +18,13 @@ from calib.robot.load import load
 
 def identify(out: Path, *arguments: object, options: str = "") -> dict:
     """Run the command and return its metrics."""
-    more: list[str] = []
+    more: list[object] = []
     if options:
         out.parent.mkdir(parents=True, exist_ok=True)
         path = out.parent / "options.toml"
         path.write_text(options)
-        more = ["--options", str(path)]
-    assert cli.run(["identify", *map(str, arguments), "--out", str(out), *more]) in (0, 1)
+        more = ["--options", path]
+    assert run("identify", *arguments, "--out", out, *more) in (0, 1)
     return json.loads((out / "metrics.json").read_text())
 
 
@@ -277,5 +277,5 @@ def test_tiago_prismatic_torso_and_signed_gains(data, tmp_path):
 @pytest.mark.parametrize("clash", ["kuka_kr300_tuk/traj_A.npz", "ur10e_innopolis/ur-20_01_17-p1.npz"])
 def test_another_robots_recording_is_refused(data, tmp_path, clash, capsys):
     robot = data / "franka_panda_inria" / "model.urdf"
-    assert cli.run(["identify", str(robot), str(data / clash), "--out", str(tmp_path / "out")]) == 2
+    assert run("identify", robot, data / clash, "--out", tmp_path / "out") == 2
     assert "7" in capsys.readouterr().err

@@ -54,7 +54,7 @@ SHORT = ExcitationSettings(starts=1, evaluations=45, period=16.0, harmonics=4, r
 def test_the_motion_keeps_its_limits_and_is_written_for_a_controller(cell, calib):
     Path("limits.toml").write_text(LIMITS)
     stands = "-0.8,-1.0,-1.0,-1.2,0.2,-1.5,0.3"
-    played = ("--start", stands, "--repeat", 2, "--slower", 3)
+    played = ("--start", stands, "--repeat", 2, "--slower", 3, "--plots")
     code, out, err = calib("excite", "lwr4plus", "--limits", "limits.toml", "--out", "e", *QUICK, *played)
     assert code == 0, err
     assert "collisions are NOT checked: limits.toml has no [collision]" in out

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import yaml
 from planned import CHAIN, WAYPOINTS, lwr
+from without_figures import run
 
-from calib import cli, files
+from calib import files
 from calib.dynamics import drives
 from calib.dynamics.bodies import STANDARD
 from calib.procedure.excitation import folder as motion_folder
@@ -57,7 +58,7 @@ def write_waypoints(points, name: str = "way.csv", header: str = "q1,q2,q3,q4,q5
 
 def plan(*more: str) -> int:
     given = list(more) if "--waypoints" in more else ["--waypoints", "way.csv", *more]
-    return cli.run(["plan", "lwr4plus", *given, *(() if "--out" in more else ("--out", "out"))])
+    return run("plan", "lwr4plus", *given, *(() if "--out" in more else ("--out", "out")))
 
 
 def columns(path: Path) -> dict[str, np.ndarray]:
@@ -67,7 +68,7 @@ def columns(path: Path) -> dict[str, np.ndarray]:
 
 
 def test_an_identified_model_is_planned_with(room, capsys):
-    assert plan("--model", "model", "--start", "0,0,0,0,0,0,0", "--slower", "4") == 0
+    assert plan("--model", "model", "--start", "0,0,0,0,0,0,0", "--slower", "4", "--plots") == 0
     table = json.loads((room / "out" / "metrics.json").read_text())
     motion = columns(room / "out" / "motion.csv")
     assert motion["t"][-1] == pytest.approx(table["duration"], abs=1e-9)

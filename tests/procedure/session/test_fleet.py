@@ -13,8 +13,8 @@ from pathlib import Path
 import dask_cluster
 import pytest
 from sessions import edit
+from without_figures import run
 
-from calib import cli
 from calib.errors import MeasurementError, NotConverged, TaskLost, Unidentifiable, UsageError, exit_code
 from calib.procedure.session import fleet
 from calib.workers import Workers, workers
@@ -33,14 +33,14 @@ def cells(finished_folder: Path, planned_folder: Path, tmp_path: Path) -> Path:
 
 
 def test_one_that_fails_stops_none(cells: Path, capsys: pytest.CaptureFixture) -> None:
-    assert cli.run(["run", *map(str, sorted(cells.iterdir()))]) == 2
+    assert run("run", *sorted(cells.iterdir())) == 2
     said = capsys.readouterr().out
     assert "1 of 4 done" in said and "1 waiting, 2 failed" in said
     assert f"{cells / 'b'} failed" in said and "looks like" in said and f"{cells / 'c'} waits for a file" in said
     assert "looks like" in (cells / "b/run.log").read_text() and "Bring " in (cells / "c/run.log").read_text()
     assert not list((cells / "d").iterdir())
-    assert cli.run(["run", str(cells / "a/session.toml")]) == 0
-    assert cli.run(["run", str(cells / "a"), str(cells / "a/session.toml")]) == 2
+    assert run("run", cells / "a/session.toml") == 0
+    assert run("run", cells / "a", cells / "a/session.toml") == 2
 
 
 def test_a_failing_verdict_is_code_1(cells: Path) -> None:
@@ -72,7 +72,7 @@ def test_a_fleet_on_a_cluster(cells: Path, tmp_path: Path, monkeypatch, capsys: 
     """Folders named from here are found there; each robot is said when it is done, the table in the order given."""
     monkeypatch.chdir(cells)
     with dask_cluster.running(tmp_path, workers=2) as cluster:
-        assert cli.run(["run", "d", "c", "a", "--workers", cluster.address]) == 2
+        assert run("run", "d", "c", "a", "--workers", cluster.address) == 2
     said = capsys.readouterr().out
     assert "1 of 3 done" in said and "a: done, " in said and " mm, " in said and "d failed: " in said
     table = said[said.index("session ") :].splitlines()
