@@ -8,8 +8,7 @@ from pathlib import Path
 
 from calib.procedure.session import demo, instructions, steps
 from calib.procedure.session.commands import begin
-from calib.procedure.session.folder import locked
-from calib.procedure.session.outcome import verdict_of
+from calib.procedure.session.folder import locked, verdict_of
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--out", type=Path, required=True)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 
 from calib import files
 from calib.errors import RobotError, UsageError
 from calib.procedure.export import geometry
+from calib.robot.formats.markup import with_comment
 
 COPIED = ("robot.toml", "joint_corrections.csv", "joint_corrections.txt")
+FIRST = "verdict fail: "  # how a README.txt of ours begins; another's is left alone
 
 
 def deliver(fit: Path, source: Path, out: Path) -> list[str]:
@@ -64,3 +67,23 @@ def deliver(fit: Path, source: Path, out: Path) -> list[str]:
         )
         notes.append(f"{words}; {left}" if left else words)
     return notes
+
+
+def mark_failed(out: Path, verdicts: Mapping[str, tuple[str, str]]) -> list[str]:
+    """Write failed verdicts at the head of the exported URDFs and into a README.txt beside them; return what to say.
+
+    Args:
+        out: the folder of the export; without a failed stage an earlier README.txt is removed from it.
+        verdicts: stage to verdict (``pass``, ``marginal``, ``fail``) and reason.
+    """
+    failed = [f"{stage}: {reason}" for stage, (verdict, reason) in verdicts.items() if verdict == "fail"]
+    readme = out / "README.txt"
+    if not failed:
+        if readme.exists() and readme.read_text(encoding="utf-8", errors="replace").startswith(FIRST):
+            readme.unlink()
+        return []
+    words = f"{FIRST}{'; '.join(failed)}; do not use"
+    files.write(readme, f"{words}\nThe files in this folder were exported for inspection only.\n")
+    for path in sorted(out.rglob("*.urdf")):
+        files.write(path, with_comment(path.read_bytes(), words))
+    return [words]

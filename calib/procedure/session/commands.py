@@ -14,9 +14,8 @@ from rich.table import Table
 from calib.errors import UsageError
 from calib.procedure.excitation.limits import read_motion_limits
 from calib.procedure.session import instructions, steps
-from calib.procedure.session.folder import Session, create, locked, open_session
-from calib.procedure.session.outcome import verdict_of
-from calib.procedure.session.presets import instrument as instrument_named
+from calib.procedure.session.folder import Session, create, locked, open_session, verdict_of
+from calib.procedure.session.questions import instrument_named
 from calib.procedure.session.settings import (
     DynamicsSection,
     FitSection,
@@ -48,7 +47,7 @@ def begin(
     Args:
         folder: new.
         robot: see `calib.robot.load`.
-        instrument: a key of `calib.procedure.session.presets.INSTRUMENTS`.
+        instrument: a key of `calib.procedure.session.questions.INSTRUMENTS`.
         poses, validation: how many to choose.
         seed: of everything random.
         base, tip: of a URDF, empty for its own.

@@ -17,8 +17,7 @@ from calib.errors import SessionError, UsageError
 from calib.procedure.report import viewer
 from calib.procedure.session import dynamics_steps, steps
 from calib.procedure.session.commands import begin
-from calib.procedure.session.folder import MARK, Session, locked, open_session
-from calib.procedure.session.outcome import verdict_of
+from calib.procedure.session.folder import MARK, Session, locked, open_session, verdict_of
 from calib.procedure.session.truth import TRUTH, against_truth, torques_against_truth
 from calib.robot import library
 from calib.robot.load import load

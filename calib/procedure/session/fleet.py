@@ -18,8 +18,7 @@ from rich.table import Table
 from calib import files
 from calib.errors import CalibError, TaskLost, UsageError, exit_code
 from calib.procedure.session import instructions, steps
-from calib.procedure.session.folder import locked, open_session
-from calib.procedure.session.outcome import verdict_of
+from calib.procedure.session.folder import locked, open_session, verdict_of
 from calib.workers import Workers
 
 LOG = "run.log"

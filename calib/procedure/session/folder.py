@@ -42,6 +42,7 @@ from calib.procedure.session.settings import SCHEMA, SessionSettings, check_sche
 
 FOLDERS = ("1-robot", "2-poses", "3-measured", "4-fit", "5-validation")
 DYNAMIC = ("6-excitation", "7-recorded", "8-dynamics")
+VERDICTS = ("pass", "marginal", "fail")  # from good to bad
 EXPORT = {False: "6-export", True: "9-export"}  # without, with dynamics
 MARK = "simulated.txt"
 
@@ -100,6 +101,21 @@ class Session:
     def export(self) -> str:
         """The folder of the export, relative to the session's."""
         return EXPORT[self.dynamic]
+
+
+def verdicts(session: Session) -> dict[str, tuple[str, str]]:
+    """Return verdict and reason of each stage."""
+    geometry = session.validation.metrics()
+    found = {"geometry": (geometry.verdict, geometry.reason)}
+    if session.dynamic:
+        dynamics = session.identification.unseen.verdict()
+        found["dynamics"] = (dynamics.verdict, dynamics.reason)
+    return found
+
+
+def verdict_of(session: Session) -> str:
+    """Return the worse of the stages' verdicts."""
+    return max((verdict for verdict, _ in verdicts(session).values()), key=VERDICTS.index)
 
 
 def create(

@@ -23,8 +23,7 @@ from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import assess
 from calib.procedure.report import certificate, fit_report
 from calib.procedure.session import arrival
-from calib.procedure.session.folder import Session
-from calib.procedure.session.outcome import mark_failed
+from calib.procedure.session.folder import Session, verdicts
 from calib.robot.chain import Chain
 from calib.units import JOINT
 
@@ -222,9 +221,11 @@ def validate(session: Session, say: Say) -> list[str]:
 
 def export(session: Session, say: Say) -> list[str]:
     """Put the calibrated robot into the forms others read; of a failed one the files say so."""
+    from calib.procedure.export.delivery import mark_failed
+
     out = session.path(session.export)
     lines = _exported(session, out, say)
-    return [*mark_failed(session, out), *lines]
+    return [*mark_failed(out, verdicts(session)), *lines]
 
 
 def _exported(session: Session, out: Path, say: Say) -> list[str]:

@@ -1,4 +1,4 @@
-"""What `calib new` needs to know, by options or by questions at a terminal; every answer is checked as it comes."""
+"""What `calib new` needs to know: instruments by name, options or questions at a terminal, each answer checked."""
 
 from __future__ import annotations
 
@@ -10,11 +10,54 @@ from typing import Any
 import numpy as np
 
 from calib.errors import UsageError
-from calib.procedure.session.presets import INSTRUMENTS
-from calib.procedure.session.presets import instrument as instrument_named
 from calib.procedure.session.settings import TORQUES
 from calib.robot import library
 from calib.robot.load import resolve
+
+
+@dataclass(frozen=True)
+class InstrumentPreset:
+    """An instrument's starting values in ``session.toml``.
+
+    Attributes:
+        label: its name for people.
+        measures: ``pose`` or ``position``.
+        sigma_position, sigma_orientation: of one measurement, per axis [m], [rad]; 0: to be estimated.
+        source: where the sigmas come from.
+    """
+
+    label: str
+    measures: str
+    sigma_position: float
+    sigma_orientation: float
+    source: str
+
+
+INSTRUMENTS = {
+    "cmm": InstrumentPreset(
+        "optical CMM", "pose", 60e-6, 0.2e-3, "Nikon K610: 60 µm volumetric; orientation our guess"
+    ),
+    "tracker": InstrumentPreset(
+        "laser tracker", "position", 20e-6, 0.0, "about 15 µm + 6 µm/m in a small cell; our guess"
+    ),
+    "tracker6d": InstrumentPreset("laser tracker, 6-D probe", "pose", 30e-6, 0.1e-3, "our guess"),
+    "mocap": InstrumentPreset("motion capture", "pose", 0.0, 0.0, "estimated from the residuals"),
+    "camera": InstrumentPreset("camera and board", "pose", 0.0, 0.0, "estimated from the residuals"),
+    "other-pose": InstrumentPreset("instrument", "pose", 0.0, 0.0, "estimated from the residuals"),
+    "other-position": InstrumentPreset("instrument", "position", 0.0, 0.0, "estimated from the residuals"),
+}
+
+
+def instrument_named(name: str) -> InstrumentPreset:
+    """Return an instrument by name.
+
+    Raises:
+        UsageError: with the names there are.
+    """
+    if name not in INSTRUMENTS:
+        known = ", ".join(f"{key} ({each.label}, {each.measures})" for key, each in INSTRUMENTS.items())
+        raise UsageError(f"no instrument '{name}'; there are {known}")
+    return INSTRUMENTS[name]
 
 
 @dataclass(frozen=True)

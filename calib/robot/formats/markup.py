@@ -6,6 +6,7 @@ cannot parse, gives links without inertia the identity, and fails without a line
 
 from __future__ import annotations
 
+import codecs
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -117,3 +118,18 @@ def _attributes(data: bytes, node: Node) -> Iterator[re.Match[bytes]]:
     while match := _ATTRIBUTE.match(data, place):
         yield match
         place = match.end()
+
+
+def with_comment(content: bytes, words: str) -> bytes:
+    """Return an XML file with a comment at its head, behind the declaration; ASCII, as any 8-bit encoding reads it.
+
+    A file in UTF-16 is returned as it is.
+    """
+    if b"\0" in content[:4]:
+        return content
+    comment = f"<!-- {re.sub('-(?=-)', '- ', words)} -->".encode("ascii", "xmlcharrefreplace")
+    bom = len(codecs.BOM_UTF8) if content.startswith(codecs.BOM_UTF8) else 0
+    if not content[bom:].startswith(b"<?xml"):
+        return content[:bom] + comment + b"\n" + content[bom:]
+    start = content.index(b"?>") + 2
+    return content[:start] + b"\n" + comment + content[start:]

@@ -16,8 +16,9 @@ from sessions import edit, go_on, quiet
 
 from calib import cli
 from calib.errors import CalibError, MeasurementError, SessionError
-from calib.procedure.session import certificate, instructions, outcome, steps
+from calib.procedure.session import certificate, instructions, steps
 from calib.procedure.session.folder import Session, locked, open_session, read_state
+from calib.robot.formats.markup import with_comment
 from calib.robot.load import load
 
 
@@ -240,7 +241,7 @@ def test_a_failed_robots_files_say_so_until_it_does_not_fail(finished: Session, 
 
 @pytest.mark.parametrize("head", [b"", b"\xef\xbb\xbf", b'<?xml version="1.0"?>', b'\xef\xbb\xbf<?xml version="1.0"?>'])
 def test_a_comment_goes_behind_what_xml_wants_first(head: bytes) -> None:
-    found = ElementTree.fromstring(outcome.headed(head + b"<robot name='a'/>", "off by 3 µm --- too much"))
+    found = ElementTree.fromstring(with_comment(head + b"<robot name='a'/>", "off by 3 µm --- too much"))
     assert found.tag == "robot" and found.get("name") == "a"
 
 
