@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.geometry.installation import Installation, Seen, see
 from calib.robot.deflection import evaluate
-from calib.robot.kinematics import element_jacobian, joint_jacobian
+from calib.robot.kinematics import joint_jacobian
 
 LENGTH = 0.3  # an orientation counts as its displacement at this distance [m]; as all constants here, our choice
 DONE = 1e-10  # error [m] below which a target is met
@@ -81,13 +81,9 @@ def _differences(seen: Seen, targets: np.ndarray, dof: int) -> np.ndarray:
     return np.hstack([missing, scale * across])
 
 
-def tool_jacobian(goal: Goal, seen: Seen) -> np.ndarray:
+def differences_jacobian(goal: Goal, seen: Seen) -> np.ndarray:
     """Return the derivative (m, dof, n) of what `differences` compares, with respect to the joints."""
-    chain = goal.cell.chain
-    moving = np.array([k for k, element in enumerate(chain.elements) if element.joint is not None])
-    elements = np.zeros((len(chain.elements), 6, seen.point.shape[1]))
-    elements[moving] = element_jacobian(chain, seen.walked, seen.point, moving)
-    jacobian = joint_jacobian(chain, elements).transpose(2, 1, 0)
+    jacobian = joint_jacobian(goal.cell.chain, seen.walked, seen.point)
     if goal.dof == 3:
         return jacobian[:, :3]
     if goal.dof == 6:
@@ -136,7 +132,7 @@ def _weighted(goal: Goal, q: np.ndarray, targets: np.ndarray) -> tuple[np.ndarra
     """Return error (m, dof) and Jacobian (m, dof, n), orientations as displacements at `LENGTH` [m]."""
     seen = seen_at(goal, q)
     weight = np.where(np.arange(goal.dof) < 3, 1.0, LENGTH)
-    return weight * _differences(seen, targets, goal.dof), weight[:, None] * tool_jacobian(goal, seen)
+    return weight * _differences(seen, targets, goal.dof), weight[:, None] * differences_jacobian(goal, seen)
 
 
 def _inside(goal: Goal, q: np.ndarray, error: np.ndarray, jacobian: np.ndarray, damping: np.ndarray) -> np.ndarray:

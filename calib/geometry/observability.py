@@ -94,8 +94,7 @@ class TargetJacobian:
 
     def __call__(self, q: np.ndarray) -> np.ndarray:
         seen = see(self.cell, q)
-        elements = element_jacobian(self.cell.chain, seen.walked, seen.point)
-        return joint_jacobian(self.cell.chain, elements).transpose(2, 1, 0)
+        return joint_jacobian(self.cell.chain, seen.walked, seen.point)
 
 
 def targets_of(chain: Chain, tools: Sequence[Sequence[float]] = ()) -> Installation:

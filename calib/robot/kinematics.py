@@ -168,13 +168,29 @@ def twist_product(
     return result
 
 
-def joint_jacobian(chain: Chain, elements: np.ndarray) -> np.ndarray:
-    """Gather an element Jacobian (K, rows, m) into the one of the joints (n, rows, m), mimic followers included."""
-    result = np.zeros((chain.n, *elements.shape[1:]))
-    for k, element in enumerate(chain.elements):
-        if element.joint is not None:
-            result[element.joint] += element.ratio * elements[k]
-    return result
+def joint_jacobian(chain: Chain, walked: Sweep, point: np.ndarray, before: int | None = None) -> np.ndarray:
+    """Return the derivative of `point` with respect to the joints, mimic followers included.
+
+    Args:
+        walked: what `sweep` returned.
+        point: (3, m) [m], in the reference frame.
+        before: elements from this one on lie behind the point and do not move it; None: the flange carries it.
+
+    Returns:
+        (m, 6, n): linear velocity of the point, then angular velocity, both in the reference frame.
+    """
+    moving = np.array([k for k, e in enumerate(chain.elements[:before]) if e.joint is not None], dtype=int)
+    result = np.zeros((chain.n, 6, point.shape[1]))
+    for k, column in zip(moving, element_jacobian(chain, walked, point, moving), strict=True):
+        element = chain.elements[k]
+        result[element.joint] += element.ratio * column
+    return result.transpose(2, 1, 0)
+
+
+def tip_jacobian(chain: Chain, q: np.ndarray) -> np.ndarray:
+    """Return the Jacobian (m, 6, n) of the tip with respect to the joints at joint values q (m, n): [v; ω]."""
+    walked = sweep(chain, q)
+    return joint_jacobian(chain, walked, walked.position)
 
 
 def joint_frames(chain: Chain, q: np.ndarray) -> np.ndarray:

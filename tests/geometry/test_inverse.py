@@ -54,7 +54,7 @@ def test_the_jacobian_is_the_slope_of_the_differences(dof):
     goal = replace(arm("panda", dof), cell=rigid(lwr4plus_cell()).truth)
     q = joints(goal, 5, 4)
     targets = inverse.seen_at(goal, q).poses()
-    for one, target, claimed in zip(q, targets, inverse.tool_jacobian(goal, inverse.seen_at(goal, q))):
+    for one, target, claimed in zip(q, targets, inverse.differences_jacobian(goal, inverse.seen_at(goal, q))):
         check(lambda x, target=target: -inverse.differences(goal, x[None], target[None])[0], claimed, one)
 
 
@@ -80,7 +80,7 @@ def test_redundant_joints_stay_nearest_to_the_start(robot, dof):
     found = inverse.nearest(goal, targets, start, inverse.reach(goal, targets, start))
     assert np.abs(inverse.differences(goal, found, targets)).max() < 1e-8
     away = found - start
-    for jacobian, change in zip(inverse.tool_jacobian(goal, inverse.seen_at(goal, found)), away):
+    for jacobian, change in zip(inverse.differences_jacobian(goal, inverse.seen_at(goal, found)), away):
         across = change - np.linalg.pinv(jacobian) @ (jacobian @ change)
         assert np.linalg.norm(across) < 0.02 * np.linalg.norm(change)
 

@@ -10,7 +10,7 @@ from calib.dynamics import base, drives
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.robot.chain import Chain
-from calib.robot.kinematics import element_jacobian, joint_jacobian, sweep
+from calib.robot.kinematics import sweep, tip_jacobian
 from calib.robot.load import load
 
 FC = (11.9, 11.5, 8.98, 8.35, 8.31, 4.72, 6.04)  # [N m], total, Jubien et al. 2014 as quoted in facts
@@ -32,9 +32,7 @@ def tool_points(chain: Chain, q: np.ndarray) -> np.ndarray:
 
 
 def tool_product(chain: Chain, q: np.ndarray, G: np.ndarray) -> np.ndarray:
-    walked = sweep(chain, q)
-    jacobian = joint_jacobian(chain, element_jacobian(chain, walked, walked.position))[:, :3]
-    return np.einsum("nim,mi->mn", jacobian, G[:, 0])
+    return np.einsum("min,mi->mn", tip_jacobian(chain, q)[:, :3], G[:, 0])
 
 
 def tool(chain: Chain):

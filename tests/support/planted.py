@@ -14,7 +14,7 @@ from calib.geometry.installation import Installation, see
 from calib.geometry.observation import observe, prepare, stack
 from calib.geometry.result import GeometricFit
 from calib.robot.chain import Chain, Element, Joint, random_joints
-from calib.robot.kinematics import element_jacobian, joint_jacobian
+from calib.robot.kinematics import joint_jacobian
 from calib.robot.load import load
 from calib.transforms import pose
 
@@ -120,8 +120,8 @@ def _touched(
     aim = sockets[group] + sigma * rng.normal(size=(len(q), 3))
     for _ in range(80):
         seen = see(inner, q, 0, tool)
-        jacobian = joint_jacobian(truth.chain, element_jacobian(truth.chain, seen.walked, seen.point)[:, :3])
-        miss, slope = (aim - seen.point.T)[:, :, None], jacobian.transpose(2, 1, 0)
+        jacobian = joint_jacobian(truth.chain, seen.walked, seen.point)[:, :3]
+        miss, slope = (aim - seen.point.T)[:, :, None], jacobian
         if kind == "plane":
             n = normals[group]
             miss, slope = (

@@ -52,7 +52,7 @@ from calib.errors import UsageError
 from calib.geometry.observability import targets_of
 from calib.procedure.kinematic_stage.pose_limits import ConstraintsFile, Limits, Point, limits_of
 from calib.robot.chain import Chain
-from calib.robot.kinematics import element_jacobian, joint_frames, joint_jacobian, sweep
+from calib.robot.kinematics import joint_frames, joint_jacobian, sweep
 from poses.space import PoseConstraint
 from trajectories.basis import SampledMotion
 from trajectories.constraints import BoxLimit, MotionConstraint, box_limits
@@ -190,10 +190,9 @@ class Points:
         walked, points = sweep(self.chain, q), self(q)
         result = np.zeros(q.shape)
         for k, joint in enumerate(self.joints):
-            elements = element_jacobian(self.chain, walked, np.ascontiguousarray(points[:, k].T))[:, :3]
-            if joint:
-                elements[self.chain.moving[joint - 1] + 1 :] = 0.0
-            result += np.einsum("nim,mi->mn", joint_jacobian(self.chain, elements), G[:, k])
+            behind = int(self.chain.moving[joint - 1]) + 1 if joint else None
+            slope = joint_jacobian(self.chain, walked, np.ascontiguousarray(points[:, k].T), behind)
+            result += np.einsum("min,mi->mn", slope[:, :3], G[:, k])
         return result
 
 

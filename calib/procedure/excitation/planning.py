@@ -27,7 +27,7 @@ from calib.procedure.excitation.waypoints import read_waypoints
 from calib.procedure.kinematic_stage.inputs import load_robot
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
-from calib.robot.kinematics import element_jacobian, forward, joint_jacobian, sweep
+from calib.robot.kinematics import forward, tip_jacobian
 from trajectories.basis import SampledMotion
 from trajectories.constraints import BoxLimit
 from trajectories.setpoints import Setpoints, joined, slowed
@@ -289,15 +289,9 @@ def _paths(chain: Chain, points: np.ndarray, lines: bool) -> tuple[list[JointPat
         return [spline(points)], None
     start, found = checked(points)[0], []
     for goal in forward(chain, points[1:]):
-        found.append(line(partial(forward, chain), partial(tool_jacobian, chain), start, goal))
+        found.append(line(partial(forward, chain), partial(tip_jacobian, chain), start, goal))
         start = found[-1].path(np.array([found[-1].path.length]))[0]
     return [one.path for one in found], np.max([one.deviation for one in found], axis=0)
-
-
-def tool_jacobian(chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return the Jacobian of the tip by the joints, (m, 6, n)."""
-    walked = sweep(chain, q)
-    return joint_jacobian(chain, element_jacobian(chain, walked, walked.position)).transpose(2, 1, 0)
 
 
 def _duration(

@@ -12,7 +12,7 @@ import numpy as np
 
 from calib.robot import description, library
 from calib.robot.chain import Chain
-from calib.robot.kinematics import element_jacobian, forward, joint_jacobian, sweep
+from calib.robot.kinematics import forward, joint_jacobian, sweep
 from calib.transforms import invert, pose
 
 COLUMNS = ("alpha", "d", "theta", "r")
@@ -84,7 +84,7 @@ def constraint_gradients(chain: Chain, station: np.ndarray, tool: np.ndarray, q:
     """
     walked = sweep(chain, q)
     fixture = walked.poses() @ tool
-    slope = joint_jacobian(chain, element_jacobian(chain, walked, fixture[:, :3, 3].T)).transpose(2, 1, 0)
+    slope = joint_jacobian(chain, walked, fixture[:, :3, 3].T)
     across = fixture[:, :2, 3] / np.maximum(np.hypot(fixture[:, 0, 3], fixture[:, 1, 3]), 1e-9)[:, None]
     turn = station[:3, :3] @ slope[:, 3:]
     x, y = (station[:3, :3] @ fixture[:, :3, 0].T)[:2, :, None]

@@ -7,7 +7,7 @@ import pytest
 from planned import CHAIN, WAYPOINTS, limits, lwr
 
 from calib.robot.chain import random_joints
-from calib.robot.kinematics import element_jacobian, forward, joint_jacobian, sweep
+from calib.robot.kinematics import forward, tip_jacobian
 from calib.robot.load import load
 from trajectories.errors import BadInput, NothingFeasible
 from trajectories.timing.lines import line
@@ -17,11 +17,7 @@ from trajectories.timing.time_scaling import time_optimal
 
 
 def kinematics(chain):
-    def jacobian(q):
-        walked = sweep(chain, q)
-        return joint_jacobian(chain, element_jacobian(chain, walked, walked.position)).transpose(2, 1, 0)
-
-    return (lambda q: forward(chain, q)), jacobian
+    return (lambda q: forward(chain, q)), (lambda q: tip_jacobian(chain, q))
 
 
 @pytest.mark.parametrize("chain", [CHAIN, load("ur5")], ids=["redundant", "six joints"])
