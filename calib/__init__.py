@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     )
     from calib.api.motions import ExcitationDesign, MotionPlan, design_excitation, plan_motion
     from calib.api.reading import load, read_poses, read_recording
+    from calib.api.sessions import new_session, run_sessions
     from calib.api.validating import validate
     from calib.errors import CalibError
     from calib.procedure.excitation.settings import ExcitationSettings, PlanSettings
@@ -51,6 +52,8 @@ _HOMES = {
     "validate": "api.validating",
     "export": "api.exporting",
     "compensate": "api.kinematic",
+    "new_session": "api.sessions",
+    "run_sessions": "api.sessions",
     "CalibratedChain": "robot.calibrated",
     "PoseSelection": "api.kinematic",
     "GeometryFit": "api.kinematic",
@@ -67,9 +70,9 @@ _HOMES = {
 
 __all__ = [  # noqa: RUF022 (in the order of use)
     "load", "read_poses", "read_recording", "select_poses", "fit_geometry", "design_excitation", "plan_motion",
-    "identify_dynamics", "validate", "export", "compensate", "CalibratedChain", "PoseSelection", "GeometryFit",
-    "ExcitationDesign", "MotionPlan", "DynamicsModel", "JointCommands", "SelectionSettings", "FitSettings",
-    "ExcitationSettings", "PlanSettings", "CalibError",
+    "identify_dynamics", "validate", "export", "compensate", "new_session", "run_sessions", "CalibratedChain",
+    "PoseSelection", "GeometryFit", "ExcitationDesign", "MotionPlan", "DynamicsModel", "JointCommands",
+    "SelectionSettings", "FitSettings", "ExcitationSettings", "PlanSettings", "CalibError",
 ]  # fmt: skip
 
 

@@ -3,21 +3,15 @@
 python examples/02_choose_poses.py [FOLDER]
 """
 
-import sys
-from pathlib import Path
+import practice
 
-from calib.procedure.kinematic_stage import selection
-from calib.procedure.kinematic_stage.settings import SelectionSettings
+import calib
 
-folder = Path(sys.argv[1] if len(sys.argv) > 1 else "example-02")
-folder.mkdir(parents=True, exist_ok=True)
+practice.enter(__file__)
 
-# from a tracker that sees one reflector at a time: three of them on the tool tell its orientation, too
-targets = [[0.05, 0.0, 0.1], [-0.05, 0.0, 0.1], [0.0, 0.05, 0.15]]
-settings = SelectionSettings(kind="position", tools=targets, candidates=500)
-chosen = selection.choose("ur5", 20, settings)
-
-for words, number in selection.table(chosen):
-    print(f"{words:38} {number}")
-selection.write(chosen, folder / "poses.csv")
-print(f"written to {folder / 'poses.csv'}: joint values in rad, for the robot program")
+# a tracker sees one reflector at a time: three of them on the tool tell its orientation, too
+reflectors = ((0.05, 0.0, 0.1), (-0.05, 0.0, 0.1), (0.0, 0.05, 0.15))
+settings = calib.SelectionSettings(kind="position", tools=reflectors, index="O1", candidates=500)
+plan = calib.select_poses("ur5", 20, settings)
+print(plan)
+plan.save("poses.csv")  # joint values in rad, for the robot program

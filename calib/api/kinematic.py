@@ -141,6 +141,11 @@ class JointCommands:
         """(m, n) joint values to send [rad or m]."""
         return self.commands.q
 
+    @property
+    def nominal(self) -> np.ndarray:
+        """(m, n) joint values [rad or m] that put the nominal robot there: what would be sent without compensation."""
+        return self.commands.nominal
+
     def save(self, path: str | Path, *, partial: bool = False) -> Path:
         """Write the commands as CSV; `partial` writes what is reached, even where some targets are not."""
         return compensation_file.write(self.commands, self.fitted, self.targets, Path(path), partial)

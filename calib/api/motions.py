@@ -60,6 +60,11 @@ class MotionPlan:
 
     planned: planning.Planned
 
+    @property
+    def duration(self) -> float:
+        """How long the motion takes [s]."""
+        return self.planned.track.duration
+
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write the folder that `calib plan --out` writes."""
         from calib.procedure.report import motion_figures

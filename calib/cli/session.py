@@ -49,16 +49,16 @@ def new(
     FOLDER/7-recorded (calib formats recordings); how the session goes on is said in FOLDER/session.toml (calib formats
     session). Without --robot or --instrument, at a terminal, it asks.
     """
-    from calib.procedure.session import commands
+    from calib.api.sessions import new_session
     from calib.procedure.session.questions import Answers, checked
 
     given = Answers(robot, instrument, tool, limits, dynamics, tuple(payload or ()), torques)
     if robot is None or instrument is None:
         given = _asked(given)
-    made = commands.begin(
+    made = new_session(
         folder, poses=poses, validation=validation, base=base or "", tip=tip or "", seed=seed, **checked(given)
     )
-    say(f"made {made.folder}; next: calib next {made.folder}")
+    say(f"made {made}; next: calib next {made}")
 
 
 def _asked(given: Answers) -> Answers:
@@ -164,7 +164,7 @@ def demo(
 
 
 @app.command("run")
-def run_sessions(
+def run(
     sessions: Annotated[list[Path], typer.Argument(help="session.toml files, or the sessions' folders")],
     workers: Annotated[str, typer.Option(help="local processes, or the address of a Dask scheduler")] = "1",
     plots: Plots = True,
@@ -175,13 +175,13 @@ def run_sessions(
     """
     import time
 
-    from calib import workers as work
+    from calib.api.sessions import run_sessions
     from calib.procedure.session import fleet
 
     folders, started, outcomes = fleet.folders_of(sessions), time.perf_counter(), []
-    with told() as (say, progress), work.workers(workers) as crew:
+    with told() as (say, progress):
         progress(f"running {len(folders)} sessions")
-        for outcome in fleet.run(folders, crew, f"calib run --workers {workers}", plots):
+        for outcome in run_sessions(folders, workers=workers, plots=plots, command=f"calib run --workers {workers}"):
             outcomes.append(outcome)
             say(fleet.line(outcome))
             progress(f"{len(outcomes)} of {len(folders)} sessions")

@@ -131,6 +131,22 @@ def test_export_and_compensation_take_results_in_memory(fitted, model, cell, log
     assert commands.save(tmp_path / "commands.csv").is_file()
 
 
+def test_a_session_in_python_is_the_commands_session(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    made = calib.new_session("script", "ur5", "cmm", poses=20, validation=0, dynamics=False)
+    command = ["new", "command", "--robot", "ur5", "--instrument", "cmm", "--poses", "20", "--validation", "0"]
+    assert cli.run([*command, "--geometry-only"]) == 0
+    written = [(tmp_path / name / "session.toml").read_text() for name in ("script", "command")]
+    assert written[0] == written[1] and made == Path("script")
+    script, command = calib.run_sessions(["script", "command/session.toml"], plots=False)
+    assert script.state == command.state == "waits" and "Bring script/3-measured/measured.csv" in str(script)
+    assert cli.run(["run", "command", "--no-plots"]) == 0
+    assert "command: waits" in capsys.readouterr().out
+    assert (made / "2-poses/poses.csv").read_bytes() == (tmp_path / "command/2-poses/poses.csv").read_bytes()
+    with pytest.raises(calib.CalibError, match="named twice"):
+        calib.run_sessions(["script", "script/session.toml"])
+
+
 def test_wrong_settings_are_refused_where_they_are_made():
     with pytest.raises(calib.CalibError, match=r"holdout 1\.5"):
         calib.FitSettings(holdout=1.5)

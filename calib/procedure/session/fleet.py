@@ -35,6 +35,7 @@ class FleetRow:
         state: `DONE`, `WAITS` or `FAILED`.
         verdict: of a session that is done.
         words: what it waits for, or what went wrong.
+        asks: what to do at the robot now, in lines.
         nominal, calibrated: position error on unseen poses, rms [mm]; None where there is none.
         torque: unexplained on unseen motion [%]; None without dynamics.
         seconds: of wall time.
@@ -50,6 +51,10 @@ class FleetRow:
     torque: float | None = None
     seconds: float = 0.0
     code: int = 0
+    asks: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        return "\n".join([line(self), *(self.asks or remarks([self]))])
 
 
 def folders_of(given: Sequence[Path]) -> list[Path]:
@@ -107,11 +112,11 @@ def _go_on(folder: Path, say: Callable[[str], None], command: str, plots: bool) 
     with locked(session, say):
         waiting = steps.run_next(session, say, lambda words: None, command)
     if waiting is not None:
-        for line in instructions.asks(session, waiting):
-            say(line)
-        return FleetRow(
-            str(folder), WAITS, words=f"{waiting.words} (step {waiting.step.name}); {LOG} says what to bring"
-        )
+        asks = tuple(instructions.asks(session, waiting))
+        for words in asks:
+            say(words)
+        words = f"{waiting.words} (step {waiting.step.name}); {LOG} says what to bring"
+        return FleetRow(str(folder), WAITS, words=words, asks=asks)
     verdict = verdict_of(session)
     pairs = [(one.nominal.main, one.calibrated.main) for one in session.validation.metrics().validation.values()]
     rms = [(before.rms, after.rms) for before, after in pairs if before is not None and after is not None]

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import pickle
-import runpy
 import shutil
-import sys
 from collections.abc import Callable, Generator, Iterable
 from functools import partial
 from pathlib import Path
@@ -18,8 +16,6 @@ from without_figures import run
 from calib.errors import MeasurementError, NotConverged, TaskLost, Unidentifiable, UsageError, exit_code
 from calib.procedure.session import fleet
 from calib.workers import Workers, workers
-
-ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture
@@ -92,11 +88,3 @@ def test_exit_codes_by_error() -> None:
     assert [exit_code(error) for error in (UsageError("x"), MeasurementError("x", "f"))] == [2, 2]
     assert [exit_code(error) for error in (Unidentifiable("x"), NotConverged("x"))] == [3, 3]
     assert exit_code(KeyError("x")) is None and exit_code(NotIdentifiable.__new__(NotIdentifiable)) == 3
-
-
-@pytest.mark.slow
-def test_a_session_as_a_script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    given = ["--out", str(tmp_path / "cell"), "--geometry-only", "--robot", "ur5"]
-    monkeypatch.setattr(sys, "argv", ["03_session_as_script.py", *given])
-    runpy.run_path(str(ROOT / "examples/03_session_as_script.py"), run_name="__main__")
-    assert (tmp_path / "cell/certificate.html").exists()

@@ -1,0 +1,82 @@
+"""Guided sessions in Python: one folder per robot, made once, run as far as it goes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from calib.api.reading import listed, optional
+from calib.procedure.session import commands, fleet
+
+
+def new_session(
+    folder: str | Path,
+    robot: str | Path,
+    instrument: str,
+    *,
+    poses: int = 40,
+    validation: int = 20,
+    tool: Sequence[float] | None = None,
+    limits: str | Path | None = None,
+    dynamics: bool = True,
+    base: str = "",
+    tip: str = "",
+    seed: int = 0,
+    **motion: Any,
+) -> Path:
+    """Make the folder of a guided session for a robot, as `calib new` does.
+
+    Args:
+        folder: new.
+        robot, base, tip: as of `calib.load`.
+        instrument: ``cmm``, ``tracker``, ``tracker6d``, ``mocap``, ``camera``, ``other-pose`` or ``other-position``.
+        poses, validation: how many to choose for the fit, and to measure and never fit.
+        tool: (3,) where the target roughly sits in the tip's frame [m].
+        limits: TOML file that both poses and motions keep (``calib formats limits``).
+        dynamics: identify the dynamics, too.
+        seed: of everything random.
+        motion: other keys of ``[dynamics]`` (``calib formats session``): torques, payloads, period …
+
+    Returns:
+        The folder; its ``session.toml`` says how the session goes on.
+
+    Raises:
+        UsageError: where the folder is in use, or a value is none of these.
+    """
+    made = commands.begin(
+        Path(folder), str(robot), instrument, poses=poses, validation=validation, seed=seed, base=base, tip=tip,
+        tool=tool, limits=optional(limits), dynamics=dynamics, **motion,
+    )  # fmt: skip
+    return made.folder
+
+
+def run_sessions(
+    folders: str | Path | Sequence[str | Path],
+    *,
+    workers: str | int = 1,
+    plots: bool = True,
+    command: str = "calib.run_sessions",
+) -> Iterator[fleet.FleetRow]:
+    """Run sessions as far as they go, and yield how each ended; none stops another.
+
+    Args:
+        folders: of the sessions, or their ``session.toml``; one or several.
+        workers: local processes, or the address of a Dask scheduler.
+        plots: whether figures are drawn.
+        command: for the sessions' records.
+
+    Returns:
+        Rows as sessions end: ``folder``, ``state`` (done, waits or failed), ``verdict``; ``print`` says what to do now.
+
+    Raises:
+        UsageError: for a session that is named twice, or where none is.
+    """
+    return _run(fleet.folders_of([Path(each) for each in listed(folders)]), workers, command, plots)
+
+
+def _run(folders: list[Path], workers: str | int, command: str, plots: bool) -> Iterator[fleet.FleetRow]:
+    from calib.workers import workers as opened
+
+    with opened(workers) as crew:
+        yield from fleet.run(folders, crew, command, plots)
