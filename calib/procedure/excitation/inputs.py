@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.data.poses.fit_options import FitOptions
 from calib.dynamics import base as base_parameters
 from calib.dynamics import drives
 from calib.dynamics.base import BaseModel, columns_at_rest, information
@@ -23,7 +22,7 @@ from calib.procedure.dynamic_stage.inputs import read_motion
 from calib.procedure.excitation import coefficients
 from calib.procedure.excitation.limits import MotionLimits, read_motion_limits
 from calib.procedure.excitation.settings import ExcitationSettings
-from calib.procedure.kinematic_stage.inputs import load_robot
+from calib.procedure.kinematic_stage.inputs import load_rigid
 from calib.robot import description
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, sampling_limits
@@ -124,7 +123,7 @@ def read_inputs(
     Raises:
         UsageError, MeasurementError: for a file that is none, or belongs to another robot.
     """
-    chain, source = load_robot(robot, None, FitOptions(), base, tip)
+    chain, source = load_rigid(robot, None, base, tip)
     known = read_motion_limits(limits, chain, source)
     dynamics = read_model(chain, model, settings.drives, known)
     locked = read_locked(settings.lock, chain, known.positions)

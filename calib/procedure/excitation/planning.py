@@ -11,7 +11,6 @@ from typing import Annotated
 import numpy as np
 
 from calib.config import Expect, numbers, parse, read_toml, strict
-from calib.data.poses.fit_options import FitOptions
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.drives import standard
 from calib.dynamics.idim import IdentificationModel
@@ -24,7 +23,7 @@ from calib.procedure.excitation.limits import MotionLimits, read_motion_limits
 from calib.procedure.excitation.playback import approach_to, check_slower
 from calib.procedure.excitation.settings import DEFAULT_PLAN, PlanSettings
 from calib.procedure.excitation.waypoints import read_waypoints
-from calib.procedure.kinematic_stage.inputs import load_robot
+from calib.procedure.kinematic_stage.inputs import load_rigid
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward, tip_jacobian
@@ -127,7 +126,7 @@ def plan(
     """
     say = progress or (lambda words: None)
     _check(settings)
-    chain, source = load_robot(robot, waypoints, FitOptions(), base, tip)
+    chain, source = load_rigid(robot, waypoints, base, tip)
     known = read_motion_limits(limits, chain, source)
     law, notes, uncertain = _law(chain, model, settings.payloads, drives, known)
     lower, upper, bounds = _bounds(chain, known, law)

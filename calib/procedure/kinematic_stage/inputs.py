@@ -173,6 +173,21 @@ def load_robot(
     return load(robot, base, tip, names or None), source
 
 
+def load_rigid(
+    robot: str | Path | CalibratedChain, measured: Path | None = None, base: str | None = None, tip: str | None = None
+) -> tuple[Chain, Path]:
+    """Return the geometry that dynamics belong to and motions are planned on, and its file; see `load_robot`.
+
+    That is the best one without joint corrections: neither torques nor a robot's controller know of these, and the
+    geometry they belong to is worse than this one where they are left out.
+    """
+    if isinstance(robot, CalibratedChain):
+        return robot.chain, Path(robot.source or robot.chain.name)
+    chain, source = load_robot(robot, measured, FitOptions(), base, tip)
+    found = CalibratedChain(chain) if source.suffix == ".urdf" else calibrated.read(source)
+    return (chain if found.corrections is None else found.chain), source
+
+
 def read_file(path: Path, chain: Chain, options: FitOptions) -> list[PoseMeasurements]:
     """Read one measurement file for a chain, held against its limits, its size and its orientations."""
     limits, kinds = (chain.lower, chain.upper), joint_kinds(chain)

@@ -24,7 +24,7 @@ from calib.procedure.excitation.coefficients import Periodic
 from calib.procedure.session import motion_check
 from calib.procedure.session.folder import Session
 from calib.robot.chain import Chain
-from calib.robot.load import load
+from calib.robot.load import load_calibrated
 
 Say = Callable[[str], None]
 SUFFIXES = (".csv", ".npz", ".mcap", ".bag", ".db3")
@@ -49,8 +49,8 @@ def _is_log(path: Path) -> bool:
 
 
 def calibrated(session: Session) -> Chain:
-    """Return the arm with the session's calibrated geometry."""
-    return load(session.fit.path)
+    """Return the geometry that dynamics are identified on: the calibrated one, without joint corrections."""
+    return load_calibrated(session.fit.path).chain
 
 
 def options_of(session: Session) -> IdentifyOptions:
