@@ -14,18 +14,37 @@ Beside the calibrated robot itself (`calib.robot.description`, `calib.robot.cali
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from calib.errors import RobotError
 from calib.geometry.installation import Installation
+from calib.records import read_record
 from calib.robot import calibrated, description
 from calib.robot.calibrated import nominal_of
 from calib.robot.chain import Chain
 from calib.robot.tables import placement, placement_table
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """The tables of stations and tools, each entry with a name and a placement."""
+
+    station: tuple[Mapping[str, Any], ...] = ()
+    tool: tuple[Mapping[str, Any], ...] = ()
+
+
+@dataclass(frozen=True)
+class _NominalFrames:
+    """Those in ``provenance``."""
+
+    nominal_station: tuple[Mapping[str, Any], ...] = ()
+    nominal_tool: tuple[Mapping[str, Any], ...] = ()
 
 
 def frame_tables(cell: Installation) -> dict[str, Any]:
@@ -44,7 +63,7 @@ def read(path: str | Path) -> Installation:
     """
     path = _file(path)
     robot, extra = calibrated.read(path), description.read_extra(path)
-    cell = _placed(robot.complete, extra.get("station", []), extra.get("tool", []), str(path))
+    cell = _placed(robot.complete, _typed(_Frames, extra, str(path)), str(path))
     return replace(cell, deflection=robot.deflection)
 
 
@@ -52,9 +71,17 @@ def _file(path: str | Path) -> Path:
     return Path(path) / calibrated.ROBOT if Path(path).is_dir() else Path(path)
 
 
-def _placed(chain: Chain, station: Any, tool: Any, where: str) -> Installation:
+def _typed(kind: type[T], content: Any, where: str) -> T:
+    """Return the tables as a value of `kind`; complains as `RobotError`."""
+    try:
+        return read_record(kind, content)
+    except ValueError as error:
+        raise RobotError(f"{where}: {error}; expected [[...]] tables, each with a name, xyz and rpy") from None
+
+
+def _placed(chain: Chain, found: _Frames, where: str) -> Installation:
     """Return a chain with stations and tools as their tables say; identity frames where a list is empty."""
-    stations, tools = _frames(station, f"{where}, station"), _frames(tool, f"{where}, tool")
+    stations, tools = _frames(found.station, f"{where}, station"), _frames(found.tool, f"{where}, tool")
     given: dict[str, Any] = {}
     if stations:
         given |= {"station_names": tuple(stations), "stations": np.array(list(stations.values()))}
@@ -73,17 +100,16 @@ def nominal(path: str | Path) -> Installation:
     """
     path = _file(path)
     chain = nominal_of(calibrated.read(path))
-    known = description.read_extra(path).get("provenance", {})
-    station, tool = (known.get(f"nominal_{kind}", []) for kind in ("station", "tool"))
-    cell = _placed(chain, station, tool, f"{path}, provenance")
+    where = f"{path}, provenance"
+    known = _typed(_NominalFrames, description.read_extra(path).get("provenance", {}), where)
+    found = _Frames(known.nominal_station, known.nominal_tool)
+    cell = _placed(chain, found, where)
     none: dict[str, Any] = {"stations": np.zeros((0, 4, 4)), "station_names": ()}
     none |= {"tools": np.zeros((0, 4, 4)), "tool_names": ()}
-    return cell if station and tool else replace(cell, **none)
+    return cell if found.station and found.tool else replace(cell, **none)
 
 
-def _frames(entries: Any, where: str) -> dict[str, np.ndarray]:
-    if not isinstance(entries, list) or not all(isinstance(entry, Mapping) for entry in entries):
-        raise RobotError(f"{where}: expected [[...]] tables, each with a name, xyz and rpy")
+def _frames(entries: tuple[Mapping[str, Any], ...], where: str) -> dict[str, np.ndarray]:
     return {
         str(entry.get("name", f"{k + 1}")): placement({key: v for key, v in entry.items() if key != "name"}, where)
         for k, entry in enumerate(entries)
