@@ -1,21 +1,31 @@
-"""What measured poses say of themselves on arrival: joints read back or only commanded, drift between two visits."""
+"""Messages on measured and recorded files as they come: commanded joints, drift, another motion, reversed torques."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import KDTree
 
-from calib.data.poses.measurements import PoseMeasurements, Positions
+from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.plans import NEAR
+from calib.data.recordings.recording import Recording
+from calib.errors import MeasurementError
+from calib.geometry.checks.drift import Drift, drift_between, drift_within, noise_of_difference
+from calib.identification.checks.recorded_motion import (
+    DesignedMotion,
+    DifferentMotion,
+    LocatedMotion,
+    explain,
+    locate,
+    nominal_share,
+)  # fmt: skip
 from calib.robot.chain import Chain
-from calib.robot.kinematics import forward
 
-SAME = 1e-3  # joints of a pose that is visited again differ by less [rad or m] (this and the next: our choice)
-MANY = 3.0  # sigmas that a repeated pose has to be off to be called drift
 EXACT = 1e-8  # read-back joints that equal the commanded ones to so much were not read back [rad or m]
+LOOSE = 0.98  # share of the motion that a recorded period explains, below which the tracking is worth a note
+SCALE = 10.0  # a factor between measured and nominal torques that no wrong mass explains
 
 
 def readback(plan: np.ndarray, measured: PoseMeasurements) -> list[str]:
@@ -38,58 +48,115 @@ def readback(plan: np.ndarray, measured: PoseMeasurements) -> list[str]:
 def drift(
     chain: Chain, blocks: Sequence[PoseMeasurements], again: Sequence[PoseMeasurements], sigma: float
 ) -> list[str]:
-    """Compare poses with their repetitions: within a block, and between blocks and what was measured again at the end.
-
-    What the joints differ by is taken off as the nominal arm says, at its size: the instrument's frame is not known.
+    """Say how far repeated poses differ: between fitted blocks and what was measured again at the end, and within each.
 
     Args:
-        blocks: measured for the fit; again: files whose name starts with drift.
+        chain: the nominal arm.
+        blocks: measured for the fit.
+        again: files whose name starts with drift.
         sigma: of one position, per axis [m]; 0: not known, then only the figure is given.
     """
-    notes = []
-    seen = [(block, k) for block in blocks if isinstance(block, Positions) for k in range(len(block))]
-    for later in again:
-        pairs = _pairs(seen, [(later, k) for k in range(len(later))] if isinstance(later, Positions) else [], chain)
-        notes += _judged(pairs, sigma, f"{Path(later.file).name}: measured again at the end")
-    for block in blocks:
-        own = [(block, k) for k in range(len(block))] if isinstance(block, Positions) else []
-        notes += _judged(_pairs(own, own, chain), sigma, f"{Path(block.file).name}: measured more than once")
-    return notes
+    found = [
+        (f"{Path(later.file).name}: measured again at the end", drift_between(chain, blocks, later)) for later in again
+    ]
+    found += [(f"{Path(block.file).name}: measured more than once", drift_within(chain, block)) for block in blocks]
+    return [_drift_words(label, one, sigma) for label, one in found if one is not None]
 
 
-def _pairs(
-    first: Sequence[tuple[Positions, int]], later: Sequence[tuple[Positions, int]], chain: Chain
-) -> list[tuple[float, float]]:
-    """Return the shift between two visits of one pose, and what their joints explain of it [m]."""
-    if not first or not later:
-        return []
-    q = np.array([block.q[k] for block, k in first])
-    result = []
-    for place, (block, k) in enumerate(later):
-        near = [int(i) for i in np.flatnonzero(np.abs(q - block.q[k]).max(axis=1) < SAME)]
-        near = [i for i in near if first is not later or i < place]
-        near = [i for i in near if first[i][0].tool[first[i][1]] == block.tool[k]]
-        if not near:
-            continue
-        other, row = first[near[0]]
-        both = forward(chain, np.array([other.q[row], block.q[k]]))[:, :3, 3]
-        shift = float(np.linalg.norm(block.position[k] - other.position[row]))
-        result.append((shift, float(np.linalg.norm(both[1] - both[0]))))
-    return result
-
-
-def _judged(pairs: list[tuple[float, float]], sigma: float, label: str) -> list[str]:
-    if not pairs:
-        return []
-    shift, joints = (np.array(column) for column in zip(*pairs))
-    beyond = np.sqrt(np.maximum(np.mean(np.maximum(shift**2 - joints**2, 0.0)), 0.0))
-    words = f"{label}, {len(pairs)} poses differ by {1e3 * beyond:.3g} mm rms"
-    expected = np.sqrt(6.0) * sigma  # of a difference of two points, three axes each
+def _drift_words(label: str, found: Drift, sigma: float) -> str:
+    words = f"{label}, {found.poses} poses differ by {1e3 * found.rms:.3g} mm rms"
     if not sigma:
-        return [words]
-    if beyond > MANY / np.sqrt(len(pairs)) * expected + expected:
-        return [
-            f"{words}, where noise alone gives {1e3 * expected:.2g} mm: did base, tool or instrument move? Measure the "
+        return words
+    noise = f"{1e3 * noise_of_difference(sigma):.2g} mm"
+    if found.exceeds(sigma):
+        return (
+            f"{words}, where noise alone gives {noise}: did base, tool or instrument move? Measure the "
             "base again, and the poses from where it began"
-        ]
-    return [f"{words}, as noise alone would ({1e3 * expected:.2g} mm)"]
+        )
+    return f"{words}, as noise alone would ({noise})"
+
+
+def check_motion(
+    recording: Recording, motion: DesignedMotion, others: Mapping[str, DesignedMotion], wanted: int
+) -> tuple[LocatedMotion, list[str]]:
+    """Find the designed motion in a recording, and say what is worth a note.
+
+    Args:
+        recording: of n joints.
+        motion: the one that was to be played.
+        others: the session's other motions by name, to say if one of them was played instead.
+        wanted: how many repetitions were asked for.
+
+    Raises:
+        MeasurementError: where it is not there, with what explains the recording.
+    """
+    found = locate(recording, motion)
+    if found is None:
+        raise MeasurementError(_other_motion(recording, motion, explain(recording, motion, others)), recording.file)
+    notes = []
+    if found.periods < wanted:
+        notes.append(f"{found.periods} of {wanted} repetitions of the motion were recorded")
+    if found.likeness < LOOSE:
+        name = recording.joint_names[found.loosest]
+        explained = f"it explains {found.likeness:.1%}"
+        notes.append(f"the robot follows the motion loosely ({explained}), {name} most: that is allowed")
+    return found, notes
+
+
+def _other_motion(recording: Recording, motion: DesignedMotion, found: DifferentMotion | None) -> str:
+    """Return what a recording without the designed motion is."""
+    if found is None:
+        duration = recording.duration
+        if duration < motion.period:
+            return (
+                f"{duration:.1f} s are shorter than one period of the motion ({motion.period:.1f} s): was it stopped?"
+            )
+        return (
+            "this is another motion than the one designed here, in no order of joints, sign, unit or speed that was "
+            "tried; play 6-excitation's, or set plan = false under [dynamics] in session.toml to identify from this one"
+        )
+    if found.name:
+        return f"this is the {found.name} motion, which belongs into a file of its own"
+    if found.speed != 1.0:
+        return f"the motion is there at {found.speed:g} times its speed: a rehearsal? Record it at full speed"
+    names, causes = recording.joint_names, []
+    if found.unit != 1.0:
+        causes.append(f"its positions are {'deg' if found.unit < 1.0 else 'rad under a header that says deg'}")
+    if moved := [j for j, column in enumerate(found.order) if column != j]:
+        pairs = ", ".join(f"the column of {names[found.order[j]]} holds {names[j]}" for j in moved)
+        causes.append(f"columns are swapped ({pairs})")
+    if turned := [names[j] for j, sign in enumerate(found.sign) if sign < 0]:
+        causes.append(f"the sign is reversed ({', '.join(turned)})")
+    return f"this is the designed motion if {' and '.join(causes)}; correct the header (or the options file)"
+
+
+def check_torques(recording: Recording, chain: Chain) -> None:
+    """Compare recorded torques with those of the nominal masses: reversed signs, other units.
+
+    Raises:
+        MeasurementError: where the torques of joints that carry much are reversed, or of another size.
+    """
+    if chain.inertias is None or recording.kind != "torque":
+        return
+    share = nominal_share(recording, chain)
+    sure = np.flatnonzero(np.isfinite(share))
+    if not len(sure):
+        return
+    names = ", ".join(recording.joint_names[j] for j in sure)
+    size = np.abs(share[sure])
+    if (size > SCALE).all() or (size < 1 / SCALE).all():
+        guess = "are they mNm? Say so in the header (tau_… [mNm])"
+        if np.median(size) < 1:
+            guess = "are they currents (i_… [A]), or torques before the gear?"
+        words = f"the torques of {names} are some {np.median(size):.2g} times what the nominal masses ask for"
+        raise MeasurementError(f"{words}: {guess}", recording.file)
+    if (share[sure] < 0).all():
+        words = f"the torques of {names} push the wrong way for the nominal masses: reverse their sign"
+        raise MeasurementError(words, recording.file)
+    if turned := [recording.joint_names[j] for j in sure if share[j] < 0]:
+        named, column = ", ".join(turned), f"column{'s' if len(turned) > 1 else ''}"
+        raise MeasurementError(
+            f"torque of {named} seems to have the wrong sign: it pushes against what the nominal masses ask for, where "
+            f"the other joints' do not; negate the {column} of {named} in the log (or correct the nominal masses)",
+            recording.file,
+        )

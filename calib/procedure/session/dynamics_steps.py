@@ -21,7 +21,7 @@ from calib.procedure.dynamic_stage import inputs
 from calib.procedure.dynamic_stage.validation import assess
 from calib.procedure.excitation import coefficients
 from calib.procedure.excitation.coefficients import Periodic
-from calib.procedure.session import motion_check
+from calib.procedure.session import arrival
 from calib.procedure.session.folder import Session
 from calib.robot.chain import Chain
 from calib.robot.load import load_calibrated
@@ -138,18 +138,18 @@ def check_recording(session: Session, path: Path, name: str) -> tuple[list[float
     notes = [f"{path.name}: {recording.duration:.1f} s at {rate:.4g} Hz, {recording.kind}s{sensors}"]
     notes += [f"{path.name}: {note}" for note in recording.notes]
     if not own.payload:  # the nominal masses hold no payload
-        motion_check.check_torques(recording, chain)
+        arrival.check_torques(recording, chain)
     motions = designed_motions(session)
     if name not in motions:
         return None, notes
     others = {other: motion for other, motion in motions.items() if other != name}
-    found = motion_check.find_motion(recording, motions[name], others, session.settings.dynamics.repeats)
+    found, loose = arrival.check_motion(recording, motions[name], others, session.settings.dynamics.repeats)
     worst = max(found.tracking)
     notes.append(
         f"{path.name}: the {name} motion, {found.periods} times, from {found.start:.2f} s on; off its design by up to "
         f"{1e3 * worst:.2g} mrad rms"
     )
-    return [found.start, found.stop], notes + [f"{path.name}: {note}" for note in found.notes]
+    return [found.start, found.stop], notes + [f"{path.name}: {note}" for note in loose]
 
 
 def designed_motions(session: Session) -> dict[str, Periodic]:

@@ -1,0 +1,196 @@
+"""Whether a recording holds the designed motion, what it holds otherwise, and whether its torques fit nominal masses.
+
+Everything is looked at on a coarse common grid; `trajectories.recall` finds the motion and its repetitions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.signal import fftconvolve, savgol_filter
+
+from calib.data.recordings.recording import Recording
+from calib.dynamics.bodies import bodies_of, standard_parameters
+from calib.dynamics.rigid_body import inverse_dynamics
+from calib.robot.chain import Chain
+from trajectories.errors import BadInput
+from trajectories.recall import Recalled, find_periods
+
+STEP = 0.01  # of the coarse grid [s] (this and all below: our choice)
+LIKE = 0.9  # share of the motion's variance a recorded period has to explain
+SPEEDS = (0.1, 0.2, 0.25, 0.5, 2.0)  # rehearsal factors that are tried to explain another motion
+UNITS = (1.0, np.pi / 180, 180 / np.pi)  # factors on recorded positions that are tried
+EDGE = 0.25  # kept before and after the motion [s], for the filters' borders
+SMOOTH = 10  # half width of the window for derivatives, in steps of the coarse grid
+SURE = 0.8  # partial correlation with the torque of the nominal masses from which on its sign counts
+HEAVY = 0.03  # of the torque limit: rigid-body torques smaller than this say nothing
+UNLIMITED = 100.0  # torque limit of a joint that states none [N m or N]
+CREEP = 0.05  # speed over which the sign of Coulomb friction is smoothed [rad/s or m/s]
+
+
+class DesignedMotion(Protocol):
+    """A periodic motion of n joints: its period [s], and position, velocity and acceleration at times (N,)."""
+
+    @property
+    def period(self) -> float: ...
+
+    def orders(self, times: np.ndarray, /) -> tuple[np.ndarray, np.ndarray, np.ndarray]: ...
+
+
+@dataclass(frozen=True)
+class LocatedMotion:
+    """A designed motion found in a recording.
+
+    Attributes:
+        start, stop: the whole repetitions with a short rim [s], in the recording's time.
+        periods: how many.
+        tracking: (n,) rms of recorded minus designed positions [rad or m].
+        likeness: least share of the motion's variance that a recorded period explains.
+        loosest: index of the joint that tracks worst, measured by its own travel.
+    """
+
+    start: float
+    stop: float
+    periods: int
+    tracking: tuple[float, ...]
+    likeness: float
+    loosest: int
+
+
+@dataclass(frozen=True)
+class DifferentMotion:
+    """How a recording relates to a designed motion that is not found in it.
+
+    Attributes:
+        name: of another designed motion that it is; empty: none.
+        speed: share of the design's speed at which it was played.
+        unit: factor on the recorded positions that makes them the design's.
+        order: recorded column that holds each joint, where columns are swapped or signs reversed; empty: as they are.
+        sign: of these columns.
+    """
+
+    name: str = ""
+    speed: float = 1.0
+    unit: float = 1.0
+    order: tuple[int, ...] = ()
+    sign: tuple[float, ...] = ()
+
+
+def locate(recording: Recording, motion: DesignedMotion) -> LocatedMotion | None:
+    """Find the repetitions of a designed motion in a recording; None where there are none."""
+    grid, q = _on_grid(recording)
+    reference = _one_period(motion)
+    found = _found(q, reference)
+    if found is None:
+        return None
+    start, stop = grid[found.start], grid[min(found.rows.stop, len(grid) - 1)]
+    played = q[found.rows] - np.tile(reference, (found.periods, 1))[: len(q[found.rows])]
+    tracking = np.sqrt(np.mean(played**2, axis=0))
+    return LocatedMotion(
+        start=max(float(recording.t[0]), float(start) - EDGE), stop=min(float(recording.t[-1]), float(stop) + EDGE),
+        periods=found.periods, tracking=tuple(map(float, tracking)), likeness=min(found.likeness),
+        loosest=int(np.argmax(tracking / np.maximum(np.std(reference, axis=0), 1e-9))),
+    )  # fmt: skip
+
+
+def explain(
+    recording: Recording, motion: DesignedMotion, others: Mapping[str, DesignedMotion]
+) -> DifferentMotion | None:
+    """Find what a recording without the designed motion holds instead; None where nothing that is tried explains it.
+
+    Args:
+        recording: of n joints.
+        motion: the one that was to be played; it is tried at other `SPEEDS`, in other `UNITS`, and with its columns
+            swapped and reversed.
+        others: designed motions by name, one of which may have been played instead.
+    """
+    q = _on_grid(recording)[1]
+    for name, other in others.items():
+        if _found(q, _one_period(other)):
+            return DifferentMotion(name=name)
+    for speed in SPEEDS:
+        if _found(q, _one_period(motion, speed)):
+            return DifferentMotion(speed=speed)
+    reference = _one_period(motion)
+    if len(q) >= len(reference):
+        order, sign = _best_order(q, reference)
+        for unit in UNITS:
+            if _found(unit * q[:, order] * sign, reference):
+                return DifferentMotion(unit=unit, order=tuple(map(int, order)), sign=tuple(map(float, sign)))
+    return None
+
+
+def _on_grid(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    grid = np.arange(recording.t[0], recording.t[-1], STEP)
+    return grid, _sampled(recording.t, recording.q, grid)
+
+
+def _sampled(t: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    return np.column_stack([np.interp(grid, t, column) for column in values.T])
+
+
+def _one_period(motion: DesignedMotion, speed: float = 1.0) -> np.ndarray:
+    """Return one period's positions every `STEP` or so, without the closing one, played at a share of the speed."""
+    count = round(motion.period / speed / STEP)
+    return motion.orders(np.arange(count) * motion.period / count)[0]
+
+
+def _found(q: np.ndarray, reference: np.ndarray) -> Recalled | None:
+    try:
+        return find_periods(q, reference, likeness=LIKE)
+    except BadInput:
+        return None
+
+
+def _best_order(q: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return which recorded column (n,) moves most like each joint, and with which sign (n,), at any shift."""
+    n = reference.shape[1]
+    likeness = np.zeros((2, n, n))
+    for j in range(n):
+        r = reference[:, j] - reference[:, j].mean()
+        for k in range(n):
+            x = q[:, k] - q[:, k].mean()
+            crossed = fftconvolve(x, r[::-1], mode="valid") / max(np.linalg.norm(r), 1e-12)
+            power = np.sqrt(np.maximum(fftconvolve(x**2, np.ones(len(r)), mode="valid"), 1e-12))
+            likeness[0, j, k], likeness[1, j, k] = (crossed / power).max(), (-crossed / power).max()
+    order = linear_sum_assignment(-likeness.max(axis=0))[1]
+    rows = np.arange(n)
+    return order, np.where(likeness[0, rows, order] >= likeness[1, rows, order], 1.0, -1.0)
+
+
+def nominal_share(recording: Recording, chain: Chain) -> np.ndarray:
+    """Compare recorded torques with those of the nominal masses, friction left free.
+
+    Least squares of τ_j on [τ_nominal,j, v_j, tanh(v_j / v0), 1] on the coarse grid. A joint counts where its
+    rigid-body torque is more than `HEAVY` of its limit and the partial correlation of both torques is above `SURE`.
+
+    Args:
+        recording: with torques of n joints.
+        chain: the arm with its nominal masses.
+
+    Returns:
+        (n,) factors on τ_nominal: 1 for right masses, below 0 for a reversed sign; NaN for joints that do not count.
+    """
+    grid, place = _on_grid(recording)
+    q, v, a = (_smooth(place, order) for order in range(3))
+    torque = _smooth(_sampled(recording.t, recording.effort, grid))
+    rigid = inverse_dynamics(bodies_of(chain), standard_parameters(chain), q, v, a)
+    limit = np.array([joint.effort for joint in chain.joints])
+    heavy = rigid.std(axis=0) > HEAVY * np.where(np.isfinite(limit), limit, UNLIMITED)
+    share = np.full(chain.n, np.nan)
+    for j in np.flatnonzero(heavy):
+        friction = np.column_stack([v[:, j], np.tanh(v[:, j] / CREEP), np.ones(len(q))])
+        own, seen = (x - friction @ np.linalg.lstsq(friction, x, rcond=None)[0] for x in (rigid[:, j], torque[:, j]))
+        common, power = own @ seen, own @ own
+        if abs(common) / max(np.sqrt(power * (seen @ seen)), 1e-12) > SURE:
+            share[j] = common / max(power, 1e-12)
+    return share
+
+
+def _smooth(values: np.ndarray, order: int = 0) -> np.ndarray:
+    """Return values (N, n) on the coarse grid, or their derivatives, by cubics over a moving window."""
+    return np.asarray(savgol_filter(values, 2 * SMOOTH + 1, 3, deriv=order, delta=STEP, axis=0))
