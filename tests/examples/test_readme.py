@@ -23,6 +23,7 @@ from calib.simulation.loop.references import random_fourier
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
 BLOCKS = re.findall(r"```sh\n(.*?)```", README, flags=re.DOTALL)
+SCRIPTS = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
 
 
 def commands(block: str) -> list[list[str]]:
@@ -51,6 +52,15 @@ def test_blocks_are_found_and_short() -> None:
     assert len(README.split()) < 600 and len(BLOCKS) == 4
     assert [len(commands(block)) for block in BLOCKS] == [0, 0, 3, 6]
     assert "calib demo" in BLOCKS[0] and "pytest" in BLOCKS[1]
+    assert len(SCRIPTS) == 1 and len(SCRIPTS[0].splitlines()) <= 10
+
+
+@pytest.mark.slow
+def test_its_script_runs(at_a_cell: Path, capsys: pytest.CaptureFixture) -> None:
+    exec(compile(SCRIPTS[0], "README.md", "exec"), {})
+    assert "verdict: pass" in capsys.readouterr().out
+    made = ("poses.csv", "motion/trajectory.csv", "calibrated/robot.urdf", "commands.csv")
+    assert all((at_a_cell / name).exists() for name in made)
 
 
 @pytest.mark.parametrize("number", [2, pytest.param(3, marks=pytest.mark.slow)])
