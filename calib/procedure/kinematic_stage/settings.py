@@ -70,7 +70,7 @@ class SelectionSettings:
     kind: str = "pose"
     tools: tuple[tuple[float, ...], ...] = ()
     index: str = "O1"
-    method: str = "detmax"
+    method: str = "polish"
     candidates: int = 2000
     sigmas: tuple[float, float] | None = None
     seed: int = 0
