@@ -14,6 +14,8 @@ from calib.errors import UsageError
 
 METRICS = "metrics.json"
 """Written last: it says that the rest of a folder is there."""
+REPORT, CERTIFICATE = "report.json", "certificate.html"
+"""What figures and a certificate are made from, and the certificate."""
 
 
 def check_target(

@@ -13,6 +13,12 @@ SOURCES = sorted((Path(__file__).parents[1] / "calib").rglob("*.py"))
 RESULTS = (
     "metrics.json", "estimate.csv", "covariance.csv", "chain_covariance.csv", "information.csv", "instrumental.csv",
     "dynamics.json", "drive_gains.csv", "errors.csv", "rows.json", "trajectory.toml", "front.csv", "rehearsal.csv",
+    "robot.toml", "robot.urdf", "robot_for_corrections.urdf", "robot.xml", "joint_corrections.csv",
+    "joint_corrections.txt", "report.json", "certificate.html", "residuals.csv", "trajectory.csv", "run.csv",
+    "motion.csv", "approach.csv", "trajectory.yaml", "trajectory.json", "geometries.csv", "geometry_effects.csv",
+    "sensitivity.csv", "drift.csv", "parameters.json", "drives.csv", "joint_offsets.csv", "joint_origins.yaml",
+    "ur_kinematics.yaml", "poses.csv", "validation.csv", "selection.json", "summary.txt", "checked.txt", "cuts.json",
+    "simulated.txt", "session.toml", "state.json", "session.rrd",
 )  # fmt: skip
 
 

@@ -54,8 +54,8 @@ def resolve(robot: str | Path) -> Path:
     path, names = Path(robot), library.names()
     known = f"a path of a .urdf or .toml file, a folder with robot.toml, or one of the library: {', '.join(names)}"
     if path.is_dir():
-        if (path / "robot.toml").is_file():
-            return path / "robot.toml"
+        if (path / calibrated.ROBOT).is_file():
+            return path / calibrated.ROBOT
         if str(robot) not in names:
             raise RobotError(f"folder {path} holds no robot.toml; give {known}")
     elif path.is_file():

@@ -14,7 +14,7 @@ from calib import files
 from calib.dynamics.base import expressions
 from calib.errors import UsageError
 from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
-from calib.folders import METRICS, check_target, write_staged
+from calib.folders import METRICS, REPORT, check_target, write_staged
 from calib.identification.cases import Case
 from calib.identification.gains import DriveGains
 from calib.identification.methods.registry import METHODS
@@ -162,7 +162,7 @@ class UnseenFolder:
     @property
     def report(self) -> Path:
         """Scores, verdict, and curves for the certificate."""
-        return self.path / "report.json"
+        return self.path / REPORT
 
     def write(self, inputs: IdentificationInputs, found: Assessment) -> None:
         """Write a table of torques per unseen recording, and the report."""

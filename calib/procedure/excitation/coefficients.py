@@ -31,6 +31,8 @@ from trajectories.errors import BadInput
 from trajectories.fourier import evaluate
 
 NAME = "trajectory.toml"
+SAMPLES, RUN, PLANNED = "trajectory.csv", "run.csv", "motion.csv"
+"""One period at the controller's rate, all that is played where that is more, and a planned motion."""
 
 
 Numbers = Annotated[tuple[float, ...], Expect("a list of finite numbers")]

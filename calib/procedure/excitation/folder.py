@@ -24,11 +24,11 @@ from trajectories.messages import joint_trajectory, to_json, to_yaml
 from trajectories.setpoints import Setpoints
 from trajectories.timing.time_scaling import ACTIVE
 
-DESIGN = (METRICS, "trajectory.csv", coefficients.NAME)
-PLAN = (METRICS, "motion.csv", "trajectory.yaml", "trajectory.json")
+DESIGN = (METRICS, coefficients.SAMPLES, coefficients.NAME)
+PLAN = (METRICS, coefficients.PLANNED, "trajectory.yaml", "trajectory.json")
 """Files by which an earlier run's folder is known."""
 REHEARSAL = "rehearsal.csv"
-ALL = (*DESIGN, *PLAN[1:], "run.csv", "front.csv", "approach.csv", REHEARSAL)
+ALL = (*DESIGN, *PLAN[1:], coefficients.RUN, "front.csv", "approach.csv", REHEARSAL)
 """Files of an earlier run that a new one replaces; besides plots, ``plot_*.png``."""
 MESSAGES = 100.0  # points per second of the ROS message, whose controllers interpolate (our choice)
 
@@ -53,10 +53,10 @@ def write_design(designed: Designed, out: Path, draw: Callable[[Designed, Path],
     def write(folder: Path) -> None:
         period, played = one_period(designed), designed.playback
         chain = designed.inputs.chain
-        _write_setpoints(period, folder / "trajectory.csv")
+        _write_setpoints(period, folder / coefficients.SAMPLES)
         files.write(folder / coefficients.NAME, dumps(coefficients.table(periodic(designed), chain.name)))
         longer = played.approach is not None or played.repeat > 1
-        _write_optional(played.run if longer else None, folder / "run.csv")
+        _write_optional(played.run if longer else None, folder / coefficients.RUN)
         _write_optional(played.approach, folder / "approach.csv")
         _write_optional(played.rehearsal, folder / REHEARSAL)
         _write_messages(played.run, chain.joint_names, folder, max(1, round(period.rate / MESSAGES)))
@@ -78,7 +78,7 @@ def write_plan(planned: Planned, out: Path, draw: Callable[[Planned, Path], None
     """
 
     def write(folder: Path) -> None:
-        _write_setpoints(planned.track, folder / "motion.csv")
+        _write_setpoints(planned.track, folder / coefficients.PLANNED)
         _write_messages(planned.track, planned.chain.joint_names, folder)
         _write_optional(planned.approach, folder / "approach.csv")
         _write_optional(planned.rehearsal, folder / REHEARSAL)

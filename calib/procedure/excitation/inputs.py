@@ -24,7 +24,7 @@ from calib.procedure.excitation.limits import MotionLimits, read_motion_limits
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.procedure.kinematic_stage.inputs import load_rigid
 from calib.robot import description
-from calib.robot.calibrated import CalibratedChain
+from calib.robot.calibrated import ROBOT, CalibratedChain
 from calib.robot.chain import Chain, sampling_limits
 from trajectories.constraints import BoxLimit
 
@@ -164,7 +164,7 @@ def _identified(chain: Chain, folder: Path) -> ExcitedModel:
         if not found.model.torque_rows.has_bodies:
             raise ValueError("rows 'drive' tell nothing of the bodies")
     except (KeyError, TypeError, ValueError, IndexError) as error:
-        theirs = description.read(folder / "robot.toml")
+        theirs = description.read(folder / ROBOT)
         if theirs.n != chain.n:
             message = f"{folder} is of a robot with {theirs.n} joints ({theirs.name}), {chain.name} has {chain.n}"
             raise UsageError(message) from error

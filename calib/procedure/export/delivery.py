@@ -9,9 +9,11 @@ from pathlib import Path
 from calib import files
 from calib.errors import RobotError, UsageError
 from calib.procedure.export import geometry
+from calib.procedure.kinematic_stage.folder import CORRECTED_URDF, FORMULA, TERMS, URDF
+from calib.robot.calibrated import ROBOT
 from calib.robot.formats.markup import with_comment
 
-COPIED = ("robot.toml", "joint_corrections.csv", "joint_corrections.txt")
+COPIED = (ROBOT, TERMS, FORMULA)
 FIRST = "verdict fail: "  # how a README.txt of ours begins; another's is left alone
 
 
@@ -33,15 +35,15 @@ def deliver(fit: Path, source: Path, out: Path) -> list[str]:
             os.unlink(out / name)
     found = geometry.read(fit)
     given = source.suffix == ".urdf"
-    urdfs = {"robot.urdf": found.chain}
+    urdfs = {URDF: found.chain}
     if found.corrections is not None:
-        urdfs["robot_for_corrections.urdf"] = found.corrections.chain
+        urdfs[CORRECTED_URDF] = found.corrections.chain
     else:
-        (out / "robot_for_corrections.urdf").unlink(missing_ok=True)
+        (out / CORRECTED_URDF).unlink(missing_ok=True)
     read = ""
     for name, chain in urdfs.items():
         if given:
-            read = geometry.export_urdf(found, source, out / name, for_corrections=name != "robot.urdf")
+            read = geometry.export_urdf(found, source, out / name, for_corrections=name != URDF)
         else:
             written = (fit / name).read_text(encoding="utf-8")
             read = geometry.check_readback(written, name, chain)
@@ -61,10 +63,7 @@ def deliver(fit: Path, source: Path, out: Path) -> list[str]:
         (out / "ur_kinematics.yaml").unlink(missing_ok=True)
     if found.corrections is not None:
         left = geometry.without_corrections(fit)
-        words = (
-            "joint_corrections.csv: what a URDF cannot hold, on top of robot_for_corrections.urdf; formula in "
-            "joint_corrections.txt"
-        )
+        words = f"{TERMS}: what a URDF cannot hold, on top of {CORRECTED_URDF}; formula in {FORMULA}"
         notes.append(f"{words}; {left}" if left else words)
     return notes
 

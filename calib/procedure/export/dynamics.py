@@ -41,6 +41,7 @@ from calib.identification.possible.information import Information
 from calib.identification.possible.information import read as read_told
 from calib.identification.possible.solve import Consistent, find_consistent
 from calib.procedure.export import geometry
+from calib.procedure.kinematic_stage.folder import URDF
 from calib.robot.calibrated import CalibratedChain, nominal_of
 from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import mjcf, urdf, urdf_inertials, urdf_write
@@ -52,7 +53,8 @@ from calib.transforms import invert
 
 SAME = 1e-9  # of poses [m, and as a rotation matrix] and of torques, relative to the largest
 TABLE = ("joint", "armature", "damping", "friction", "offset", "armature_unit", "damping_unit", "friction_unit")
-WRITTEN = ("robot.urdf", "robot.xml", "drives.csv", "joint_origins.yaml", "parameters.json")
+MJCF = "robot.xml"
+WRITTEN = (URDF, MJCF, "drives.csv", "joint_origins.yaml", "parameters.json")
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,8 +121,8 @@ def deliver_dynamics(identified: Path, source: Path | None, out: Path) -> list[s
     model = mjcf.text(given.chain, given.bodies, *given.drives.values.T[:3])
     check_mjcf(given, model)
     out.mkdir(parents=True, exist_ok=True)
-    files.write(out / "robot.urdf", edited.encode(encoding))
-    files.write(out / "robot.xml", model)
+    files.write(out / URDF, edited.encode(encoding))
+    files.write(out / MJCF, model)
     export_drives(given, out / "drives.csv")
     export_parameters(given, out / "parameters.json")
     if source is None:
@@ -186,7 +188,7 @@ def with_dynamics(given: Exported, content: str, where: str, nominal: Chain) -> 
 
 def check_mjcf(given: Exported, model: str) -> None:
     """Refuse an MJCF in which Pinocchio sees other poses, torques or drives."""
-    _check(given, model, given.chain, "robot.xml", mjcf=True)
+    _check(given, model, given.chain, MJCF, mjcf=True)
 
 
 def joint_origins(source: str, edited: str, where: str) -> str:

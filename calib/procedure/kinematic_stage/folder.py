@@ -16,7 +16,7 @@ import numpy as np
 from calib import files
 from calib.errors import UsageError
 from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
-from calib.folders import METRICS, check_target, write_staged
+from calib.folders import CERTIFICATE, METRICS, REPORT, check_target, write_staged
 from calib.geometry import installation_file
 from calib.geometry.weighing import Settings, combine
 from calib.procedure.kinematic_stage.fit import Outcome
@@ -30,10 +30,12 @@ from calib.robot.calibrated import CorrectedChain
 from calib.robot.formats import urdf_write
 
 T = TypeVar("T")
+URDF, CORRECTED_URDF = "robot.urdf", "robot_for_corrections.urdf"
+TERMS, FORMULA = "joint_corrections.csv", "joint_corrections.txt"
 OURS = (
-    calibrated.ROBOT, "robot.urdf", "robot_for_corrections.urdf",
-    ESTIMATE, COVARIANCE, calibrated.COVARIANCE, "residuals.csv", "joint_corrections.csv",
-    "joint_corrections.txt", "report.json", "certificate.html", METRICS,
+    calibrated.ROBOT, URDF, CORRECTED_URDF,
+    ESTIMATE, COVARIANCE, calibrated.COVARIANCE, "residuals.csv", TERMS,
+    FORMULA, REPORT, CERTIFICATE, METRICS,
 )  # fmt: skip
 """Files of an earlier fit that a new one replaces; besides plots, ``plot_*.png``."""
 
@@ -76,12 +78,12 @@ class FitFolder:
     @property
     def urdf(self) -> Path:
         """The best geometry without joint corrections."""
-        return self.path / "robot.urdf"
+        return self.path / URDF
 
     @property
     def report(self) -> Path:
         """What a certificate is printed from."""
-        return self.path / "report.json"
+        return self.path / REPORT
 
     @property
     def residuals(self) -> Path:
@@ -141,7 +143,7 @@ class ValidationFolder:
     @property
     def report(self) -> Path:
         """What a certificate is printed from."""
-        return self.path / "report.json"
+        return self.path / REPORT
 
     def write(self, found: Assessment, inputs: Inputs, rows: Sequence[Mapping[str, Any]]) -> ValidationMetrics:
         """Write errors, rows and, last, the metrics; return these."""
@@ -192,9 +194,9 @@ def _write_all(outcome: Outcome, folder: Path) -> None:
     fit, chain = outcome.climb.fit, outcome.inputs.chain
     robot, origin = outcome.calibrated, f"calibrated from {outcome.inputs.source}"
     calibrated.write(folder, robot, installation_file.frame_tables(fit.cell), _record(outcome), origin)
-    urdfs = {"robot.urdf": robot.chain}
+    urdfs = {URDF: robot.chain}
     if robot.corrections is not None:
-        urdfs["robot_for_corrections.urdf"] = robot.corrections.chain
+        urdfs[CORRECTED_URDF] = robot.corrections.chain
         write_corrections(robot.corrections, folder)
     for name, geometry in urdfs.items():
         if outcome.inputs.source.suffix == ".urdf":
@@ -272,7 +274,5 @@ def write_corrections(corrections: CorrectedChain, folder: Path) -> None:
         joint = owners[term.element]
         target = term.element if joint is None else chain.joint_names[joint]
         rows.append([target, units[term.element], term.basis, chain.joint_names[term.source], term.order, float(value)])
-    files.write_table(
-        folder / "joint_corrections.csv", ("corrected", "unit", "basis", "joint", "order", "coefficient"), rows
-    )
-    files.write(folder / "joint_corrections.txt", CORRECTIONS)
+    files.write_table(folder / TERMS, ("corrected", "unit", "basis", "joint", "order", "coefficient"), rows)
+    files.write(folder / FORMULA, CORRECTIONS)

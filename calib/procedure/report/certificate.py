@@ -14,13 +14,13 @@ from importlib import metadata, resources
 from pathlib import Path
 
 from calib import files
+from calib.folders import CERTIFICATE
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.folder import FitFolder
 from calib.procedure.report import fit_report, geometry_section
 from calib.procedure.report.fit_report import Report
 from calib.procedure.report.page import Page, Picture, Section, Table, Text
 
-NAME = "certificate.html"
 WORDS = {"pass": "PASS", "marginal": "MARGINAL", "fail": "FAIL"}
 EDITED = "edited by hand"
 SHORT = 12  # hexadecimal digits of a SHA-256 on the first sheet
@@ -120,7 +120,7 @@ def render(page: Page) -> str:
     import jinja2  # slow to load, and not needed to write the rest
 
     here = resources.files("calib.procedure.report")
-    source = here.joinpath(NAME).read_text(encoding="utf-8")
+    source = here.joinpath(CERTIFICATE).read_text(encoding="utf-8")
     style = here.joinpath("certificate.css").read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     environment.filters["data_uri"] = lambda png: f"data:image/png;base64,{base64.b64encode(png).decode()}"
@@ -138,7 +138,7 @@ def write_fit(outcome: Outcome, folder: Path, plots: bool = True) -> None:
     drawn = draw(report) if plots else {}
     for name, figure in drawn.items():
         files.write(folder / f"plot_{name}.png", figure.png)
-    files.write(folder / NAME, render(of_fit(report, drawn)))
+    files.write(folder / CERTIFICATE, render(of_fit(report, drawn)))
 
 
 def draw(report: Report) -> Mapping[str, Picture]:

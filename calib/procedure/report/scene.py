@@ -123,7 +123,7 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
     chain, source = _arm(folder, robot)
     meshes, notes = _meshes(chain, source)
     fits = [place for place in (folder, folder / IN_SESSION) if FitFolder(place).residuals.is_file()]
-    motions = [path for name in ("trajectory.csv", "motion.csv") for path in _below(folder, name)]
+    motions = [path for name in (coefficients.SAMPLES, coefficients.PLANNED) for path in _below(folder, name)]
     torques = [path for path in _below(folder, "torques_*.csv") if not (path.parent / "unseen").is_dir()]
     scene = Scene(
         folder.resolve().name,
@@ -155,7 +155,7 @@ def _arm(folder: Path, robot: str | None) -> tuple[Chain | None, Path | None]:
     if robot is not None:
         return load(robot), resolve(robot)
     for place in (folder, folder / IN_SESSION):
-        if (place / "robot.toml").is_file():
+        if (place / calibrated.ROBOT).is_file():
             known = calibrated.read(place)
             return known.complete, Path(known.source) if known.source and Path(known.source).is_file() else None
     for place in sorted(folder.glob("1-robot/robot.*")):

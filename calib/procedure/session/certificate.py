@@ -9,12 +9,14 @@ from datetime import datetime
 from pathlib import Path
 
 from calib import files
-from calib.procedure.kinematic_stage.folder import SCHEMA
+from calib.folders import CERTIFICATE
+from calib.procedure.excitation.coefficients import SAMPLES
+from calib.procedure.kinematic_stage.folder import SCHEMA, URDF
 from calib.procedure.report import certificate, fit_report, viewer
 from calib.procedure.report.fit_report import RowErrors
 from calib.procedure.report.page import Section, Text
 from calib.procedure.session.dynamics_steps import recordings
-from calib.procedure.session.folder import MARK, Session, fingerprint, read_state
+from calib.procedure.session.folder import CHECKED, MARK, SELECTION, Session, fingerprint, read_state
 from calib.procedure.session.geometry_steps import measured_files, robot_file
 from calib.records import read_record
 
@@ -55,9 +57,9 @@ def certify(session: Session, say: Say) -> list[str]:
         judged,
         listed(session),
     )
-    files.write(session.path("certificate.html"), certificate.render(page))
+    files.write(session.path(CERTIFICATE), certificate.render(page))
     recording = [viewer.write_beside(session.folder)] if session.plots else []
-    return [*notes, "certificate.html", *recording]
+    return [*notes, CERTIFICATE, *recording]
 
 
 def whole_report(session: Session) -> fit_report.Report:
@@ -74,7 +76,7 @@ def whole_report(session: Session) -> fit_report.Report:
 
 def noticed(session: Session, place: str, unseen: str) -> list[str]:
     """Return what was said of files as they came: those to learn from, and those that the step `unseen` looked at."""
-    path = session.path(f"{place}/checked.txt")
+    path = session.path(f"{place}/{CHECKED}")
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
     files_there = measured_files(session)[1] if place == "3-measured" else recordings(session)[1]
     said = read_state(session)["steps"].get(unseen, {}).get("notes", [])
@@ -146,7 +148,7 @@ def dated(paths: list[Path]) -> str:
 
 def session_plan(session: Session) -> str:
     """Return in a few words how the poses were chosen."""
-    path = session.path("2-poses/selection.json")
+    path = session.path(SELECTION)
     if not session.settings.poses.plan or not path.exists():
         return "poses not planned here"
     return str(json.loads(path.read_text()).get("words", "chosen by hand"))
@@ -155,11 +157,11 @@ def session_plan(session: Session) -> str:
 def listed(session: Session) -> list[tuple[str, str, str, str]]:
     """Return the files the certificate rests on, the ones to be filed first: name, what it is, bytes, SHA-256."""
     exported = sorted(path for path in session.path(session.export).glob("*") if path.is_file())
-    exported.sort(key=lambda path: path.name != "robot.urdf")
+    exported.sort(key=lambda path: path.name != URDF)
     wanted = [*exported[:1], robot_file(session), *measured_files(session)[0], *measured_files(session)[1]]
     if session.dynamic:
         wanted += [path for paths in recordings(session) for path in paths if path.is_file()]
-        wanted += sorted(session.path("6-excitation").glob("*/trajectory.csv"))
+        wanted += sorted(session.path("6-excitation").glob(f"*/{SAMPLES}"))
         wanted += [*session.identification.tables, session.identification.model]
     wanted += [*session.fit.tables, *exported[1:]]
     made = {name: mark for step in read_state(session)["steps"].values() for name, mark in step["outputs"].items()}

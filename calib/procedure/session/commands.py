@@ -12,7 +12,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from calib.errors import UsageError
+from calib.folders import CERTIFICATE
 from calib.procedure.excitation.limits import read_motion_limits
+from calib.procedure.kinematic_stage.folder import URDF
 from calib.procedure.session import instructions, steps
 from calib.procedure.session.folder import Session, create, locked, open_session, verdict_of
 from calib.procedure.session.questions import instrument_named
@@ -97,7 +99,7 @@ def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", 
 
 def ending(session: Session) -> tuple[str, ...]:
     """Return what is said of a session that has come to its end: a failed one's robot is for inspection only."""
-    page, robot = session.path("certificate.html"), session.path(f"{session.export}/robot.urdf")
+    page, robot = session.path(CERTIFICATE), session.path(f"{session.export}/{URDF}")
     if verdict_of(session) == "fail":
         return ("", f"certificate: {page}", f"verdict fail: exported for inspection only, do not use: {robot}")
     return ("", f"done; certificate: {page}", f"robot: {robot}")
@@ -115,7 +117,7 @@ def status_lines(folder: Path) -> Iterator[RenderableType]:
     yield table
     ahead = next((state for state in found if state.kind not in (steps.DONE, steps.KEPT)), None)
     if ahead is None:
-        yield escape(f"certificate: {session.path('certificate.html')}")
+        yield escape(f"certificate: {session.path(CERTIFICATE)}")
     elif ahead.kind == steps.WAITING:
         yield from (escape(line) for line in instructions.asks(session, ahead))
     else:

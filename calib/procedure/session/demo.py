@@ -14,10 +14,12 @@ import numpy as np
 from calib import files
 from calib.data.poses.plans import read_poses
 from calib.errors import SessionError, UsageError
+from calib.folders import CERTIFICATE
+from calib.procedure.kinematic_stage.folder import URDF
 from calib.procedure.report import viewer
 from calib.procedure.session import dynamics_steps, steps
 from calib.procedure.session.commands import begin
-from calib.procedure.session.folder import MARK, Session, locked, open_session, verdict_of
+from calib.procedure.session.folder import MARK, SETTINGS, Session, locked, open_session, verdict_of
 from calib.procedure.session.truth import TRUTH, against_truth, torques_against_truth
 from calib.robot import library
 from calib.robot.load import load
@@ -115,15 +117,15 @@ def stopped(session: Session, waiting: steps.State) -> tuple[str, ...]:
 def results(session: Session) -> tuple[tuple[str, str], ...]:
     """Return what to look at."""
     found = [
-        ("certificate", "certificate.html"),
+        ("certificate", CERTIFICATE),
         ("plots" if session.plots else "fit", "4-fit"),
-        ("calibrated URDF", f"{session.export}/robot.urdf"),
+        ("calibrated URDF", f"{session.export}/{URDF}"),
     ]
     if session.dynamic:
         found += [("motions", "6-excitation"), ("dynamics", "8-dynamics")]
     if session.path(viewer.FILE).exists():
         found.append(("to play", viewer.FILE))
-    return (*found, ("the session", "session.toml"))
+    return (*found, ("the session", SETTINGS))
 
 
 def told_truth(session: Session, cell: Cell, say: Say) -> tuple[float, float]:

@@ -22,7 +22,7 @@ from calib.procedure.dynamic_stage.validation import assess
 from calib.procedure.excitation import coefficients
 from calib.procedure.excitation.coefficients import Periodic
 from calib.procedure.session import arrival
-from calib.procedure.session.folder import Session
+from calib.procedure.session.folder import CUTS, MOTION_CHECKED, Session
 from calib.robot.chain import Chain
 from calib.robot.load import load_calibrated
 
@@ -119,8 +119,8 @@ def record(session: Session, say: Say) -> list[str]:
         found, told = check_recording(session, path, "training")
         cuts[path.name] = found
         notes += told
-    files.write_json(session.path("7-recorded/cuts.json"), cuts)
-    files.write(session.path("7-recorded/checked.txt"), "\n".join(notes) + "\n")
+    files.write_json(session.path(CUTS), cuts)
+    files.write(session.path(MOTION_CHECKED), "\n".join(notes) + "\n")
     return notes
 
 
@@ -173,7 +173,7 @@ def identify(session: Session, say: Say) -> list[str]:
     draw = None
     if session.plots:
         from calib.procedure.report.dynamics_figures import write as draw
-    cuts = json.loads(session.path("7-recorded/cuts.json").read_text(encoding="utf-8"))
+    cuts = json.loads(session.path(CUTS).read_text(encoding="utf-8"))
     given = inputs.gather(
         session.fit.path, cut_paths(recordings(session)[0], cuts), options=options_of(session),
         seed=session.settings.seed, progress=say,
@@ -194,7 +194,7 @@ def identify(session: Session, say: Say) -> list[str]:
 
 def predict(session: Session, say: Say) -> list[str]:
     """Hold the identified model against motion it has not seen, and judge."""
-    cuts = json.loads(session.path("7-recorded/cuts.json").read_text(encoding="utf-8"))
+    cuts = json.loads(session.path(CUTS).read_text(encoding="utf-8"))
     training, unseen = recordings(session)
     notes, aside = [], {}
     for path in unseen:

@@ -18,7 +18,7 @@ from rich.table import Table
 from calib import files
 from calib.errors import CalibError, TaskLost, UsageError, exit_code
 from calib.procedure.session import instructions, steps
-from calib.procedure.session.folder import locked, open_session, verdict_of
+from calib.procedure.session.folder import SETTINGS, locked, open_session, verdict_of
 from calib.workers import Workers
 
 LOG = "run.log"
@@ -63,7 +63,7 @@ def folders_of(given: Sequence[Path]) -> list[Path]:
     Raises:
         UsageError: for one that is named twice, or where nothing was.
     """
-    found = [path.parent if path.name == "session.toml" else path for path in given]
+    found = [path.parent if path.name == SETTINGS else path for path in given]
     real = [path.resolve() for path in found]
     twice = [path for path, own in zip(found, real) if real.count(own) > 1]
     if twice:
@@ -101,7 +101,7 @@ def run_one(folder: Path, command: str = "calib run", plots: bool = True) -> Fle
             said.append(traceback.format_exc())
         said.append(f"failed: {words}")
         outcome = FleetRow(str(folder), FAILED, words=words, code=code or 1)
-    if (folder / "session.toml").exists():
+    if (folder / SETTINGS).exists():
         with suppress(CalibError):  # a full disk, a folder that cannot be written: said already
             files.write(folder / LOG, "\n".join(said) + "\n")
     return replace(outcome, seconds=time.perf_counter() - started)

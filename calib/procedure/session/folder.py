@@ -45,6 +45,10 @@ DYNAMIC = ("6-excitation", "7-recorded", "8-dynamics")
 VERDICTS = ("pass", "marginal", "fail")  # from good to bad
 EXPORT = {False: "6-export", True: "9-export"}  # without, with dynamics
 MARK = "simulated.txt"
+SETTINGS, CHECKED = "session.toml", "checked.txt"
+SUMMARY, SELECTION, CUTS = "1-robot/summary.txt", "2-poses/selection.json", "7-recorded/cuts.json"
+POSES, UNSEEN = "poses.csv", "validation.csv"  # as planned, in 2-poses
+POSES_CHECKED, MOTION_CHECKED = f"3-measured/{CHECKED}", f"7-recorded/{CHECKED}"
 
 
 @dataclass(frozen=True)
@@ -137,7 +141,7 @@ def create(
     settings = replace(settings, created=created, robot=replace(settings.robot, file=target))
     staging = folder.parent / f".{folder.name}.part"
     try:
-        if (folder / "session.toml").exists():
+        if (folder / SETTINGS).exists():
             raise SessionError(f"{folder} is a session already; go on with: calib next {folder}")
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise SessionError(f"{folder} is not empty; give a new folder")
@@ -149,8 +153,8 @@ def create(
             shutil.copyfile(source, staging / name)
         shutil.copyfile(robot_file, staging / target)
         text = written(settings)
-        parse(SessionSettings, tomllib.loads(text), str(folder / "session.toml"), SessionError)
-        files.write(staging / "session.toml", text)
+        parse(SessionSettings, tomllib.loads(text), str(folder / SETTINGS), SessionError)
+        files.write(staging / SETTINGS, text)
         if folder.exists():
             folder.rmdir()
         os.replace(staging, folder)
@@ -168,7 +172,7 @@ def open_session(folder: Path, plots: bool = True) -> Session:
     Raises:
         SessionError: where there is none, it was made by a newer version, or its file is damaged.
     """
-    path = folder / "session.toml"
+    path = folder / SETTINGS
     if not path.exists():
         raise SessionError(f"{folder} is no session (no session.toml); make one with: calib new {folder}")
     return Session(folder, read_settings(path), plots=plots)

@@ -23,7 +23,7 @@ from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import assess
 from calib.procedure.report import certificate, fit_report
 from calib.procedure.session import arrival
-from calib.procedure.session.folder import Session, verdicts
+from calib.procedure.session.folder import POSES, POSES_CHECKED, SELECTION, SUMMARY, UNSEEN, Session, verdicts
 from calib.robot.chain import Chain
 from calib.units import JOINT
 
@@ -86,7 +86,7 @@ def describe(session: Session, say: Say) -> list[str]:
         lines.append(f"{joint.name}: {joint.kind}, {factor * joint.lower:g} to {factor * joint.upper:g} {unit}")
     lines += ["", "elements, base to tip [m, rad]"]
     lines += [f"  {element.name:<24} {element.axis}  {element.value:.9g}" for element in chain.elements]
-    files.write(session.path("1-robot/summary.txt"), "\n".join(lines) + "\n")
+    files.write(session.path(SUMMARY), "\n".join(lines) + "\n")
     return [lines[0]]
 
 
@@ -99,15 +99,15 @@ def select(session: Session, say: Say) -> list[str]:
     chosen = plan(session, robot_file(session), chain, say)
     kinds = [joint.kind for joint in chain.joints]
     names = chain.joint_names
-    write_poses(session.path("2-poses/poses.csv"), chosen.fit, names, unit="deg", kinds=kinds)
+    write_poses(session.path(f"2-poses/{POSES}"), chosen.fit, names, unit="deg", kinds=kinds)
     notes = [f"{len(chosen.fit)} poses for the fit: {chosen.words}"]
     if wanted.validation:
-        write_poses(session.path("2-poses/validation.csv"), chosen.validation, names, unit="deg", kinds=kinds)
+        write_poses(session.path(f"2-poses/{UNSEEN}"), chosen.validation, names, unit="deg", kinds=kinds)
         notes.append(f"{len(chosen.validation)} poses for validation, at random")
     if not wanted.constraints:
         notes.append("only joint limits were kept: look at every pose for collisions, or name a constraints file")
     notes += chosen.record["notes"]
-    files.write_json(session.path("2-poses/selection.json"), chosen.record)
+    files.write_json(session.path(SELECTION), chosen.record)
     return notes
 
 
@@ -127,7 +127,7 @@ def arrive(session: Session, say: Say) -> list[str]:
     for path in fit:
         notes += check_file(session, chain, path, plan)
     notes += drifts(session, chain)
-    files.write(session.path("3-measured/checked.txt"), "\n".join(notes) + "\n")
+    files.write(session.path(POSES_CHECKED), "\n".join(notes) + "\n")
     return notes
 
 
@@ -238,7 +238,7 @@ def _exported(session: Session, out: Path, say: Say) -> list[str]:
     from calib.procedure.export.dynamics import deliver_dynamics
 
     say("all parameters of possible bodies")
-    corrected = (out / "robot_for_corrections.urdf").exists()  # identified on another geometry than robot.urdf's
+    corrected = (out / outputs.CORRECTED_URDF).exists()  # identified on another geometry than robot.urdf's
     place = out / "dynamics" if corrected else out
     try:
         found = deliver_dynamics(session.identification.path, source if source.suffix == ".urdf" else None, place)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from calib.errors import SessionError
+from calib.procedure.excitation.coefficients import RUN, SAMPLES
 from calib.procedure.session import dynamics_steps, geometry_steps
-from calib.procedure.session.folder import Session
+from calib.procedure.session.folder import UNSEEN, Session
 from calib.procedure.session.steps import WAITING, State
 from calib.robot.chain import Chain
 
@@ -15,7 +16,7 @@ def asks(session: Session, state: State) -> tuple[str, str]:
         return _play(session, state.step.name), _log(session, state.step.name)
     if state.kind == WAITING and state.step.name in ("measure", "validate"):
         name = "poses" if state.step.name == "measure" else "validation"
-        target = "measured.csv" if name == "poses" else "validation.csv"
+        target = "measured.csv" if name == "poses" else UNSEEN
         both = name == "poses" and not geometry_steps.measured_files(session)[1]
         return _at_the_robot(session, name, both), _form(session, target, both)
     return f"step {state.step.name} needs {state.words}", f"put it into {session.folder} and run calib next again"
@@ -38,7 +39,7 @@ def _at_the_robot(session: Session, name: str, both: bool) -> str:
 
 def _and_validation(session: Session) -> str:
     """Name the list of validation poses, so that the robot is visited once."""
-    path = session.path("2-poses/validation.csv")
+    path = session.path(f"2-poses/{UNSEEN}")
     if not session.settings.poses.validation or not path.exists():
         return ""
     return f" and, into a file of their own, the {sum(1 for _ in path.open()) - 1} of {path} (never fitted)"
@@ -51,7 +52,7 @@ def _form(session: Session, target: str, both: bool) -> str:
     quaternion = ", qx, qy, qz, qw" if full else ""
     files = [str(session.path("3-measured") / target)]
     if both and session.settings.poses.validation:
-        files.append(str(session.path("3-measured/validation.csv")))
+        files.append(str(session.path(f"3-measured/{UNSEEN}")))
     each = f"Bring {' and '.join(files)}, one row per pose: {columns}{quaternion} (calib formats measurements)"
     return f"{each}; then: calib next {session.folder}"
 
@@ -62,7 +63,7 @@ def _play(session: Session, step: str) -> str:
     names = _motions(session, step)
     if not wanted.plan:
         return "Record the robot moving in all its joints, in one motion to learn from and in another, unseen one."
-    file = "run.csv" if wanted.repeats > 1 else "trajectory.csv"
+    file = RUN if wanted.repeats > 1 else SAMPLES
     motions = " and, into a file of its own, ".join(str(session.path(f"6-excitation/{name}/{file}")) for name in names)
     unseen = " (never learnt from)" if "validation" in names else ""
     loads = ", ".join(f"'{label}' ({mass:g} kg)" for label, mass in wanted.payloads.items())

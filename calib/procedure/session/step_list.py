@@ -6,9 +6,21 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from calib.folders import CERTIFICATE
 from calib.procedure.excitation import coefficients
+from calib.procedure.kinematic_stage.folder import URDF
 from calib.procedure.session import certificate, dynamics_steps, geometry_steps
-from calib.procedure.session.folder import MARK, Session
+from calib.procedure.session.folder import (
+    CUTS,
+    MARK,
+    MOTION_CHECKED,
+    POSES,
+    POSES_CHECKED,
+    SELECTION,
+    SUMMARY,
+    UNSEEN,
+    Session,
+)
 
 Say = Callable[[str], None]
 
@@ -46,7 +58,7 @@ def _plan(session: Session) -> list[Path]:
 
 def _arrived(session: Session) -> list[Path]:
     brought = [*geometry_steps.measured_files(session)[0], *geometry_steps.measured_again(session)]
-    return [*_robot(session), session.path("2-poses/poses.csv"), *_options(session), *brought]
+    return [*_robot(session), session.path(f"2-poses/{POSES}"), *_options(session), *brought]
 
 
 def _options(session: Session) -> list[Path]:
@@ -62,7 +74,7 @@ def _validated(session: Session) -> list[Path]:
     fit = [session.fit.robot, session.fit.report]
     return [
         *fit,
-        session.path("2-poses/validation.csv"),
+        session.path(f"2-poses/{UNSEEN}"),
         *_options(session),
         *geometry_steps.measured_files(session)[1],
     ]
@@ -89,7 +101,7 @@ def _reading(session: Session) -> list[Path]:
 
 
 def _identified(session: Session) -> list[Path]:
-    own = [session.fit.robot, session.path("7-recorded/cuts.json"), *_reading(session)]
+    own = [session.fit.robot, session.path(CUTS), *_reading(session)]
     return [*own, *files_of(dynamics_steps.recordings(session)[0])]
 
 
@@ -98,7 +110,7 @@ def _predicted(session: Session) -> list[Path]:
     own = [found.robot, found.model, found.numbers]
     plan = session.path(f"6-excitation/validation/{coefficients.NAME}")
     training, unseen = dynamics_steps.recordings(session)
-    cuts = session.path("7-recorded/cuts.json")
+    cuts = session.path(CUTS)
     return [*own, plan, cuts, *_reading(session), *files_of(training), *files_of(unseen)]
 
 
@@ -115,11 +127,11 @@ def _exported(session: Session) -> list[Path]:
 
 
 def _certified(session: Session) -> list[Path]:
-    made = [session.fit.report, session.validation.judged, session.path(f"{session.export}/robot.urdf")]
-    made += [session.path("2-poses/selection.json"), session.path("3-measured/checked.txt")]
+    made = [session.fit.report, session.validation.judged, session.path(f"{session.export}/{URDF}")]
+    made += [session.path(SELECTION), session.path(POSES_CHECKED)]
     if session.dynamic:
         found = session.identification
-        made += [session.path("7-recorded/checked.txt"), found.numbers, found.tables[0], found.unseen.report]
+        made += [session.path(MOTION_CHECKED), found.numbers, found.tables[0], found.unseen.report]
     return [*made, *([session.path(MARK)] if session.path(MARK).exists() else [])]
 
 
@@ -132,14 +144,14 @@ def _keys(names: str) -> tuple[str, ...]:
 
 
 STEPS = (
-    SessionStep("describe", "read the robot", ("robot",), _robot, geometry_steps.describe, ("1-robot/summary.txt",)),
+    SessionStep("describe", "read the robot", ("robot",), _robot, geometry_steps.describe, (SUMMARY,)),
     SessionStep(
         "select", "choose the poses to measure", ("robot", "instrument", "poses", "seed"), _plan, geometry_steps.select,
-        ("2-poses/poses.csv", "2-poses/validation.csv", "2-poses/selection.json"),
+        (f"2-poses/{POSES}", f"2-poses/{UNSEEN}", SELECTION),
     ),
     SessionStep(
         "measure", "check what was measured", ("robot", "instrument", "poses", "fit"), _arrived, geometry_steps.arrive,
-        ("3-measured/checked.txt",),
+        (POSES_CHECKED,),
     ),
     SessionStep(
         "fit", "fit the geometry", ("robot", "instrument", "fit", "seed"), _fitted, geometry_steps.fit, ("4-fit/*",),
@@ -155,7 +167,7 @@ STEPS = (
     ),
     SessionStep(
         "record", "check what was recorded", _keys("plan repeats torques options payloads"), _recorded,
-        dynamics_steps.record, ("7-recorded/checked.txt", "7-recorded/cuts.json"), True,
+        dynamics_steps.record, (MOTION_CHECKED, CUTS), True,
     ),
     SessionStep(
         "identify", "identify the dynamics", (*_keys(MODEL), "seed"), _identified, dynamics_steps.identify,
@@ -173,6 +185,6 @@ STEPS = (
     SessionStep(
         "certificate", "print the certificate",
         ("name", "created", "instrument", "poses", "fit", *_keys("torques payloads tolerance_percent")), _certified,
-        certificate.certify, ("certificate.html",),
+        certificate.certify, (CERTIFICATE,),
     ),
 )  # fmt: skip

@@ -18,13 +18,22 @@ from calib.errors import SessionError
 from calib.procedure.excitation import coefficients
 from calib.procedure.report import certificate
 from calib.procedure.session import dynamics_steps, geometry_steps
-from calib.procedure.session.folder import EXPORT, Session, fingerprint, read_state, write_state
+from calib.procedure.session.folder import (
+    EXPORT,
+    POSES,
+    SELECTION,
+    SETTINGS,
+    UNSEEN,
+    Session,
+    fingerprint,
+    read_state,
+    write_state,
+)
 from calib.procedure.session.step_list import STEPS, SessionStep
 
 Say = Callable[[str], None]
 DONE, READY, WAITING, STALE, KEPT, AFTER = "done", "ready", "waiting", "stale", "kept", "after"
-SETTINGS = "session.toml"
-PLANS = ("poses.csv", "validation.csv", "selection.json", coefficients.NAME)  # there only where we plan
+PLANS = (POSES, UNSEEN, SELECTION.rpartition("/")[2], coefficients.NAME)  # there only where we plan
 
 
 @dataclass(frozen=True)

@@ -109,7 +109,7 @@ def motion_torques(
 def _from_mjcf(pin: Any, source: str) -> Any:
     """Return the model of an MJCF text; Pinocchio reads that from a file only."""
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "robot.xml"
+        path = Path(folder) / "model.xml"
         path.write_text(source, encoding="utf-8")
         return pin.buildModelFromMJCF(str(path))
 
