@@ -14,7 +14,6 @@ wrong is the torque on other motion, against the torque without noise, and how f
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from dataclasses import dataclass, replace
@@ -23,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import study_options
 
 from calib import files
 from calib.data.recordings.recording import Recording
@@ -326,14 +326,12 @@ def _percent(share: float | None) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, required=True, help="folder for metrics.json")
-    parser.add_argument("--runs", type=int, default=20, help="simulated calibrations per setup; 0 for none")
-    parser.add_argument("--kind", choices=sorted(SETS), default="link", help="joint torque sensors, or motor torques")
-    parser.add_argument("--workers", default=None, help="number of processes, or a Dask scheduler's address")
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
+    options = study_options.read(
+        __doc__,
+        runs=(20, "simulated calibrations per setup; 0 for none"),
+        kind=(("link", "motor"), "joint torque sensors, or motor torques"),
+        workers=(None, "number of processes, or a Dask scheduler's address"),
+    )
     show(run(options.out, options.runs, options.kind, options.seed, options.workers))
 
 

@@ -16,12 +16,12 @@ has an RSD above 10 % goes, and the paper's own ratio of RSDs is shown beside it
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import study_options
 
 from calib import files
 from calib.data.recordings.recording import Recording
@@ -342,12 +342,7 @@ def show(metrics: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, required=True, help="folder for metrics.json")
-    parser.add_argument("--quick", action="store_true", help="fewer candidate motions")
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
+    options = study_options.read(__doc__, quick="fewer candidate motions")
     show(run(options.out, options.quick, options.seed))
 
 

@@ -19,14 +19,13 @@ Some ten seconds; --full sweeps T0, Models 1 to 3 and both geometries, some four
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import excitation_figures as figures
 import numpy as np
+import study_options
 from excitation_moves import moves
 
 from calib import files
@@ -303,11 +302,7 @@ def printed(found: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--full", action="store_true")
-    parser.add_argument("--seed", type=int, default=0)
-    chosen = parser.parse_args()
+    chosen = study_options.read(__doc__, full="sweep T0, Models 1 to 3 and both geometries")
     found, motions = study(chosen.full, chosen.seed)
     save(figures.paths(geometry("CAD"), motions), chosen.out / "plot_paths.png")
     save(figures.estimates(found["estimates"]), chosen.out / "plot_estimates.png")

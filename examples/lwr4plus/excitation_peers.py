@@ -21,7 +21,6 @@ Some seven minutes at 60 s of processor time per method; 2 seconds are enough to
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -33,6 +32,7 @@ from unittest import mock
 
 import numpy as np
 import scipy.optimize
+import study_options
 from matplotlib.figure import Figure
 
 from calib import files
@@ -264,12 +264,9 @@ def compare(seconds: float, seed: int, out: Path, robots: Sequence[str]) -> dict
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--alone", action="store_true", help="leave out the Panda and the TX40")
-    chosen = parser.parse_args()
+    chosen = study_options.read(
+        __doc__, seconds=(60.0, "of processor time per method"), alone="leave out the Panda and the TX40"
+    )
     found = compare(chosen.seconds, chosen.seed, chosen.out, () if chosen.alone else ("panda", "tx40"))
     files.write_json(chosen.out / "metrics.json", found)
 

@@ -11,14 +11,13 @@ Some six minutes of processor time, most of it for comparing ways of choosing po
 
 from __future__ import annotations
 
-import argparse
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+import study_options
 
 from calib import files
 from calib.geometry.accuracy import errors, summary
@@ -364,14 +363,13 @@ def printed(metrics: dict[str, Any]) -> str:
 
 def main() -> None:
     """Run the study from the command line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--quick", action="store_true", help="one method, fewer poses: to see that it runs")
-    parser.add_argument("--seeds", type=int, default=3, help="of each way of choosing poses")
-    parser.add_argument("--seconds", type=float, default=3.0, help="of processor time for each search")
-    parser.add_argument("--workers", type=int, default=2)
-    given = parser.parse_args()
+    given = study_options.read(
+        __doc__,
+        quick="one method, fewer poses: to see that it runs",
+        seeds=(3, "of each way of choosing poses"),
+        seconds=(3.0, "of processor time for each search"),
+        workers=(2, "local processes"),
+    )
     metrics = run(given.seed, given.quick, given.seeds, given.seconds, given.workers)
     files.write_json(given.out / "metrics.json", metrics)
     print(printed(metrics))

@@ -12,12 +12,11 @@ Some twenty seconds.
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+import study_options
 
 from calib import files
 from calib.dynamics import base, drives
@@ -153,11 +152,7 @@ def printed(found: dict[str, Any]) -> str:
 
 def main() -> None:
     """Run the study from the command line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--paths", type=int, default=12)
-    parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
+    given = study_options.read(__doc__, paths=(12, "to plan"))
     found = run(given.paths, given.seed)
     files.write_json(given.out / "metrics.json", found)
     print(printed(found))
