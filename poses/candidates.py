@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import qmc
 
 from poses.errors import BadInput, NothingFeasible
 
@@ -37,6 +36,8 @@ def draw_candidates(
     Raises:
         NothingFeasible: where `most` draws hold fewer than N feasible poses; the message gives their share.
     """
+    from scipy.stats import qmc  # slow to load
+
     low, high = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
     if low.ndim != 1 or low.shape != high.shape or not (low < high).all():
         raise BadInput(f"limits: expected two (n,) arrays with lower < upper, found {low} and {high}")

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from scipy.optimize import minimize
 
 from poses.indices import Index, has_kinks, merit
 from poses.space import SearchSpace, constraint_gradients, constraint_values, is_feasible, product
@@ -232,11 +231,13 @@ def climb(
         result[np.arange(m), :, np.arange(m)] = -blocks
         return result.reshape(-1, m * n)
 
+    import scipy.optimize  # slow to load
+
     bounds = list(zip(np.tile(space.lower, m), np.tile(space.upper, m), strict=True))
     kept = [{"type": "ineq", "fun": values, "jac": slopes}] if space.constraints else []
     options = {"maxiter": evaluations, "ftol": 1e-2 * tolerance}
     try:
-        run = minimize(
+        run = scipy.optimize.minimize(
             negative, start.ravel(), jac=True, method="SLSQP", bounds=bounds, constraints=kept, callback=accepted,
             options=options,
         )  # fmt: skip

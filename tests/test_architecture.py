@@ -94,6 +94,14 @@ def test_every_folder_with_modules_is_a_package():
     assert [str(folder) for folder in folders if not (folder / "__init__.py").exists()] == []
 
 
+def test_a_fit_loads_no_dynamics():
+    """Loading these modules took longer than the mathematics of a fit."""
+    heavy = ["scipy.signal", "scipy.stats", "scipy.interpolate", "numba", "calib.procedure.dynamic_stage.inputs"]
+    code = f"import sys, calib.api.kinematic; print([name for name in {heavy} if name in sys.modules])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
+
+
 def test_the_command_line_starts_light():
     """`calib --help` loads neither Pinocchio nor matplotlib nor the optimisers."""
     heavy = ["pinocchio", "matplotlib", "scipy", "numpy", "nlopt", "cvxpy", "jinja2", "numba"]

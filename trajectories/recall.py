@@ -12,7 +12,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import fftconvolve
 
 from trajectories.errors import BadInput
 
@@ -105,6 +104,8 @@ def average(values: np.ndarray, found: Recalled) -> Averaged:
 
 def _likeness(q: np.ndarray, r: np.ndarray) -> np.ndarray:
     """Return 1 - D(k) / Σ |r - mean|² for every place (N - P + 1,)."""
+    from scipy.signal import fftconvolve  # slow to load
+
     centre = r.mean(axis=0)
     q, r = q - centre, r - centre
     energy = np.concatenate([[0.0], np.cumsum((q**2).sum(axis=1))])

@@ -13,7 +13,6 @@ from calib.data.poses.measurements import PoseMeasurements
 from calib.data.recordings.recording import Recording
 from calib.data.recordings.recording_files import read_recording as read_file
 from calib.data.recordings.recording_options import RecordingOptions
-from calib.procedure.dynamic_stage.inputs import joints_of
 from calib.procedure.kinematic_stage import inputs
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.load import load_calibrated
@@ -66,6 +65,8 @@ def read_recording(path: str | Path, robot: CalibratedChain, *, options: Recordi
     Raises:
         MeasurementError: naming file, row, column and the likely cause.
     """
+    from calib.procedure.dynamic_stage.inputs import joints_of  # the dynamics' modules: none of the geometry's
+
     return read_file(path, joints_of(robot.chain), options or RecordingOptions())
 
 

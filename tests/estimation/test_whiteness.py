@@ -89,3 +89,13 @@ def test_r_squared_is_one_for_no_residual_zero_for_the_mean_and_negative_below()
 def test_too_few_residuals_are_refused():
     with pytest.raises(CalibError, match="too few"):
         examine(np.ones(25))
+
+
+@pytest.mark.parametrize("count", [20, 33, 1000])
+def test_the_normal_law_is_tested_as_scipy_does(count):
+    rng = np.random.default_rng(count)
+    for x in (rng.standard_normal(count), rng.standard_exponential(count), rng.standard_t(2, count)):
+        found = examine(x, lags=10)
+        assert found.skewness == pytest.approx(scipy.stats.skew(x), rel=1e-12)
+        assert found.kurtosis == pytest.approx(scipy.stats.kurtosis(x), rel=1e-12)
+        assert found.normal_p == pytest.approx(scipy.stats.normaltest(x).pvalue, rel=1e-9)

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
-from scipy.signal import get_window
 
 from calib.arrays import frozen
 from calib.data.signals.decimation import factor_for
+from calib.data.signals.filtering import hann
 from calib.data.signals.resampling import Resampled
 from calib.errors import MeasurementError
 
@@ -97,7 +97,7 @@ def spectrum(values: np.ndarray, rate: float, size: int) -> tuple[np.ndarray, np
 
     Windows of `size` samples (Hann's), half overlapping, a straight line taken off each.
     """
-    window = np.asarray(get_window("hann", size))
+    window = hann(size)
     line = np.linalg.qr(np.stack([np.ones(size), np.arange(size)], axis=1))[0]
     starts = range(0, len(values) - size + 1, max(1, size // 2))
     power = np.zeros((size // 2 + 1, values.shape[1]))

@@ -12,10 +12,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-from scipy.signal import cheby1, firwin, kaiser_beta, sosfreqz
+from scipy.special import i0
 
 from calib.arrays import frozen
 from calib.errors import CalibError, MeasurementError
@@ -23,6 +23,7 @@ from calib.errors import CalibError, MeasurementError
 KINDS = ("chebyshev", "kaiser")
 SHARE = 0.8  # of the new Nyquist frequency that is kept
 RIPPLE = 0.05  # of one pass of the Chebyshev filter [dB]
+KAISER = 0.1102 * (60.0 - 8.7)  # beta of a window whose stop band is 60 dB down (Kaiser 1974)
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,11 +186,14 @@ def _windows(sums: np.ndarray, count: int) -> np.ndarray:
 
 
 def _kaiser(factor: int) -> np.ndarray:
-    window: Any = ("kaiser", kaiser_beta(60.0))
-    return np.asarray(firwin(18 * factor + 1, 1 / factor, window=window))
+    place = np.arange(18 * factor + 1) - 9 * factor
+    window = i0(KAISER * np.sqrt(1.0 - (place / (9 * factor)) ** 2)) / i0(KAISER)
+    return np.sinc(place / factor) * window
 
 
 def _chebyshev(factor: int) -> np.ndarray:
+    from scipy.signal import cheby1, sosfreqz  # slow to load, and seldom needed
+
     sos = cheby1(8, RIPPLE, SHARE / factor, output="sos")
     size = 1 << int(np.ceil(np.log2(400 * factor)))
     _, response = sosfreqz(sos, np.linspace(0, np.pi, size // 2 + 1))

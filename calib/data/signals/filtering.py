@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.signal import butter, sosfiltfilt
 
 from calib.errors import MeasurementError
 
@@ -30,6 +29,8 @@ def low_pass(values: np.ndarray, rate: float, cutoff: float, order: int = ORDER)
     if not 0 < cutoff < rate / 2:
         message = f"a cut-off of {cutoff:g} Hz is not between 0 and the Nyquist frequency {rate / 2:g} Hz: lower it"
         raise MeasurementError(message + " below 0.8 of that, or sample faster")
+    from scipy.signal import butter, sosfiltfilt  # slow to load
+
     sos = butter(order, cutoff, fs=rate, output="sos")
     pad = min(len(values) - 1, int(3 * rate / cutoff) + 1)
     return sosfiltfilt(sos, values, axis=0, padtype="odd", padlen=pad)
@@ -38,6 +39,11 @@ def low_pass(values: np.ndarray, rate: float, cutoff: float, order: int = ORDER)
 def border(rate: float, cutoff: float) -> int:
     """Return the number of samples at each end that a `low_pass` spoils: 2 rate/f_c, our choice (0.8 % is left)."""
     return int(np.ceil(2 * rate / cutoff))
+
+
+def hann(size: int) -> np.ndarray:
+    """Return Hann's window (size,) for a spectrum: one period, its last zero left out."""
+    return 0.5 + 0.5 * np.cos(np.linspace(-np.pi, np.pi, size + 1)[:-1])
 
 
 def slope(values: np.ndarray, rate: float, width: int = 4) -> np.ndarray:

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.fft import next_fast_len
-from scipy.signal import detrend, find_peaks, get_window
 from scipy.spatial import KDTree
 
 from calib.arrays import frozen
+from calib.data.signals.filtering import hann
 from calib.data.signals.motion import Motion, standstill
 
 LINE = 3e-3  # of the strongest line's power: a line that counts; Hann's side lobes are at 7e-4
@@ -59,7 +59,7 @@ def report_excitation(motion: Motion) -> ExcitationReport:
     longest = int(np.bincount(motion.segment).argmax())
     start, stop = (int(i) for i in np.searchsorted(motion.segment, [longest, longest + 1]))
     thin = max(1, int(motion.rate / (4.0 * float(motion.cutoff.max())))) if stop - start > LONG else 1
-    q = detrend(motion.q[start:stop:thin], axis=0, type="constant")
+    q = motion.q[start:stop:thin] - motion.q[start:stop:thin].mean(axis=0)
     still = np.ptp(q, axis=0) < STILL
     found = [(0, np.nan, 0.0) if still[j] else _lines(q[:, j], motion.rate / thin) for j in range(motion.n)]
     unit = q / np.where(still, np.inf, np.sqrt((q**2).sum(axis=0)))
@@ -102,11 +102,27 @@ def repeats(training: Motion, other: Motion) -> float:
 
 def _lines(q: np.ndarray, rate: float) -> tuple[int, float, float]:
     """Return the number of lines of a series (N,), the best sine's frequency [Hz], and the variance it explains."""
-    window, size = np.asarray(get_window("hann", len(q))), int(next_fast_len(4 * len(q), real=True) or 0)
+    window, size = hann(len(q)), int(next_fast_len(4 * len(q), real=True) or 0)
     power = np.abs(np.fft.rfft(window * (q - window @ q / window.sum()), size)) ** 2
-    peaks, _ = find_peaks(power, height=LINE * power.max(), distance=8, prominence=0.5 * LINE * power.max())
     best, frequency = max((_one_sine(q, f, rate), f) for f in _about(int(np.argmax(power)), rate, size))
-    return max(1, len(peaks)), frequency, best
+    return max(1, count_peaks(power, LINE * power.max())), frequency, best
+
+
+def count_peaks(power: np.ndarray, least: float) -> int:
+    """Return how many peaks of a spectrum (N,) are at least so high, 8 bins apart and half as high above the dips."""
+    high = 1 + np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] > power[2:]) & (power[1:-1] >= least))
+    apart: list[int] = []
+    for peak in high[np.argsort(-power[high], kind="stable")]:
+        if all(abs(peak - other) >= 8 for other in apart):
+            apart.append(int(peak))
+    count = 0
+    for peak in apart:
+        above = np.flatnonzero(power > power[peak])
+        place = int(np.searchsorted(above, peak))
+        start, stop = above[place - 1] if place else 0, above[place] if place < len(above) else len(power)
+        dip = max(power[start : peak + 1].min(), power[peak:stop].min())
+        count += bool(power[peak] - dip >= 0.5 * least)
+    return count
 
 
 def _about(top: int, rate: float, size: int) -> list[float]:

@@ -11,7 +11,6 @@ from typing import Protocol
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.signal import fftconvolve, savgol_filter
 
 from calib.data.recordings.recording import Recording
 from calib.dynamics.bodies import bodies_of, standard_parameters
@@ -148,6 +147,8 @@ def _found(q: np.ndarray, reference: np.ndarray) -> Recalled | None:
 
 def _best_order(q: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return which recorded column (n,) moves most like each joint, and with which sign (n,), at any shift."""
+    from scipy.signal import fftconvolve  # slow to load
+
     n = reference.shape[1]
     likeness = np.zeros((2, n, n))
     for j in range(n):
@@ -193,4 +194,6 @@ def nominal_share(recording: Recording, chain: Chain) -> np.ndarray:
 
 def _smooth(values: np.ndarray, order: int = 0) -> np.ndarray:
     """Return values (N, n) on the coarse grid, or their derivatives, by cubics over a moving window."""
+    from scipy.signal import savgol_filter  # slow to load
+
     return np.asarray(savgol_filter(values, 2 * SMOOTH + 1, 3, deriv=order, delta=STEP, axis=0))

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.signal
 
 from calib.data.signals.decimation import (
     KINDS,
@@ -16,7 +17,8 @@ from calib.data.signals.decimation import (
     factor_for,
     kept,
 )
-from calib.data.signals.filtering import border, curvature, low_pass, slope
+from calib.data.signals.filtering import border, curvature, hann, low_pass, slope
+from calib.data.signals.persistency import count_peaks
 from calib.errors import CalibError, MeasurementError
 
 RATE = 1000.0
@@ -149,3 +151,19 @@ def test_factors_follow_gautiers_formula():
     assert factor_for(100.0, 45.0) == 1
     with pytest.raises(CalibError, match="decimation by 0"):
         design_decimator(RATE, 0)
+
+
+def test_windows_and_peaks_are_scipys():
+    """Written out because scipy.signal takes longer to load than a fit to compute."""
+    for size in (5, 64, 999):
+        assert hann(size) == pytest.approx(np.asarray(scipy.signal.get_window("hann", size)), abs=1e-15)
+    for factor in (2, 7, 12):
+        window = ("kaiser", scipy.signal.kaiser_beta(60.0))
+        taps = scipy.signal.firwin(18 * factor + 1, 1 / factor, window=window)
+        assert design_decimator(1000.0, factor).taps == pytest.approx(taps / taps.sum(), abs=1e-15)
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        power = rng.random(rng.integers(5, 300)) ** rng.integers(1, 9)
+        least = 0.3 * rng.random() * power.max()
+        peaks, _ = scipy.signal.find_peaks(power, height=least, distance=8, prominence=0.5 * least)
+        assert count_peaks(power, least) == len(peaks)
