@@ -6,11 +6,15 @@ reason, where the folder is absent.
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
 from recordings import DATA
+
+# a shell's job in the background inherits that Ctrl-C is ignored; tests send it to themselves and to their processes
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # the same inputs in every run; `pytest --hypothesis-profile=search` looks for new ones
 settings.register_profile(

@@ -151,6 +151,7 @@ def test_a_search_that_loses_every_task_says_so() -> None:
     assert list(Workers(stream).map_without([])(square, [])) == []
 
 
+@pytest.mark.slow
 def test_a_cluster_loses_workers_and_no_result(tmp_path: Path) -> None:
     """Of two workers one is killed in the middle; then a task kills whoever runs it, twice; then the scheduler goes."""
     with dask_cluster.running(tmp_path, workers=2, failures=1) as cluster, workers(cluster.address) as crew:

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import planted_motion as planted
 import pytest
+from without_figures import run
 
-from calib import cli
 from calib.estimation.triangles import collect
 from calib.identification.methods.least_squares import scaled_tls
 from calib.identification.methods.registry import METHODS
@@ -18,9 +18,10 @@ from calib.identification.methods.registry import METHODS
 
 def identify(robot: Path, log: Path, method: str, out: Path) -> dict[str, tuple[float, float]]:
     """Return value and sigma of the drives' parameters."""
-    (out.parent / "o.toml").write_text("[filter]\ncutoff = 30.0\nband = 8.0\n")
-    arguments = ["identify", str(robot), str(log), "--method", method, "--friction", "standard", "--out", str(out)]
-    assert cli.run([*arguments, "--options", str(out.parent / "o.toml")]) == 0
+    options = out.parent / "o.toml"
+    options.write_text("[filter]\ncutoff = 30.0\nband = 8.0\n")
+    chosen = ("--method", method, "--friction", "standard", "--options", options)
+    assert run("identify", robot, log, *chosen, "--out", out) == 0
     rows = csv.DictReader((out / "estimate.csv").open())
     return {row["name"]: (float(row["value"]), float(row["sigma"])) for row in rows}
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import planted_motion as planted
 import pytest
+from without_figures import run
 
-from calib import cli
 from calib.errors import CalibError, UsageError
 from calib.identification import identify_options
 from calib.identification.loop import loop_settings
@@ -62,7 +62,7 @@ def identify(robot: Path, folder: Path, train: Path, loop: str, method: str = "i
     (folder / "options.toml").write_text(PLAIN + (f"[loop]\n{loop}" if loop else ""))
     out = folder / f"out_{method}"
     chosen = ["--options", folder / "options.toml", "--method", method, "--friction", "standard", "--out", out, *more]
-    return cli.run(["identify", str(robot), str(train), *map(str, chosen)]), out
+    return run("identify", robot, train, *chosen), out
 
 
 def friction_error(out: Path) -> float:

@@ -8,8 +8,8 @@ from functools import cache
 import numpy as np
 import planted_motion as planted
 import pytest
+from without_figures import run
 
-from calib import cli
 from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.identification.cases import Case, make_case
@@ -91,8 +91,7 @@ def test_a_model_of_no_possible_robot_is_replayed_with_inertia_added_and_that_to
 def test_the_command_reports_it(robot, tmp_path, capsys):
     train, other = planted.write(tmp_path, "train.npz", 0), planted.write(tmp_path, "other.npz", 1)
     out = tmp_path / "out"
-    files = [str(train), "--validate", str(other), "--out", str(out), "--friction", "standard"]
-    assert cli.run(["identify", str(robot), *files]) == 0
+    assert run("identify", robot, train, "--validate", other, "--out", out, "--friction", "standard") == 0
     said = json.loads((out / "metrics.json").read_text())["tracking"]["other.npz"]
     assert said["unseen"] and not said["controller"]["stated"] and said["feedback_over_model"] > 5.0
     assert set(said["rms"]) == {"feedback", "cad", "model", "floor"} and len(said["rms"]["model"]) == 3

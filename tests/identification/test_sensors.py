@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import planted_motion as planted
 import pytest
+from without_figures import run
 
-from calib import cli
 from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of, with_payload
 from calib.dynamics.idim import IdentificationModel
@@ -53,8 +53,8 @@ def identify(robot: Path, folder: Path, rows: str, *logs: str) -> tuple[int, Pat
         f'rows = "{rows}"\n[filter]\ncutoff = 30.0\nband = 8.0\n[payload.tool]\n'
         + "".join(f'[files."{Path(name).name}"]\npayload = ["tool"]\n' for name in logs if "loaded" in name)
     )
-    arguments = ["identify", str(robot), *logs, "--options", str(folder / "options.toml"), "--out", str(folder / rows)]
-    return cli.run(arguments), folder / rows
+    options, out = folder / "options.toml", folder / rows
+    return run("identify", robot, *logs, "--options", options, "--out", out), out
 
 
 @pytest.mark.parametrize("rows, count", [("link", 34), ("both", 46), ("drive", 12)])

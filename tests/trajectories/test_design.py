@@ -93,6 +93,7 @@ def test_the_search_beats_random_motions():
     assert found.values[0] < 0.5 * min(values)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["auglag", "mma"])
 def test_the_other_methods_improve_their_start_too(method):
     spot = problem()
@@ -101,6 +102,7 @@ def test_the_other_methods_improve_their_start_too(method):
     assert ensured(spot, run)[1].feasible
 
 
+@pytest.mark.slow
 def test_splines_are_a_family_like_any_other():
     spot = problem(family=bspline_family(12, 15.0, 7))
     run = one_start(spot, 120, "slsqp", 1, 0)
@@ -146,6 +148,7 @@ def test_the_next_motion_complements_what_was_recorded():
     assert second.values[0] < 0.9 * alone
 
 
+@pytest.mark.slow
 def test_single_objectives_propose_goals_and_a_front_trades_them():
     spot, first = designed()
     motion = spot.basis().motion(first.x)
@@ -221,6 +224,7 @@ def test_verification_finds_what_happens_between_samples():
     assert coarse < peak  # the samples alone would have called it feasible
 
 
+@pytest.mark.slow
 def test_a_motion_infeasible_between_coarse_samples_is_searched_again():
     spot = problem(samples=14, tightening=0.0)
     run = one_start(spot, 120, "slsqp", 1, 0)

@@ -154,6 +154,7 @@ band = 20.0
 """
 
 
+@pytest.mark.slow
 def test_tx40_its_coupled_wrist_and_coulomb_friction(data, tmp_path):
     """Friction at speed within 2.5 % of the reference; Fc itself is where a line meets standstill, and less certain.
 
@@ -179,6 +180,7 @@ def test_tx40_its_coupled_wrist_and_coulomb_friction(data, tmp_path):
     assert not [line for line in found["warnings"] if "Coulomb" in line]
 
 
+@pytest.mark.slow
 def test_tx40_standstill_in_the_fit_is_noticed(data, tmp_path):
     """Measured: Fc2 and Fc3 are 5 % lower with the rows of nearly standing joints, under 10 % of them all."""
     folder = data / "staubli_tx40"
@@ -216,6 +218,7 @@ def test_lwr_with_one_sine_says_what_it_cannot_tell(data, tmp_path):
     assert all(own[name] >= 0.0 for name in own if name[:2] in ("Ia", "Fv", "Fc"))
 
 
+@pytest.mark.slow
 def test_lwr_full_parameters_hold_where_it_has_not_been(data, tmp_path):
     """Half of the one closed curve learnt, the other half predicted: plain least squares is worse than the CAD."""
     from calib.dynamics.bodies import standard_parameters

@@ -237,7 +237,7 @@ def test_folders_and_words_that_do_not_serve_are_refused(fitted, here, calib):
         ((fitted, "t.csv", "--frame", "table"), "seen"),
         ((fitted, "t.csv", "--tool", "1,2"), "x,y,z"),
         ((fitted, "t.csv", "--dof", "4"), "expected 6, 5"),
-        ((fitted, "t.csv", "--start", "1,2"), "6 numbers"),
+        ((fitted, "t.csv", "--start", "1,2"), "6 finite numbers"),
     ):
         code, _, err = calib("compensate", *arguments, "--out", "commands.csv")
         assert code == 2 and said in err, (arguments, err)

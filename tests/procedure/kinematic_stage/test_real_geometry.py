@@ -94,6 +94,7 @@ def report(
         )
 
 
+@pytest.mark.slow
 def test_ur5_with_a_laser_tracker(data, capsys):
     chain, measured = ur5(data)
     found, nominal, calibrated = judged(chain, *holdout(measured, 0.25))
@@ -118,6 +119,7 @@ def test_motoman_in_a_small_volume(data, capsys):
     assert calibrated["position_mm"]["rms"] <= 0.07
 
 
+@pytest.mark.slow
 def test_motoman_in_the_whole_workspace(data, capsys):
     chain, measured = motoman(data, "right_wide_386.csv")
     found, nominal, calibrated = judged(chain, *holdout(measured, 100 / 386))
@@ -180,6 +182,7 @@ def test_motoman_in_a_small_volume_cannot_tell_base_from_tool(data):
     assert any("the tool cannot be told from the base" in line for line in explain(found.fit))
 
 
+@pytest.mark.slow
 def test_motoman_in_the_whole_workspace_is_said_not_to_be_rigid(data):
     chain, measured = motoman(data, "right_wide_386.csv")
     found = climb(install(chain, [measured]), [measured], "geometry")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from without_figures import run
 
 from calib import cli
 from calib.procedure.session import steps
@@ -21,7 +22,7 @@ README = (Path(__file__).parents[3] / "README.md").read_text()
 
 def test_demo_of_the_lwr4plus(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     out = tmp_path / "demo"
-    assert cli.run(["demo", "--geometry-only", "--out", str(out)]) == 0
+    assert run("demo", "--geometry-only", "--out", out) == 0
     said = capsys.readouterr().out
     for name in ("certificate.html", "4-fit", "6-export/robot.urdf"):
         assert str(out / name) in said.replace("\n", "") and (out / name).exists()
@@ -37,7 +38,7 @@ def test_demo_of_the_lwr4plus(tmp_path: Path, capsys: pytest.CaptureFixture) -> 
     chain, read = load(out / "6-export"), urdf.read(out / "6-export/robot_for_corrections.urdf")
     q = np.random.default_rng(0).uniform(-1.5, 1.5, (5, 7))
     np.testing.assert_allclose(forward(read, q), forward(chain, q), atol=1e-9)
-    assert cli.run(["demo", "--out", str(out)]) == 2
+    assert run("demo", "--out", out) == 2
 
 
 @pytest.mark.slow

@@ -115,6 +115,7 @@ def test_it_ends_in_one_certificate_of_both(whole: Session) -> None:
     assert own["filtered"]["relative_error_percent"]["total"] < 3.0
 
 
+@pytest.mark.slow
 def test_the_parameters_are_those_of_the_hidden_arm(whole: Session) -> None:
     from calib.procedure.session.truth import torques_against_truth
 
@@ -123,6 +124,7 @@ def test_the_parameters_are_those_of_the_hidden_arm(whole: Session) -> None:
     assert found.identified < 1.5 < found.nominal
 
 
+@pytest.mark.slow
 def test_a_worse_stage_decides(whole: Session) -> None:
     before = whole.path("8-dynamics/estimate.csv").stat().st_mtime_ns
     edit(whole.path("session.toml"), "tolerance_percent = 0.0", "tolerance_percent = 0.1")
@@ -212,11 +214,11 @@ def test_the_validation_motion_is_not_learnt_from_and_the_training_motion_no_pro
         go_on(recorded)
 
 
-def test_recordings_keep_the_plan_they_were_made_to(whole: Session) -> None:
-    before = whole.path("6-excitation/training/trajectory.csv").read_text()
-    edit(whole.path("session.toml"), "harmonics = 5", "harmonics = 4")
-    assert kinds(whole)["excite"] == steps.KEPT
-    assert whole.path("6-excitation/training/trajectory.csv").read_text() == before
+def test_recordings_keep_the_plan_they_were_made_to(recorded: Session) -> None:
+    before = recorded.path("6-excitation/training/trajectory.csv").read_text()
+    edit(recorded.path("session.toml"), "harmonics = 5", "harmonics = 4")
+    assert kinds(recorded)["excite"] == steps.KEPT
+    assert recorded.path("6-excitation/training/trajectory.csv").read_text() == before
 
 
 def test_a_guided_demonstration_stops_where_an_engineer_would(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

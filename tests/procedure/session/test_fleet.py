@@ -64,6 +64,7 @@ def test_a_robot_whose_process_dies_is_one_that_failed(cells: Path) -> None:
     assert "3 processes died" in found[1].words and "is lost" not in found[0].words
 
 
+@pytest.mark.slow
 def test_a_fleet_on_a_cluster(cells: Path, tmp_path: Path, monkeypatch, capsys: pytest.CaptureFixture) -> None:
     """Folders named from here are found there; each robot is said when it is done, the table in the order given."""
     monkeypatch.chdir(cells)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
-import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -121,25 +120,19 @@ def test_killed_at_any_step_it_goes_on_from_there(measured: Session, finished_fo
 
 
 def _killed_at(session: Session, name: str) -> int:
-    """Run `calib next` in a process of its own and kill it while it is in a step; return its exit code."""
-    code = (
-        "import sys, time\n"
-        "from calib.procedure.session import steps\n"
-        "from dataclasses import replace\n"
-        "def slow(session, say):\n"
-        "    (session.folder / '.4-fit.x.part').mkdir(exist_ok=True)\n"
-        "    print('there', flush=True); time.sleep(60)\n"
-        f"steps.STEPS = tuple(replace(s, make=slow) if s.name == {name!r} else s for s in steps.STEPS)\n"
-        "from calib import cli\n"
-        f"cli.run(['next', {str(session.folder)!r}])\n"
-    )
-    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    for line in process.stdout:
-        if line.strip() == "there":
-            break
-    process.kill()
-    return process.wait()
+    """Run `calib next` in a process of its own that is killed while it is in a step; return its exit code."""
+
+    def killed(session: Session, say: object) -> None:
+        (session.folder / ".4-fit.x.part").mkdir(exist_ok=True)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    if not (child := os.fork()):
+        try:
+            steps.STEPS = tuple(replace(step, make=killed) if step.name == name else step for step in steps.STEPS)
+            cli.run(["next", "--no-plots", str(session.folder)])
+        finally:
+            os._exit(1)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
 def test_two_commands_do_not_work_on_one_session(planned: Session) -> None:
