@@ -117,7 +117,8 @@ def check_readback(edited: str, where: str, chain: Chain) -> str:
         seen = link_poses(edited, (*own.links, own.tip), own.base, own.joint_names, few)
     except RobotError as error:
         return f"Pinocchio reads the same poses to 1e-9; not read a second time: {error}"
-    error = float(np.abs(seen - np.concatenate([joint_frames(own, few), forward(own, few)[None]])).max())
+    straight = np.stack([invert(urdf.align(tree.above[link].axis)) for link in own.links])[:, None]  # of slanted axes
+    error = float(np.abs(seen - np.concatenate([joint_frames(own, few) @ straight, forward(own, few)[None]])).max())
     if error > SAME:
         raise RobotError(f"{where}: yourdfpy reads the calibrated URDF otherwise, by {error:.2g}; nothing was written")
     return "Pinocchio and yourdfpy read the same poses to 1e-9"

@@ -22,6 +22,13 @@ def test_yourdfpy_puts_every_link_where_we_do(robot):
     assert check_readback(source, "robot.urdf", load(robot)) == "Pinocchio and yourdfpy read the same poses to 1e-9"
 
 
+def test_a_slanted_axis_is_no_disagreement():
+    source = urdf_write.write_new(load("lwr4plus")).replace('<axis xyz="0 0 1.0"/>', '<axis xyz="0.48 -0.6 0.64"/>')
+    own = urdf.parse(source)
+    assert source.count("0.48 -0.6 0.64") > 1
+    assert check_readback(source, "robot.urdf", own) == "Pinocchio and yourdfpy read the same poses to 1e-9"
+
+
 def test_a_second_reader_that_disagrees_refuses_and_one_that_cannot_read_is_said(monkeypatch):
     chain = load("ur5")
     source, right = urdf_write.write_new(chain), readback.link_poses
