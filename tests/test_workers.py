@@ -220,7 +220,7 @@ from pathlib import Path
 from calib.workers import processes, workers
 from worker_tasks import until_told
 if {guard}:
-    processes.GRACE = 0.5
+    processes.GRACE, processes.ATTEMPTS = 0.5, 1
     with workers(2) as crew:
         for result in crew.{run}(until_told, [Path(sys.argv[1])] * 9):
             print(result, flush=True)

@@ -82,7 +82,15 @@ def test_correlated_joints_tell_more_together():
     assert np.all(gain > 2.0)  # 1 / (1 - 0.9²) = 5.3 where no other joint tells the same
 
 
-@pytest.mark.parametrize("loss, gate", [("none", None), ("huber", 0.999), ("cauchy", None), ("none", 0.99)])
+@pytest.mark.parametrize(
+    "loss, gate",
+    [
+        ("none", None),
+        ("huber", 0.999),
+        pytest.param("cauchy", None, marks=pytest.mark.slow),
+        pytest.param("none", 0.99, marks=pytest.mark.slow),
+    ],
+)
 def test_the_covariance_of_the_estimate_is_true_on_normal_noise(loss, gate):
     sizes = []
     for seed in range(120):

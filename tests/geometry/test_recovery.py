@@ -52,6 +52,7 @@ SCENES = {
     "three reflectors": (three_reflectors, 1, 3),
     "poses and distances": (poses_and_distances, 1, 2),
 }
+QUICK = ("pose", "position", "distance")
 
 
 def planted(name: str, seed: int, robot: str = "ur5"):
@@ -68,7 +69,9 @@ def calibrate(nominal, measured, settings=None):
     return fit(start.cell, measured, settings=settings)
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in SCENES]
+)
 def test_errors_are_what_the_stated_covariance_says(name):
     """dxᵀ C⁻¹ dx / p is Fisher's F(p, dof), C being scaled by the residuals; two-sided, at four standard errors."""
     scores, squares, freedom = [], 0.0, 0
@@ -115,7 +118,7 @@ def test_without_noise_the_truth_is_found_to_rounding(name):
     assert max(np.abs(part.value).max() for part in (piece.part for piece in found.pieces)) < 1e-8
 
 
-@pytest.mark.parametrize("name", ["pose", "position"])
+@pytest.mark.parametrize("name", [pytest.param("pose", marks=pytest.mark.slow), "position"])
 def test_sigmas_that_are_not_stated_are_estimated(name):
     """Position and orientation each get their own, within the scatter that so many rows allow."""
     ratios = []

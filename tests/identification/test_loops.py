@@ -72,6 +72,7 @@ def friction_error(out: Path) -> float:
     return float(np.sqrt(np.mean([(rows[name] / value - 1.0) ** 2 for name, value in truth.items()])))
 
 
+@pytest.mark.slow
 def test_iv_is_right_where_noisy_positions_bias_least_squares(robot, tmp_path, capsys):
     """Both through the command, on another motion whose log is clean."""
     train, other = log(tmp_path, "train.csv", 1, noise=3e-3), log(tmp_path, "other.csv", 2)
@@ -95,6 +96,7 @@ def test_iv_is_right_where_noisy_positions_bias_least_squares(robot, tmp_path, c
     ]
 
 
+@pytest.mark.slow
 def test_didim_is_a_method_of_its_own(robot, tmp_path):
     """Chosen by name it is what iv makes of instruments = 'didim', and no measured position blurs it."""
     train = log(tmp_path, "train.csv", 1, noise=3e-3)

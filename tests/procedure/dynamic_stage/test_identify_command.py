@@ -215,7 +215,7 @@ def test_the_model_comes_back_from_its_folder_and_predicts_the_same(robot, tmp_p
         read_dynamics(out)
 
 
-@pytest.mark.parametrize("kind", ["mcap", "sqlite3"])
+@pytest.mark.parametrize("kind", ["mcap", pytest.param("sqlite3", marks=pytest.mark.slow)])
 def test_a_bag_of_two_publishers_tells_what_the_archive_tells(robot, tmp_path, kind):
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore

@@ -136,6 +136,7 @@ def test_motions_before_count(earlier, tmp_path):
     assert 0.9 < np.median(ratio) < 1.02
 
 
+@pytest.mark.slow
 def test_a_held_joint_stays_and_its_columns_are_said(cell, calib):
     code, out, err = calib("excite", "lwr4plus", "--lock", "joint4=0.5", "--out", "e", *QUICK)
     assert code == 0, err

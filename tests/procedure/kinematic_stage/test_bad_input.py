@@ -203,13 +203,14 @@ def test_a_killed_fit_leaves_no_folder(cell):
     assert not Path("done").exists()
 
 
-def test_debug_shows_the_traceback(cell):
-    command = [sys.executable, "-m", "calib.cli", "fit", "ur7", "a.csv", "--out", "done"]
-    plain = subprocess.run(command, cwd=cell.folder, capture_output=True, text=True, check=False)
-    assert (plain.returncode, "Traceback" in plain.stderr) == (2, False)
+def test_debug_shows_the_traceback(cell, calib):
+    arguments = ["fit", "ur7", "a.csv", "--out", "done"]
+    code, _, err = calib(*arguments)
+    assert (code, "Traceback" in err) == (2, False)
     loud = subprocess.run(
-        command, cwd=cell.folder, capture_output=True, text=True, check=False, env=os.environ | {"CALIB_DEBUG": "1"}
-    )
+        [sys.executable, "-m", "calib.cli", *arguments],
+        cwd=cell.folder, capture_output=True, text=True, check=False, env=os.environ | {"CALIB_DEBUG": "1"},
+    )  # fmt: skip
     assert "Traceback" in loud.stderr
 
 

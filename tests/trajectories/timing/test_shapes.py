@@ -65,6 +65,7 @@ def test_a_line_is_timed_like_any_path():
     assert found.active_share > 0.95
 
 
+@pytest.mark.slow
 def test_the_outer_loop_shortens_and_passes_the_waypoints():
     bounds, waypoints = limits(), 0.7 * random_joints(CHAIN, 4, 2)
 
