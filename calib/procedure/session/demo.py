@@ -14,17 +14,20 @@ import numpy as np
 from calib import files
 from calib.data.poses.plans import read_poses
 from calib.errors import SessionError, UsageError
+from calib.estimate_files import read_estimate
 from calib.folders import CERTIFICATE
+from calib.geometry import installation_file
+from calib.identification.model_file import read_dynamics
 from calib.procedure.kinematic_stage.folder import URDF
 from calib.procedure.report import viewer
 from calib.procedure.session import dynamics_steps, steps
 from calib.procedure.session.commands import begin
 from calib.procedure.session.folder import MARK, SETTINGS, Session, locked, open_session, verdict_of
-from calib.procedure.session.truth import TRUTH, against_truth, torques_against_truth
-from calib.robot import library
+from calib.robot import calibrated, library
 from calib.robot.load import load
 from calib.simulation.cells import measured_files
 from calib.simulation.cells.cell import Cell, measure, wandering
+from calib.simulation.cells.truth import TRUTH, position_errors, share_within, torque_errors, true_base
 from calib.simulation.cells.virtual_arm import MovingArm, moving_arm, play, record
 from calib.simulation.cells.virtual_cells import virtual_cell
 
@@ -130,7 +133,8 @@ def results(session: Session) -> tuple[tuple[str, str], ...]:
 
 def told_truth(session: Session, cell: Cell, say: Say) -> tuple[float, float]:
     """Say how far the outcome is from the hidden truth, write it down, and return the errors of the tool [mm]."""
-    before, after, bare = against_truth(session, cell)
+    found = installation_file.read(session.fit.path)
+    before, after, bare = position_errors(cell, found, calibrated.read(session.fit.path).chain)
     lines = [
         f"hidden truth, over {TRUTH} poses of the whole joint range: the tool is off by {before:.3f} mm rms with the "
         f"nominal arm, {after:.3f} mm with the calibrated one"
@@ -140,12 +144,15 @@ def told_truth(session: Session, cell: Cell, say: Say) -> tuple[float, float]:
     notes = [cell.note]
     if session.dynamic:
         arm = arm_of(session, cell)
-        found = torques_against_truth(session, cell, arm)
+        chain, dynamics = read_dynamics(session.identification.path)
+        torques = torque_errors(cell, arm, dynamics.model, dynamics.values, chain)
+        true = true_base(dynamics.model, cell, arm, session.settings.seed)
+        within, count = share_within(true, read_estimate(session.identification.path))
         notes.append(arm.note)
         lines.append(
-            f"hidden truth, on a motion nobody has seen: noise-free torques are predicted to {found.identified:.2f} % "
-            f"({found.nominal:.1f} % behind the gears by the nominal masses, with the true friction); of "
-            f"{found.count} base parameters {found.within:.0%} are within two sigmas of the truth"
+            "hidden truth, on a motion nobody has seen: noise-free torques are predicted to "
+            f"{torques.identified:.2f} % ({torques.nominal:.1f} % behind the gears by the nominal masses, with the "
+            f"true friction); of {count} base parameters {within:.0%} are within two sigmas of the truth"
         )
     files.write(session.path("truth.txt"), "\n".join([*notes, *lines]) + "\n")
     for line in lines:

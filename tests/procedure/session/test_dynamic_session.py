@@ -13,9 +13,11 @@ from sessions import edit, go_on
 
 from calib import cli
 from calib.errors import MeasurementError
+from calib.identification.model_file import read_dynamics
 from calib.procedure.session import commands, demo, instructions, steps
 from calib.procedure.session.commands import begin
 from calib.procedure.session.folder import Session, open_session
+from calib.simulation.cells.truth import torque_errors
 from calib.simulation.cells.virtual_cells import virtual_cell
 
 QUICK = {"period": 6.0, "starts": 1, "evaluations": 40, "repeats": 2, "rate": 250.0}
@@ -117,10 +119,9 @@ def test_it_ends_in_one_certificate_of_both(whole: Session) -> None:
 
 @pytest.mark.slow
 def test_the_parameters_are_those_of_the_hidden_arm(whole: Session) -> None:
-    from calib.procedure.session.truth import torques_against_truth
-
     cell = virtual_cell("lwr4plus", 1)
-    found = torques_against_truth(whole, cell, demo.arm_of(whole, cell))
+    chain, dynamics = read_dynamics(whole.identification.path)
+    found = torque_errors(cell, demo.arm_of(whole, cell), dynamics.model, dynamics.values, chain)
     assert found.identified < 1.5 < found.nominal
 
 

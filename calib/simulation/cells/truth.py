@@ -1,7 +1,8 @@
-"""A virtual cell's hidden truth beside what its calibration found: poses, torques, parameters."""
+"""Errors of a calibration against the hidden truth of a virtual cell: positions, torques, base parameters."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,16 +13,11 @@ from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.gravity import gravity_torques
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.rigid_body import inverse_dynamics
-from calib.estimate_files import read_estimate
-from calib.geometry import installation_file
+from calib.estimate_files import StoredEstimate
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation, see
-from calib.identification.model_file import read_dynamics
-from calib.identification.prediction import Dynamics
-from calib.procedure.session.folder import Session
-from calib.robot import calibrated
-from calib.robot.chain import random_joints, sampling_limits
+from calib.robot.chain import Chain, random_joints, sampling_limits
 from calib.robot.deflection import evaluate
 from calib.simulation.cells.cell import Cell, true_poses
 from calib.simulation.cells.virtual_arm import MovingArm, link_torque, true_torque
@@ -32,19 +28,22 @@ TRUTH = 2000  # poses over the whole joint range
 SECONDS, RATE = 20.0, 250.0  # of the motion nobody has seen [s], [Hz]
 
 
-def against_truth(session: Session, cell: Cell) -> tuple[float, float, float]:
-    """Return rms position errors against the noise-free truth [mm]: nominal, calibrated, and its URDF alone.
+def position_errors(cell: Cell, calibrated: Installation, urdf: Chain) -> tuple[float, float, float]:
+    """Return rms position errors against the noise-free truth over `TRUTH` poses [mm]: nominal, calibrated, URDF.
 
     The nominal arm and the URDF get their best station and tool for these very poses, so that arms are compared.
+
+    Args:
+        cell: the virtual cell.
+        calibrated: the fitted arm with its station, tool and deflections.
+        urdf: the calibrated arm without joint corrections.
     """
     q = random_joints(cell.nominal, TRUTH, 12345)
     true = true_poses(cell, q)
     points = true[:, :3, 3]
     block = Poses(q, cell.nominal.joint_names, points, to_quaternion(true))
-    rigid = calibrated.read(session.fit.path).chain
-    nominal, alone = (polish_frames(install(chain, [block]), [block]).cell for chain in (cell.nominal, rigid))
-    found = installation_file.read(session.fit.path)
-    before, after, bare = (_rms(arm, q, points) for arm in (nominal, found, alone))
+    nominal, alone = (polish_frames(install(chain, [block]), [block]).cell for chain in (cell.nominal, urdf))
+    before, after, bare = (_rms(arm, q, points) for arm in (nominal, calibrated, alone))
     return before, after, bare
 
 
@@ -65,53 +64,51 @@ class TorqueErrors:
     Attributes:
         identified: 100 ‖τ̂ - τ‖ / ‖τ‖ by the identified model, over all rows [%].
         joints: (rows,) rms [N m or N].
-        within: share of the base parameters whose truth is within two sigmas of the estimate.
-        count: how many base parameters.
         nominal: error behind the gears by the nominal masses on the nominal geometry, the true friction given [%].
     """
 
     identified: float
     joints: np.ndarray
-    within: float
-    count: int
     nominal: float
 
 
-def torques_against_truth(session: Session, cell: Cell, arm: MovingArm, seed: int = 4321) -> TorqueErrors:
-    """Compare predicted torques with the noise-free truth along a random motion, and parameters with theirs."""
-    chain, dynamics = read_dynamics(session.identification.path)
+def torque_errors(
+    cell: Cell, arm: MovingArm, model: IdentificationModel, values: np.ndarray, chain: Chain, seed: int = 4321
+) -> TorqueErrors:
+    """Compare a model's torques with the noise-free truth along a random motion of `SECONDS`.
+
+    Args:
+        cell, arm: the virtual cell, and its arm as it moves.
+        model: as identified, with values (p,) of its parameters.
+        chain: the calibrated arm, whose limits the motion keeps.
+        seed: of the motion.
+    """
     lower, upper = sampling_limits(chain)
     speed = np.array([joint.velocity if np.isfinite(joint.velocity) else 2.0 for joint in chain.joints])
     motion = random_fourier(0.8 * lower, 0.8 * upper, 0.8 * speed, SECONDS, RATE, seed=seed)
     states = (motion.q, motion.v, motion.a)
     motor, link = true_torque(arm, *states), link_torque(arm, *states)
-    true = dynamics.model.torque_rows.target(motor, link, motion.q, motion.v)
-    load = transmitted_along(dynamics, *states)
-    predicted = np.einsum("kij,j->ki", dynamics.model.regressor(*states, load, ()), dynamics.values)
+    true = model.torque_rows.target(motor, link, motion.q, motion.v)
+    load = model.transmitted(values, *states, ())
+    predicted = np.einsum("kij,j->ki", model.regressor(*states, load, ()), values)
     friction = link - inverse_dynamics(arm.plant.bodies, arm.plant.parameters[: arm.plant.inertial], *states)
     nominal = inverse_dynamics(bodies_of(cell.nominal), standard_parameters(cell.nominal), *states) + friction
     error = predicted - true
-    within, count = _parameters(session, dynamics.model, cell, arm)
-    return TorqueErrors(
-        _percent(error, true), np.sqrt(np.mean(error**2, axis=0)), within, count, _percent(nominal - link, link)
-    )
+    return TorqueErrors(_percent(error, true), np.sqrt(np.mean(error**2, axis=0)), _percent(nominal - link, link))
 
 
 def _percent(error: np.ndarray, size: np.ndarray) -> float:
     return float(100.0 * np.linalg.norm(error) / np.linalg.norm(size))
 
 
-def transmitted_along(dynamics: Dynamics, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-    """Return what the gears pass on to the bodies by the model, without payloads (N, n): load-dependent friction."""
-    model = dynamics.model
-    return model.transmitted(dynamics.values, q, v, a, ())
+def share_within(true: Mapping[str, float], estimate: StoredEstimate) -> tuple[float, int]:
+    """Return the share of estimated parameters whose true value is within two sigmas, and how many there are.
 
-
-def _parameters(session: Session, model: IdentificationModel, cell: Cell, arm: MovingArm) -> tuple[float, int]:
-    """Return the share of estimated base parameters whose truth is within two sigmas, and how many there are."""
-    found = read_estimate(session.identification.path)
-    rows = zip((name.removesuffix("R") for name in found.names), found.values, found.sigma)
-    true = true_base(model, cell, arm, session.settings.seed)
+    Args:
+        true: values by name, as `true_base` returns; parameters without one, or without sigma, are not counted.
+        estimate: with sigmas; an R behind a name (regrouped) is not part of it.
+    """
+    rows = zip((name.removesuffix("R") for name in estimate.names), estimate.values, estimate.sigma)
     inside = [abs(value - true[name]) < 2 * sigma for name, value, sigma in rows if name in true and sigma > 0]
     return (float(np.mean(inside)) if inside else 0.0), len(inside)
 
