@@ -8,6 +8,7 @@ from calib.api.dynamic import DynamicsModel
 from calib.api.kinematic import GeometryFit
 from calib.api.reading import optional, saved
 from calib.procedure.export import delivery, dynamics
+from calib.procedure.export.identified import is_identified
 from calib.robot.load import resolve
 
 
@@ -33,7 +34,7 @@ def export(
     """
     into = Path(into)
     with saved(result) as place:
-        if dynamics.is_identified(place):
+        if is_identified(place):
             return tuple(dynamics.deliver_dynamics(place, optional(urdf), into))
         into.mkdir(parents=True, exist_ok=True)
         return tuple(delivery.deliver(place, source_of(place) if urdf is None else Path(urdf), into))

@@ -147,10 +147,11 @@ def export(
 
     if into:
         from calib.procedure.export import dynamics
+        from calib.procedure.export.identified import check_identified
 
         if out or ur_kinematics or offsets:
             raise UsageError("--into writes all files into one folder; leave --out, --ur-kinematics and --offsets out")
-        dynamics.check_identified(folder)
+        check_identified(folder)
         geometry.check_targets(urdf, [into / name for name in dynamics.WRITTEN])
         with progress() as show:
             show("all parameters, and each file read back")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,18 +12,15 @@ from calib.errors import RobotError, UsageError
 from calib.procedure.kinematic_stage.folder import FitFolder
 from calib.robot import calibrated
 from calib.robot.calibrated import CalibratedChain, nominal_of
-from calib.robot.chain import AXES, Chain, random_joints
-from calib.robot.formats import urdf, urdf_write
+from calib.robot.chain import Chain, random_joints
+from calib.robot.formats import ur, urdf, urdf_write
 from calib.robot.formats.markup import text
 from calib.robot.formats.readback import link_poses, tip_poses
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.kinematics import forward, joint_frames
-from calib.transforms import invert, to_xyz_rpy
+from calib.transforms import invert
 
 SAME = 1e-9  # poses read back by Pinocchio have to agree to this [m, and as a rotation matrix]
-ON_AXIS = 1e-3  # [m]
-UR_KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
-UR_LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 
 
 def read(folder: Path) -> CalibratedChain:
@@ -65,14 +61,10 @@ def without_corrections(folder: Path) -> str:
 def check_targets(source: Path | None, targets: Sequence[Path]) -> None:
     """Refuse to write over the source, or two files into one."""
     for number, target in enumerate(targets):
-        if source is not None and _same_file(source, target):
+        if source is not None and files.same_file(source, target):
             raise UsageError(f"{target} is the source URDF, which stays as it is; give another name to write to")
-        if any(_same_file(target, other) for other in targets[:number]):
+        if any(files.same_file(target, other) for other in targets[:number]):
             raise UsageError(f"{target} is to be written twice; give each file a name of its own")
-
-
-def _same_file(one: Path, other: Path) -> bool:
-    return one.resolve() == other.resolve() or (one.exists() and other.exists() and one.samefile(other))
 
 
 def export_urdf(robot: CalibratedChain, source: Path, out: Path, for_corrections: bool = False) -> str:
@@ -141,33 +133,19 @@ def export_offsets(robot: CalibratedChain, out: Path) -> Path:
 
 
 def export_ur_kinematics(robot: CalibratedChain, out: Path) -> Path:
-    """Write the kinematics YAML of ur_description: x y z roll pitch yaw of the six joints' origins.
+    """Write the kinematics YAML of ur_description (see `calib.robot.formats.ur.kinematics`).
 
-    The frames are UR's own (base_link_inertia, then each joint about its z). They follow from the nominal arm's axes,
-    so that only the calibrated part of the numbers is new. ur_description puts its tool0 where wrist_3 is: fixed joints
-    of the robot's file behind it (a flange, a tool) are not part of it, see `flange_note`.
+    ur_description puts its tool0 where wrist_3 is: fixed joints of the robot's file behind it (a flange, a tool) are
+    not part of it, see `flange_note`.
 
     Raises:
         UsageError: for an arm that has not UR's axes.
     """
-    nominal = nominal_of(robot)
     try:
-        template = ur_template(nominal)
-        edited = read_tree(urdf_write.edit(template, nominal, robot.chain, "UR frames"), "UR frames")
+        content = ur.kinematics(nominal_of(robot), robot.chain)
     except RobotError as error:
         raise UsageError(f"'{robot.chain.name}' has not the axes of a UR arm: {error}") from error
-    lines = []
-    for link in UR_LINKS:
-        xyz, rpy = to_xyz_rpy(edited.joints[link].origin)
-        lines.append(f"  {link}:")
-        lines += [f"    {key}: {value!r}" for key, value in zip(UR_KEYS, [*xyz.tolist(), *rpy.tolist()])]
-    digest = int(hashlib.sha256("\n".join(lines).encode()).hexdigest()[:15], 16)
-    head = [
-        "# Calibrated by armature-calib; for ur_description's kinematics_params_file. The driver compares the hash",
-        "# with the controller's own calibration and will say that they differ: this file is not the controller's.",
-        "kinematics:",
-    ]
-    return files.write(out, "\n".join([*head, *lines, f"  hash: calib_{digest}"]) + "\n")
+    return files.write(out, content)
 
 
 def flange_note(robot: CalibratedChain) -> str:
@@ -175,68 +153,9 @@ def flange_note(robot: CalibratedChain) -> str:
     nominal = nominal_of(robot)
     zero = np.zeros((1, nominal.n))
     behind = invert(joint_frames(nominal, zero)[-1, 0]) @ forward(nominal, zero)[0]
-    if np.abs(behind - np.eye(4)).max() < ON_AXIS:
+    if np.abs(behind - np.eye(4)).max() < ur.ON_AXIS:
         return ""
     away = f"{nominal.tip}, {1e3 * float(np.linalg.norm(behind[:3, 3])):.4g} mm behind the last joint's frame"
-    if _wrist(nominal) > ON_AXIS:
+    if ur.wrist_offset(nominal) > ur.ON_AXIS:
         return f"wrist_3 is the last joint's frame, as UR's tool0 is; the fixed joint to {away}, is not in it"
     return f"wrist_3 reaches to {away}: this file holds UR's d6 there; it has to be UR's own flange, without a tool"
-
-
-def _wrist(nominal: Chain) -> float:
-    """Return how far the last joint's frame is from axis 5 at q = 0 [m]: UR's d6, or nothing in URDFs of old."""
-    frames = joint_frames(nominal, np.zeros((1, nominal.n)))[:, 0]
-    across = _axis(nominal, frames[1], int(nominal.moving[1]))
-    return abs(float(across @ (frames[5, :3, 3] - frames[4, :3, 3])))
-
-
-def ur_template(nominal: Chain) -> str:
-    """Return a URDF of a nominal arm in UR's frames, its six lengths taken from the arm's axes at q = 0.
-
-    d1 height of axis 2; a2, a3 distances of axes 2 to 3 and 3 to 4; d4 distance of axis 5 from axis 1; d5 height of
-    axis 4 over axis 6; d6 distance of the last joint's frame from axis 5, or of the tip where that frame is on axis 5
-    (URDFs of the years before ur_description hold d6 in the fixed joint to tool0).
-    """
-    if nominal.n != 6 or any(joint.kind != "revolute" for joint in nominal.joints):
-        raise RobotError(f"it has {nominal.n} joints, not six revolute ones")
-    zero = np.zeros((1, 6))
-    frames = joint_frames(nominal, zero)[:, 0]
-    axis = np.array([_axis(nominal, frames[j], k) for j, k in enumerate(nominal.moving)])
-    point, tip = frames[:, :3, 3], forward(nominal, zero)[0, :3, 3]
-    up, across = axis[0], axis[1]
-    level = [float(up @ (p - point[0])) for p in point]
-    base_height = float(up @ point[0])
-    d1 = level[1] + base_height
-    a2, a3 = (_gap(point[k], point[k + 1], across) for k in (1, 2))
-    d4, d6 = abs(float(across @ (point[4] - point[0]))), _wrist(nominal)
-    d6 = d6 if d6 > ON_AXIS else abs(float(across @ (tip - point[4])))
-    d5 = abs(level[3] - level[5])
-    half = repr(np.pi / 2)
-    origins = {
-        "shoulder": (f"0 0 {d1!r}", "0 0 0"),
-        "upper_arm": ("0 0 0", f"{half} 0 0"),
-        "forearm": (f"{-a2!r} 0 0", "0 0 0"),
-        "wrist_1": (f"{-a3!r} 0 {d4!r}", "0 0 0"),
-        "wrist_2": (f"0 {-d5!r} 0", f"{half} 0 0"),
-        "wrist_3": (f"0 {d6!r} 0", f"{half} {np.pi!r} {np.pi!r}"),
-    }
-    lines, parent = ['<robot name="ur"><link name="base_link_inertia"/>'], "base_link_inertia"
-    for name, (xyz, rpy) in origins.items():
-        lines.append(
-            f'<link name="{name}_link"/><joint name="{name}" type="revolute"><parent link="{parent}"/>'
-            f'<child link="{name}_link"/><origin xyz="{xyz}" rpy="{rpy}"/><axis xyz="0 0 1"/>'
-            '<limit lower="-6.3" upper="6.3" effort="1" velocity="1"/></joint>'
-        )
-        parent = f"{name}_link"
-    return "\n".join([*lines, "</robot>"])
-
-
-def _axis(chain: Chain, frame: np.ndarray, k: int) -> np.ndarray:
-    element = chain.elements[k]
-    return element.sign * frame[:3, AXES.index(element.axis) % 3]
-
-
-def _gap(one: np.ndarray, two: np.ndarray, direction: np.ndarray) -> float:
-    """Return the distance of two parallel lines [m]."""
-    between = two - one
-    return float(np.linalg.norm(between - direction * (direction @ between)))

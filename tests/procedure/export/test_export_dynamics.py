@@ -18,7 +18,7 @@ from calib.dynamics.idim import from_chain
 from calib.errors import RobotError, UsageError
 from calib.identification.model_file import to_table
 from calib.identification.prediction import Dynamics
-from calib.procedure.export import dynamics
+from calib.procedure.export import dynamics, identified
 from calib.robot import description
 from calib.robot.formats import urdf
 from calib.robot.formats.urdf_tree import read as read_tree
@@ -82,7 +82,7 @@ def test_urdf_mjcf_and_tables_hold_the_same_robot(tmp_path, kind):
     folder = write_identification(tmp_path / "found", source)
     notes = dynamics.deliver_dynamics(folder, tmp_path / "source.urdf", tmp_path / "out")
     assert any("no place for motor inertias" in note for note in notes)
-    given = dynamics.read(folder)
+    given = identified.read(folder)
     check_torques_with_pinocchio(tmp_path / "out" / "robot.urdf", given)
     before, after = read_tree(source, "before"), read_tree((tmp_path / "out" / "robot.urdf").read_text(), "after")
     assert np.array_equal(after.bodies["cover"], before.bodies["cover"]), "links fixed to others keep their CAD"
@@ -97,7 +97,7 @@ def test_urdf_mjcf_and_tables_hold_the_same_robot(tmp_path, kind):
     assert all(margin > 0.0 for margin in table["dynamics"]["consistency"]["margins_m"].values())
 
 
-def check_torques_with_pinocchio(path: Path, given: dynamics.Exported) -> None:
+def check_torques_with_pinocchio(path: Path, given: identified.IdentifiedRobot) -> None:
     """Compare with a reading of the test's own: `rnea` of the file against W χ of all standard parameters."""
     pin = pytest.importorskip("pinocchio")
     model = pin.buildModelFromUrdf(str(path))
@@ -169,7 +169,7 @@ def test_a_robot_without_urdf_gets_a_new_one_and_a_fit_is_refused(tmp_path):
     check_torques_with_pinocchio_by_joint_names(tmp_path / "out" / "robot.urdf")
     (tmp_path / "found" / "dynamics.json").unlink()
     with pytest.raises(UsageError, match="calib identify"):
-        dynamics.check_identified(folder)
+        identified.check_identified(folder)
 
 
 def check_torques_with_pinocchio_by_joint_names(path: Path) -> None:
@@ -184,7 +184,7 @@ def test_mujoco_reads_the_mjcf(tmp_path):
         pytest.skip("MuJoCo is not part of the environment: set CALIB_MUJOCO to a python that has it")
     folder = write_identification(tmp_path / "found", SOURCE.replace("AXIS", "revolute"))
     dynamics.deliver_dynamics(folder, None, tmp_path / "out")
-    given = dynamics.read(folder)
+    given = identified.read(folder)
     from calib.dynamics import rigid_body
 
     rng = np.random.default_rng(3)

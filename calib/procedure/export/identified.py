@@ -1,0 +1,105 @@
+"""An identification made ready for export: its estimate, all parameters of possible bodies, and what to say of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from calib.dynamics.bodies import Bodies, bodies_of, with_gravity
+from calib.errors import UsageError
+from calib.identification.friction.drive_table import Drives, drive_table
+from calib.identification.model_file import MODEL, refuse_currents
+from calib.identification.possible.information import Information
+from calib.identification.possible.information import read as read_information
+from calib.identification.possible.solve import Consistent, find_consistent
+from calib.procedure.export import geometry
+from calib.robot.calibrated import CalibratedChain
+from calib.robot.chain import Chain
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiedRobot:
+    """An identified robot, ready to be written.
+
+    Attributes:
+        robot: the geometry, with that before calibration.
+        information: the estimate.
+        found: all its parameters, of possible bodies.
+        bodies: (B, 10) of the arm's own bodies, payloads left out.
+        drives: by joint.
+    """
+
+    robot: CalibratedChain
+    information: Information
+    found: Consistent
+    bodies: np.ndarray
+    drives: Drives
+
+    @property
+    def chain(self) -> Chain:
+        return self.robot.chain
+
+    @property
+    def arm(self) -> Bodies:
+        """The arm's bodies under the gravity it was identified with."""
+        return with_gravity(bodies_of(self.chain), self.found.dynamics.model.bodies.gravity)
+
+
+def is_identified(folder: Path) -> bool:
+    """Say whether a folder is that of an identification."""
+    return (folder / MODEL).is_file()
+
+
+def check_identified(folder: Path) -> None:
+    """Refuse a folder that holds no identification, where its dynamics are asked for."""
+    if not is_identified(folder):
+        raise UsageError(
+            f"{folder} holds no identified dynamics (dynamics.json); give the folder that calib identify has written, "
+            "or leave --into out"
+        )
+
+
+def read(folder: Path) -> IdentifiedRobot:
+    """Return what an identification left, with all parameters made those of possible bodies."""
+    refuse_currents(folder, "an export of masses")
+    information = read_information(folder)
+    found = find_consistent(information)
+    own = bodies_of(information.chain).count
+    bodies = found.dynamics.values[: 10 * own].reshape(own, 10)
+    return IdentifiedRobot(geometry.read(folder), information, found, bodies, drive_table(found.dynamics))
+
+
+def consistency_lines(found: Consistent, b: int) -> list[str]:
+    """Return what consistency cost, in words."""
+    lines = [
+        f"masses of possible bodies: thinnest {1e3 * float(found.margins.min()):.3g} mm (as a standard deviation), "
+        f"{found.distance:.3g} sigmas from the estimate of {b} parameters (95 %: {found.allowed:.3g}); drawn to "
+        f"{found.source}, weight {found.weight:.3g} by the evidence"
+    ]
+    if not found.possible:
+        blamed = ", ".join(f"{name} (without it {left:.3g})" for name, left in found.blamed)
+        lines.append(
+            f"THE ESTIMATE IS THAT OF NO POSSIBLE ROBOT: the nearest one is {found.nearest:.3g} sigmas away, beyond "
+            f"{found.allowed:.3g}; most of it by {blamed}. The model does not tell all that the torques hold "
+            "(friction, gains, a payload), or the sigmas are too small"
+        )
+    return [*lines, *found.notes]
+
+
+def drive_notes(given: IdentifiedRobot) -> list[str]:
+    """Return what of the drives and payloads is in none of the robot files."""
+    notes = []
+    if np.any(given.drives.values[:, 0]):
+        notes.append(
+            "URDF has no place for motor inertias: robot.urdf is without them, drives.csv and robot.xml are not"
+        )
+    if np.any(given.drives.values[:, 3]) or given.drives.left:
+        names = [*(["offsets"] if np.any(given.drives.values[:, 3]) else []), *given.drives.left]
+        more = f" and {len(names) - 8} more" if len(names) > 8 else ""
+        notes.append(f"in parameters.json alone: {', '.join(names[:8])}{more}")
+    carried = given.found.dynamics.model.bodies
+    if payloads := [label for label, c in zip(carried.labels, carried.coordinates) if c < 0]:
+        notes.append(f"payload {', '.join(payloads)} is not part of the robot: in parameters.json alone")
+    return notes

@@ -1,0 +1,127 @@
+"""Masses and friction of an identified robot in a URDF and in MJCF, each checked against what Pinocchio reads."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from calib.dynamics import pseudo_inertia, rigid_body
+from calib.errors import RobotError
+from calib.procedure.export import geometry
+from calib.procedure.export.identified import IdentifiedRobot
+from calib.robot.chain import Chain, random_joints
+from calib.robot.formats import mjcf, urdf, urdf_inertials, urdf_write
+from calib.robot.formats.readback import motion_torques
+from calib.robot.formats.urdf_tree import UrdfTree, transform_body
+from calib.robot.formats.urdf_tree import read as read_tree
+from calib.transforms import invert
+
+MJCF = "robot.xml"
+SAME = 1e-9  # of poses [m, and as a rotation matrix] and of torques, relative to the largest
+
+
+def as_mjcf(given: IdentifiedRobot) -> str:
+    """Return the MJCF of an identified robot.
+
+    Raises:
+        RobotError: where Pinocchio reads other poses, torques or drives.
+    """
+    model = mjcf.text(given.chain, given.bodies, *given.drives.values.T[:3])
+    _check(given, model, given.chain, MJCF, mjcf=True)
+    return model
+
+
+def as_urdf(given: IdentifiedRobot, content: str, where: str, nominal: Chain) -> tuple[str, list[str]]:
+    """Return a URDF text with calibrated origins, masses and friction, and notes.
+
+    Args:
+        given: the identified robot.
+        content: the URDF of the nominal robot.
+        where: names it in messages.
+        nominal: the arm that `content` describes.
+
+    Raises:
+        RobotError: where Pinocchio reads other poses, torques or drives.
+    """
+    chain = given.chain
+    calibrated_text = urdf_write.edit(content, nominal, chain, where)
+    tree = read_tree(calibrated_text, where)
+    own = _own_chain(tree, chain)
+    links, notes = _link_bodies(given, tree, own)
+    names = own.joint_names
+    friction = {name: (float(row[1]), float(row[2])) for name, row in zip(names, given.drives.values)}
+    edited = urdf_inertials.put(calibrated_text, where, links, friction)
+    geometry.check_readback(edited, where, chain)
+    _check(given, edited, own, where)
+    return edited, notes
+
+
+def _own_chain(tree: UrdfTree, chain: Chain) -> Chain:
+    """Return the chain as the URDF has it, in the frames of its links, under the identified chain's gravity."""
+    named = chain.joint_names if chain.joint_names[0] in tree.joints else None
+    base = chain.base if chain.base in tree.bodies else None
+    own = urdf.build(tree, *urdf.ends(tree, base, chain.tip if chain.tip in tree.bodies else None, named))
+    return replace(own, gravity=chain.gravity)
+
+
+def _link_bodies(given: IdentifiedRobot, tree: UrdfTree, own: Chain) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Return the inertials to write by link, about the links' frames, and notes."""
+    path = [joint for joint in tree.path(own.base, own.tip) if joint.moves]
+    zero = np.zeros((1, own.n))
+    between = invert(urdf_write.moving_frames(own, zero)[:, 0]) @ urdf_write.moving_frames(given.chain, zero)[:, 0]
+    links: dict[str, np.ndarray] = {}
+    notes: list[str] = []
+    for joint, turn, body in zip(path, between, given.bodies):
+        if not body.any():
+            continue
+        whole = transform_body(body, urdf.align(joint.axis) @ turn)
+        fixed, loose = urdf_inertials.hanging(tree, tree.path(own.base, own.tip), joint.child)
+        others = {
+            name: placed for name, placed in fixed.items() if name != joint.child and tree.bodies[name] is not None
+        }
+        rest = whole - _sum(tree, loose)
+        links[joint.child] = rest - _sum(tree, others)
+        if others and not pseudo_inertia.margin(links[joint.child]) > 0.0:
+            links |= {joint.child: rest, **{name: np.zeros(10) for name in others}}
+            notes.append(
+                f"link {joint.child}: with what {', '.join(others)} weigh in the URDF the rest would be no possible "
+                "body, so it takes all, and they have mass zero"
+            )
+        if not pseudo_inertia.margin(links[joint.child]) > 0.0:
+            raise RobotError(
+                f"{tree.where}: link '{joint.child}' would have to be no possible body, since what hangs on it "
+                f"({', '.join(loose)}) is heavier than what was identified: are the drives' gains "
+                "known? Correct those masses, or leave --urdf out for all other files"
+            )
+    return links, notes
+
+
+def _sum(tree: UrdfTree, placed: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return the standard parameters (10,) of links together, as the URDF has them."""
+    found = [(tree.bodies[name], pose) for name, pose in placed.items()]
+    return sum((transform_body(body, pose) for body, pose in found if body is not None), np.zeros(10))
+
+
+def _check(given: IdentifiedRobot, source: str, chain: Chain, where: str, mjcf: bool = False) -> None:
+    """Compare with what Pinocchio reads: frames and torques of random motion, motor inertia where there is some."""
+    rng = np.random.default_rng(0)
+    q = random_joints(given.chain, 20, 0)
+    v, a = rng.uniform(-1.0, 1.0, (2, *q.shape))
+    torques, frames, damping, friction = motion_torques(source, chain, q, v, a, mjcf)
+    wanted = rigid_body.inverse_dynamics(given.arm, given.bodies.ravel(), q, v, a)
+    if mjcf:
+        wanted = wanted + given.drives.values[:, 0] * a
+        away = float(np.abs(frames - urdf_write.moving_frames(given.chain, q)).max())
+        if away > SAME:
+            raise RobotError(f"{where}: Pinocchio reads other poses, by {away:.2g}; nothing was written")
+    off = float(np.abs(torques - wanted).max()) / max(1.0, float(np.abs(wanted).max()))
+    if off > SAME:
+        raise RobotError(
+            f"{where}: Pinocchio reads other torques, by {off:.2g} of the largest; nothing was written. Do other "
+            "joints of the file carry mass that the arm's identification has not seen?"
+        )
+    for what, read_back, own in (("damping", damping, 1), ("friction", friction, 2)):
+        if not np.allclose(read_back, given.drives.values[:, own], rtol=SAME, atol=1e-12):
+            raise RobotError(f"{where}: Pinocchio reads another {what} than was written")
