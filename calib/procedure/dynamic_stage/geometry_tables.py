@@ -26,14 +26,10 @@ from calib import files
 from calib.identification.geometry_uncertainty import NOTHING, TILTS, GeometryUncertainty
 from calib.identification.two_geometries import GeometryComparison
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
-from calib.procedure.dynamic_stage.metrics import GeometricEffect
+from calib.procedure.dynamic_stage.metrics import GeometricEffect, TwoGeometries
 
 EFFECTS, SENSITIVITY, GEOMETRIES = "geometry_effects.csv", "sensitivity.csv", "geometries.csv"
 LEAST = float(np.sqrt((1.0 + NOTHING) ** 2 - 1.0))  # a shift, in σ_torque, that raises a σ by more than `NOTHING`
-GEOMETRIES_HEADER = (
-    "name", "unit", "nominal", "sigma_nominal", "calibrated", "sigma_calibrated", "relative_percent",
-    "sigma_difference", "essential",
-)  # fmt: skip
 
 
 def write(outcome: IdentificationOutcome, folder: Path) -> None:
@@ -47,7 +43,7 @@ def write(outcome: IdentificationOutcome, folder: Path) -> None:
     files.write_table(folder / EFFECTS, GeometricEffect._fields, effects(carried))
     if outcome.geometries is not None:
         table = geometries(outcome.geometries, essential_names(outcome))
-        files.write_table(folder / GEOMETRIES, GEOMETRIES_HEADER, table)
+        files.write_table(folder / GEOMETRIES, TwoGeometries._fields, table)
 
 
 def ranking(carried: GeometryUncertainty) -> np.ndarray:
@@ -85,10 +81,10 @@ def effects(carried: GeometryUncertainty) -> list[GeometricEffect]:
     return found
 
 
-def geometries(found: GeometryComparison, essential: Sequence[str]) -> list[tuple[Any, ...]]:
+def geometries(found: GeometryComparison, essential: Sequence[str]) -> list[TwoGeometries]:
     """Return the rows of ``geometries.csv``: each parameter on the nominal and on the calibrated geometry."""
     return [
-        (
+        TwoGeometries(
             name, unit, float(first), float(s_first), float(second), float(s_second),
             float(relative) if np.isfinite(relative) else None, float(apart), "yes" if name in essential else "no",
         )

@@ -267,6 +267,20 @@ class IdentifiedParameter(NamedTuple):
     rsd: float | None
 
 
+class TwoGeometries(NamedTuple):
+    """A row of ``geometries.csv``: a parameter identified on the nominal and on the calibrated geometry."""
+
+    name: str
+    unit: str
+    nominal: float
+    sigma_nominal: float
+    calibrated: float
+    sigma_calibrated: float
+    relative_percent: float | None
+    sigma_difference: float
+    essential: str
+
+
 class GeometricEffect(NamedTuple):
     """A row of ``geometry_effects.csv``: what one sigma of a geometric element does to the dynamics."""
 

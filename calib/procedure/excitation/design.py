@@ -14,6 +14,7 @@ from calib.errors import UsageError
 from calib.procedure.excitation.goals import SCALINGS, NamedGoal, read_goals, torque_slack, wrist
 from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel, read_inputs
 from calib.procedure.excitation.limits import MotionLimits
+from calib.procedure.excitation.metrics import DesignCondition
 from calib.procedure.excitation.playback import Playback, check_playback, play
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, ExcitationSettings
 from calib.robot.calibrated import CalibratedChain
@@ -54,7 +55,7 @@ class Designed:
     problem: ExcitationProblem
     found: SearchResult
     proof: Verification
-    condition: dict[str, float]
+    condition: DesignCondition
     goals: tuple[tuple[str, float, float, float], ...]
     front: Front | None
     playback: Playback
@@ -171,7 +172,7 @@ def _searched(
     return replace(found, evaluations=spent, seconds=seconds), problem
 
 
-def condition_of(given: ExcitationInputs, family: Family, found: SearchResult, repeat: int = 1) -> dict[str, float]:
+def condition_of(given: ExcitationInputs, family: Family, found: SearchResult, repeat: int = 1) -> DesignCondition:
     """Return the condition numbers of `INSTANTS` samples over the period, with the model's own Coulomb sign.
 
     With motions before they are those of all motions together; ``alone`` and ``before`` say what each has by itself.
@@ -181,11 +182,14 @@ def condition_of(given: ExcitationInputs, family: Family, found: SearchResult, r
     Y = given.model.exact.regressor(motion.q, motion.v, motion.a)
     alone = condition_numbers(Y, columns.sigmas, columns=columns.columns)
     if given.prior is None:
-        return alone
+        return DesignCondition(**alone)
     known = given.prior.per_sample(INSTANTS, repeat * family.period * found.factor)
     both = condition_numbers(Y, columns.sigmas, known, columns.columns)
     before = condition_numbers(0.0 * Y, None, known, columns.columns)
-    return both | {f"{key}_alone": alone[key] for key in alone} | {f"{key}_before": before[key] for key in before}
+    named = {
+        f"{key}_{when}": value for when, one in (("alone", alone), ("before", before)) for key, value in one.items()
+    }
+    return DesignCondition(**both, **named)
 
 
 def _family(given: ExcitationInputs, settings: ExcitationSettings) -> Family:

@@ -6,6 +6,7 @@ Each is written whole, beside its place, then moved there.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -129,7 +130,7 @@ def design_metrics(designed: Designed) -> dict[str, Any]:
     """Return the content of ``metrics.json`` of a designed motion."""
     found, given, settings, family = designed.found, designed.inputs, designed.settings, designed.family
     return {
-        "condition_number": designed.condition,
+        "condition_number": designed.condition.table(),
         "objective": found.merit,
         "feasible": designed.proof.feasible,
         "margins": {
@@ -170,7 +171,7 @@ def design_lines(designed: Designed) -> list[str]:
     columns = len(designed.inputs.columns.names)
     result = [
         *(["interrupted: this is the best motion found until then"] if found.interrupted else []),
-        f"condition number of {columns} columns: {cond['raw']:.4g} raw, {cond['normalised']:.4g} normalised "
+        f"condition number of {columns} columns: {cond.raw:.4g} raw, {cond.normalised:.4g} normalised "
         f"({designed.settings.family}, period {designed.period:g} s)",
         *_together(designed),
         *(f"goal {name}: {value:.4g} (asked: {goal:.4g})" for name, goal, _, value in designed.goals),
@@ -196,21 +197,20 @@ def _together(designed: Designed) -> list[str]:
         return []
     return [
         f"together with {', '.join(prior.names)} ({prior.seconds:.1f} s), which alone has "
-        f"{cond['raw_before']:.4g} raw, {cond['normalised_before']:.4g} normalised; this motion alone "
-        f"{cond['raw_alone']:.4g} and {cond['normalised_alone']:.4g}"
+        f"{cond.raw_before:.4g} raw, {cond.normalised_before:.4g} normalised; this motion alone "
+        f"{cond.raw_alone:.4g} and {cond.normalised_alone:.4g}"
     ]
 
 
 def plan_metrics(planned: Planned) -> dict[str, Any]:
     """Return the content of ``metrics.json``."""
-    used = {name: np.concatenate([one.used[name] for one in planned.timings]) for name in planned.timings[0].used}
     seconds = np.array([one.duration for one in planned.timings])
     shaped = planned.shaped
     return {
         "feasible": True,
         "duration": planned.track.duration,
-        "margins": {"position": _nearest(planned)} | {name: _margin(planned, name, x) for name, x in used.items()},
-        "active_share": float(seconds @ [one.active_share for one in planned.timings] / seconds.sum()),
+        "margins": {name: asdict(one) for name, one in _margins(planned).items()},
+        "active_share": _active_share(planned),
         "active_within": ACTIVE,
         "iterations": sum(one.iterations for one in planned.timings),
         "tightened": max(one.tightened for one in planned.timings),
@@ -218,7 +218,7 @@ def plan_metrics(planned: Planned) -> dict[str, Any]:
         "segments": seconds.tolist(),
         "rate": planned.track.rate,
         "samples": len(planned.track),
-        "samples_verified": sum(len(one.sampled.s) for one in planned.timings),
+        "samples_verified": _verified(planned),
         "line_deviation": None
         if planned.deviation is None
         else {"position": float(planned.deviation[0]), "orientation": float(planned.deviation[1])},
@@ -237,14 +237,13 @@ def plan_metrics(planned: Planned) -> dict[str, Any]:
 
 def plan_lines(planned: Planned) -> list[str]:
     """Return what a person wants to read at the end."""
-    found = plan_metrics(planned)
     words = [
-        f"{found['duration']:.3f} s at {found['rate']:g} Hz; some limit is within {ACTIVE:.0%} of being reached for "
-        f"{found['active_share']:.1%} of the time, none is crossed at {found['samples_verified']} instants",
+        f"{planned.track.duration:.3f} s at {planned.track.rate:g} Hz; some limit is within {ACTIVE:.0%} of being "
+        f"reached for {_active_share(planned):.1%} of the time, none is crossed at {_verified(planned)} instants",
         "smallest margins:",
     ]
-    for name, one in found["margins"].items():
-        words.append(f"  {name:12} {one['margin']:.4g} {one['unit']} ({one['at']})")
+    for name, one in _margins(planned).items():
+        words.append(f"  {name:12} {one.margin:.4g} {one.unit} ({one.at})")
     if planned.sigma is not None:
         free = ", ".join(f"{x:.3g}" for x in planned.sigma)
         words.append(f"limits of torque narrowed for the model's uncertainty, one sigma of each joint: {free} N m")
@@ -255,22 +254,43 @@ def plan_lines(planned: Planned) -> list[str]:
     return words + [f"note: {note}" for note in planned.notes]
 
 
-def _margin(planned: Planned, name: str, used: np.ndarray) -> dict[str, Any]:
+@dataclass(frozen=True)
+class _PlanMargin:
+    """What is left of a limit at the joint nearest to it, and each joint's share that is left."""
+
+    margin: float
+    unit: str
+    at: str
+    share: float
+    joints: list[float]
+
+
+def _active_share(planned: Planned) -> float:
+    seconds = np.array([one.duration for one in planned.timings])
+    return float(seconds @ [one.active_share for one in planned.timings] / seconds.sum())
+
+
+def _verified(planned: Planned) -> int:
+    return sum(len(one.sampled.s) for one in planned.timings)
+
+
+def _margins(planned: Planned) -> dict[str, _PlanMargin]:
+    """Return the smallest margin of every limit, by name."""
+    used = {name: np.concatenate([one.used[name] for one in planned.timings]) for name in planned.timings[0].used}
+    return {"position": _nearest(planned)} | {name: _margin(planned, name, x) for name, x in used.items()}
+
+
+def _margin(planned: Planned, name: str, used: np.ndarray) -> _PlanMargin:
     size = getattr(planned.limits, name)
     share = 1.0 - used.max(axis=0)
     j = int(np.argmin(share))
     joint = planned.chain.joints[j]
     unit = motion_units([joint.kind])[("position", "velocity", "acceleration", "torque").index(name)]
-    return {
-        "margin": float(share[j] * size[j]), "unit": unit, "at": joint.name, "share": float(share[j]),
-        "joints": share.tolist(),
-    }  # fmt: skip
+    return _PlanMargin(float(share[j] * size[j]), unit, joint.name, float(share[j]), share.tolist())
 
 
-def _nearest(planned: Planned) -> dict[str, Any]:
+def _nearest(planned: Planned) -> _PlanMargin:
     j = int(np.argmin(planned.margins))
     joint = planned.chain.joints[j]
-    return {
-        "margin": float(planned.margins[j]), "unit": joint.unit, "at": joint.name,
-        "share": float(planned.margins[j] / (planned.upper[j] - planned.lower[j])), "joints": planned.margins.tolist(),
-    }  # fmt: skip
+    share = float(planned.margins[j] / (planned.upper[j] - planned.lower[j]))
+    return _PlanMargin(float(planned.margins[j]), joint.unit, joint.name, share, planned.margins.tolist())

@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 
 @dataclass(frozen=True)
 class DesignCondition:
-    """Condition number of the observation matrix, in its units and with columns of unit norm."""
+    """Condition number of the observation matrix, in its units and with columns of unit norm.
+
+    Where motions before count, too: of this motion alone, and of those before it.
+    """
 
     raw: float
     normalised: float
+    raw_alone: float | None = None
+    normalised_alone: float | None = None
+    raw_before: float | None = None
+    normalised_before: float | None = None
+
+    def table(self) -> dict[str, float]:
+        """Return the entry of ``metrics.json``."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 @dataclass(frozen=True)

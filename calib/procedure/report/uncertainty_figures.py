@@ -6,9 +6,9 @@ made later shows the same.
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,18 +16,22 @@ from matplotlib.figure import Figure
 
 from calib import files
 from calib.procedure.dynamic_stage.geometry_tables import EFFECTS, GEOMETRIES, LEAST
+from calib.procedure.dynamic_stage.metrics import GeometricEffect, TwoGeometries
 from calib.procedure.report.page import Picture
 from calib.procedure.report.style import AFTER, BEFORE, MARK, QUIET, WIDE, legend, number, picture, room, sheet, styled
+from calib.records import read_rows
 from calib.units import small
 
 TOP = 15  # elements in the ranked figure
-Row = Mapping[str, str]
+T = TypeVar("T")
 
 
 def from_folder(folder: Path) -> dict[str, Picture]:
     """Return the figures that an identification's folder gives, by name; none of a robot without a fit."""
     result: dict[str, Picture] = {}
-    rows = [row for row in _read(folder / GEOMETRIES) if row["essential"] == "yes" and float(row["calibrated"]) != 0.0]
+    rows = [
+        row for row in _read(TwoGeometries, folder / GEOMETRIES) if row.essential == "yes" and row.calibrated != 0.0
+    ]
     if rows:
         words = (
             "Essential parameters identified from the same torques on the nominal (CAD) and on the calibrated geometry "
@@ -36,7 +40,7 @@ def from_folder(folder: Path) -> dict[str, Picture]:
             "is off, in the calibrated one's sigmas."
         )
         result["geometries"] = picture(geometries(rows), words, True)
-    known = [row for row in _read(folder / EFFECTS) if row["sigma"]]
+    known = [row for row in _read(GeometricEffect, folder / EFFECTS) if row.sigma is not None]
     if known:
         words = (
             "Which geometric errors matter for the dynamics: what one standard deviation of each does to the parameter "
@@ -55,15 +59,15 @@ def write(folder: Path) -> None:
             files.write(folder / file, drawn[name].png)
 
 
-def geometries(rows: Sequence[Row]) -> Figure:
+def geometries(rows: Sequence[TwoGeometries]) -> Figure:
     """Draw each parameter on both geometries with error bars, and the difference in sigmas."""
-    columns = ("nominal", "sigma_nominal", "calibrated", "sigma_calibrated")
-    nominal, s_nominal, own, s_own = (np.array([float(row[name]) for row in rows]) for name in columns)
+    table = np.array([(row.nominal, row.sigma_nominal, row.calibrated, row.sigma_calibrated) for row in rows])
+    nominal, s_nominal, own, s_own = table.T
     x = np.arange(len(rows))
     percent = 100.0 / np.abs(own)
     size = np.divide(nominal - own, s_own, out=np.zeros(len(rows)), where=s_own > 0.0)
     thick = min(8.0, 0.7 * 72.0 * (WIDE - 0.75) / (len(rows) + 1))
-    margin = room([row["name"] for row in rows], 6.5)
+    margin = room([row.name for row in rows], 6.5)
     with styled():
         figure, (above, below) = sheet(2, 1, WIDE, 3.7 + margin, bottom=margin, top=0.45, between=0.15)
         for values, sigma, colour, shift, label in (
@@ -83,7 +87,7 @@ def geometries(rows: Sequence[Row]) -> Figure:
             axis.set_xlim(-0.7, len(rows) - 0.3)
             axis.grid(axis="y")
         above.set_xticks(x, [])
-        below.set_xticks(x, [row["name"] for row in rows], rotation=90, fontsize=6.5)
+        below.set_xticks(x, [row.name for row in rows], rotation=90, fontsize=6.5)
         moved = int((np.abs(size) > 2.0).sum())
         legend(figure, above, f"{moved} of {len(rows)} parameters move by two sigmas with the geometry")
     return figure
@@ -101,18 +105,18 @@ def _symlog(axes: Axes, linear: float) -> None:
     axes.set_yticks([], minor=True)
 
 
-def effects(rows: Sequence[Row]) -> Figure:
+def effects(rows: Sequence[GeometricEffect]) -> Figure:
     """Draw the ranked geometric errors by the largest shift they cause."""
-    labels = [f"{row['element']} ({_milli(row)})" for row in rows]
-    size = np.array([float(row["shift_sigma"]) for row in rows])
+    labels = [f"{row.element} ({_milli(row)})" for row in rows]
+    size = np.array([row.shift_sigma or 0.0 for row in rows])
     places = np.arange(len(rows))[::-1]
-    beside = room([row["parameter"] for row in rows], 6.5)
+    beside = room([row.parameter for row in rows], 6.5)
     with styled():
         figure, (axis,) = sheet(height=0.75 + 0.19 * len(rows), left=room(labels, 7.0), right=beside)
         axis.hlines(places, 0.0, size, colors=np.where(size > LEAST, AFTER, QUIET).tolist(), linewidth=8.0)
         axis.axvline(LEAST, color=MARK, linewidth=0.7, linestyle="--")
         for place, value, row in zip(places, size, rows):
-            axis.text(value, place, f" {row['parameter']}", va="center", fontsize=6.5)
+            axis.text(value, place, f" {row.parameter}", va="center", fontsize=6.5)
         axis.set_yticks(places, labels, fontsize=7)
         axis.set(xlabel="shift [σ of torque noise]", ylim=(-0.7, len(rows) - 0.3))
         axis.set_xlim(left=0.0)
@@ -120,12 +124,9 @@ def effects(rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def _milli(row: Row) -> str:
-    return small(float(row["sigma"]), row["unit"], digits=2)
+def _milli(row: GeometricEffect) -> str:
+    return small(row.sigma or 0.0, row.unit, digits=2)
 
 
-def _read(path: Path) -> list[Row]:
-    if not path.is_file():
-        return []
-    with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
+def _read(kind: type[T], path: Path) -> tuple[T, ...]:
+    return read_rows(kind, path) if path.is_file() else ()

@@ -102,7 +102,7 @@ def excite(session: Session, say: Say) -> list[str]:
         motion_folder.write_design(designed, session.path("6-excitation") / name, draw)
         cond = designed.condition
         notes.append(
-            f"{name}: {designed.period:g} s, condition number {cond['raw']:.3g} raw, {cond['normalised']:.3g} "
+            f"{name}: {designed.period:g} s, condition number {cond.raw:.3g} raw, {cond.normalised:.3g} "
             f"normalised, {len(designed.inputs.model.exact.names)} columns; every limit is kept"
         )
         notes += [f"{name}: {note}" for note in designed.notes if first]

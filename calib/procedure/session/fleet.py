@@ -17,8 +17,10 @@ from rich.table import Table
 
 from calib import files
 from calib.errors import CalibError, TaskLost, UsageError, exit_code
+from calib.procedure.dynamic_stage.metrics import UnseenReport
 from calib.procedure.session import instructions, steps
 from calib.procedure.session.folder import SETTINGS, locked, open_session, verdict_of
+from calib.records import read_record
 from calib.workers import Workers
 
 LOG = "run.log"
@@ -122,9 +124,9 @@ def _go_on(folder: Path, say: Callable[[str], None], command: str, plots: bool) 
     rms = [(before.rms, after.rms) for before, after in pairs if before is not None and after is not None]
     errors, torque = max(rms, key=lambda pair: pair[1], default=(None, None)), None
     if session.dynamic:
-        unseen = json.loads(session.identification.unseen.report.read_text(encoding="utf-8"))
-        sets = (unseen["validation"] or unseen["fit"]).values()
-        torque = max((one["raw"]["relative_error_percent"]["total"] or 0.0 for one in sets), default=None)
+        unseen = read_record(UnseenReport, json.loads(session.identification.unseen.report.read_text(encoding="utf-8")))
+        sets = (unseen.validation or unseen.fit).values()
+        torque = max((one.raw.relative_error_percent.total or 0.0 for one in sets), default=None)
     return FleetRow(str(folder), DONE, verdict, "", *errors, torque, code=1 if verdict == "fail" else 0)
 
 

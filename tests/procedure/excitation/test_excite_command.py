@@ -118,15 +118,15 @@ def test_motions_before_count(earlier, tmp_path):
     before = coefficients.read(earlier)
     known = json.loads((earlier / "metrics.json").read_text())["condition_number"]
     second = design.excite("lwr4plus", replace(SHORT, existing=(str(earlier),)))
-    assert second.condition["raw_before"] == pytest.approx(known["raw"], rel=0.02)
-    assert second.condition["raw"] < 0.9 * second.condition["raw_before"]
+    assert second.condition.raw_before == pytest.approx(known["raw"], rel=0.02)
+    assert second.condition.raw < 0.9 * second.condition.raw_before
     # the same from the matrices themselves
     sharp, period = second.inputs.model.exact.regressor, second.period
     times = np.arange(1000) * (period / 1000)
     one = np.sqrt(2) * sharp(*before.orders(times))
     motion = dense_motion(second.family, second.found.x, times)
     both = np.concatenate([one, sharp(motion.q, motion.v, motion.a)])
-    assert condition_numbers(both)["raw"] == pytest.approx(second.condition["raw"], rel=0.02)
+    assert condition_numbers(both)["raw"] == pytest.approx(second.condition.raw, rel=0.02)
     # a recording of the first motion counts as the motion itself, less what the filters' borders eat
     q = np.tile(before.orders(np.arange(1600) / 100)[0], (2, 1))
     np.savez(tmp_path / "log.npz", t=np.arange(len(q)) / 100, q=q, tau=q)
