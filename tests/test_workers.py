@@ -274,6 +274,7 @@ def test_no_process_outlives_its_parent(tmp_path: Path) -> None:
     running.communicate(timeout=SECONDS)
 
 
+@pytest.mark.slow
 def test_a_script_that_starts_itself_again_is_told(tmp_path: Path) -> None:
     running = script(tmp_path, guard="True")
     _, err = running.communicate(timeout=SECONDS)

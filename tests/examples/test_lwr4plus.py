@@ -12,6 +12,7 @@ import pytest
 
 from calib.simulation.cells import lwr4plus
 
+pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 
 

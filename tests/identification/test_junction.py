@@ -34,7 +34,7 @@ def geometry(model: str) -> kinematic.Outcome:
     return kinematic.run(Inputs(cell.nominal, Path("planted.toml"), (block,)), wanted=FitSettings(model=model))
 
 
-@pytest.mark.parametrize("model", ["geometry", "harmonics"])
+@pytest.mark.parametrize("model", ["geometry", pytest.param("harmonics", marks=pytest.mark.slow)])
 def test_fit_and_identification_in_one_process_equal_the_way_through_files(model, tmp_path):
     outcome = geometry(model)
     robot = outcome.calibrated

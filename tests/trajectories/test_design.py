@@ -111,6 +111,7 @@ def test_splines_are_a_family_like_any_other():
     assert proof.feasible and max(proof.rest) < 1e-6
 
 
+@pytest.mark.slow
 def test_goals_are_attained_within_gamma():
     spot = problem(goals=(AttainmentGoal(Excitation("cond", "normalised"), 20.0), AttainmentGoal(SLACK, 0.85, 0.0)))
     run = design(spot, starts=1, evaluations=150, seed=1, guesses=(designed()[1].x,))

@@ -298,7 +298,7 @@ def test_ctrl_c_in_worker_processes(tmp_path, whom):
 )
 def test_bad_input_is_refused_with_exit_code_2(cell, calib, extra, options, words):
     Path("limits.toml").write_text(extra)
-    quick = (*QUICK[:2], "--evaluations", 30, *QUICK[4:])
+    quick = (*QUICK[:2], "--evaluations", 12, *QUICK[4:])
     code, _, err = calib("excite", "lwr4plus", "--limits", "limits.toml", "--out", "e", *quick, *options)
     assert (code, words in err) == (2, True), err
     assert not Path("e").exists()
