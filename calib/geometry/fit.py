@@ -12,13 +12,15 @@ from calib.errors import MeasurementError
 from calib.estimation.base_columns import ColumnSplit
 from calib.estimation.nonlinear import covariance, solve
 from calib.estimation.relevance import gram, relevance
+from calib.geometry.first_guess import install
 from calib.geometry.identifiability import base_columns
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, observe, prepare, stack
 from calib.geometry.parameters import layout, parameter_values, step
 from calib.geometry.result import GeometricFit
 from calib.geometry.weighing import Settings, Weigher
-from calib.robot.chain import element_length
+from calib.robot.chain import Chain, element_length
+from calib.robot.deflection import Deflection
 
 PLAUSIBLE = {"m": 0.01, "rad": 0.05}  # how far a real arm may be from its nominal (our choice)
 RETRIES = 4
@@ -235,3 +237,28 @@ def polish_frames(
 ) -> GeometricFit:
     """Fit stations and tools only, the arm staying as it is: what 'nominal' errors are measured with."""
     return fit(cell, measured, frames_only(cell), settings=settings, torques=torques)
+
+
+def placed_on(
+    cell: Installation, block: PoseMeasurements, torques: Sequence[np.ndarray | None] | None, settings: Settings
+) -> Installation:
+    """Return an arm, deflections included, with base and tool placement fitted on a block and nothing else."""
+    start = replace(install(cell.chain, [block], cell.known), deflection=cell.deflection)
+    return polish_frames(start, [block], settings, torques).cell
+
+
+def without_corrections(
+    cell: Installation, rigid: Chain, blocks: Sequence[PoseMeasurements], settings: Settings
+) -> Installation | None:
+    """Return the arm as a URDF holds it, base and tool placement fitted for it; None where `cell` has no corrections.
+
+    Args:
+        cell: the calibrated installation.
+        rigid: the best geometry without corrections; that inside `cell` is good only together with them.
+        blocks: the fit's rows.
+        settings: of the fit.
+    """
+    if not (cell.deflection.terms or cell.known.terms):
+        return None
+    bare = replace(cell, chain=rigid, deflection=Deflection(), known=Deflection())
+    return polish_frames(bare, blocks, settings).cell

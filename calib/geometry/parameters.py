@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calib.data.poses.fit_options import FitOptions
 from calib.errors import UsageError
 from calib.geometry.installation import FRAME_AXES, Installation
 from calib.robot import deflection
@@ -117,3 +118,25 @@ def parameter_values(cell: Installation) -> np.ndarray:
     """Return the full parameter vector; frames count from their present placement, hence zeros."""
     _, stations, tools, _ = layout_counts(cell)
     return np.concatenate([cell.chain.values, np.zeros(stations + tools), np.asarray(cell.deflection.coefficients)])
+
+
+def fixed_parameters(start: Installation, options: FitOptions) -> np.ndarray:
+    """Return the positions of parameters that stay at their nominal: those in ``fix``, or all but those in ``free``.
+
+    ``free`` speaks of the arm; frames are always fitted.
+    """
+    table = layout(start)
+    fixed = table.find(options.fix)
+    if options.free:
+        fixed = np.union1d(fixed, np.setdiff1d(table.arm_index, table.find(options.free)))
+    return fixed
+
+
+def stated_prior(start: Installation, options: FitOptions) -> np.ndarray | None:
+    """Return the standard deviations of the parameter vector that the options state; infinite elsewhere."""
+    if not options.prior:
+        return None
+    table = layout(start)
+    prior = np.full(len(table.names), np.inf)
+    prior[table.find(tuple(options.prior))] = list(options.prior.values())
+    return prior

@@ -211,3 +211,10 @@ def element_index(chain: Chain, names: Iterable[str]) -> np.ndarray:
         return np.array([table[name] for name in names], dtype=int)
     except KeyError as error:
         raise RobotError(f"robot '{chain.name}' has no element {error}; it has {', '.join(chain.names)}") from None
+
+
+def stretched_length(chain: Chain) -> float:
+    """Return how long the stretched arm is at most [m]: the sum of its constant offsets."""
+    total = sum(abs(e.value) for e in chain.elements if e.axis[0] == "t" and e.joint is None)
+    placed = sum(float(np.linalg.norm(e.placement[:3, 3])) for e in chain.elements if e.placement is not None)
+    return max(total + placed + float(np.linalg.norm(chain.tail[:3, 3])), 0.1)

@@ -282,3 +282,14 @@ def _places(offered: dict[str, list[Term]]) -> dict[str, np.ndarray]:
     """Return where each effect's terms stand among all of them."""
     edges = np.cumsum([0, *(len(terms) for terms in offered.values())])
     return {name: np.arange(edges[k], edges[k + 1]) for k, name in enumerate(offered)}
+
+
+def rigid_fit(found: ModelSelection, measured: Sequence[PoseMeasurements], settings: Settings) -> GeometricFit:
+    """Return the best fit without any corrections, those that came with the robot included: for a URDF."""
+    if not found.rigid.cell.known.terms:
+        return found.rigid
+    bare = polish_frames(replace(found.nominal.cell, known=Deflection()), measured, settings).cell
+    drawn = not all(block.has_instrument for block in measured)
+    table = layout(bare)
+    every = np.concatenate([table.arm_index, table.frame_index])
+    return fit(bare, measured, every, settings=settings, drawn=drawn)

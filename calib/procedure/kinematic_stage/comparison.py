@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,14 +11,12 @@ import numpy as np
 from calib.data.poses.measurements import PoseMeasurements
 from calib.geometry.accuracy import Errors, Torques, errors, pair_errors, statistics, summary
 from calib.geometry.checks.repeatability import SAME, Repeats, repeats
-from calib.geometry.first_guess import install
-from calib.geometry.fit import polish_frames
+from calib.geometry.fit import placed_on
 from calib.geometry.installation import Installation
 from calib.geometry.weighing import Settings
 from calib.procedure.kinematic_stage.inputs import Unseen, pose_count
 from calib.procedure.kinematic_stage.metrics import RepeatedPoses
 from calib.robot.chain import Chain
-from calib.robot.deflection import Deflection
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,8 +101,8 @@ def compare_unseen(
     block = unseen.block
     torques = [torque_of(block)]
     if unseen.own_frames:
-        nominal, calibrated = (place(cell, block, torques, settings) for cell in (nominal, calibrated))
-        alone = None if alone is None else place(alone, block, torques, settings)
+        nominal, calibrated = (placed_on(cell, block, torques, settings) for cell in (nominal, calibrated))
+        alone = None if alone is None else placed_on(alone, block, torques, settings)
         words = "base and tool placement refitted on these rows"
     elif unseen.held_out:
         words = "those of the fit"
@@ -114,29 +112,6 @@ def compare_unseen(
     return compare(
         nominal, calibrated, [block], torques, words, not unseen.seen, seed, alone=alone, shares_frames=shares
     )
-
-
-def place(cell: Installation, block: PoseMeasurements, torques: Torques, settings: Settings) -> Installation:
-    """Return an arm, deflections included, with base and tool placement fitted on a block and nothing else."""
-    start = replace(install(cell.chain, [block], cell.known), deflection=cell.deflection)
-    return polish_frames(start, [block], settings, torques).cell
-
-
-def without_corrections(
-    cell: Installation, rigid: Chain, blocks: Sequence[PoseMeasurements], settings: Settings
-) -> Installation | None:
-    """Return the arm as a URDF holds it, base and tool placement fitted for it; None where `cell` has no corrections.
-
-    Args:
-        cell: the calibrated installation.
-        rigid: the best geometry without corrections; that inside `cell` is good only together with them.
-        blocks: the fit's rows.
-        settings: of the fit.
-    """
-    if not (cell.deflection.terms or cell.known.terms):
-        return None
-    bare = replace(cell, chain=rigid, deflection=Deflection(), known=Deflection())
-    return polish_frames(bare, blocks, settings).cell
 
 
 def gravity_of(chain: Chain, block: PoseMeasurements) -> np.ndarray | None:

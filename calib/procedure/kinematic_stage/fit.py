@@ -14,11 +14,11 @@ from calib.geometry.accuracy import errors
 from calib.geometry.checks.diagnosis import diagnose
 from calib.geometry.checks.explanation import explain
 from calib.geometry.first_guess import install
-from calib.geometry.fit import fit, polish_frames
+from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.folds import folds_by_name
-from calib.geometry.model_choice.ladder import ModelSelection, climb
-from calib.geometry.parameters import layout
+from calib.geometry.model_choice.ladder import ModelSelection, climb, rigid_fit
+from calib.geometry.parameters import fixed_parameters, stated_prior
 from calib.geometry.result import GeometricFit, calibrated_chain
 from calib.geometry.weighing import Settings, combine
 from calib.procedure.kinematic_stage.comparison import (
@@ -32,8 +32,7 @@ from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import Arms, Assessment, assess
 from calib.procedure.kinematic_stage.verdict import Verdict
 from calib.robot.calibrated import CalibratedChain
-from calib.robot.chain import Chain
-from calib.robot.deflection import Deflection
+from calib.robot.chain import stretched_length
 
 Progress = Callable[[str], None]
 MOVED = 3.0  # nominal errors fall by this factor when each file gets a station of its own: it was moved (our choice)
@@ -153,7 +152,7 @@ def assessed(outcome: Outcome, inputs: Inputs, options: FitOptions, wanted: FitS
 
 def found_of(inputs: Inputs, found: ModelSelection, named: Sequence[Outlier], notes: Sequence[str]) -> Findings:
     """Return what a fit says of itself, whatever rows it has not seen; `notes` are those of moved instruments etc."""
-    long = reach(inputs.chain)
+    long = stretched_length(inputs.chain)
     said = plateau(found, long)
     return Findings(
         model=found.chosen,
@@ -167,49 +166,9 @@ def found_of(inputs: Inputs, found: ModelSelection, named: Sequence[Outlier], no
     )
 
 
-def rigid_fit(found: ModelSelection, measured: Sequence[PoseMeasurements], settings: Settings) -> GeometricFit:
-    """Return the best fit without any corrections, those that came with the robot included: for a URDF."""
-    if not found.rigid.cell.known.terms:
-        return found.rigid
-    bare = polish_frames(replace(found.nominal.cell, known=Deflection()), measured, settings).cell
-    drawn = not all(block.has_instrument for block in measured)
-    table = layout(bare)
-    every = np.concatenate([table.arm_index, table.frame_index])
-    return fit(bare, measured, every, settings=settings, drawn=drawn)
-
-
-def fixed_parameters(start: Installation, options: FitOptions) -> np.ndarray:
-    """Return the positions of parameters that stay at their nominal: those in ``fix``, or all but those in ``free``.
-
-    ``free`` speaks of the arm; frames are always fitted.
-    """
-    table = layout(start)
-    fixed = table.find(options.fix)
-    if options.free:
-        fixed = np.union1d(fixed, np.setdiff1d(table.arm_index, table.find(options.free)))
-    return fixed
-
-
-def stated_prior(start: Installation, options: FitOptions) -> np.ndarray | None:
-    """Return the standard deviations of the parameter vector that the options state; infinite elsewhere."""
-    if not options.prior:
-        return None
-    table = layout(start)
-    prior = np.full(len(table.names), np.inf)
-    prior[table.find(tuple(options.prior))] = list(options.prior.values())
-    return prior
-
-
 def cross_validated(found: ModelSelection) -> float:
     """Return the error of the chosen model on rows left out [m]: that of the last rung kept."""
     return [rung.cross_validated for rung in found.rungs if rung.kept][-1]
-
-
-def reach(chain: Chain) -> float:
-    """Return how long the stretched arm is at most [m]: the sum of its constant offsets."""
-    total = sum(abs(e.value) for e in chain.elements if e.axis[0] == "t" and e.joint is None)
-    placed = sum(float(np.linalg.norm(e.placement[:3, 3])) for e in chain.elements if e.placement is not None)
-    return max(total + placed + float(np.linalg.norm(chain.tail[:3, 3])), 0.1)
 
 
 def moved_between(nominal: Installation, blocks: Sequence[PoseMeasurements], settings: Settings) -> list[str]:

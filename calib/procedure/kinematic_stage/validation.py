@@ -16,7 +16,7 @@ from calib import files
 from calib.data.poses.measurements import PoseMeasurements, Positions
 from calib.geometry.accuracy import Errors
 from calib.geometry.first_guess import install
-from calib.geometry.fit import polish_frames
+from calib.geometry.fit import polish_frames, without_corrections
 from calib.geometry.installation import Installation
 from calib.geometry.observation import predict, prepare
 from calib.geometry.weighing import Settings
@@ -25,7 +25,6 @@ from calib.procedure.kinematic_stage.comparison import (
     compare,
     compare_unseen,
     gravity_of,
-    without_corrections,
 )
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import Findings
