@@ -44,10 +44,10 @@ def new_session(
     Raises:
         UsageError: where the folder is in use, or a value is none of these.
     """
-    made = commands.begin(
-        Path(folder), str(robot), instrument, poses=poses, validation=validation, seed=seed, base=base, tip=tip,
-        tool=tool, limits=optional(limits), dynamics=dynamics, **motion,
-    )  # fmt: skip
+    wanted = commands.NewSession(
+        str(robot), instrument, poses, validation, seed, base, tip, tool, optional(limits), dynamics, motion
+    )
+    made = commands.begin(Path(folder), wanted)
     return made.folder
 
 

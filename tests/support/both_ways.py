@@ -15,7 +15,7 @@ from sessions import edit, quiet
 from calib import cli
 from calib.errors import CalibError
 from calib.procedure.session import steps
-from calib.procedure.session.commands import begin
+from calib.procedure.session.commands import NewSession, begin
 from calib.procedure.session.folder import Session, locked, open_session
 
 
@@ -74,9 +74,9 @@ def command(*words: object) -> str:
     return refusal(lambda: cli.app(arguments, standalone_mode=False))
 
 
-def session_with(folder: Path, robot: Path, model: str, *measured: Path, **wanted: Any) -> Session:
+def session_with(folder: Path, robot: Path, model: str, *measured: Path) -> Session:
     """Make a session, with the measured files brought to it."""
-    session = begin(folder, str(robot), "cmm", poses=4, validation=1, seed=0, **{"dynamics": False, **wanted})
+    session = begin(folder, NewSession(str(robot), "cmm", 4, 1, dynamics=False))
     settings = session.path("session.toml")
     for old, new in (
         ("plan = true", "plan = false"),

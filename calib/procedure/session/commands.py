@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from calib.procedure.session.settings import (
 from calib.robot.load import load, resolve
 
 Say = Callable[[str], None]
+LIMITS = "limits.toml"
 COLOURS = {"done": "green", "kept": "green", "ready": "cyan", "stale": "yellow", "waiting": "yellow", "after": "dim"}
 
 
@@ -40,14 +41,11 @@ class Stop:
     verdict: str = ""
 
 
-def begin(
-    folder: Path, robot: str, instrument: str, *, poses: int, validation: int, seed: int, base: str = "", tip: str = "",
-    tool: Sequence[float] | None = None, limits: Path | None = None, dynamics: bool = True, **motion: Any,
-) -> Session:  # fmt: skip
-    """Make a session for a robot, which is read once to see that it can be.
+@dataclass(frozen=True)
+class NewSession:
+    """What a new session is about.
 
-    Args:
-        folder: new.
+    Attributes:
         robot: see `calib.robot.load`.
         instrument: a key of `calib.procedure.session.questions.INSTRUMENTS`.
         poses, validation: how many to choose.
@@ -58,23 +56,40 @@ def begin(
         dynamics: identify the dynamics, too.
         motion: other keys of ``[dynamics]``: ``torques``, ``payloads``, ``period`` …
     """
-    if poses < 1 or validation < 0:
-        raise UsageError(f"--poses {poses} --validation {validation}: at least one pose, and no fewer than 0")
-    device, source = instrument_named(instrument), resolve(robot)
-    chain = load(robot, base or None, tip or None)
-    copied, named = ({}, "") if limits is None else ({"limits.toml": limits}, "limits.toml")
-    if limits is not None:
-        read_motion_limits(limits, chain, source)
+
+    robot: str
+    instrument: str
+    poses: int = 40
+    validation: int = 20
+    seed: int = 0
+    base: str = ""
+    tip: str = ""
+    tool: Sequence[float] | None = None
+    limits: Path | None = None
+    dynamics: bool = True
+    motion: Mapping[str, Any] = field(default_factory=dict)
+
+
+def begin(folder: Path, wanted: NewSession) -> Session:
+    """Make a session in the new folder `folder`, for a robot, which is read once to see that it can be."""
+    if wanted.poses < 1 or wanted.validation < 0:
+        words = f"--poses {wanted.poses} --validation {wanted.validation}"
+        raise UsageError(f"{words}: at least one pose, and no fewer than 0")
+    device, source = instrument_named(wanted.instrument), resolve(wanted.robot)
+    chain = load(wanted.robot, wanted.base or None, wanted.tip or None)
+    copied, named = ({}, "") if wanted.limits is None else ({LIMITS: wanted.limits}, LIMITS)
+    if wanted.limits is not None:
+        read_motion_limits(wanted.limits, chain, source)
     measured = InstrumentSection(device.label, device.measures, device.sigma_position, device.sigma_orientation)
-    if tool is not None:
-        x, y, z = (float(value) for value in tool)
+    if wanted.tool is not None:
+        x, y, z = (float(value) for value in wanted.tool)
         measured = replace(measured, tool=(x, y, z))
-    wanted = SessionSettings(
-        chain.name, "", seed, RobotSection("", robot, base, tip), measured,
-        PosesSection(poses, validation, constraints=named), FitSection(),
-        DynamicsSection(wanted=dynamics, limits=named, **motion),
+    settings = SessionSettings(
+        chain.name, "", wanted.seed, RobotSection("", wanted.robot, wanted.base, wanted.tip), measured,
+        PosesSection(wanted.poses, wanted.validation, constraints=named), FitSection(),
+        DynamicsSection(wanted=wanted.dynamics, limits=named, **wanted.motion),
     )  # fmt: skip
-    return create(folder, source, wanted, copied)
+    return create(folder, source, settings, copied)
 
 
 def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", plots: bool = True) -> Stop:

@@ -21,7 +21,7 @@ from calib.identification.model_file import read_dynamics
 from calib.procedure.kinematic_stage.folder import URDF
 from calib.procedure.report import viewer
 from calib.procedure.session import dynamics_steps, steps
-from calib.procedure.session.commands import begin
+from calib.procedure.session.commands import NewSession, begin
 from calib.procedure.session.folder import MARK, SETTINGS, Session, locked, open_session, verdict_of
 from calib.robot import calibrated, library
 from calib.robot.load import load
@@ -84,7 +84,7 @@ def run(
         )
         dynamics = False
     motion = MOTION if dynamics else {}
-    session = begin(folder, robot, "cmm", poses=FIT, validation=VALIDATION, seed=seed, dynamics=dynamics, **motion)
+    session = begin(folder, NewSession(robot, "cmm", FIT, VALIDATION, seed, dynamics=dynamics, motion=motion))
     session = replace(session, plots=plots)
     say(f"the cell: {cell.note}")
     with locked(session):

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calib.errors import SessionError
-from calib.procedure.session.commands import begin
+from calib.procedure.session.commands import NewSession, begin
 from calib.procedure.session.folder import open_session
 from calib.procedure.session.settings import (
     DynamicsSection,
@@ -135,16 +135,14 @@ def test_a_robot_whose_name_holds_quotes_and_lines_makes_a_session(tmp_path: Pat
     joint = "[[joint]]\nlower = -1\nupper = 1\n"
     text = f'name = {json.dumps(name)}\n{joint}{joint}alpha = "pi/2"\n'
     (tmp_path / "robot.toml").write_text(text)
-    made = begin(
-        tmp_path / "cell", str(tmp_path / "robot.toml"), "tracker", poses=20, validation=5, seed=3, dynamics=False
-    )
+    made = begin(tmp_path / "cell", NewSession(str(tmp_path / "robot.toml"), "tracker", 20, 5, seed=3, dynamics=False))
     assert (made.settings.name, made.settings.seed) == (name, 3)
     assert open_session(made.folder).settings == made.settings
 
 
 def test_what_cannot_be_leaves_no_session(tmp_path: Path) -> None:
     with pytest.raises(SessionError, match=r"cell/session.toml: seed: expected a whole number, 0 or more, found -1"):
-        begin(tmp_path / "cell", "ur5", "tracker", poses=20, validation=5, seed=-1)
+        begin(tmp_path / "cell", NewSession("ur5", "tracker", 20, 5, seed=-1))
     assert list(tmp_path.iterdir()) == []
 
 
