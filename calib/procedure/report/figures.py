@@ -5,22 +5,22 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from calib.folders import METRICS
-from calib.procedure.dynamic_stage.metrics import UnseenReport
-from calib.procedure.excitation import coefficients
-from calib.procedure.excitation.metrics import DesignMetrics
 from calib.procedure.kinematic_stage.metrics import LadderStep
-from calib.procedure.report import dynamics_figures, geometry_figures, motion_figures, uncertainty_figures
-from calib.procedure.report.dynamics_section import DynamicReport, percent, proof_of
+from calib.procedure.report import geometry_figures
 from calib.procedure.report.fit_report import Report, RowErrors
 from calib.procedure.report.page import Picture, Pictures
 from calib.procedure.report.style import HALF, WIDE, picture
 from calib.records import read_record
+
+if TYPE_CHECKING:  # the figures of a fit are drawn without loading the dynamics' modules
+    from calib.procedure.dynamic_stage.metrics import UnseenReport
+    from calib.procedure.report.dynamics_section import DynamicReport
 
 DRAWN = 300  # points per curve of the excitation
 
@@ -104,6 +104,8 @@ def draw_dynamics(found: DynamicReport, folder: Path, excitation: Path) -> dict[
         folder: of the identification.
         excitation: folder with ``training/trajectory.csv`` and its ``metrics.json``, if a motion was designed.
     """
+    from calib.procedure.report import uncertainty_figures
+
     return {
         "errors": Pictures("", _judged(found.unseen)),
         "torques": Pictures("Torques", _torques(found.unseen)),
@@ -115,6 +117,9 @@ def draw_dynamics(found: DynamicReport, folder: Path, excitation: Path) -> dict[
 
 def _judged(unseen: UnseenReport) -> list[Picture]:
     """Return errors by row and autocorrelations of the recording that judges."""
+    from calib.procedure.report import dynamics_figures
+    from calib.procedure.report.dynamics_section import proof_of
+
     _, proof, where = proof_of(unseen)
     own = next(iter(unseen.fit.values()))
     sides = [[x or 0.0 for x in one.raw.relative_error_percent.joints] for one in (own, proof)]
@@ -130,6 +135,9 @@ def _judged(unseen: UnseenReport) -> list[Picture]:
 
 def _torques(unseen: UnseenReport) -> list[Picture]:
     """Return measured and predicted torques of each unseen recording, or of those fitted."""
+    from calib.procedure.report import dynamics_figures
+    from calib.procedure.report.dynamics_section import percent
+
     seen = "unseen" if unseen.validation else "fitted"
     result = []
     for curves in unseen.curves:
@@ -146,6 +154,10 @@ def _torques(unseen: UnseenReport) -> list[Picture]:
 
 def _excitation(excitation: Path) -> list[Picture]:
     """Return the designed motion, and how well it tells the parameters; nothing where none was designed."""
+    from calib.procedure.excitation import coefficients
+    from calib.procedure.excitation.metrics import DesignMetrics
+    from calib.procedure.report import motion_figures
+
     folder = excitation / "training"
     if not (folder / coefficients.NAME).exists():
         return []
@@ -168,6 +180,8 @@ def _excitation(excitation: Path) -> list[Picture]:
 
 def _significance(found: DynamicReport) -> Picture:
     """Return the figure of parameters over their sigma."""
+    from calib.procedure.report import dynamics_figures
+
     known = [row for row in found.estimate if row.sigma]
     sigma = np.array([row.sigma or np.nan for row in known])
     figure = dynamics_figures.significance([row.name for row in known], np.array([row.value for row in known]), sigma)
