@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import difflib
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -99,6 +100,18 @@ def suggestion(word: str, words: Collection[str]) -> str:
     lower = {str(other).lower(): other for other in words}
     close = difflib.get_close_matches(word.lower(), lower, 1, 0.6)
     return f" (did you mean '{lower[close[0]]}'?)" if close else ""
+
+
+@contextmanager
+def as_ours() -> Iterator[None]:
+    """Raise what ``poses`` and ``trajectories`` refuse as errors of this toolkit, the original as their cause."""
+    try:
+        yield
+    except ValueError as error:
+        code = exit_code(error)
+        if code is None:
+            raise
+        raise (Unidentifiable if code == 3 else UsageError)(str(error)) from error
 
 
 def exit_code(error: Exception) -> int | None:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 Recorded = str | Path | Recording
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class DynamicsModel:
     """Identified dynamics and how far to trust them. ``print`` shows errors on other motion, friction and verdict.
 
@@ -82,6 +82,11 @@ class DynamicsModel:
         from calib.procedure.report import console, dynamics_section
 
         yield from console.section(dynamics_section.outcome_section(self.outcome))
+
+    def __repr__(self) -> str:
+        return (
+            f"<DynamicsModel of {self.robot.chain.name}: {len(self.estimate.names)} parameters, {self.verdict.level}>"
+        )
 
     def __str__(self) -> str:
         return as_text(self.renderables())

@@ -15,6 +15,7 @@ from calib.api.rendering import as_text, data_frame
 from calib.data.poses.fit_options import FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.target_files import Targets, read_targets
+from calib.errors import as_ours
 from calib.estimation.estimate import Estimate
 from calib.procedure.kinematic_stage import compensation, compensation_file, fit, folder, inputs, selection
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSettings, SelectionSettings
@@ -29,7 +30,7 @@ Progress = Callable[[str], None]
 Measured = str | Path | PoseMeasurements
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PoseSelection:
     """Poses at which a robot's geometry shows best. ``print`` shows index, bound and what random poses reach.
 
@@ -56,12 +57,15 @@ class PoseSelection:
         """Return the joint values as a pandas DataFrame, a row per pose."""
         return data_frame(self.q.tolist(), list(self.chosen.chain.joint_names))
 
+    def __repr__(self) -> str:
+        return f"<PoseSelection: {len(self.q)} poses of {self.chosen.chain.name}>"
+
     def __str__(self) -> str:
         lines = [f"{words:38} {number}" for words, number in selection.table(self.chosen)]
         return "\n".join([*lines, *(f"note: {note}" for note in self.chosen.notes)])
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class GeometryFit:
     """A fitted geometry and how far to trust it. ``print`` shows the ladder, errors on unseen poses and the verdict.
 
@@ -118,11 +122,14 @@ class GeometryFit:
 
         yield from console.section(geometry_section.outcome_section(fit_metrics(self.outcome)))
 
+    def __repr__(self) -> str:
+        return f"<GeometryFit of {self.robot.chain.name}: model {self.outcome.climb.chosen}, {self.verdict.level}>"
+
     def __str__(self) -> str:
         return as_text(self.renderables())
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class JointCommands:
     """Joint commands that put the real tool on nominal targets. ``print`` says what is reached and how well.
 
@@ -149,6 +156,9 @@ class JointCommands:
     def save(self, path: str | Path, *, partial: bool = False) -> Path:
         """Write the commands as CSV; `partial` writes what is reached, even where some targets are not."""
         return compensation_file.write(self.commands, self.fitted, self.targets, Path(path), partial)
+
+    def __repr__(self) -> str:
+        return f"<JointCommands: {int(self.commands.reached.sum())} of {len(self.q)} targets reached>"
 
     def __str__(self) -> str:
         return "\n".join(compensation_file.lines(self.commands, self.targets, self.fitted))
@@ -183,7 +193,7 @@ def select_poses(
     from calib.workers import workers as opened
 
     say, lost = progress or (lambda words: None), []
-    with opened(workers) as crew:
+    with as_ours(), opened(workers) as crew:
         chosen = selection.choose(
             robot, count, settings, constraints=optional(constraints), existing=optional(existing), base=base, tip=tip,
             map=crew.map_without(lost), progress=lambda done, total, what: say(f"{what} ({done} of {total})"),

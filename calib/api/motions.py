@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from calib.api.dynamic import DynamicsModel
 from calib.api.reading import optional, saved
+from calib.errors import as_ours
 from calib.procedure.excitation import design, folder, planning
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, DEFAULT_PLAN, ExcitationSettings, PlanSettings
 from calib.robot.calibrated import CalibratedChain
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 Progress = Callable[[str], None]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ExcitationDesign:
     """A motion that shows a robot's dynamics, proved to keep its limits. ``print`` shows condition numbers and margins.
 
@@ -46,11 +47,14 @@ class ExcitationDesign:
         """Return the metrics as ``metrics.json`` holds them."""
         return folder.design_metrics(self.designed)
 
+    def __repr__(self) -> str:
+        return f"<ExcitationDesign for {self.designed.inputs.chain.name}: {self.designed.period:g} s>"
+
     def __str__(self) -> str:
         return "\n".join(folder.design_lines(self.designed))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class MotionPlan:
     """The fastest motion through waypoints, within speeds and torques. ``print`` shows duration and margins.
 
@@ -80,6 +84,9 @@ class MotionPlan:
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as ``metrics.json`` holds them."""
         return folder.plan_metrics(self.planned)
+
+    def __repr__(self) -> str:
+        return f"<MotionPlan for {self.planned.chain.name}: {self.planned.track.duration:g} s>"
 
     def __str__(self) -> str:
         return "\n".join(folder.plan_lines(self.planned))
@@ -113,7 +120,7 @@ def design_excitation(
     from calib.workers import workers as opened
 
     lost = []
-    with ExitStack() as stack:
+    with as_ours(), ExitStack() as stack:
         place = None if model is None else stack.enter_context(saved(model))
         crew = stack.enter_context(opened(workers))
         designed = design.excite(
@@ -148,7 +155,7 @@ def plan_motion(
     Raises:
         UsageError: for waypoints that cannot be reached, and limits that cannot be kept.
     """
-    with ExitStack() as stack:
+    with as_ours(), ExitStack() as stack:
         place = None if model is None else stack.enter_context(saved(model))
         planned = planning.plan(
             robot, Path(waypoints), settings, model=place, limits=optional(limits), drives=optional(drives), base=base,

@@ -8,7 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from calib.data.poses.fit_options import FitOptions
+from calib.data.poses.fit_options import FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements
 from calib.data.recordings.recording import Recording
 from calib.data.recordings.recording_files import read_recording as read_file
@@ -36,14 +36,14 @@ def load(robot: str | Path, *, base: str | None = None, tip: str | None = None) 
 
 
 def read_poses(
-    path: str | Path, robot: CalibratedChain, *, options: FitOptions | None = None
+    path: str | Path, robot: str | Path | CalibratedChain, *, options: FitOptions | str | Path | None = None
 ) -> tuple[PoseMeasurements, ...]:
     """Read measured poses, positions, distances, sockets or planes of a robot from a CSV file.
 
     Args:
         path: the file; its columns and units: ``calib formats measurements``.
-        robot: whose joints the columns name.
-        options: what the header does not say (`calib formats options`).
+        robot: whose joints the columns name, as `load` takes or returns it.
+        options: what the header does not say, or the TOML file that says it (``calib formats options``).
 
     Returns:
         One block per kind of measurement and station, joints [rad, m], lengths [m].
@@ -51,7 +51,8 @@ def read_poses(
     Raises:
         MeasurementError: naming file, row, column and the likely cause.
     """
-    return tuple(inputs.read_file(Path(path), robot.complete, options or FitOptions()))
+    chosen = options if isinstance(options, FitOptions) else read_options(optional(options))
+    return tuple(inputs.read_file(Path(path), _loaded(robot).complete, chosen))
 
 
 def read_recording(path: str | Path, robot: CalibratedChain, *, options: RecordingOptions | None = None) -> Recording:
@@ -59,15 +60,15 @@ def read_recording(path: str | Path, robot: CalibratedChain, *, options: Recordi
 
     Args:
         path: the file; ``log.npz@0:9.4`` cuts out seconds 0 to 9.4.
-        robot: whose joints are logged.
-        options: what the file does not say (`calib formats recordings`).
+        robot: whose joints are logged, as `load` takes or returns it.
+        options: what the file does not say, `calib.data.recordings.recording_options.RecordingOptions`.
 
     Raises:
         MeasurementError: naming file, row, column and the likely cause.
     """
     from calib.procedure.dynamic_stage.inputs import joints_of  # the dynamics' modules: none of the geometry's
 
-    return read_file(path, joints_of(robot.chain), options or RecordingOptions())
+    return read_file(path, joints_of(_loaded(robot).chain), options or RecordingOptions())
 
 
 def listed(given: object | Sequence[object]) -> list:
@@ -90,3 +91,7 @@ def saved(result: Any) -> Iterator[Path]:
     else:
         with TemporaryDirectory() as place:
             yield result.save(Path(place) / "result", plots=False)
+
+
+def _loaded(robot: str | Path | CalibratedChain) -> CalibratedChain:
+    return robot if isinstance(robot, CalibratedChain) else load_calibrated(robot)

@@ -153,3 +153,21 @@ def test_wrong_settings_are_refused_where_they_are_made():
         calib.FitSettings(holdout=1.5)
     with pytest.raises(calib.CalibError, match="--model geometri"):
         calib.FitSettings(model="geometri")
+
+
+def test_what_the_search_packages_refuse_is_a_calib_error():
+    """``poses`` and ``trajectories`` raise errors of their own; a script needs only one `except`."""
+    with pytest.raises(calib.CalibError, match="O9"):
+        calib.select_poses("ur5", 5, calib.SelectionSettings(index="O9"))
+    with pytest.raises(calib.CalibError):
+        calib.design_excitation("tx40", calib.ExcitationSettings(period=-1.0))
+
+
+def test_results_have_a_short_representation_and_readers_take_names(fitted, cell):
+    assert len(repr(fitted)) < 120 and "ur5" in repr(fitted)
+    assert len(calib.read_poses(cell / "measured.csv", "ur5")[0]) == 60
+
+
+def test_poses_chosen_without_constraints_say_that_collisions_are_not_checked():
+    chosen = calib.select_poses("ur5", 8, calib.SelectionSettings(method="detmax", candidates=200))
+    assert "NOT checked" in str(chosen)

@@ -79,6 +79,8 @@ def choose(
     index, method = cast(Any, settings.index), cast(Any, settings.method)  # checked by `select_poses`
     before = value = None
     notes = list(limits.notes)
+    if limits.collision is None:
+        notes.append("collisions and the floor are NOT checked: name a constraints file with [collision]")
     if existing is not None:
         q = read_poses(existing, chain.joint_names, kinds=joint_kinds(chain), limits=(chain.lower, chain.upper))
         before = jacobian(q)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from calib.data.poses.fit_options import MODELS
+from calib.data.poses.fit_options import LOSSES, MODELS
 from calib.errors import UsageError
 
 
@@ -38,7 +38,12 @@ class FitSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for option, allowed in (("model", (None, *MODELS)), ("stations", ("each", "one")), ("tools", ("one", "each"))):
+        for option, allowed in (
+            ("model", (None, *MODELS)),
+            ("loss", (None, *LOSSES)),
+            ("stations", ("each", "one")),
+            ("tools", ("one", "each")),
+        ):
             if (value := getattr(self, option)) not in allowed:
                 raise UsageError(f"--{option} {value}: expected one of {', '.join(name for name in allowed if name)}")
         if not 0.0 <= self.holdout < 1.0:
