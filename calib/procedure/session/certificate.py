@@ -35,7 +35,7 @@ def certify(session: Session, say: Say) -> list[str]:
     say("drawing" if session.plots else "writing")
     whole = whole_report(session)
     section = geometry_section.certificate_section(whole, certificate.draw(whole) if session.plots else {})
-    judged = [with_arrival(section, noticed(session, "3-measured", "validate"))]
+    judged = [with_arrival(section, arrival_notes(session, "3-measured", "validate"))]
     notes = [f"geometry {section.verdict}: {section.reason}"]
     if session.dynamic:
         dynamics = dynamics_section.read(session.identification.path)
@@ -47,12 +47,12 @@ def certify(session: Session, say: Say) -> list[str]:
             drawn = draw_dynamics(dynamics, session.identification.path, session.path("6-excitation"))
         tolerance = session.settings.dynamics.tolerance_percent
         section = dynamics_section.certificate_section(dynamics, drawn, exported, tolerance)
-        judged.append(with_arrival(section, noticed(session, "7-recorded", "predict")))
+        judged.append(with_arrival(section, arrival_notes(session, "7-recorded", "predict")))
         notes.append(f"dynamics {section.verdict}: {section.reason}")
-    told = simulated(session)
+    lines = simulated(session)
     page = certificate.certificate(
-        f"{'Simulated calibration' if told else 'Calibration'} of {session.settings.name}",
-        f"{'SIMULATED: ' if told else ''}{session.settings.instrument.name}, {session.settings.created[:10]}",
+        f"{'Simulated calibration' if lines else 'Calibration'} of {session.settings.name}",
+        f"{'SIMULATED: ' if lines else ''}{session.settings.instrument.name}, {session.settings.created[:10]}",
         setup(session, whole),
         judged,
         listed(session),
@@ -74,7 +74,7 @@ def whole_report(session: Session) -> fit_report.Report:
     return fit_report.with_unseen(fit, whole, read_record(tuple[RowErrors, ...], content))
 
 
-def noticed(session: Session, place: str, unseen: str) -> list[str]:
+def arrival_notes(session: Session, place: str, unseen: str) -> list[str]:
     """Return what was said of files as they came: those to learn from, and those that the step `unseen` looked at."""
     path = session.path(f"{place}/{CHECKED}")
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []

@@ -96,7 +96,7 @@ def run(
         if not guided:
             raise SessionError(f"the demonstration stopped at {waiting.step.name}: {waiting.words}")
         return DemoResult(session, "", (), time.perf_counter() - started, stopped(session, waiting))
-    before, after = told_truth(session, cell, say)
+    before, after = compare_with_truth(session, cell, say)
     seconds = time.perf_counter() - started
     return DemoResult(session, verdict_of(session), results(session), seconds, (), before, after, largest_memory())
 
@@ -131,8 +131,8 @@ def results(session: Session) -> tuple[tuple[str, str], ...]:
     return (*found, ("the session", SETTINGS))
 
 
-def told_truth(session: Session, cell: Cell, say: Say) -> tuple[float, float]:
-    """Say how far the outcome is from the hidden truth, write it down, and return the errors of the tool [mm]."""
+def compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, float]:
+    """Compare a session's result with the cell's truth, print and write the errors; return those of the tool [mm]."""
     found = installation_file.read(session.fit.path)
     before, after, bare = position_errors(cell, found, calibrated.read(session.fit.path).chain)
     lines = [
@@ -174,7 +174,7 @@ def bring_what_waits(folder: Path, say: Say) -> None:
     with locked(session, say):
         waiting = next((state for state in steps.states(session) if state.kind not in (steps.DONE, steps.KEPT)), None)
         if waiting is None:
-            told_truth(session, virtual_cell(session.settings.robot.given, session.settings.seed), say)
+            compare_with_truth(session, virtual_cell(session.settings.robot.given, session.settings.seed), say)
             return
         if waiting.kind != steps.WAITING:
             raise UsageError(f"{folder} waits for nothing; next: calib next {folder}")

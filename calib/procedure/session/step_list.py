@@ -1,4 +1,4 @@
-"""The walk: which steps there are, in their order, what each reads and what it makes."""
+"""The steps of a session in their order: what each reads, and what it makes."""
 
 from __future__ import annotations
 
@@ -57,8 +57,8 @@ def _plan(session: Session) -> list[Path]:
 
 
 def _arrived(session: Session) -> list[Path]:
-    brought = [*geometry_steps.measured_files(session)[0], *geometry_steps.measured_again(session)]
-    return [*_robot(session), session.path(f"2-poses/{POSES}"), *_options(session), *brought]
+    measured = [*geometry_steps.measured_files(session)[0], *geometry_steps.measured_again(session)]
+    return [*_robot(session), session.path(f"2-poses/{POSES}"), *_options(session), *measured]
 
 
 def _options(session: Session) -> list[Path]:
