@@ -33,7 +33,7 @@ def check_target(
     Raises:
         UsageError: with the file or folder concerned.
     """
-    check_folder(out)
+    _check_folder(out)
     read = [one for path in inputs if path is not None for one in (path, str(path).rpartition("@")[0] or path)]
     files.check_not_input([out, *(out / name for name in ours)], read)
     present = [name for name in ours if (out / name).exists()]
@@ -41,7 +41,7 @@ def check_target(
         raise UsageError(f"{out} holds {', '.join(present)} which no earlier {what} left there; choose another --out")
 
 
-def check_folder(out: Path) -> None:
+def _check_folder(out: Path) -> None:
     """Refuse, before any work is done, an `out` that is a file or cannot be written."""
     if out.exists() and not out.is_dir():
         raise UsageError(f"{out} is a file; --out needs a folder")

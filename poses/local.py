@@ -276,7 +276,7 @@ def restored(space: SearchSpace, q: np.ndarray, steps: int = 20) -> np.ndarray:
 
 def _keeps(space: SearchSpace, q: np.ndarray) -> np.ndarray:
     """Return whether each pose keeps the constraints that have gradients (m,)."""
-    return (constraint_values(space, q) <= FEASIBLE).all(1)
+    return np.asarray((constraint_values(space, q) <= FEASIBLE).all(axis=1))
 
 
 def _with_rows(space: SearchSpace, q: np.ndarray, existing: np.ndarray | None) -> np.ndarray | None:

@@ -37,10 +37,10 @@ def export(
         if is_identified(place):
             return tuple(dynamics.deliver_dynamics(place, optional(urdf), into))
         into.mkdir(parents=True, exist_ok=True)
-        return tuple(delivery.deliver(place, source_of(place) if urdf is None else Path(urdf), into))
+        return tuple(delivery.deliver(place, _source_of(place) if urdf is None else Path(urdf), into))
 
 
-def source_of(place: Path) -> Path:
+def _source_of(place: Path) -> Path:
     """Return the description that a fit's folder says it was made from."""
     from calib.robot.calibrated import read
 

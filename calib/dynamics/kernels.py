@@ -393,7 +393,7 @@ def _inertia(links, constants, frames, composite, matrix):
 
 
 @njit(**OPTIONS)
-def solve(matrix, vector):
+def _solve(matrix, vector):
     """Overwrite vector (n,) with matrix⁻¹ vector by Cholesky; `matrix` is lost. False where it is not definite."""
     n = vector.shape[0]
     for j in range(n):
@@ -423,13 +423,13 @@ def solve(matrix, vector):
 
 @njit(**OPTIONS)
 def workspace(bodies, n):
-    """Return the scratch arrays of `accelerate` for B bodies and n coordinates."""
+    """Return the scratch arrays of `_accelerate` for B bodies and n coordinates."""
     frames, motion, wrench = np.empty((bodies, 12)), np.zeros((bodies + 1, 9)), np.empty((bodies, 6))
     return frames, motion, wrench, np.empty((bodies, 10)), np.empty((n, n))
 
 
 @njit(**OPTIONS)
-def accelerate(links, constants, parameters, added, q, v, tau, work, out):
+def _accelerate(links, constants, parameters, added, q, v, tau, work, out):
     """Write the accelerations (n,) of one state: (M(q) + added) a = tau - c(q, v) - g(q).
 
     Made to be called from other compiled loops: allocates nothing, `work` from `workspace`, `parameters` from
@@ -458,15 +458,15 @@ def accelerate(links, constants, parameters, added, q, v, tau, work, out):
     for i in range(bodies - 1, -1, -1):
         _return(links, constants, i, frames, wrench, -1.0, out)
     _inertia(links, constants, frames, composite, matrix)
-    return solve(matrix, out)
+    return _solve(matrix, out)
 
 
 @njit(**OPTIONS)
 def forward_dynamics(links, constants, parameters, added, q, v, tau, out):
-    """Fill out (N, n) by `accelerate`; return the first sample whose inertia is not positive definite, or -1."""
+    """Fill out (N, n) by `_accelerate`; return the first sample whose inertia is not positive definite, or -1."""
     work = workspace(links.shape[0], q.shape[1])
     for sample in range(q.shape[0]):
-        if not accelerate(links, constants, parameters, added, q[sample], v[sample], tau[sample], work, out[sample]):
+        if not _accelerate(links, constants, parameters, added, q[sample], v[sample], tau[sample], work, out[sample]):
             return sample
     return -1
 

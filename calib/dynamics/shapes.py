@@ -61,7 +61,7 @@ class Shape:
     exact: bool = False
 
 
-def smooth_sign(v: np.ndarray, v0: float) -> np.ndarray:
+def _smooth_sign(v: np.ndarray, v0: float) -> np.ndarray:
     """Return tanh(v / v0), the exact sign for v0 = 0."""
     return np.tanh(v / v0) if v0 > 0 else np.sign(v)
 
@@ -71,13 +71,13 @@ def _sign_slope(v: np.ndarray, v0: float) -> np.ndarray | float:
 
 
 def _stribeck(m: Joined, s: tuple[float, ...]) -> np.ndarray:
-    return smooth_sign(m.v, s[2]) * np.exp(-((np.abs(m.v) / s[0]) ** s[1]))
+    return _smooth_sign(m.v, s[2]) * np.exp(-((np.abs(m.v) / s[0]) ** s[1]))
 
 
 def _stribeck_slopes(m: Joined, s: tuple[float, ...]):
     ratio = np.abs(m.v) / s[0]
     inner = s[1] / s[0] * ratio ** (s[1] - 1.0) * np.sign(m.v)
-    return 0.0, np.exp(-(ratio ** s[1])) * (_sign_slope(m.v, s[2]) - smooth_sign(m.v, s[2]) * inner), 0.0
+    return 0.0, np.exp(-(ratio ** s[1])) * (_sign_slope(m.v, s[2]) - _smooth_sign(m.v, s[2]) * inner), 0.0
 
 
 def _fading(v: np.ndarray, speed: float) -> np.ndarray:
@@ -124,7 +124,7 @@ SHAPES: dict[str, Shape] = {
     ),
     "position": Shape(lambda m, s: m.x, lambda m, s: (np.ones_like(m.x), 0.0, 0.0), "N m/rad", "N/m"),
     "sign": Shape(
-        lambda m, s: smooth_sign(m.v, s[0]), lambda m, s: (0.0, _sign_slope(m.v, s[0]), 0.0), "N m", "N", ("v0",),
+        lambda m, s: _smooth_sign(m.v, s[0]), lambda m, s: (0.0, _sign_slope(m.v, s[0]), 0.0), "N m", "N", ("v0",),
         dissipative=True, of_velocity=True, nonnegative=True, exact=True,
     ),
     "dead": Shape(
@@ -148,7 +148,7 @@ SHAPES: dict[str, Shape] = {
         _stribeck, _stribeck_slopes, "N m", "N", ("vs", "exponent", "v0"), dissipative=True, of_velocity=True
     ),
     "load": Shape(
-        lambda m, s: np.abs(_given(m.load)) * smooth_sign(m.v, s[0]), None, "", "", ("v0",),
+        lambda m, s: np.abs(_given(m.load)) * _smooth_sign(m.v, s[0]), None, "", "", ("v0",),
         loaded=True, dissipative=True,
     ),
     "load_velocity": Shape(
@@ -156,7 +156,7 @@ SHAPES: dict[str, Shape] = {
     ),
     "stop": Shape(lambda m, s: _given(m.state), None, "N m", "N", ("width",), remembers=True, dissipative=True),
     "presliding": Shape(
-        lambda m, s: _given(m.state) - smooth_sign(m.v, s[1]), None, "N m", "N", ("width", "v0"), remembers=True
+        lambda m, s: _given(m.state) - _smooth_sign(m.v, s[1]), None, "N m", "N", ("width", "v0"), remembers=True
     ),
     "sine": Shape(
         lambda m, s: np.sin(s[0] * m.x) * _fading(m.v, s[1]),

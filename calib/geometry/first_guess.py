@@ -135,14 +135,14 @@ def _guess_from_positions(
     block: Positions, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
 ) -> Guess:
     _enough(block, rows, 4)
-    return place_position(arm[rows], block.position[rows], station, tool)
+    return _place_position(arm[rows], block.position[rows], station, tool)
 
 
 @_guess.register
 def _guess_from_sockets(
     block: Sockets, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
 ) -> Guess:
-    return None, pose(None, place_sockets(arm[rows], block.group[rows])) if tool is None else tool
+    return None, pose(None, _place_sockets(arm[rows], block.group[rows])) if tool is None else tool
 
 
 def _enough(block: PoseMeasurements, rows: np.ndarray, needed: int) -> None:
@@ -184,7 +184,7 @@ def place_pose(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return pose(station_rotation, solution[3:]), pose(tool_rotation, solution[:3])
 
 
-def place_position(
+def _place_position(
     arm: np.ndarray, seen: np.ndarray, station: np.ndarray | None = None, tool: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Solve y_i = S (R_i t + a_i) for S and t, linearly; given S or t, for the other.
@@ -244,7 +244,7 @@ def _align(points: np.ndarray, seen: np.ndarray) -> np.ndarray:
     return placement
 
 
-def place_sockets(arm: np.ndarray, group: np.ndarray) -> np.ndarray:
+def _place_sockets(arm: np.ndarray, group: np.ndarray) -> np.ndarray:
     """Return the offset t (3,) for which R_i t + a_i varies least within each group."""
     rotation, position = arm[:, :3, :3].copy(), arm[:, :3, 3].copy()
     for number in np.unique(group):

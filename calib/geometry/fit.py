@@ -68,7 +68,7 @@ def fit(
     _enough(cell, blocks, len(free))
     stated = np.full(len(table.names), np.inf) if prior is None else prior
     if drawn:
-        free = np.setdiff1d(free, scale_reference(cell, split, candidates))
+        free = np.setdiff1d(free, _scale_reference(cell, split, candidates))
         return replace(shrunk_fit(cell, blocks, free, settings, stated[free]), split=split, candidates=candidates)
     start, found = cell, None
     for attempt in range(1 + RETRIES):
@@ -79,7 +79,7 @@ def fit(
         own = np.minimum(stated[free], plausible) if wide else stated[free]
         once = replace(settings, passes=1) if wide else settings
         found = fit_with_prior(start, blocks, free, own, settings=once, nominal=cell)
-        told = identifiable_columns(found, plausible)
+        told = _identifiable_columns(found, plausible)
         if not wide and len(told) == len(free):
             break
         start, free = _back_to_nominal(found.cell, cell, candidates, free[told]), free[told]
@@ -100,7 +100,7 @@ def _enough(cell: Installation, blocks: list[Block], unknowns: int) -> None:
         )
 
 
-def scale_reference(cell: Installation, split: ColumnSplit, candidates: np.ndarray) -> np.ndarray:
+def _scale_reference(cell: Installation, split: ColumnSplit, candidates: np.ndarray) -> np.ndarray:
     """Return the position of the arm's longest length among the base columns, as an array of one (or none).
 
     Sockets and planes are as well explained by a smaller arm, in the limit by none at all, so that the scale has to
@@ -134,7 +134,7 @@ def shrunk_fit(
     nominal = parameter_values(cell)[free]
     found = fit_with_prior(cell, blocks, free, prior, settings=settings)
     for _ in range(WIDTHS):
-        residual, matrix = whitened(found)
+        residual, matrix = _whitened(found)
         moved = np.where(family >= 0, parameter_values(found.cell)[free] - nominal, 0.0)
         widths = relevance(gram(residual + matrix @ moved, matrix), family, prior).ridge
         prior = np.where(family >= 0, np.clip(widths, NARROWEST, plausible_deviation(cell, free)), np.inf)
@@ -197,13 +197,13 @@ def plausible_deviation(cell: Installation, columns: np.ndarray) -> np.ndarray:
     return np.array([PLAUSIBLE[table.units[k]] if k < table.arm else np.inf for k in columns])
 
 
-def identifiable_columns(found: GeometricFit, plausible: np.ndarray) -> np.ndarray:
+def _identifiable_columns(found: GeometricFit, plausible: np.ndarray) -> np.ndarray:
     """Return which of the fitted parameters the data tell (indices): σ below half the plausible deviation.
 
     Backward elimination: the worst told parameter goes back to its nominal, which changes the covariance C of the
     others to C - c cᵀ / c_k (c its column), until all that remain are told.
     """
-    _, matrix = whitened(found)
+    _, matrix = _whitened(found)
     factor = np.linalg.qr(matrix, mode="r")
     norms = np.linalg.norm(factor, axis=0)
     left = covariance(factor / norms, found.estimate.residual_std**2) / np.outer(norms, norms)
@@ -217,14 +217,14 @@ def identifiable_columns(found: GeometricFit, plausible: np.ndarray) -> np.ndarr
         left = left - np.outer(left[:, worst], left[worst]) / left[worst, worst]
 
 
-def whitened(found: GeometricFit) -> tuple[np.ndarray, np.ndarray]:
+def _whitened(found: GeometricFit) -> tuple[np.ndarray, np.ndarray]:
     """Return the residual (rows,) and W (rows, f) of a fit as they were weighed, without its prior."""
     return stack(
         [piece.part for piece in found.pieces], [piece.sigma / np.sqrt(piece.weight) for piece in found.pieces]
     )
 
 
-def frames_only(cell: Installation) -> np.ndarray:
+def _frames_only(cell: Installation) -> np.ndarray:
     """Return the positions of all station and tool elements."""
     return layout(cell).frame_index
 
@@ -236,7 +236,7 @@ def polish_frames(
     torques: Sequence[np.ndarray | None] | None = None,
 ) -> GeometricFit:
     """Fit stations and tools only, the arm staying as it is: what 'nominal' errors are measured with."""
-    return fit(cell, measured, frames_only(cell), settings=settings, torques=torques)
+    return fit(cell, measured, _frames_only(cell), settings=settings, torques=torques)
 
 
 def placed_on(

@@ -38,7 +38,7 @@ def _reach(cell: Installation) -> float:
     return max(total, 0.1)
 
 
-def preference(cell: Installation, columns: np.ndarray) -> list[np.ndarray]:
+def _preference(cell: Installation, columns: np.ndarray) -> list[np.ndarray]:
     """Return groups of columns, first choice first: frames, joint offsets, rotations, translations, deflections.
 
     Frames come first, so that what cannot be told from the installation (the first joint's placement, the last joint's
@@ -65,4 +65,4 @@ def base_columns(
     cell: Installation, blocks: Sequence[Block], columns: np.ndarray, tolerance: float = 1e-5
 ) -> ColumnSplit:
     """Split candidate parameters into identifiable ones and those that merge with them; indices into `columns`."""
-    return split_columns(observation_matrix(cell, blocks, columns), preference(cell, columns), tolerance)
+    return split_columns(observation_matrix(cell, blocks, columns), _preference(cell, columns), tolerance)

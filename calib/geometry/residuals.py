@@ -151,7 +151,7 @@ def _bar(measured: Bars, seen: Seen, jacobian: np.ndarray) -> list[Part]:
         if len(rows) < 4:  # three lengths always meet in a centre
             continue
         points, lengths = seen.point[:, rows], measured.distance[rows]
-        away = points - sphere_centre(points, lengths)[:, None]
+        away = points - _sphere_centre(points, lengths)[:, None]
         unit = away / np.linalg.norm(away, axis=0)
         value[rows] = lengths - np.linalg.norm(away, axis=0)
         slope[:, rows] = _project(np.einsum("im,fim->fm", unit, jacobian[:, :3, rows]), unit.T)
@@ -165,7 +165,7 @@ def _unknowns(measured: Planes | Bars) -> int:
     return int(np.minimum(counts, 3).sum())
 
 
-def sphere_centre(points: np.ndarray, lengths: np.ndarray, iterations: int = 20) -> np.ndarray:
+def _sphere_centre(points: np.ndarray, lengths: np.ndarray, iterations: int = 20) -> np.ndarray:
     """Return the point (3,) whose distances to points (3, m) come nearest to lengths (m,), by Gauss–Newton.
 
     The start is linear: |p|² - L² = 2 p·c - |c|² (algebraic sphere fit).

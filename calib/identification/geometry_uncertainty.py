@@ -152,14 +152,14 @@ def sensitivity(
     p, count = len(how.pull), len(chain.elements) + len(TILTS)
     if not found.dynamics.model.torque_rows.has_bodies:  # no bodies: rows that no geometry reaches
         return np.zeros((p, count)), np.zeros(count), np.zeros(count)
-    moved = neighbours(found, chain)
+    moved = _neighbours(found, chain)
     decimator = common_decimator(cases, found.settings)
     step = -(-sum(len(case.motion) for case in cases) // SAMPLES)
     pulled = np.zeros((p, count))
     used: list[ObservationRows] = []
     changes: list[np.ndarray] = []
     for part, case in zip(found.rows, cases):
-        for number, (own, span) in enumerate(pieces(case, decimator, step)):
+        for number, (own, span) in enumerate(_pieces(case, decimator, step)):
             say(f"sensitivity to the geometry: {case.name}, part {number + 1}")
             used.append(cut(part, own))
             residual = used[-1].target - used[-1].matrix @ found.fitted.estimate.values
@@ -179,7 +179,7 @@ def sensitivity(
     return solved, _rms(change[seen]), _rms(after[seen])
 
 
-def neighbours(found: Identification, chain: Chain) -> list[tuple[Bodies, Bodies]]:
+def _neighbours(found: Identification, chain: Chain) -> list[tuple[Bodies, Bodies]]:
     """Return the bodies with each element, then with each tilt of gravity, `STEP` above and below its value."""
     result = []
     for k in range(len(chain.elements)):
@@ -199,7 +199,7 @@ def _tree(found: Identification, chain: Chain) -> Bodies:
     return make_model(chain, found.settings).bodies
 
 
-def pieces(case: Case, decimator: Decimator, step: int = 1) -> list[tuple[slice, slice]]:
+def _pieces(case: Case, decimator: Decimator, step: int = 1) -> list[tuple[slice, slice]]:
     """Return (thinned rows, samples at the full rate that these see) of every `step`-th piece of a case.
 
     With step 1 each segment is one piece.

@@ -141,7 +141,7 @@ def identify_model(
     method = method_named(settings.method)
     settings = require_loop(settings) if method.simulates else settings
     _require_motion(cases)
-    noise = repeats_noise(cases, settings)
+    noise = _repeats_noise(cases, settings)
     say("base parameters")
     states = bases.random_samples(model, seed=settings.seed) if states is None else states
     base = find_base(model, cases, states, nominal)
@@ -272,7 +272,7 @@ def common_decimator(cases: Sequence[Case], settings: IdentificationSettings) ->
     return replace(widest, factor=one_in * widest.factor)
 
 
-def repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> np.ndarray | None:
+def _repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> np.ndarray | None:
     """Return the noise (rows,) that repeats of the motion told, its mean square over cases by length; None: not asked.
 
     Raises:

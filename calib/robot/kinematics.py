@@ -39,7 +39,7 @@ class Sweep:
         return result
 
 
-def displacements(chain: Chain, q: np.ndarray) -> np.ndarray:
+def _displacements(chain: Chain, q: np.ndarray) -> np.ndarray:
     """Return value + ratio · q for every element: (K, m) [m or rad]."""
     values = np.repeat(chain.values[:, None], len(q), axis=1)
     for k, element in enumerate(chain.elements):
@@ -59,7 +59,7 @@ def sweep(chain: Chain, q: np.ndarray, base: np.ndarray | None = None, extra: np
     """
     q = shaped(q, (None, chain.n), f"joint values of '{chain.name}'")
     m, count = len(q), len(chain.elements)
-    motion = displacements(chain, q)
+    motion = _displacements(chain, q)
     if extra is not None:
         motion = motion + extra
     rotation, position = _start(base, m)
@@ -196,7 +196,7 @@ def tip_jacobian(chain: Chain, q: np.ndarray) -> np.ndarray:
 def joint_frames(chain: Chain, q: np.ndarray) -> np.ndarray:
     """Return the frames right after each joint's moving element, (n, m, 4, 4): where `Chain.inertias` are given."""
     m = len(q)
-    motion = displacements(chain, shaped(q, (None, chain.n), "joint values"))
+    motion = _displacements(chain, shaped(q, (None, chain.n), "joint values"))
     rotation, position = _start(None, m)
     frames = np.zeros((chain.n, m, 4, 4))
     frames[..., 3, 3] = 1.0

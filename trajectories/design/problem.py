@@ -114,7 +114,7 @@ def evaluate(problem: ExcitationProblem, basis: Basis, y: np.ndarray, sharpness:
     Y = problem.regressor(motion.q, motion.v, motion.a)
     values, slopes, by_duration = list[float](), list[np.ndarray](), list[float]()
     for objective in terms(problem):
-        found = sharpened(objective, sharpness[0]).evaluate(motion, Y)
+        found = _sharpened(objective, sharpness[0]).evaluate(motion, Y)
         slope = np.zeros((4, *motion.q.shape)) if found.by_motion is None else found.by_motion
         if found.by_regressor is not None:
             slope[:3] += problem.product(motion.q, motion.v, motion.a, found.by_regressor)
@@ -136,7 +136,7 @@ def terms(problem: ExcitationProblem) -> list[Objective]:
     return [goal.objective for goal in problem.goals] or [one for one, _ in problem.objectives]
 
 
-def sharpened(objective: Objective, p: float) -> Objective:
+def _sharpened(objective: Objective, p: float) -> Objective:
     return replace(objective, sharpness=p) if isinstance(objective, Excitation) else objective
 
 
@@ -146,7 +146,7 @@ def is_condition(objective: Objective) -> bool:
 
 def exact_values(problem: ExcitationProblem, motion: SampledMotion, regressor: np.ndarray) -> np.ndarray:
     """Return the unsmoothed objectives of a motion (k,)."""
-    return np.array([sharpened(one, np.inf).evaluate(motion, regressor).value for one in terms(problem)])
+    return np.array([_sharpened(one, np.inf).evaluate(motion, regressor).value for one in terms(problem)])
 
 
 def merit(problem: ExcitationProblem, values: np.ndarray) -> float:

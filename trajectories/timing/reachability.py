@@ -135,7 +135,7 @@ def fastest(rows: Bounded, s: np.ndarray) -> Profile:
     Raises:
         NothingFeasible: where no speed can be kept from some grid point on.
     """
-    most = controllable(rows, s)
+    most = _controllable(rows, s)
     if not np.isfinite(most).all():
         k = int(np.flatnonzero(~np.isfinite(most)).max())
         raise NothingFeasible(
@@ -164,7 +164,7 @@ def _largest(rows: Bounded, k: int, x: float, step: float) -> float:
     return float(min(upper.min(initial=np.inf), (rows.top[k + 1] - x) / (2 * step)))
 
 
-def controllable(rows: Bounded, s: np.ndarray) -> np.ndarray:
+def _controllable(rows: Bounded, s: np.ndarray) -> np.ndarray:
     """Return the largest x (K + 1,) at each grid point from which the end is reached at rest; NaN where there is none.
 
     u and x are handed over in units of a typical x, without which the linear programs fail where speeds are large.

@@ -58,7 +58,7 @@ class Timing:
     @property
     def used(self) -> dict[str, np.ndarray]:
         """Share of each limit in use, (N, n) per kind of limit; 1 is the limit."""
-        return shares(self.sampled, self.limits)
+        return _shares(self.sampled, self.limits)
 
     @property
     def margins(self) -> dict[str, np.ndarray]:
@@ -80,16 +80,16 @@ def time_optimal(
     Args:
         law: the robot's dynamics; None: kinematic limits alone.
         rate: of a controller [Hz]: the duration is rounded up to whole samples.
-        grid: intervals on the path; None: see `grid_points`.
+        grid: intervals on the path; None: see `_grid_points`.
 
     Raises:
         NothingFeasible: where the torque limits do not even hold the robot: which joint, where, by how much.
     """
     if law is None and np.isfinite(limits.torque).any():
         raise BadInput("torque limits need the robot's dynamics; leave them infinite, or give a model")
-    s = grid_points(path, grid)
+    s = _grid_points(path, grid)
     if law is not None:
-        check_holding(path, limits, law, s)
+        _check_holding(path, limits, law, s)
     rows = ConstraintRows.of(path, s, limits, law)
     tight = {name: np.ones((len(s) - 1, path.n)) for name in ("velocity", "acceleration", "torque")}
     history: list[float] = []
@@ -100,7 +100,7 @@ def time_optimal(
         rounded = profile if rate is None else profile.slower(_whole(profile.duration, rate))
         sampled = dense(path, rounded, None if law is None else law.torque)
         last = Timing(path, rounded, limits, sampled, 0, 0.0)
-        excess = {name: _per_interval(values, len(s) - 1) - 1 for name, values in shares(sampled, limits).items()}
+        excess = {name: _per_interval(values, len(s) - 1) - 1 for name, values in _shares(sampled, limits).items()}
         kept = all(values.max() <= 0 for values in excess.values())
         settled = x is not None and np.abs(profile.x - x).mean() <= SETTLED * x.mean()
         history.append(profile.duration)
@@ -148,7 +148,7 @@ def _round(
         return fastest(rows.bounded(rows.friction(law, x, None), tight), rows.s)
 
 
-def shares(sampled: Sampled, limits: TimingLimits) -> dict[str, np.ndarray]:
+def _shares(sampled: Sampled, limits: TimingLimits) -> dict[str, np.ndarray]:
     """Return the shares of the limits in use, (N, n) each; kinds of limit that no joint has are left out."""
     found = {"velocity": sampled.v, "acceleration": sampled.a, "torque": sampled.tau}
     sizes = {"velocity": limits.velocity, "acceleration": limits.acceleration, "torque": limits.torque}
@@ -159,7 +159,7 @@ def shares(sampled: Sampled, limits: TimingLimits) -> dict[str, np.ndarray]:
     }
 
 
-def check_holding(path: Path, limits: TimingLimits, law: Law, s: np.ndarray) -> None:
+def _check_holding(path: Path, limits: TimingLimits, law: Law, s: np.ndarray) -> None:
     """Refuse a path on which the torque limits do not hold the robot still, or do not move it slowly.
 
     A motion that swings through such a place can exist; it could not be stopped there, nor rehearsed (our choice).
@@ -179,7 +179,7 @@ def check_holding(path: Path, limits: TimingLimits, law: Law, s: np.ndarray) -> 
             )  # fmt: skip
 
 
-def grid_points(path: Path, count: int | None = None) -> np.ndarray:
+def _grid_points(path: Path, count: int | None = None) -> np.ndarray:
     """Return a grid on the path: even in time where it starts and stops, and with its knots and turning points.
 
     Args:

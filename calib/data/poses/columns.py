@@ -80,7 +80,7 @@ def find_layout(table: Table, options: FileOptions, joints: Sequence[str]) -> La
     tool, base = _find(table, options, "tool"), _family(table, options, BASE)
     if kind == "position":
         return Layout(kind, columns, positions, sigmas, tool=tool, base=base, notes=notes)
-    orientation = find_orientation(table, options)
+    orientation = _find_orientation(table, options)
     if not orientation:
         raise MeasurementError("kind 'pose' needs qx qy qz qw, or r11 to r33; the header has neither", table.file)
     if len(positions) > 1:
@@ -150,7 +150,7 @@ def find_joints(table: Table, options: FileOptions, joints: Sequence[str]) -> tu
     raise MeasurementError(f"{message}. Map them in the options' [columns]", table.file)
 
 
-def find_orientation(table: Table, options: FileOptions) -> tuple[str, ...]:
+def _find_orientation(table: Table, options: FileOptions) -> tuple[str, ...]:
     """Return the names of a quaternion's four columns, a matrix's nine, or none."""
     return _family(table, options, QUATERNION) or _family(table, options, MATRIX)
 
@@ -172,7 +172,7 @@ def _find_kind(table: Table, options: FileOptions) -> str:
     if any(kind in kinds for kind in ("distance", "bar")) and not _find(table, options, "distance"):
         kinds = [kind for kind in kinds if kind not in ("distance", "bar")]
     if _find_targets(table, options)[0]:
-        kinds.append("pose" if find_orientation(table, options) else "position")
+        kinds.append("pose" if _find_orientation(table, options) else "position")
     if len(kinds) == 1:
         return kinds[0]
     if kinds:

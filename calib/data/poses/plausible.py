@@ -40,7 +40,7 @@ def check_joints(
         MeasurementError: for degrees under a rad header, values outside the limits, a robot that never moved.
     """
     kinds = kinds or ["revolute"] * len(joints)
-    check_joint_units(table, columns, kinds)
+    _check_joint_units(table, columns, kinds)
     if len(q) > 1 and np.ptp(q, axis=0).max() < STILL:
         message = f"all {len(q)} rows have the same joint values: one pose tells nothing of the robot"
         raise MeasurementError(message, table.file, int(table.rows[-1]), columns[0])
@@ -60,7 +60,7 @@ def check_joints(
     return (*notes, *_few_degrees(q, table, columns, kinds, options))
 
 
-def check_joint_units(table: Table, columns: Sequence[str], kinds: Sequence[str]) -> None:
+def _check_joint_units(table: Table, columns: Sequence[str], kinds: Sequence[str]) -> None:
     """Refuse a header whose unit does not suit the joint: mm for a revolute one, deg for a prismatic one."""
     for name, kind in zip(columns, kinds):
         unit = table.units[table.index(name)].lower()

@@ -94,7 +94,7 @@ def measurements(
     limits: Limits | None = None,
 ) -> PoseMeasurements:
     """Return what `table` holds, as `read_measurements`."""
-    table = select_rows(table, options)
+    table = _select_rows(table, options)
     layout = find_layout(table, options, joints)
     q = read_joints(table, options, layout.joints)
     notes = (*layout.notes, *plausible.check_joints(q, table, layout.joints, joints, options, kinds, limits))
@@ -103,7 +103,7 @@ def measurements(
     return replace(block, station=station, ignored=layout.ignored(table), notes=(*notes, *block.notes))
 
 
-def select_rows(table: Table, options: FileOptions) -> Table:
+def _select_rows(table: Table, options: FileOptions) -> Table:
     """Return the rows whose cells have the values that ``where`` allows."""
     keep = np.ones(len(table), dtype=bool)
     for name, values in options.where.items():

@@ -28,23 +28,23 @@ def check_recording(recording: Recording, joints: Joints | None = None) -> Recor
         MeasurementError: for too few samples, values that are not finite, time that stands or runs backwards, degrees
             for radians, a torque that is one number while its joint moves.
     """
-    check_count(recording)
-    check_finite(recording)
-    recording = drop_repeats(recording)
-    check_time(recording.t, recording.rows, recording.file)
-    check_size(recording, joints)
-    check_speed(recording)
+    _check_count(recording)
+    _check_finite(recording)
+    recording = _drop_repeats(recording)
+    _check_time(recording.t, recording.rows, recording.file)
+    _check_size(recording, joints)
+    _check_speed(recording)
     notes = (*_still(recording), *_effort_notes(recording, joints), *_limit_notes(recording, joints))
     return _noted(recording, *notes, *_work_notes(recording))
 
 
-def check_count(recording: Recording) -> None:
+def _check_count(recording: Recording) -> None:
     if len(recording) < FEWEST:
         message = f"{len(recording)} samples are too few to filter and to learn from; at least {FEWEST} are needed"
         raise MeasurementError(message, recording.file)
 
 
-def check_finite(recording: Recording) -> None:
+def _check_finite(recording: Recording) -> None:
     """Refuse NaN and infinities; in `q_link` they say that a joint has no second encoder."""
     for name in NEEDED:
         values = getattr(recording, name)
@@ -58,7 +58,7 @@ def check_finite(recording: Recording) -> None:
         raise MeasurementError(message + " out", recording.file, int(recording.rows[row]), where)
 
 
-def drop_repeats(recording: Recording) -> Recording:
+def _drop_repeats(recording: Recording) -> Recording:
     """Return the recording without rows that a logger wrote twice: same stamp, same positions, same torques."""
     same = np.diff(recording.t) == 0
     for name in ("q", "effort"):
@@ -70,7 +70,7 @@ def drop_repeats(recording: Recording) -> Recording:
     return _noted(kept, f"{int(same.sum())} rows repeat the one before, stamp and all (first: row {first}); dropped")
 
 
-def check_time(t: np.ndarray, rows: np.ndarray, file: str) -> None:
+def _check_time(t: np.ndarray, rows: np.ndarray, file: str) -> None:
     """Refuse stamps (N,) [s] that do not rise, and those whose step looks like another unit."""
     step = np.diff(t)
     if (step < 0).any():
@@ -97,7 +97,7 @@ def check_time(t: np.ndarray, rows: np.ndarray, file: str) -> None:
         raise MeasurementError(f"the median step is {np.median(step):.4g} s, {rate:.3g} Hz: {hint}", file, column="t")
 
 
-def check_size(recording: Recording, joints: Joints | None = None) -> None:
+def _check_size(recording: Recording, joints: Joints | None = None) -> None:
     """Refuse positions that no joint has: degrees, millimetres, or the columns of another robot."""
     n = recording.n
     kinds = joints.kinds if joints else ("revolute",) * n
@@ -118,7 +118,7 @@ def check_size(recording: Recording, joints: Joints | None = None) -> None:
         raise MeasurementError(message, recording.file, int(recording.rows[row]), column(recording, "q", j))
 
 
-def check_speed(recording: Recording) -> None:
+def _check_speed(recording: Recording) -> None:
     """Refuse measured velocities that differ from the slope of the positions by 180/π: one of them is in degrees."""
     if recording.v is None:
         return

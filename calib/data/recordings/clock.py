@@ -62,9 +62,9 @@ def find_clock(recording: Recording, kind: str = "auto") -> Clock:
     if kind not in ("auto", *CLOCKS):
         raise UsageError(f"clock: expected one of auto, {', '.join(CLOCKS)}, found '{kind}'")
     clocks = {"stamps": (recording.t, np.ones(len(recording), dtype=bool), _step(recording.t))}
-    if (even := even_times(recording.t)) is not None:
+    if (even := _even_times(recording.t)) is not None:
         clocks["even"] = even
-    if (counted := counted_times(recording)) is not None:
+    if (counted := _counted_times(recording)) is not None:
         clocks["counted"] = counted
     if kind != "auto" and kind not in clocks:
         raise UsageError(f"clock '{kind}': the samples of {recording.file or 'this recording'} cannot be dated so")
@@ -76,7 +76,7 @@ def find_clock(recording: Recording, kind: str = "auto") -> Clock:
     return Clock(chosen, frozen(t), frozen(keep, bool), period, rough)
 
 
-def even_times(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
+def _even_times(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
     """Return even times (N,), all kept, and their step [s]: k T + drift, k counting lost samples; None if not even."""
     step = _step(t)
     k = np.arange(len(t)) + np.concatenate([[0], np.cumsum(_lost(t, step))])
@@ -88,7 +88,7 @@ def even_times(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
     return even, np.ones(len(t), dtype=bool), float(period)
 
 
-def counted_times(recording: Recording) -> tuple[np.ndarray, np.ndarray, float] | None:
+def _counted_times(recording: Recording) -> tuple[np.ndarray, np.ndarray, float] | None:
     """Return counted times (N,), the mask of samples not read twice, and the step [s]; None if steps are not whole.
 
     Where the robot is too slow to count, a repeated row counts zero, any other one; a wrong count there does little,

@@ -33,11 +33,11 @@ def read_recording(
     reader = _reader(Path(file))
     recording = reader(Path(file), joints, options, (start, stop))
     if joints is not None:
-        check_names(recording, joints)
+        _check_names(recording, joints)
     return check_recording(recording, joints)
 
 
-def check_names(recording: Recording, joints: Joints) -> None:
+def _check_names(recording: Recording, joints: Joints) -> None:
     """Refuse a recording of another number of joints, or of other joints, than the robot has."""
     if recording.n != len(joints.names):
         message = (

@@ -29,7 +29,7 @@ def diagnose(found: GeometricFit) -> list[str]:
     return lines
 
 
-def implausible(found: GeometricFit) -> list[str]:
+def _implausible(found: GeometricFit) -> list[str]:
     """Name arm parameters that a fit moved further than any sound arm is off: what was fitted is not this robot."""
     table, before, after = layout(found.start), found.start.chain.values, found.cell.chain.values
     far = [

@@ -106,7 +106,7 @@ def _loose(found: GeometricFit) -> list[str]:
         partner = _confused(found, own, index)
         if partner:
             text += f": the tool cannot be told from the base (the placement of '{partner}' trades with it)"
-        spread = orientation_range(found)
+        spread = _orientation_range(found)
         if spread is not None and spread < STILL:
             range_ = "less than 1°" if spread < 1.0 else f"{spread:.0f}°"
             text += f", because all poses hold the wrist nearly still (orientations within {range_} of each other)"
@@ -128,7 +128,7 @@ def _confused(found: GeometricFit, own: list[int], index: dict[str, int]) -> str
     return ""
 
 
-def orientation_range(found: GeometricFit) -> float | None:
+def _orientation_range(found: GeometricFit) -> float | None:
     """Return the 95 % range of the flange's orientation over the poses an instrument saw [deg]; None without any."""
     q = [block.measured.q for block in found.blocks if block.measured.has_instrument]
     if not q:

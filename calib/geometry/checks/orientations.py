@@ -38,7 +38,7 @@ def check_orientations(chain: Chain, block: PoseMeasurements) -> None:
     rows = np.flatnonzero(block.tool == np.argmax(np.bincount(block.tool)))
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, ROWS).astype(int))]
     arm, position, stated = forward(chain, block.q[rows]), block.position[rows], block.quaternion[rows]
-    if len(rows) < 4 or (found := misfit(arm, position, stated)[0]) <= WRONG:
+    if len(rows) < 4 or (found := _misfit(arm, position, stated)[0]) <= WRONG:
         return
     readings = {
         "as w x y z they do: are these w first? Name the columns in the order they stand in: qw, qx, qy, qz": np.roll(
@@ -47,7 +47,7 @@ def check_orientations(chain: Chain, block: PoseMeasurements) -> None:
         "inverted they do: they have to be those of the target seen from the instrument": stated * [-1, -1, -1, 1],
     }
     for words, quaternion in readings.items():
-        angle, distance = misfit(arm, position, quaternion)
+        angle, distance = _misfit(arm, position, quaternion)
         if angle < RIGHT and distance < NEAR:
             raise MeasurementError(
                 f"the orientations do not turn with the arm (as x y z w they are off by {found:.0f}° in the median, "
@@ -56,7 +56,7 @@ def check_orientations(chain: Chain, block: PoseMeasurements) -> None:
             )
 
 
-def misfit(arm: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> tuple[float, float]:
+def _misfit(arm: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> tuple[float, float]:
     """Return how far measured poses are from the arm's after the best placement of instrument and tool.
 
     Args:

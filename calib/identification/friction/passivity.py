@@ -14,7 +14,7 @@ from calib.identification.rows import term_columns
 LEAST = -0.01  # of the energy that a joint moves: noise and what other columns take over stay above (our choice)
 
 
-def dissipated(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
+def _dissipated(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
     """Return the energy that each joint's friction takes, ∫ v_j τ_friction,j dt, as a share of ∫ |v_j τ_j| dt, (n,).
 
     Joints that do not move have zero.
@@ -43,7 +43,7 @@ def driven(dynamics: Dynamics, cases: Sequence[Case]) -> tuple[int, ...]:
     Raises:
         MeasurementError: where these are most of the joints that move.
     """
-    share = dissipated(dynamics, cases)
+    share = _dissipated(dynamics, cases)
     found = np.flatnonzero(share < LEAST)
     if len(found) and 2 * len(found) > np.count_nonzero(share):
         named = ", ".join(str(joint + 1) for joint in found)

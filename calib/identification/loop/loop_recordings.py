@@ -87,9 +87,9 @@ def close_loops(
         UsageError: for a rate that does not go with the recording's, or gains of another number of joints.
     """
     for case in cases:
-        check_reference(case.motion)
+        _check_reference(case.motion)
     stretches = [
-        (case, part, *make_reference(part.motion, loop.rate))
+        (case, part, *_make_reference(part.motion, loop.rate))
         for case in cases
         for part in (take(case, slice(a, b)) for a, b in segments(case.motion.segment))
         if _inside(part.motion).stop - _inside(part.motion).start > 2 * len(decimator.taps)
@@ -113,7 +113,7 @@ def take(case: Case, part: slice) -> Case:
     )  # fmt: skip
 
 
-def check_reference(motion: Motion) -> None:
+def _check_reference(motion: Motion) -> None:
     """Refuse a motion without a reference, or with one that is not its own (or is in degrees)."""
     if motion.q_ref is None:
         raise MeasurementError(
@@ -134,7 +134,7 @@ def check_reference(motion: Motion) -> None:
 
 def _compare(motion: Motion, joint: int) -> None:
     """Refuse a reference that one joint does not follow; say where it looks like another unit."""
-    assert motion.q_ref is not None  # `check_reference` asks first
+    assert motion.q_ref is not None  # `_check_reference` asks first
     q, asked = motion.q[:, joint], motion.q_ref[:, joint]
     spread, size = np.std(q), np.std(asked)
     away = float(np.sqrt(np.mean((q - asked) ** 2)) / spread)
@@ -156,7 +156,7 @@ def _compare(motion: Motion, joint: int) -> None:
     )
 
 
-def make_reference(motion: Motion, rate: float | None = None) -> tuple[Reference, int]:
+def _make_reference(motion: Motion, rate: float | None = None) -> tuple[Reference, int]:
     """Return the reference of a motion without gaps at the control rate, and control periods per sample.
 
     The logged positions are low-passed at `SMOOTH` f_q and joined by a cubic spline, whose slopes are v and a.

@@ -75,7 +75,7 @@ class Information:
         return float(np.sqrt(max(float(rest @ rest) - self.best, 0.0)))
 
 
-def information(found: Identification) -> np.ndarray:
+def _information(found: Identification) -> np.ndarray:
     """Return the triangle [R z] (b + 1, b + 1) of an identification's data, without its prior of base parameters.
 
     Rows count as their residuals' autocorrelation lets them. The ridge of richer friction stays in: those terms have
@@ -146,8 +146,8 @@ def _transform(names: tuple[str, ...], groups: dict[str, dict[str, float]], stan
 
 
 def write(found: Identification, folder: Path) -> None:
-    """Write the triangle of an identification's data (`information`)."""
-    files.write_table(folder / INFORMATION, (*found.names, "target"), information(found).tolist())
+    """Write the triangle of an identification's data (`_information`)."""
+    files.write_table(folder / INFORMATION, (*found.names, "target"), _information(found).tolist())
 
 
 def _numbers(path: Path) -> np.ndarray:

@@ -167,7 +167,7 @@ class UnseenFolder:
     def write(self, inputs: IdentificationInputs, found: Assessment) -> None:
         """Write a table of torques per unseen recording, and the report."""
         for number, case in enumerate(inputs.unseen, 1):
-            write_torques(case, found.predictions[case.name], self.path / f"torques_{number}.csv")
+            _write_torques(case, found.predictions[case.name], self.path / f"torques_{number}.csv")
         files.write_json(self.report, report(inputs, found))
 
     def verdict(self) -> StoredVerdict:
@@ -205,7 +205,7 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     inputs, found = outcome.inputs, outcome.found
     robot = replace(inputs.robot, nominal=inputs.robot.nominal or inputs.chain, source=str(inputs.source))
     calibrated.write(folder, robot, comment=f"identified from {inputs.source}")
-    write_estimate(folder, HEADER, estimate_rows(outcome))
+    write_estimate(folder, HEADER, _estimate_rows(outcome))
     estimate = found.fitted.estimate
     covariance = estimate.covariance if outcome.carried is None else outcome.carried.covariance
     write_covariance(folder / COVARIANCE, found.names, covariance)
@@ -214,8 +214,8 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     if found.prior is not None:  # else estimate and covariance say it all
         information.write(found, folder)
     first = (*inputs.unseen, *inputs.cases)[0]
-    write_torques(first, outcome.predictions[first.name], folder / "torques_1.csv")
-    table = to_table(found.dynamics, found.base, inputs.unit) | {"drive_gains": gain_table(inputs.gains, inputs.unit)}
+    _write_torques(first, outcome.predictions[first.name], folder / "torques_1.csv")
+    table = to_table(found.dynamics, found.base, inputs.unit) | {"drive_gains": _gain_table(inputs.gains, inputs.unit)}
     files.write_json(folder / MODEL, table)
     if inputs.gains is not None:
         columns = (inputs.chain.joint_names, inputs.gains.gains.tolist(), inputs.gains.sigma.tolist())
@@ -223,7 +223,7 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     files.write_json(folder / METRICS, metrics(outcome))
 
 
-def write_torques(case: Case, predicted: np.ndarray, path: Path) -> Path:
+def _write_torques(case: Case, predicted: np.ndarray, path: Path) -> Path:
     """Write measured and predicted torques (N, rows) of a recording and its joints (N, n), at about `TORQUE_RATE`."""
     motion, rows = case.motion, case.target.shape[1]
     step = max(1, round(motion.rate / TORQUE_RATE))
@@ -233,7 +233,7 @@ def write_torques(case: Case, predicted: np.ndarray, path: Path) -> Path:
     return files.write_table(path, ["t [s]", *names, *joints], table.tolist())
 
 
-def estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:
+def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:
     """Return name, expression, unit, value, σ, RSD [%] and the essential value of each parameter, then σ's two parts.
 
     σ is the total; the geometry's part is left out where the geometry is taken as exact. Terms that the evidence
@@ -288,9 +288,9 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
     if found.elimination is not None:
         essential = len(found.elimination.kept)
     return {
-        "identification": {name: score_table(found_score) for name, found_score in outcome.fit.items()},
+        "identification": {name: _score_table(found_score) for name, found_score in outcome.fit.items()},
         "validation": {
-            name: score_table(found_score) | {"evidence": name not in outcome.repeated}
+            name: _score_table(found_score) | {"evidence": name not in outcome.repeated}
             for name, found_score in outcome.validation.items()
         },
         "parameters": {
@@ -300,7 +300,7 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
         },
         "counts": {"without_effect": len(found.base.without_effect), "regrouped": len(found.base.regrouped)},
         "unit": outcome.inputs.unit,
-        "drive_gains": gain_table(outcome.inputs.gains, outcome.inputs.unit),
+        "drive_gains": _gain_table(outcome.inputs.gains, outcome.inputs.unit),
         "rows": list(found.settings.torque_rows.numbered(outcome.inputs.chain.n)),
         "condition_number": {"raw": _finite(found.condition[0]), "normalised": _finite(found.condition[1])},
         "friction": found.friction.chosen,
@@ -327,10 +327,10 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
             }
             for one in found.ripples
         ],
-        "elimination": elimination_table(outcome),
+        "elimination": _elimination_table(outcome),
         "loop": loop_table(found.bias),
         "tracking": tracking_table(outcome.tracking),
-        "filters": {case.name: filter_table(case.motion) for case in (*outcome.inputs.cases, *outcome.inputs.unseen)},
+        "filters": {case.name: _filter_table(case.motion) for case in (*outcome.inputs.cases, *outcome.inputs.unseen)},
         "geometry": geometry_tables.metrics(outcome.carried, outcome.geometries),
         "repeated": dict(outcome.repeated),
         "findings": asdict(
@@ -345,7 +345,7 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
     }
 
 
-def gain_table(found: DriveGains | None, unit: str) -> dict[str, Any] | None:
+def _gain_table(found: DriveGains | None, unit: str) -> dict[str, Any] | None:
     """Return gains as identified, by joint: torque = gain · current; None where none were."""
     if found is None:
         return None
@@ -358,13 +358,13 @@ def gain_table(found: DriveGains | None, unit: str) -> dict[str, Any] | None:
     }
 
 
-def score_table(found: Score) -> dict[str, Any]:
+def _score_table(found: Score) -> dict[str, Any]:
     """Return M of the contract, and what stands beside it."""
     return {
-        "raw": part_table(found.raw),
-        "filtered": part_table(found.filtered),
-        "moving": part_table(found.moving),
-        "standing": part_table(found.standing),
+        "raw": _part_table(found.raw),
+        "filtered": _part_table(found.filtered),
+        "moving": _part_table(found.moving),
+        "standing": _part_table(found.standing),
         "above_band_percent": [_finite(x) for x in found.above],
         "r_squared": [_finite(x) for x in found.r_squared],
         "whiteness": [
@@ -377,12 +377,12 @@ def score_table(found: Score) -> dict[str, Any]:
     }
 
 
-def part_table(part: PredictionErrors) -> dict[str, Any]:
+def _part_table(part: PredictionErrors) -> dict[str, Any]:
     relative = {"total": _finite(part.total), "joints": [_finite(x) for x in part.joints]}
     return {"relative_error_percent": relative, "rms": [_finite(x) for x in part.rms], "samples": part.samples}
 
 
-def filter_table(motion: Any) -> dict[str, Any]:
+def _filter_table(motion: Any) -> dict[str, Any]:
     return {
         "rate": float(motion.rate),
         "cutoff": [float(x) for x in motion.cutoff],
@@ -391,7 +391,7 @@ def filter_table(motion: Any) -> dict[str, Any]:
     }
 
 
-def elimination_table(outcome: IdentificationOutcome) -> list[dict[str, Any]]:
+def _elimination_table(outcome: IdentificationOutcome) -> list[dict[str, Any]]:
     gone = outcome.found.elimination
     if gone is None:
         return []
@@ -419,9 +419,9 @@ def report(inputs: IdentificationInputs, found: Assessment) -> dict[str, Any]:
         "warnings": list(found.warnings),
         "rows": list(rows.titles(chain.joint_names)),
         "units": list(rows.units([joint.kind == "prismatic" for joint in chain.joints])),
-        "fit": {name: score_table(one) for name, one in found.fit.items()},
+        "fit": {name: _score_table(one) for name, one in found.fit.items()},
         "validation": {
-            name: score_table(one) | {"evidence": name not in found.repeated} for name, one in found.validation.items()
+            name: _score_table(one) | {"evidence": name not in found.repeated} for name, one in found.validation.items()
         },
         "curves": [_curves(case, found.predictions[case.name]) for case in (inputs.unseen or inputs.cases)],
         "tracking": tracking_table(found.tracking),

@@ -42,11 +42,11 @@ def write(outcome: IdentificationOutcome, folder: Path) -> None:
     files.write_table(folder / SENSITIVITY, ("name", *header), rows)
     files.write_table(folder / EFFECTS, GeometricEffect._fields, effects(carried))
     if outcome.geometries is not None:
-        table = geometries(outcome.geometries, essential_names(outcome))
+        table = geometries(outcome.geometries, _essential_names(outcome))
         files.write_table(folder / GEOMETRIES, TwoGeometries._fields, table)
 
 
-def ranking(carried: GeometryUncertainty) -> np.ndarray:
+def _ranking(carried: GeometryUncertainty) -> np.ndarray:
     """Return the elements' indices: by the largest shift that one σ of theirs causes, then the ones without any σ."""
     known = np.isfinite(carried.deviations)
     unit = _per_sigma(carried).max(axis=0, initial=0.0)
@@ -63,7 +63,7 @@ def effects(carried: GeometryUncertainty) -> list[GeometricEffect]:
     more than 1 %; without a σ nothing can be said.
     """
     found, units = [], _per_sigma(carried)
-    for rank, k in enumerate(ranking(carried), start=1):
+    for rank, k in enumerate(_ranking(carried), start=1):
         per_unit = units[:, k]
         worst, sigma = int(np.argmax(per_unit)), carried.deviations[k]
         known = bool(np.isfinite(sigma))
@@ -94,7 +94,7 @@ def geometries(found: GeometryComparison, essential: Sequence[str]) -> list[TwoG
     ]  # fmt: skip
 
 
-def essential_names(outcome: IdentificationOutcome) -> tuple[str, ...]:
+def _essential_names(outcome: IdentificationOutcome) -> tuple[str, ...]:
     """Return the names of the essential parameters; all, where none were left out."""
     found = outcome.found
     if found.elimination is None:
@@ -114,7 +114,7 @@ def metrics(carried: GeometryUncertainty | None, compared: GeometryComparison | 
         "parameters": len(carried.names),
         "changed": [name for name, yes in zip(carried.names, carried.changed) if yes],
         "geometry_exceeds_torque": [name for name, yes in zip(carried.names, carried.dominated) if yes],
-        "moved_by_1_mrad_of_tilt": {"parameter": tilt(carried)[0], "sigmas": tilt(carried)[1]},
+        "moved_by_1_mrad_of_tilt": {"parameter": _tilt(carried)[0], "sigmas": _tilt(carried)[1]},
         "largest_growth_of_sigma": float(growth.max(initial=1.0)),
         "largest_changes_from_nominal": [] if compared is None else _largest(compared),
     }
@@ -136,7 +136,7 @@ def summary(carried: GeometryUncertainty) -> str:
     return f"the geometry's uncertainty raises {count} of {p} sigmas by more than {100 * NOTHING:g} %{more}{rest}"
 
 
-def tilt(carried: GeometryUncertainty) -> tuple[str, float]:
+def _tilt(carried: GeometryUncertainty) -> tuple[str, float]:
     """Return which parameter 1 mrad of tilt of the base against gravity moves most, and by how many σ of torque."""
     size = 1e-3 * _per_sigma(carried)[:, -len(TILTS) :].max(axis=1, initial=0.0)
     worst = int(np.argmax(size))

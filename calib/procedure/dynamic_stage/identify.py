@@ -91,7 +91,7 @@ def run(inputs: IdentificationInputs, progress: Progress | None = None) -> Ident
     say, settings = progress or (lambda words: None), inputs.options.settings
     found = identify(inputs.robot, inputs.cases, settings, progress)
     wrong = driven(found.dynamics, inputs.cases)  # refused before hours go into the geometry's share
-    carried, geometries = carry(inputs, found, say)
+    carried, geometries = _carry(inputs, found, say)
     excitation = {case.name: report_excitation(case.motion) for case in inputs.cases}
     loops = found.bias.loops
     findings = ModelFindings(
@@ -107,7 +107,7 @@ def assessed(outcome: IdentificationOutcome, inputs: IdentificationInputs) -> Id
     return replace(outcome, inputs=inputs, assessment=assess(inputs, outcome.found.dynamics, outcome.findings))
 
 
-def carry(
+def _carry(
     inputs: IdentificationInputs, found: Identification, say: Progress
 ) -> tuple[GeometryUncertainty, GeometryComparison | None]:
     """Return what the geometry's uncertainty adds to the estimate, and the estimate on the nominal geometry beside."""

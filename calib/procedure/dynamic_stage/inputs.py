@@ -95,12 +95,12 @@ def gather(
         seed: for everything random.
     """
     say = progress or (lambda words: None)
-    options = with_choices(options or IdentifyOptions(), method, friction, seed)
+    options = _with_choices(options or IdentifyOptions(), method, friction, seed)
     if not recordings:
         raise UsageError("no recording given")
     given = [*recordings, *validate]
     paths = [_path(each) for each in given]
-    check_files(options, paths)
+    _check_files(options, paths)
     known = robot if isinstance(robot, CalibratedChain) else load_calibrated(robot, base, tip)
     source = Path(known.source or known.chain.name) if isinstance(robot, CalibratedChain) else resolve(robot)
     chain = known.chain
@@ -110,12 +110,12 @@ def gather(
         say(f"reading {name}")
         like = motions[0] if len(motions) >= len(recordings) else None
         motion = read_motion(each, chain, file_settings(options, path), like)
-        motions.append(referred(motion, path, chain, options) if len(motions) < len(recordings) else motion)
+        motions.append(_referred(motion, path, chain, options) if len(motions) < len(recordings) else motion)
     notes = [f"{name}: {note}" for name, motion in zip(names, motions) for note in motion.notes]
     count = len(recordings)
     found = find_gains(chain, options, dict(zip(paths, motions)), paths[:count], say)
     options = found.options
-    cases = [read_case(path, name, motion, options, found) for name, path, motion in zip(names, paths, motions)]
+    cases = [_read_case(path, name, motion, options, found) for name, path, motion in zip(names, paths, motions)]
     return IdentificationInputs(
         without_corrections(known), source, tuple(cases[:count]), tuple(cases[count:]), options,
         (*notes, *found.notes), found,
@@ -134,7 +134,7 @@ def with_unseen(given: IdentificationInputs, validate: Sequence[str | Path | Rec
     cases, notes = [], []
     for name, path, each in zip(names, paths, validate):
         motion = read_motion(each, given.chain, file_settings(given.options, path), given.cases[0].motion)
-        cases.append(read_case(path, name, motion, given.options, given.currents))
+        cases.append(_read_case(path, name, motion, given.options, given.currents))
         notes += [f"{name}: {note}" for note in motion.notes]
     return replace(given, unseen=(*given.unseen, *cases), notes=(*given.notes, *notes))
 
@@ -146,7 +146,7 @@ def _path(each: str | Path | Recording) -> str:
     return f"{each.file or 'recording'}@{each.t[0]:.6g}:{each.t[-1]:.6g}"
 
 
-def with_choices(options: IdentifyOptions, method: str | None, friction: str | None, seed: int) -> IdentifyOptions:
+def _with_choices(options: IdentifyOptions, method: str | None, friction: str | None, seed: int) -> IdentifyOptions:
     """Return the options with the command's choices in them, held against what exists."""
     from calib.identification.friction.friction_ladder import NAMES
     from calib.identification.methods.registry import METHODS
@@ -161,7 +161,7 @@ def with_choices(options: IdentifyOptions, method: str | None, friction: str | N
     return replace(options, settings=settings)
 
 
-def read_case(path: str, name: str, motion: Motion, options: IdentifyOptions, found: FoundGains) -> Case:
+def _read_case(path: str, name: str, motion: Motion, options: IdentifyOptions, found: FoundGains) -> Case:
     """Return the case of one recording; payload and gains as the options, or the gain identification, say."""
     own = file_settings(options, path)
     slow = (options.slow if options.slow is not None else 0.01) if options.cut_slow else None
@@ -227,7 +227,7 @@ def _sharper(recording: Recording, motion: Motion, options: FilterOptions, sampl
     return replace(sharper, notes=(*motion.notes, note), cutoffs=motion.cutoffs)
 
 
-def referred(motion: Motion, path: str, chain: Chain, options: IdentifyOptions) -> Motion:
+def _referred(motion: Motion, path: str, chain: Chain, options: IdentifyOptions) -> Motion:
     """Return the motion with the reference of a file of its own, where the options name one."""
     own, loop = file_settings(options, path), options.settings.loop
     named = own.reference or (loop.reference if loop is not None and loop.reference != "recording" else "")
@@ -237,7 +237,7 @@ def referred(motion: Motion, path: str, chain: Chain, options: IdentifyOptions) 
     return with_reference(motion, beside if beside.exists() else Path(named), Joints(chain.joint_names), own.recording)
 
 
-def check_files(options: IdentifyOptions, paths: Sequence[str]) -> None:
+def _check_files(options: IdentifyOptions, paths: Sequence[str]) -> None:
     """Refuse a [files] table that names none of the recordings."""
 
     from calib.data.recordings.recording import parse_cut

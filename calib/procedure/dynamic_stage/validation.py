@@ -112,12 +112,12 @@ def assess(
         *findings.notes,
     )  # fmt: skip
     return Assessment(
-        fit, validation, predictions, repeated, excitation, tolerated(verdict, proofs, tolerance),
+        fit, validation, predictions, repeated, excitation, _tolerated(verdict, proofs, tolerance),
         tuple(dict.fromkeys(told)), tracking,
     )  # fmt: skip
 
 
-def tolerated(verdict: Verdict, proofs: Mapping[str, Score], tolerance: float) -> Verdict:
+def _tolerated(verdict: Verdict, proofs: Mapping[str, Score], tolerance: float) -> Verdict:
     """Return the verdict, made to fail where the tolerance [%] is not kept."""
     worst = max((one.raw.total for one in proofs.values()), default=0.0)
     if not tolerance or worst <= tolerance:

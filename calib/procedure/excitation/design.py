@@ -107,8 +107,8 @@ def excite(
     say = progress or (lambda words: None)
     given = read_inputs(robot, settings, model, limits, base, tip)
     check_playback(settings, given)
-    problem, checked, notes = excitation_problem(given, settings)
-    condition = condition_objective(given, settings)
+    problem, checked, notes = _excitation_problem(given, settings)
+    condition = _condition_objective(given, settings)
     wanted = read_goals(settings, given, condition)
     report = lambda done, total, what: say(f"{what} ({done} of {total})")  # noqa: E731
     search = partial(design, evaluations=settings.evaluations, seed=settings.seed, map=map, report=report)
@@ -122,18 +122,18 @@ def excite(
     played = play(problem.family, found, given, settings)
     cut = ("interrupted before any motion met the goals",) if wanted and not problem.goals else ()
     return Designed(
-        given, settings, problem, found, proof, condition_of(given, problem.family, found, settings.repeat),
+        given, settings, problem, found, proof, _condition_of(given, problem.family, found, settings.repeat),
         _reached(problem, found), front, played,
         (*given.limits.notes, *given.model.notes, *notes, *given.columns.notes, *cut, *played.notes),
     )  # fmt: skip
 
 
-def excitation_problem(
+def _excitation_problem(
     given: ExcitationInputs, settings: ExcitationSettings
 ) -> tuple[ExcitationProblem, tuple[MotionConstraint, ...], tuple[str, ...]]:
     """Return the problem of both condition numbers within the limits, the constraints to verify, and notes."""
     search, checked, notes = _constraints(given.model, given.limits)
-    condition, smooth = condition_objective(given, settings), given.model.smooth
+    condition, smooth = _condition_objective(given, settings), given.model.smooth
     objectives = tuple((replace(condition, scaling=scaling), 0.5) for scaling in SCALINGS)
     problem = ExcitationProblem(
         _family(given, settings), smooth.regressor, smooth.regressor_gradient, objectives, search,
@@ -142,7 +142,7 @@ def excitation_problem(
     return problem, checked, notes
 
 
-def condition_objective(given: ExcitationInputs, settings: ExcitationSettings) -> Excitation:
+def _condition_objective(given: ExcitationInputs, settings: ExcitationSettings) -> Excitation:
     """Return the condition number of the columns that can be told, motions before included."""
     known = None if given.prior is None else given.prior.per_sample(settings.samples, settings.repeat * settings.period)
     return Excitation("cond", sigmas=given.columns.sigmas, existing=known, columns=given.columns.columns)
@@ -172,7 +172,7 @@ def _searched(
     return replace(found, evaluations=spent, seconds=seconds), problem
 
 
-def condition_of(given: ExcitationInputs, family: Family, found: SearchResult, repeat: int = 1) -> DesignCondition:
+def _condition_of(given: ExcitationInputs, family: Family, found: SearchResult, repeat: int = 1) -> DesignCondition:
     """Return the condition numbers of `INSTANTS` samples over the period, with the model's own Coulomb sign.
 
     With motions before they are those of all motions together; ``alone`` and ``before`` say what each has by itself.

@@ -52,10 +52,10 @@ def write_design(designed: Designed, out: Path, draw: Callable[[Designed, Path],
     """
 
     def write(folder: Path) -> None:
-        period, played = one_period(designed), designed.playback
+        period, played = _one_period(designed), designed.playback
         chain = designed.inputs.chain
         _write_setpoints(period, folder / coefficients.SAMPLES)
-        files.write(folder / coefficients.NAME, dumps(coefficients.table(periodic(designed), chain.name)))
+        files.write(folder / coefficients.NAME, dumps(coefficients.table(_periodic(designed), chain.name)))
         longer = played.approach is not None or played.repeat > 1
         _write_optional(played.run if longer else None, folder / coefficients.RUN)
         _write_optional(played.approach, folder / "approach.csv")
@@ -109,7 +109,7 @@ def _write_messages(track: Setpoints, joint_names: Sequence[str], folder: Path, 
     files.write(folder / "trajectory.yaml", to_yaml(message))
 
 
-def one_period(designed: Designed) -> Setpoints:
+def _one_period(designed: Designed) -> Setpoints:
     """Return one period at the controller's rate, both ends included; without torques."""
     count = round(designed.period * designed.settings.rate)
     times = np.arange(count + 1) * (designed.period / count)
@@ -117,7 +117,7 @@ def one_period(designed: Designed) -> Setpoints:
     return Setpoints(count / designed.period, motion.q, motion.v, motion.a)
 
 
-def periodic(designed: Designed) -> Periodic:
+def _periodic(designed: Designed) -> Periodic:
     """Return the motion by its coefficients."""
     settings = designed.settings
     return Periodic(

@@ -126,7 +126,7 @@ def read_inputs(
     chain, source = load_rigid(robot, None, base, tip)
     known = read_motion_limits(limits, chain, source)
     dynamics = read_model(chain, model, settings.drives, known)
-    locked = read_locked(settings.lock, chain, known.positions)
+    locked = _read_locked(settings.lock, chain, known.positions)
     prior = read_prior(settings.existing, dynamics, chain)
     return ExcitationInputs(chain, known, dynamics, locked, identifiable(dynamics, chain, locked, prior), prior)
 
@@ -209,7 +209,7 @@ def _covariance(folder: Path, names: Sequence[str]) -> np.ndarray | None:
     return found[1][np.ix_(index, index)]
 
 
-def read_locked(texts: Sequence[str], chain: Chain, limits: BoxLimit) -> dict[int, float | None]:
+def _read_locked(texts: Sequence[str], chain: Chain, limits: BoxLimit) -> dict[int, float | None]:
     """Return the joints that rest: at the value said (``joint4=0.5``, rad or m), or where the search likes it (None).
 
     Raises:

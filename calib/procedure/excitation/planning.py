@@ -118,7 +118,7 @@ def plan(
         waypoints: see `calib.procedure.excitation.waypoints`.
         settings: see `calib.procedure.excitation.settings`.
         model: folder of an identification; its geometry is planned with, the limits are the robot's.
-        limits: see `calib.procedure.excitation.limits`; drives: see `read_drives`.
+        limits: see `calib.procedure.excitation.limits`; drives: see `_read_drives`.
         progress: called with words.
 
     Raises:
@@ -144,7 +144,7 @@ def plan(
         paths = [shaped.path]
     margins = np.min([check_within(path, lower, upper) for path in paths], axis=0)
     for path in paths:
-        check_places(path, known)
+        _check_places(path, known)
     say("timing")
     timings, bounds, sigma = _timed(paths, bounds, law, uncertain, known.deviations, chain, settings.rate)
     torque = None if law is None else law.torque
@@ -176,14 +176,14 @@ def _timed(
     return tuple(time_optimal(path, bounds, law, rate=rate) for path in paths), bounds, sigma
 
 
-def read_drives(path: Path, chain: Chain) -> dict[str, np.ndarray]:
+def _read_drives(path: Path, chain: Chain) -> dict[str, np.ndarray]:
     """Read drive parameters from TOML, one per joint: ``[drives]`` with any of Ia, Fv, Fc, off (SI, joint side)."""
     own = parse(DrivesFile, read_toml(path), str(path)).drives
     stated = {key: value for key in DRIVES if (value := getattr(own, key)) is not None}
     return {key: np.array(numbers(value, chain.n, f"{path}: drives.{key}")) for key, value in stated.items()}
 
 
-def check_places(path: JointPath, known: MotionLimits) -> None:
+def _check_places(path: JointPath, known: MotionLimits) -> None:
     """Refuse a path that breaks the workspace or comes too near to something (limits file), at 500 places.
 
     Raises:
@@ -223,7 +223,7 @@ def _law(
         law, unsure = _identified(chain, folder, payloads)
         return law, () if unsure else ("the model states no covariance: torques have no margin for it",), unsure
     try:
-        stated = {} if drives_file is None else read_drives(drives_file, chain)
+        stated = {} if drives_file is None else _read_drives(drives_file, chain)
         if known.friction is not None and not stated:
             stated = {"Fv": known.friction[0], "Fc": known.friction[1]}
         if chain.inertias is None:
@@ -297,5 +297,5 @@ def _duration(
     path: JointPath, limits: TimingLimits, law: PathDynamics | None, lower, upper, known: MotionLimits
 ) -> float:
     check_within(path, lower, upper)
-    check_places(path, known)
+    _check_places(path, known)
     return time_optimal(path, limits, law, grid=COARSE).duration

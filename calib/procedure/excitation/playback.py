@@ -53,7 +53,7 @@ def check_playback(settings: ExcitationSettings, given: ExcitationInputs) -> Non
         raise UsageError(f"--repeat {settings.repeat}: expected 1 period or more")
     check_slower(settings.slower)
     if settings.start is not None:
-        check_start(np.asarray(settings.start, dtype=float), given.chain, given.limits)
+        _check_start(np.asarray(settings.start, dtype=float), given.chain, given.limits)
 
 
 def check_slower(factor: float) -> None:
@@ -121,7 +121,7 @@ def approach_to(
     """
     here = np.asarray(start, dtype=float)
     boxes = {one.order: one for one in known.constraints if isinstance(one, BoxLimit)}
-    check_start(here, chain, known)
+    _check_start(here, chain, known)
     sizes = {order: box.upper for order, box in boxes.items()}
     free = np.full(chain.n, np.inf)
     velocity = np.minimum(sizes.get(1, free), LEISURE)
@@ -134,7 +134,7 @@ def approach_to(
     return found, tuple(note for note in notes if note)
 
 
-def check_start(start: np.ndarray, chain: Chain, known: MotionLimits) -> None:
+def _check_start(start: np.ndarray, chain: Chain, known: MotionLimits) -> None:
     """Refuse a pose (n,) that the robot cannot be in."""
     limits = known.positions
     if start.shape != (chain.n,):

@@ -61,7 +61,7 @@ def deliver_dynamics(identified: Path, source: Path | None, out: Path) -> list[s
     out.mkdir(parents=True, exist_ok=True)
     files.write(out / URDF, edited.encode(encoding))
     files.write(out / MJCF, model)
-    export_drives(given, out / "drives.csv")
+    _export_drives(given, out / "drives.csv")
     files.write_json(out / "parameters.json", parameters(given))
     if source is None:
         (out / "joint_origins.yaml").unlink(missing_ok=True)
@@ -75,7 +75,7 @@ def deliver_dynamics(identified: Path, source: Path | None, out: Path) -> list[s
     return [*lines, *consistency_lines(given.found, given.information.b), *notes, *drive_notes(given)]
 
 
-def export_drives(given: IdentifiedRobot, out: Path) -> Path:
+def _export_drives(given: IdentifiedRobot, out: Path) -> Path:
     """Write the drives' table."""
     rows = []
     for joint, row in zip(given.chain.joints, given.drives.values):

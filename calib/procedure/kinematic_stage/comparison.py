@@ -84,7 +84,7 @@ def compare(
     rigid = None if alone is None else errors(alone, blocks)
     return Comparison(
         tuple(blocks), torques, cells, (one, two), (first, second), pose_count(blocks), frames, proves, rigid,
-        shares_frames, repeated_table(cells, blocks, torques),
+        shares_frames, _repeated_table(cells, blocks, torques),
     )  # fmt: skip
 
 
@@ -127,7 +127,7 @@ POSES, CYCLES, ENOUGH = 5, 30, 100  # what the norm asks for; how many poses mak
 ARMS = ("nominal", "calibrated")
 
 
-def repeated_table(
+def _repeated_table(
     cells: tuple[Installation, Installation], blocks: Sequence[PoseMeasurements], torques: Torques
 ) -> dict[str, Any] | None:
     """Return what ``metrics.json`` holds of repeated poses under ``iso9283``; None where there are none.

@@ -220,7 +220,7 @@ def compensate(
     missed = _sizes(inverse.differences(after, np.clip(q0, lower, upper), wanted))
     if count == 3:
         sigma[:, 1] = np.nan
-    words = (frame_words(fitted, frame), tool_words(tool), *notes, *_turn_words(fitted, count))
+    words = (_frame_words(fitted, frame), _tool_words(tool), *notes, *_turn_words(fitted, count))
     return Commands(q, q0, reached, reason, left, missed, sigma, count, words)
 
 
@@ -313,7 +313,7 @@ def _predicted_sigmas(fitted: Fitted, q: np.ndarray, frame: str, tool: str, goal
     return pose_sigmas(cell, q, free, covariance, torque, -1 if frame == "base" else _station(fitted, frame), number)
 
 
-def frame_words(fitted: Fitted, frame: str) -> str:
+def _frame_words(fitted: Fitted, frame: str) -> str:
     """Say in which frame targets were taken to be, and how far its alternative is."""
     if frame not in ("base", "nominal"):
         return f"targets are in the instrument's frame, station '{frame}'"
@@ -338,7 +338,7 @@ def _turn_words(fitted: Fitted, dof: int) -> tuple[str, ...]:
     return ("the fit saw no orientations: how the flange is turned behind the last joint axis stays nominal",)
 
 
-def tool_words(tool: str) -> str:
+def _tool_words(tool: str) -> str:
     """Say which tool stands at the targets."""
     if tool == "flange":
         return "what stands there is the flange (--tool)"

@@ -132,8 +132,8 @@ def run(
     say("comparing on unseen poses")
     rigid = rigid_fit(found, inputs.fit, settings)
     named = named_outliers(found.fit)
-    notes = *moved_between(found.nominal.cell, inputs.fit, settings), *diagnose(found.fit)
-    findings = found_of(inputs, found, named, notes)
+    notes = *_moved_between(found.nominal.cell, inputs.fit, settings), *diagnose(found.fit)
+    findings = _found_of(inputs, found, named, notes)
     arms = Arms(found.nominal.cell, found.fit.cell, rigid.cell.chain)
     result = assess(arms, inputs, findings, settings, asked=asked, tolerance=wanted.tolerance, seed=seed)
     return Outcome(inputs, found, rigid, named, tuple(explain(found.fit)), findings, result, seed, wanted.tolerance)
@@ -150,7 +150,7 @@ def assessed(outcome: Outcome, inputs: Inputs, options: FitOptions, wanted: FitS
     return replace(outcome, inputs=inputs, assessment=result)
 
 
-def found_of(inputs: Inputs, found: ModelSelection, named: Sequence[Outlier], notes: Sequence[str]) -> Findings:
+def _found_of(inputs: Inputs, found: ModelSelection, named: Sequence[Outlier], notes: Sequence[str]) -> Findings:
     """Return what a fit says of itself, whatever rows it has not seen; `notes` are those of moved instruments etc."""
     long = stretched_length(inputs.chain)
     said = plateau(found, long)
@@ -171,7 +171,7 @@ def cross_validated(found: ModelSelection) -> float:
     return [rung.cross_validated for rung in found.rungs if rung.kept][-1]
 
 
-def moved_between(nominal: Installation, blocks: Sequence[PoseMeasurements], settings: Settings) -> list[str]:
+def _moved_between(nominal: Installation, blocks: Sequence[PoseMeasurements], settings: Settings) -> list[str]:
     """Say that several files share one station where stations of their own explain them far better."""
     own = [block for block in blocks if block.has_instrument]
     if len({block.file for block in own}) < 2 or len({block.station for block in own}) > 1:

@@ -197,7 +197,7 @@ def _write_all(outcome: Outcome, folder: Path) -> None:
     urdfs = {URDF: robot.chain}
     if robot.corrections is not None:
         urdfs[CORRECTED_URDF] = robot.corrections.chain
-        write_corrections(robot.corrections, folder)
+        _write_corrections(robot.corrections, folder)
     for name, geometry in urdfs.items():
         if outcome.inputs.source.suffix == ".urdf":
             urdf_write.edit_file(outcome.inputs.source, folder / name, chain, geometry)
@@ -264,7 +264,7 @@ def _record(outcome: Outcome) -> dict[str, object]:
     }
 
 
-def write_corrections(corrections: CorrectedChain, folder: Path) -> None:
+def _write_corrections(corrections: CorrectedChain, folder: Path) -> None:
     """Write what a URDF cannot hold: the joint correction table and how to read it."""
     chain, deflection = corrections.chain, corrections.deflection
     units = dict(zip(chain.names, chain.units))

@@ -115,7 +115,7 @@ def assess(
     blocks = (*inputs.fit, *(unseen.block for unseen in inputs.unseen.values()))
     warnings = (
         *loud, *inputs.notes, *(note for block in blocks for note in block.notes), *elsewhere(fitted, validation),
-        *findings.notes, *doubtful(validation),
+        *findings.notes, *_doubtful(validation),
     )  # fmt: skip
     return Assessment(fitted, validation, verdict, tuple(dict.fromkeys(warnings)))
 
@@ -160,7 +160,7 @@ def elsewhere(fit: Comparison, validation: Mapping[str, Comparison]) -> list[str
     ]
 
 
-def doubtful(validation: Mapping[str, Comparison]) -> list[str]:
+def _doubtful(validation: Mapping[str, Comparison]) -> list[str]:
     """Name unseen rows whose error is more than `GROSS` times the median: they may be wrong measurements."""
     result = []
     for name, each in validation.items():

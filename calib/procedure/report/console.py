@@ -19,13 +19,13 @@ def rendered(blocks: Iterable[Block]) -> Iterator[RenderableType]:
     """Yield each block as rich prints it; pictures are left out."""
     for block in blocks:
         if isinstance(block, Table):
-            yield rich_table(block)
+            yield _rich_table(block)
         elif isinstance(block, Text):
             label = [(block.label, "yellow"), ": "] if block.label else []
             yield from (RichText.assemble(*label, line) for line in block.lines)
 
 
-def rich_table(table: Table) -> RichTable:
+def _rich_table(table: Table) -> RichTable:
     """Return a table of `page` as rich's."""
     title = table.title[:1].lower() + table.title[1:]
     result = RichTable(

@@ -118,15 +118,15 @@ def outcome_section(outcome: IdentificationOutcome) -> Section:
     found = model_metrics(metrics_of(outcome))
     chain, torques = outcome.inputs.chain, outcome.found.settings.torque_rows
     effects = () if outcome.carried is None else geometry_tables.effects(outcome.carried)
-    blocks: list[Block] = [friction_table(found)] if found.ladder else []
-    blocks += [Text("", model_sentences(found)), *geometry_blocks(found, effects)]
+    blocks: list[Block] = [_friction_table(found)] if found.ladder else []
+    blocks += [Text("", _model_sentences(found)), *_geometry_blocks(found, effects)]
     if found.loop:
-        blocks.append(Text("", loop_sentences(found.loop)))
+        blocks.append(Text("", _loop_sentences(found.loop)))
     rows = torques.titles(chain.joint_names)
     units = torques.units([joint.kind == "prismatic" for joint in chain.joints])
     units = units if found.unit == "N m" else (found.unit,) * len(units)
     blocks += [
-        error_table(found.identification, found.validation, rows, units),
+        _error_table(found.identification, found.validation, rows, units),
         *tracking_blocks(found.tracking, found.tracking_failure),
     ]
     blocks.append(Text("", [_plain(line) for line in found.warnings], "note"))
@@ -145,19 +145,19 @@ def certificate_section(
     """
     metrics, unseen = found.metrics, found.unseen
     pictures = lambda name: [drawn[name]] if name in drawn else []  # noqa: E731
-    blocks: list[Block] = [error_table(unseen.fit, unseen.validation, unseen.rows, unseen.units)]
+    blocks: list[Block] = [_error_table(unseen.fit, unseen.validation, unseen.rows, unseen.units)]
     blocks += [*pictures("errors"), *pictures("torques"), *pictures("excitation")]
     if len(metrics.ladder) > 1:
-        blocks.append(friction_table(metrics))
-    blocks += [Text("The model", model_sentences(metrics)), Text("What the motion can tell", identifiability(found))]
-    blocks += [*geometry_blocks(metrics, found.effects), *pictures("geometry")]
-    blocks += [*pictures("parameters"), parameter_table(found)]
+        blocks.append(_friction_table(metrics))
+    blocks += [Text("The model", _model_sentences(metrics)), Text("What the motion can tell", identifiability(found))]
+    blocks += [*_geometry_blocks(metrics, found.effects), *pictures("geometry")]
+    blocks += [*pictures("parameters"), _parameter_table(found)]
     if metrics.loop:
-        blocks.append(Text("Closed loop", loop_sentences(metrics.loop)))
+        blocks.append(Text("Closed loop", _loop_sentences(metrics.loop)))
     blocks += tracking_blocks(metrics.tracking, metrics.tracking_failure)
     blocks.append(Text("What was exported", exported))
     blocks.append(Text("Notes on the dynamics", list(dict.fromkeys((*metrics.warnings, *unseen.warnings)))))
-    return Section("Dynamics", blocks, unseen.verdict, unseen.reason, key_figures(unseen, tolerance))
+    return Section("Dynamics", blocks, unseen.verdict, unseen.reason, _key_figures(unseen, tolerance))
 
 
 def proof_of(unseen: UnseenReport) -> tuple[str, RecordingErrors, str]:
@@ -168,7 +168,7 @@ def proof_of(unseen: UnseenReport) -> tuple[str, RecordingErrors, str]:
     return name, found, where
 
 
-def key_figures(unseen: UnseenReport, tolerance: float = 0.0) -> list[KeyFigure]:
+def _key_figures(unseen: UnseenReport, tolerance: float = 0.0) -> list[KeyFigure]:
     """Return the errors of the torque that the verdict rests on, of the worst unseen recording."""
     name, proof, _ = proof_of(unseen)
     count = len(unseen.proofs)
@@ -191,7 +191,7 @@ def percent(value: float | None) -> str:
     return "–" if value is None else f"{value:.3g} %"
 
 
-def error_table(
+def _error_table(
     training: Mapping[str, RecordingErrors], unseen: Mapping[str, RecordingErrors], rows: Sequence[str],
     units: Sequence[str],
 ) -> Table:  # fmt: skip
@@ -222,7 +222,7 @@ def error_table(
     return Table("Torque errors", header, cells, ERROR_NOTE, frozenset(strong), range(1, 8))
 
 
-def friction_table(metrics: ModelMetrics) -> Table:
+def _friction_table(metrics: ModelMetrics) -> Table:
     """Return the friction models tried, with their error on time left out, of all rows and of each."""
     rows, strong = [], set()
     for step in metrics.ladder:
@@ -239,7 +239,7 @@ def friction_table(metrics: ModelMetrics) -> Table:
     return Table(title, header, rows, f"Chosen: {metrics.friction}.", frozenset(strong), range(1, 3 + len(each)))
 
 
-def model_sentences(metrics: ModelMetrics) -> list[str]:
+def _model_sentences(metrics: ModelMetrics) -> list[str]:
     """Return how many parameters there are, by which method they were found, and which the data do not tell."""
     lines = []
     for one in metrics.ripple:
@@ -267,7 +267,7 @@ def model_sentences(metrics: ModelMetrics) -> list[str]:
     return lines
 
 
-def geometry_blocks(metrics: ModelMetrics, effects: Sequence[GeometricEffect]) -> list[Block]:
+def _geometry_blocks(metrics: ModelMetrics, effects: Sequence[GeometricEffect]) -> list[Block]:
     """Return which geometric errors matter for the dynamics: a summary, and the worst of them."""
     found = metrics.geometry
     if found is None:
@@ -293,7 +293,7 @@ def geometry_blocks(metrics: ModelMetrics, effects: Sequence[GeometricEffect]) -
     return blocks
 
 
-def loop_sentences(loop: LoopMetrics) -> list[str]:
+def _loop_sentences(loop: LoopMetrics) -> list[str]:
     """Return how the simulated loop went and what it says of least squares."""
     lines, test = list(loop.notes), loop.durbin_wu_hausman
     if test is None:
@@ -379,7 +379,7 @@ def identifiability(found: DynamicReport) -> list[str]:
     return lines
 
 
-def parameter_table(found: DynamicReport) -> Table:
+def _parameter_table(found: DynamicReport) -> Table:
     """Return the identified parameters with σ and RSD, and what is regrouped in them."""
     rows = []
     for row in found.estimate:

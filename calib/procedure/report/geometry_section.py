@@ -55,9 +55,9 @@ def read_blocks(inputs: Inputs) -> list[Block]:
 
 def outcome_section(metrics: FitMetrics) -> Section:
     """Return what a fit came to as the console says it: ladder, errors, repeated poses, what to know, verdict."""
-    blocks: list[Block] = [ladder_table(metrics), error_table(metrics)]
-    blocks += [Text("", repeated_sentences(metrics)), Text("", metrics.not_identifiable, "identifiability")]
-    blocks += [Text("", metrics.warnings, "note"), Text("", outlier_sentences(metrics), "outliers")]
+    blocks: list[Block] = [_ladder_table(metrics), _error_table(metrics)]
+    blocks += [Text("", _repeated_sentences(metrics)), Text("", metrics.not_identifiable, "identifiability")]
+    blocks += [Text("", metrics.warnings, "note"), Text("", _outlier_sentences(metrics), "outliers")]
     return Section("Geometry", blocks, metrics.verdict, metrics.reason)
 
 
@@ -68,21 +68,21 @@ def certificate_section(report: Report, drawn: Mapping[str, Picture]) -> Section
         drawn: figures by name, see `calib.procedure.report.figures.draw`; those that are not there are left out.
     """
     metrics = report.metrics
-    blocks: list[Block] = [error_table(metrics), *iso9283_tables(metrics)]
+    blocks: list[Block] = [_error_table(metrics), *iso9283_tables(metrics)]
     blocks.append(_pictures("Before and after", drawn, ("position", "orientation", "distance")))
     blocks.append(_pictures("What remains", drawn, ("joints", "map")))
     if any(step.cross_validated_mm is not None for step in metrics.ladder):
-        blocks += [ladder_table(metrics), _pictures("", drawn, ("ladder",))]
+        blocks += [_ladder_table(metrics), _pictures("", drawn, ("ladder",))]
     blocks.append(Text("What the poses can tell", identifiability(report)))
     blocks.append(_pictures("Parameters", drawn, ("parameters", "singular_values", "correlations")))
-    blocks.append(parameter_table(report))
+    blocks.append(_parameter_table(report))
     if metrics.outliers:
-        blocks.append(outlier_table(metrics))
+        blocks.append(_outlier_table(metrics))
     blocks.append(Text("Notes", metrics.warnings))
-    return Section("Geometry", blocks, metrics.verdict, metrics.reason, key_figures(report))
+    return Section("Geometry", blocks, metrics.verdict, metrics.reason, _key_figures(report))
 
 
-def key_figures(report: Report) -> list[KeyFigure]:
+def _key_figures(report: Report) -> list[KeyFigure]:
     """Return the errors that the verdict rests on, before and after: of the worst unseen rows, else of the fit's."""
     metrics, proofs = report.metrics, report.metrics.proofs
     name, proof = max(proofs.items(), key=lambda item: _main_rms(item[1]), default=("fit", metrics.fit))
@@ -119,7 +119,7 @@ def _errors(rows: ComparedRows, arm: str, key: str) -> ErrorStatistics | None:
     return None if found is None else getattr(found, key)
 
 
-def error_table(metrics: FitMetrics) -> Table:
+def _error_table(metrics: FitMetrics) -> Table:
     """Return errors of both arms, fitted and unseen: mean, rms, 95 % quantile and maximum."""
     sets = [(f"fitted: {metrics.fit.poses} poses", metrics.fit)]
     for name, found in metrics.validation.items():
@@ -151,7 +151,7 @@ def _error_lines(found: ComparedRows) -> Iterator[tuple[str, str, ErrorStatistic
             yield "distance of pairs [mm]", arm, found.pair_distance_mm[arm]
 
 
-def ladder_table(metrics: FitMetrics) -> Table:
+def _ladder_table(metrics: FitMetrics) -> Table:
     """Return the models tried with their error on rows left out."""
     rows, strong = [], set()
     for step in metrics.ladder:
@@ -163,7 +163,7 @@ def ladder_table(metrics: FitMetrics) -> Table:
     return Table("Ladder of models", header, rows, f"Chosen: {metrics.model}.", frozenset(strong), (1, 2))
 
 
-def parameter_table(report: Report) -> Table:
+def _parameter_table(report: Report) -> Table:
     """Return the fitted parameters; of many joint corrections only the arm and the frames are printed."""
     shown = [row for row in report.parameters if len(report.parameters) <= MOST_ROWS or row.group != "deflection"]
     rows = []
@@ -186,7 +186,7 @@ def relative_sigma(percent: float | None) -> str:
     return "" if percent is None or percent > 999 else f"{percent:.0f} %" if percent >= 10 else f"{percent:.2g} %"
 
 
-def outlier_sentences(metrics: FitMetrics) -> list[str]:
+def _outlier_sentences(metrics: FitMetrics) -> list[str]:
     """Return in a sentence how many rows do not fit, and the worst of them; none where all fit."""
     if not metrics.outliers:
         return []
@@ -206,7 +206,7 @@ def _outlier_size(each: OutlierRow) -> str:
     return f"{each.size_mm:.3g} mm" if each.size_deg is None else f"{each.size_deg:.3g} deg"
 
 
-def outlier_table(metrics: FitMetrics) -> Table:
+def _outlier_table(metrics: FitMetrics) -> Table:
     """Return the rows that do not fit, worst first."""
     found = metrics.outliers
     rows = [
@@ -244,7 +244,7 @@ def _pictures(title: str, drawn: Mapping[str, Picture], names: Sequence[str]) ->
     return Pictures(title, [drawn[name] for name in names if name in drawn])
 
 
-def repeated_sentences(metrics: FitMetrics) -> list[str]:
+def _repeated_sentences(metrics: FitMetrics) -> list[str]:
     """Return for each set of rows with repeated poses what they tell."""
     sets = {"fitted": metrics.fit, **metrics.validation}
     return [f"{name}: {iso9283_sentence(found.iso9283)}" for name, found in sets.items() if found.iso9283]

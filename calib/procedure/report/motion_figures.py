@@ -91,7 +91,7 @@ def _nearest(series: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray, str]], n
     return words
 
 
-def motion_figure(designed: Designed) -> Figure:
+def _motion_figure(designed: Designed) -> Figure:
     """Draw q, v, a and τ of every joint over one period, with their limits dashed."""
     motion = _motion(designed)
     states = zip((motion.q, motion.v, motion.a), (_limits(designed, order) for order in range(3)), TITLES)
@@ -104,7 +104,7 @@ def motion_figure(designed: Designed) -> Figure:
     return motion_sheet(motion.times, rows, units, designed.inputs.chain.joint_names)
 
 
-def path_figure(designed: Designed) -> Figure:
+def _path_figure(designed: Designed) -> Figure:
     """Draw the tool's path from above and from the side."""
     tool = sweep(designed.inputs.chain, _motion(designed).q).position
     with styled():
@@ -124,7 +124,7 @@ def path_figure(designed: Designed) -> Figure:
     return figure
 
 
-def history_figure(designed: Designed) -> Figure:
+def _history_figure(designed: Designed) -> Figure:
     """Draw the improving feasible motions of the best start."""
     history = np.asarray(designed.found.history, dtype=float)
     with styled():
@@ -136,7 +136,7 @@ def history_figure(designed: Designed) -> Figure:
     return figure
 
 
-def front_figure(front: Front) -> Figure:
+def _front_figure(front: Front) -> Figure:
     """Draw the trade-off the engineer chooses from; open points are beaten by others."""
     with styled():
         figure, (axis,) = sheet(width=HALF, height=2.7)
@@ -166,18 +166,18 @@ def _limits(designed: Designed, order: int) -> tuple[np.ndarray, np.ndarray]:
 def design_figures(designed: Designed) -> dict[str, Figure]:
     """Return the figures of a designed motion by name: motion, tool path, search, and front if any."""
     figures = {
-        "motion": motion_figure(designed),
-        "path": path_figure(designed),
-        "history": history_figure(designed),
+        "motion": _motion_figure(designed),
+        "path": _path_figure(designed),
+        "history": _history_figure(designed),
     }
     if designed.front is not None and len(designed.front.values):
-        figures["front"] = front_figure(designed.front)
+        figures["front"] = _front_figure(designed.front)
     return figures
 
 
 def plan_figures(planned: Planned) -> dict[str, Figure]:
     """Return the figures of a planned motion by name: motion and speed profile."""
-    return {"motion": plan_figure(planned), "profile": profile_figure(planned)}
+    return {"motion": _plan_figure(planned), "profile": _profile_figure(planned)}
 
 
 def write_design(designed: Designed, folder: Path) -> None:
@@ -190,7 +190,7 @@ def write_plan(planned: Planned, folder: Path) -> None:
     save_all(plan_figures(planned), folder)
 
 
-def plan_figure(planned: Planned) -> Figure:
+def _plan_figure(planned: Planned) -> Figure:
     """Draw q, v, a and τ of every joint with their limits dashed."""
     track, limits = planned.track, planned.limits
     rows = [
@@ -204,7 +204,7 @@ def plan_figure(planned: Planned) -> Figure:
     return motion_sheet(track.times, rows, units, planned.chain.joint_names)
 
 
-def profile_figure(planned: Planned) -> Figure:
+def _profile_figure(planned: Planned) -> Figure:
     """Draw the speed along the path, and which limit is nearest to being reached."""
     with styled():
         figure, (above, below) = sheet(2, 1, WIDE, 3.8, top=0.4, between=0.2)

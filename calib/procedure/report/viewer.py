@@ -58,7 +58,7 @@ def write(folder: str | Path, path: str | Path, robot: str | None = None) -> Sce
     with tempfile.TemporaryDirectory() as place:
         temporary = Path(place) / "scene.rrd"
         recording = rr.RecordingStream("armature-calib", recording_id=scene.title)
-        recording.save(temporary, default_blueprint=blueprint(scene))
+        recording.save(temporary, default_blueprint=_blueprint(scene))
         _send(recording, scene)
         recording.flush()
         recording.disconnect()
@@ -86,7 +86,7 @@ def spawn(folder: str | Path, robot: str | None = None) -> Scene:
     rr = _rerun()
     recording = rr.RecordingStream("armature-calib", recording_id=scene.title)
     try:
-        recording.spawn(default_blueprint=blueprint(scene))
+        recording.spawn(default_blueprint=_blueprint(scene))
     except Exception as error:
         raise CalibError(f"Rerun's window did not open ({error}); --save FILE.rrd writes it to a file") from error
     _send(recording, scene)
@@ -281,7 +281,7 @@ def _meshes(recording: Any, scene: Scene) -> None:
         recording.log(place, placed, rr.Asset3D(path=mesh.file), static=True)
 
 
-def blueprint(scene: Scene) -> Any:
+def _blueprint(scene: Scene) -> Any:
     """Return how the recording opens: the arm at the left, what goes with it at the right."""
     import rerun.blueprint as rrb
 

@@ -33,9 +33,9 @@ def certify(session: Session, say: Say) -> list[str]:
     from calib.procedure.report import dynamics_section, geometry_section
 
     say("drawing" if session.plots else "writing")
-    whole = whole_report(session)
+    whole = _whole_report(session)
     section = geometry_section.certificate_section(whole, certificate.draw(whole) if session.plots else {})
-    judged = [with_arrival(section, arrival_notes(session, "3-measured", "validate"))]
+    judged = [_with_arrival(section, _arrival_notes(session, "3-measured", "validate"))]
     notes = [f"geometry {section.verdict}: {section.reason}"]
     if session.dynamic:
         dynamics = dynamics_section.read(session.identification.path)
@@ -47,13 +47,13 @@ def certify(session: Session, say: Say) -> list[str]:
             drawn = draw_dynamics(dynamics, session.identification.path, session.path("6-excitation"))
         tolerance = session.settings.dynamics.tolerance_percent
         section = dynamics_section.certificate_section(dynamics, drawn, exported, tolerance)
-        judged.append(with_arrival(section, arrival_notes(session, "7-recorded", "predict")))
+        judged.append(_with_arrival(section, _arrival_notes(session, "7-recorded", "predict")))
         notes.append(f"dynamics {section.verdict}: {section.reason}")
     lines = simulated(session)
     page = certificate.certificate(
         f"{'Simulated calibration' if lines else 'Calibration'} of {session.settings.name}",
         f"{'SIMULATED: ' if lines else ''}{session.settings.instrument.name}, {session.settings.created[:10]}",
-        setup(session, whole),
+        _setup(session, whole),
         judged,
         listed(session),
     )
@@ -62,7 +62,7 @@ def certify(session: Session, say: Say) -> list[str]:
     return [*notes, CERTIFICATE, *recording]
 
 
-def whole_report(session: Session) -> fit_report.Report:
+def _whole_report(session: Session) -> fit_report.Report:
     """Return the fit's report with what the step validate found."""
     place = session.validation
     found = place.metrics()
@@ -74,7 +74,7 @@ def whole_report(session: Session) -> fit_report.Report:
     return fit_report.with_unseen(fit, whole, read_record(tuple[RowErrors, ...], content))
 
 
-def arrival_notes(session: Session, place: str, unseen: str) -> list[str]:
+def _arrival_notes(session: Session, place: str, unseen: str) -> list[str]:
     """Return what was said of files as they came: those to learn from, and those that the step `unseen` looked at."""
     path = session.path(f"{place}/{CHECKED}")
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
@@ -84,7 +84,7 @@ def arrival_notes(session: Session, place: str, unseen: str) -> list[str]:
     return [line for line in (*lines, *(note for note in said if names and note.startswith(names))) if line.strip()]
 
 
-def with_arrival(section: Section, lines: list[str]) -> Section:
+def _with_arrival(section: Section, lines: list[str]) -> Section:
     """Return a section with what was noticed when its files came."""
     return replace(section, blocks=[*section.blocks, Text("What was noticed when the files came", lines)])
 
@@ -96,7 +96,7 @@ def simulated(session: Session) -> list[tuple[str, str]]:
     return [("simulated", line) for line in lines if line.strip()]
 
 
-def setup(session: Session, found: fit_report.Report) -> list[tuple[str, str]]:
+def _setup(session: Session, found: fit_report.Report) -> list[tuple[str, str]]:
     """Return what stands under Setup on the certificate."""
     settings, fitted = session.settings, measured_files(session)
     instrument = settings.instrument
@@ -108,18 +108,18 @@ def setup(session: Session, found: fit_report.Report) -> list[tuple[str, str]]:
         ("description", settings.robot.given),
         ("instrument", f"{instrument.name}, measures {instrument.measures}{stated}{turning}"),
         ("session made", settings.created.replace("T", " ")),
-        ("measurements", dated([*fitted[0], *fitted[1]])),
-        ("pose plan", session_plan(session)),
+        ("measurements", _dated([*fitted[0], *fitted[1]])),
+        ("pose plan", _session_plan(session)),
         ("model", found.metrics.model),
         ("tolerance", certificate.tolerance(settings.fit.tolerance_mm)),
-        *dynamic_setup(session),
+        *_dynamic_setup(session),
         ("seed", str(settings.seed)),
         ("command", f"calib next {session.folder.name}"),
         ("toolkit", certificate.versions()),
     ]
 
 
-def dynamic_setup(session: Session) -> list[tuple[str, str]]:
+def _dynamic_setup(session: Session) -> list[tuple[str, str]]:
     """Return the dynamics' lines under Setup."""
     if not session.dynamic:
         return []
@@ -132,21 +132,21 @@ def dynamic_setup(session: Session) -> list[tuple[str, str]]:
     }
     loads = ", ".join(f"{label} {mass:g} kg" for label, mass in wanted.payloads.items())
     rows = [
-        ("recordings", dated([*training, *unseen])),
+        ("recordings", _dated([*training, *unseen])),
         ("torques", torques[wanted.torques]),
         ("tolerance of torque", f"{allowed:g} % on unseen motion" if allowed else "none was given: pass below 10 %"),
     ]
     return [*rows, ("payloads", loads)] if loads else rows
 
 
-def dated(paths: list[Path]) -> str:
+def _dated(paths: list[Path]) -> str:
     """Return names of files, and the day of the last."""
     when = max((path.stat().st_mtime for path in paths), default=0.0)
     day = datetime.fromtimestamp(when).strftime("%Y-%m-%d %H:%M") if when else "unknown"
     return f"{', '.join(path.name for path in paths)}; files of {day}"
 
 
-def session_plan(session: Session) -> str:
+def _session_plan(session: Session) -> str:
     """Return in a few words how the poses were chosen."""
     path = session.path(SELECTION)
     if not session.settings.poses.plan or not path.exists():

@@ -109,10 +109,10 @@ def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", 
         state = steps.run_next(session, say, progress, command)
     if state is not None:
         return Stop(("", *instructions.asks(session, state)))
-    return Stop(ending(session), verdict_of(session))
+    return Stop(_ending(session), verdict_of(session))
 
 
-def ending(session: Session) -> tuple[str, ...]:
+def _ending(session: Session) -> tuple[str, ...]:
     """Return what is said of a session that has come to its end: a failed one's robot is for inspection only."""
     page, robot = session.path(CERTIFICATE), session.path(f"{session.export}/{URDF}")
     if verdict_of(session) == "fail":

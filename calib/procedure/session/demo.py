@@ -90,18 +90,18 @@ def run(
     with locked(session):
         waiting = steps.run_next(session, say, progress, "calib demo")
         while waiting is not None and waiting.kind == steps.WAITING and not guided:
-            bring_for(session, waiting.step.name, say)
+            _bring_for(session, waiting.step.name, say)
             waiting = steps.run_next(session, say, progress, "calib demo")
     if waiting is not None:
         if not guided:
             raise SessionError(f"the demonstration stopped at {waiting.step.name}: {waiting.words}")
         return DemoResult(session, "", (), time.perf_counter() - started, stopped(session, waiting))
-    before, after = compare_with_truth(session, cell, say)
+    before, after = _compare_with_truth(session, cell, say)
     seconds = time.perf_counter() - started
-    return DemoResult(session, verdict_of(session), results(session), seconds, (), before, after, largest_memory())
+    return DemoResult(session, verdict_of(session), results(session), seconds, (), before, after, _largest_memory())
 
 
-def largest_memory() -> float:
+def _largest_memory() -> float:
     """Return the largest resident set of this process so far [MB]; Linux counts it in kB, macOS in bytes."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2.0**20 if sys.platform == "darwin" else 2.0**10)
 
@@ -131,7 +131,7 @@ def results(session: Session) -> tuple[tuple[str, str], ...]:
     return (*found, ("the session", SETTINGS))
 
 
-def compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, float]:
+def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, float]:
     """Compare a session's result with the cell's truth, print and write the errors; return those of the tool [mm]."""
     found = installation_file.read(session.fit.path)
     before, after, bare = position_errors(cell, found, calibrated.read(session.fit.path).chain)
@@ -174,15 +174,15 @@ def bring_what_waits(folder: Path, say: Say) -> None:
     with locked(session, say):
         waiting = next((state for state in steps.states(session) if state.kind not in (steps.DONE, steps.KEPT)), None)
         if waiting is None:
-            compare_with_truth(session, virtual_cell(session.settings.robot.given, session.settings.seed), say)
+            _compare_with_truth(session, virtual_cell(session.settings.robot.given, session.settings.seed), say)
             return
         if waiting.kind != steps.WAITING:
             raise UsageError(f"{folder} waits for nothing; next: calib next {folder}")
-        bring_for(session, waiting.step.name, say)
+        _bring_for(session, waiting.step.name, say)
     say(f"next: calib next {folder}")
 
 
-def bring_for(session: Session, step: str, say: Say) -> None:
+def _bring_for(session: Session, step: str, say: Say) -> None:
     """Let the simulated cell do what a step waits for."""
     seed = session.settings.seed
     cell = virtual_cell(session.settings.robot.given, seed)
@@ -203,7 +203,7 @@ def arm_of(session: Session, cell: Cell) -> MovingArm:
 
 def bring(session: Session, cell: Cell, seed: int) -> None:
     """Let the simulated cell measure the planned poses, and three of them once more at the end; the CMM wanders."""
-    mark(session, cell.note)
+    _mark(session, cell.note)
     kinds = [joint.kind for joint in cell.nominal.joints]
     for number, (plan, name) in enumerate((("poses", "measured"), ("validation", "validation"))):
         q = read_poses(session.path(f"2-poses/{plan}.csv"), cell.nominal.joint_names, kinds=kinds)
@@ -214,7 +214,7 @@ def bring(session: Session, cell: Cell, seed: int) -> None:
             measured_files.write(wandering(again, DRIFT, seed, begin=1.0), session.path("3-measured/drift.csv"))
 
 
-def mark(session: Session, note: str) -> None:
+def _mark(session: Session, note: str) -> None:
     """Write down in the session that its files are a simulated cell's; the certificate says so."""
     path, line = session.path(MARK), SIMULATED.format(note=note)
     known = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
@@ -223,7 +223,7 @@ def mark(session: Session, note: str) -> None:
 
 def bring_logs(session: Session, arm: MovingArm, seed: int) -> None:
     """Let the simulated arm play the designed motions, and log them."""
-    mark(session, arm.note)
+    _mark(session, arm.note)
     motions = dynamics_steps.designed_motions(session)
     for name, number in LOGS:
         if name not in motions:

@@ -116,7 +116,7 @@ def record(session: Session, say: Say) -> list[str]:
     cuts, notes = {}, []
     for path in recordings(session)[0]:
         say(f"reading {path.name}")
-        found, told = check_recording(session, path, "training")
+        found, told = _check_recording(session, path, "training")
         cuts[path.name] = found
         notes += told
     files.write_json(session.path(CUTS), cuts)
@@ -124,7 +124,7 @@ def record(session: Session, say: Say) -> list[str]:
     return notes
 
 
-def check_recording(session: Session, path: Path, name: str) -> tuple[list[float] | None, list[str]]:
+def _check_recording(session: Session, path: Path, name: str) -> tuple[list[float] | None, list[str]]:
     """Return from when to when the designed motion is in a recording [s] (None: all of it counts), and notes.
 
     Raises:
@@ -160,7 +160,7 @@ def designed_motions(session: Session) -> dict[str, Periodic]:
     return {name: coefficients.read(folder) for name, folder in folders.items() if folder.exists()}
 
 
-def cut_paths(paths: list[Path], cuts: dict[str, Any]) -> list[str]:
+def _cut_paths(paths: list[Path], cuts: dict[str, Any]) -> list[str]:
     """Return paths with the cut that holds the motion."""
     marked = {path: cuts.get(path.name) for path in paths}
     return [str(path) if cut is None else f"{path}@{cut[0]:.6g}:{cut[1]:.6g}" for path, cut in marked.items()]
@@ -175,7 +175,7 @@ def identify(session: Session, say: Say) -> list[str]:
         from calib.procedure.report.dynamics_figures import write as draw
     cuts = json.loads(session.path(CUTS).read_text(encoding="utf-8"))
     given = inputs.gather(
-        session.fit.path, cut_paths(recordings(session)[0], cuts), options=options_of(session),
+        session.fit.path, _cut_paths(recordings(session)[0], cuts), options=options_of(session),
         seed=session.settings.seed, progress=say,
     )  # fmt: skip
     outcome = identifying.run(given, progress=say)
@@ -198,11 +198,11 @@ def predict(session: Session, say: Say) -> list[str]:
     training, unseen = recordings(session)
     notes, aside = [], {}
     for path in unseen:
-        aside[path.name], told = check_recording(session, path, "validation")
+        aside[path.name], told = _check_recording(session, path, "validation")
         notes += told
     say("predicting unseen motion")
     given = inputs.gather(
-        session.fit.path, cut_paths(training, cuts), cut_paths(unseen, aside), options=options_of(session),
+        session.fit.path, _cut_paths(training, cuts), _cut_paths(unseen, aside), options=options_of(session),
         seed=session.settings.seed, progress=say,
     )  # fmt: skip
     place, tolerance = session.identification, session.settings.dynamics.tolerance_percent

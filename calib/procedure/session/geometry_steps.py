@@ -38,11 +38,11 @@ def robot_file(session: Session) -> Path:
 def chain_of(session: Session) -> Chain:
     """Return the nominal arm."""
     robot = session.settings.robot
-    options = options_of(session)
+    options = _options_of(session)
     return inputs.load_robot(robot_file(session), None, options, robot.base or None, robot.tip or None)[0]
 
 
-def options_of(session: Session) -> FitOptions:
+def _options_of(session: Session) -> FitOptions:
     """Return the fit options, with the instrument's sigmas where a file states none."""
     name, instrument = session.settings.fit.options, session.settings.instrument
     options = read_options(session.path(name) if name else None)
@@ -59,7 +59,7 @@ def options_of(session: Session) -> FitOptions:
     return replace(options, sigma=stated(options).sigma, files={n: stated(each) for n, each in options.files.items()})
 
 
-def tolerance_of(session: Session) -> float | None:
+def _tolerance_of(session: Session) -> float | None:
     """Return the largest rms on unseen poses that is good enough [m]; None where the session states none."""
     return 1e-3 * session.settings.fit.tolerance_mm or None
 
@@ -126,7 +126,7 @@ def arrive(session: Session, say: Say) -> list[str]:
     plan = planned(session, chain, "poses")
     for path in fit:
         notes += check_file(session, chain, path, plan)
-    notes += drifts(session, chain)
+    notes += _drifts(session, chain)
     files.write(session.path(POSES_CHECKED), "\n".join(notes) + "\n")
     return notes
 
@@ -138,7 +138,7 @@ def check_file(session: Session, chain: Chain, path: Path, plan: np.ndarray | No
         MeasurementError: for whatever cannot be right, with row and column.
     """
     notes = []
-    for block in inputs.read_file(path, chain, options_of(session)):
+    for block in inputs.read_file(path, chain, _options_of(session)):
         wanted = session.settings.instrument.measures
         if wanted == Poses.kind and isinstance(block, Positions) and not isinstance(block, Poses):
             notes.append(f"{path.name}: positions only, where the instrument gives poses")
@@ -150,9 +150,9 @@ def check_file(session: Session, chain: Chain, path: Path, plan: np.ndarray | No
     return notes
 
 
-def drifts(session: Session, chain: Chain) -> list[str]:
+def _drifts(session: Session, chain: Chain) -> list[str]:
     """Return what poses that were measured more than once say of drift."""
-    options = options_of(session)
+    options = _options_of(session)
     first, again = (
         [block for path in paths for block in inputs.read_file(path, chain, options)]
         for paths in (measured_files(session)[0], measured_again(session))
@@ -160,29 +160,29 @@ def drifts(session: Session, chain: Chain) -> list[str]:
     return arrival.drift(chain, first, again, session.settings.instrument.sigma_position)
 
 
-def fit_settings(session: Session) -> FitSettings:
+def _fit_settings(session: Session) -> FitSettings:
     """Return how the geometry is fitted and judged, as session.toml says."""
     wanted = session.settings.fit
     return FitSettings(
-        model=wanted.model, loss=wanted.loss, stations=wanted.stations, tolerance=tolerance_of(session),
+        model=wanted.model, loss=wanted.loss, stations=wanted.stations, tolerance=_tolerance_of(session),
         refit_frames=wanted.validation_frames == "own", seed=session.settings.seed,
     )  # fmt: skip
 
 
-def gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
+def _gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
     """Return the robot with the fit's measurements, and with validation files if asked for."""
     chain = chain_of(session)
     links = (chain.base, chain.tip) if robot_file(session).suffix == ".urdf" else (None, None)
     return inputs.gather(
-        robot_file(session), measured_files(session)[0], validate, options=options_of(session),
-        settings=fit_settings(session), base=links[0], tip=links[1],
+        robot_file(session), measured_files(session)[0], validate, options=_options_of(session),
+        settings=_fit_settings(session), base=links[0], tip=links[1],
     )  # fmt: skip
 
 
 def fit(session: Session, say: Say) -> list[str]:
     """Fit the geometry to the measured files; validation files are not looked at."""
     settings = session.settings
-    outcome = fitting.run(gathered(session), options_of(session), fit_settings(session), say)
+    outcome = fitting.run(_gathered(session), _options_of(session), _fit_settings(session), say)
     outputs.write_folder(outcome, session.fit.path, partial(certificate.write_fit, plots=session.plots))
     count = len(outcome.climb.fit.free)
     notes = [f"model {outcome.climb.chosen}, {count} parameters on {outcome.fit.poses} poses", *outcome.warnings]
@@ -206,7 +206,7 @@ def validate(session: Session, say: Say) -> list[str]:
     for path in unseen:
         notes += check_file(session, chain, path, plan)
     say("comparing on unseen poses")
-    given, options, wanted = gathered(session, unseen), options_of(session), fit_settings(session)
+    given, options, wanted = _gathered(session, unseen), _options_of(session), _fit_settings(session)
     settings = combine(Settings(), loss=wanted.loss, loss_scale=options.loss_scale)
     found = assess(
         fit.arms(given, settings), given, fit.findings(), settings, asked=wanted.model or options.model,

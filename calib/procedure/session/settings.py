@@ -161,7 +161,7 @@ class DynamicsSection:
     ] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.repeats > MOST_SAMPLES / max(self.period * self.rate, 1e-300):  # a whole number may be too large to multiply
+        if self.repeats > MOST_SAMPLES / max(self.period * self.rate, 1e-300):  # a quotient: repeats may be huge
             raise ValueError(
                 f"period {self.period:g} s at rate {self.rate:g} Hz, {self.repeats} times: more than "
                 f"{MOST_SAMPLES:.0e} samples"

@@ -91,7 +91,7 @@ def _recorded(session: Session) -> list[Path]:
         session.fit.robot,
         plan,
         *_reading(session),
-        *files_of(dynamics_steps.recordings(session)[0]),
+        *_files_of(dynamics_steps.recordings(session)[0]),
     ]
 
 
@@ -102,7 +102,7 @@ def _reading(session: Session) -> list[Path]:
 
 def _identified(session: Session) -> list[Path]:
     own = [session.fit.robot, session.path(CUTS), *_reading(session)]
-    return [*own, *files_of(dynamics_steps.recordings(session)[0])]
+    return [*own, *_files_of(dynamics_steps.recordings(session)[0])]
 
 
 def _predicted(session: Session) -> list[Path]:
@@ -111,10 +111,10 @@ def _predicted(session: Session) -> list[Path]:
     plan = session.path(f"6-excitation/validation/{coefficients.NAME}")
     training, unseen = dynamics_steps.recordings(session)
     cuts = session.path(CUTS)
-    return [*own, plan, cuts, *_reading(session), *files_of(training), *files_of(unseen)]
+    return [*own, plan, cuts, *_reading(session), *_files_of(training), *_files_of(unseen)]
 
 
-def files_of(paths: list[Path]) -> list[Path]:
+def _files_of(paths: list[Path]) -> list[Path]:
     """Return the files behind paths, some of which are folders (ROS 2 bags)."""
     return [each for path in paths for each in (sorted(p for p in path.rglob("*") if p.is_file()) or [path])]
 

@@ -45,7 +45,7 @@ class State:
     words: str
 
 
-def steps_of(session: Session) -> tuple[SessionStep, ...]:
+def _steps_of(session: Session) -> tuple[SessionStep, ...]:
     """Return the steps of a session."""
     return tuple(step for step in STEPS if session.dynamic or not step.dynamic)
 
@@ -56,7 +56,7 @@ def find(session: Session, name: str) -> SessionStep:
     Raises:
         SessionError: with the names there are.
     """
-    own = steps_of(session)
+    own = _steps_of(session)
     for number, step in enumerate(own, 1):
         if name in (step.name, str(number)):
             return step
@@ -70,7 +70,7 @@ def find(session: Session, name: str) -> SessionStep:
 def states(session: Session) -> list[State]:
     """Return how every step stands."""
     recorded, result, current = read_state(session), [], True
-    for step in steps_of(session):
+    for step in _steps_of(session):
         state = _state(session, step, recorded) if current else _behind(session, step, recorded)
         result.append(state)
         current = current and state.kind in (DONE, KEPT)
@@ -168,7 +168,7 @@ def run_next(session: Session, say: Say, progress: Say, command: str = "calib ne
     The session has to be locked.
     """
     geometry_steps.clear_staging(session)
-    move_export(session)
+    _move_export(session)
     while True:
         state = next((each for each in states(session) if each.kind not in (DONE, KEPT)), None)
         if state is None or state.kind == WAITING:
@@ -177,7 +177,7 @@ def run_next(session: Session, say: Say, progress: Say, command: str = "calib ne
 
 
 def _run(session: Session, step: SessionStep, say: Say, progress: Say, command: str) -> None:
-    number = steps_of(session).index(step) + 1
+    number = _steps_of(session).index(step) + 1
     recorded = read_state(session)
     recorded["steps"].pop(step.name, None)
     write_state(session, recorded | {"running": step.name})
@@ -209,13 +209,13 @@ def _run(session: Session, step: SessionStep, say: Say, progress: Say, command: 
 def forget(session: Session, step: SessionStep) -> None:
     """Let a step and all behind it be made again."""
     recorded = read_state(session)
-    own = steps_of(session)
+    own = _steps_of(session)
     for later in own[own.index(step) :]:
         recorded["steps"].pop(later.name, None)
     write_state(session, recorded)
 
 
-def move_export(session: Session) -> None:
+def _move_export(session: Session) -> None:
     """Rename the folder of the export, once dynamics are switched on or off in ``session.toml``."""
     before, now = session.path(EXPORT[not session.dynamic]), session.path(session.export)
     if (now.is_dir() and any(now.iterdir())) or not before.is_dir():

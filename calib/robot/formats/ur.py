@@ -32,7 +32,7 @@ def kinematics(nominal: Chain, calibrated: Chain) -> str:
     Raises:
         RobotError: for an arm that has not UR's axes.
     """
-    edited = read(urdf_write.edit(template(nominal), nominal, calibrated, "UR frames"), "UR frames")
+    edited = read(urdf_write.edit(_template(nominal), nominal, calibrated, "UR frames"), "UR frames")
     places = {link: to_xyz_rpy(edited.joints[link].origin) for link in LINKS}
     origins = {link: dict(zip(KEYS, [*xyz.tolist(), *rpy.tolist()])) for link, (xyz, rpy) in places.items()}
     digest = int(hashlib.sha256(block(origins, "  ").rstrip().encode()).hexdigest()[:15], 16)
@@ -46,7 +46,7 @@ def wrist_offset(nominal: Chain) -> float:
     return abs(float(across @ (frames[5, :3, 3] - frames[4, :3, 3])))
 
 
-def template(nominal: Chain) -> str:
+def _template(nominal: Chain) -> str:
     """Return a URDF of a nominal arm in UR's frames, its six lengths taken from the arm's axes at q = 0.
 
     d1 height of axis 2; a2, a3 distances of axes 2 to 3 and 3 to 4; d4 distance of axis 5 from axis 1; d5 height of

@@ -60,7 +60,7 @@ def edit(source: str, nominal: Chain, calibrated: Chain, where: str = "URDF") ->
     tree = read_tree(source, where)
     path = _matching_path(tree, nominal)
     q = np.vstack([np.zeros(nominal.n), random_joints(nominal, 7, 1)])
-    links = link_frames(tree, path, nominal, q)
+    links = _link_frames(tree, path, nominal, q)
     frames, calibrated_frames = moving_frames(nominal, q), moving_frames(calibrated, q)
     base = _base_offset(tree, path, nominal, frames, links)
     offsets = invert(frames[:, 0]) @ base @ links[:, 0]
@@ -72,7 +72,7 @@ def edit(source: str, nominal: Chain, calibrated: Chain, where: str = "URDF") ->
         changes += _change(source, tree.joints[name], origin)
     result = edited(source, changes)
     written = read_tree(result, where)
-    error = np.abs(link_frames(written, [written.joints[joint.name] for joint in path], nominal, q) - wanted).max()
+    error = np.abs(_link_frames(written, [written.joints[joint.name] for joint in path], nominal, q) - wanted).max()
     if error > WRITTEN:
         raise RobotError(
             f"{where}: the edited text does not read back as the calibrated robot (difference {error:.2g})"
@@ -127,7 +127,7 @@ def moving_frames(chain: Chain, q: np.ndarray) -> np.ndarray:
     return np.array(frames)
 
 
-def link_frames(tree: UrdfTree, path: Sequence[JointTag], chain: Chain, q: np.ndarray) -> np.ndarray:
+def _link_frames(tree: UrdfTree, path: Sequence[JointTag], chain: Chain, q: np.ndarray) -> np.ndarray:
     """Return the frames of the links behind the moving joints of a path, (moving, m, 4, 4), in the path's first link.
 
     Args:

@@ -72,7 +72,7 @@ def perturbed_cell(
         hidden: scale of the hidden deflections, in those of the LWR4+.
     """
     rng = np.random.default_rng(seed)
-    true = perturbed(nominal, rng, size)
+    true = _perturbed(nominal, rng, size)
     span = float(np.linalg.norm(forward(nominal, np.zeros((1, nominal.n)))[0, :3, 3])) + 0.5
     amplitude = np.array([AMPLITUDE if joint.kind == "revolute" else 0.3 * AMPLITUDE for joint in true.joints])
     truth = Installation(
@@ -88,7 +88,7 @@ def perturbed_cell(
     return Cell(nominal, truth, instrument or SimulatedInstrument(), note)
 
 
-def perturbed(chain: Chain, seed: int | np.random.Generator, size: float = 1.0) -> Chain:
+def _perturbed(chain: Chain, seed: int | np.random.Generator, size: float = 1.0) -> Chain:
     """Return a chain whose elements deviate by normal errors: `LENGTH`, `ANGLE`, and `OFFSET` for joint offsets."""
     rng = np.random.default_rng(seed)
     spread = [

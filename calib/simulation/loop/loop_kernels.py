@@ -162,7 +162,7 @@ def dynamics(tree, body, linear, q, v, work, matrix, out):
 
 
 @njit(**JOINED)
-def factorise(matrix):
+def _factorise(matrix):
     """Overwrite the lower triangle with L, the diagonal with 1 / D, M = L D Lᵀ; False where M is not definite."""
     for i in range(matrix.shape[0]):
         for j in range(i):
@@ -182,7 +182,7 @@ def factorise(matrix):
 
 
 @njit(**JOINED)
-def substitute(matrix, vector):
+def _substitute(matrix, vector):
     """Overwrite vector (n,) with M⁻¹ vector, M factorised."""
     n = vector.shape[0]
     for i in range(n):
@@ -242,7 +242,7 @@ def stiffness(kinds, acts, v, matrix, unit):
         for j in range(n):
             unit[j] = 0.0
         unit[kinds[t, 0]] = 1.0
-        substitute(matrix, unit)
+        _substitute(matrix, unit)
         slope = acts[t, 0] / acts[t, 3]
         for k in range(n):
             total += abs(slope * acts[t, 4 + k] * unit[k])
@@ -250,15 +250,15 @@ def stiffness(kinds, acts, v, matrix, unit):
 
 
 @njit(**OPTIONS)
-def accelerate(tree, body, linear, kinds, acts, q, v, tau, work, matrix, out):
+def _accelerate(tree, body, linear, kinds, acts, q, v, tau, work, matrix, out):
     """Write the accelerations (n,) under the torques of the drives; M is left factorised. False: M not definite."""
     for j in range(q.shape[0]):
         out[j] = tau[j]
     dynamics(tree, body, linear, q, v, work, matrix, out)
     friction(linear, kinds, acts, v, out)
-    if not factorise(matrix):
+    if not _factorise(matrix):
         return False
-    substitute(matrix, out)
+    _substitute(matrix, out)
     return True
 
 
@@ -268,7 +268,7 @@ def forward_dynamics(tree, body, linear, kinds, acts, q, v, tau, out):
     work, matrix = np.empty((tree.shape[0] + 1, 46)), np.empty((q.shape[1], q.shape[1]))
     for sample in range(q.shape[0]):
         args = (q[sample], v[sample], tau[sample], work, matrix, out[sample])
-        if not accelerate(tree, body, linear, kinds, acts, *args):
+        if not _accelerate(tree, body, linear, kinds, acts, *args):
             return sample
     return FINE
 
@@ -299,7 +299,7 @@ def _advance(tree, body, linear, kinds, acts, q, v, tau, period, slopes, work, m
                     before = slopes[stage - 2, j] if stage > 1 else 0.0
                     at[j] = q[j] + part * (v[j] + half * before)
                     rate[j] = v[j] + part * slopes[stage - 1, j]
-            if not accelerate(tree, body, linear, kinds, acts, at, rate, tau, work, matrix, slopes[stage]):
+            if not _accelerate(tree, body, linear, kinds, acts, at, rate, tau, work, matrix, slopes[stage]):
                 return SINGULAR
         for j in range(n):
             first, inner, last = slopes[0, j], slopes[1, j] + slopes[2, j], slopes[3, j]
@@ -372,7 +372,7 @@ def closed_loop(
                 at[j] = tau[j] + push[k, j]
             else:
                 at[j] = tau[j]
-        if not accelerate(tree, body, linear, kinds, acts, q, v, at, work, matrix, slopes[0]):
+        if not _accelerate(tree, body, linear, kinds, acts, q, v, at, work, matrix, slopes[0]):
             return SINGULAR, k
         if k % every == 0:
             m = k // every
