@@ -40,7 +40,7 @@ class Comparison:
     """
 
     blocks: tuple[PoseMeasurements, ...]
-    torques: Torques
+    torques: list[np.ndarray | None]
     cells: tuple[Installation, Installation]
     errors: tuple[Errors, Errors]
     pairs: tuple[np.ndarray, np.ndarray]
@@ -69,7 +69,7 @@ def compare(
     nominal: Installation,
     calibrated: Installation,
     blocks: Sequence[PoseMeasurements],
-    torques: Torques,
+    torques: list[np.ndarray | None],
     frames: str,
     proves: bool = True,
     seed: int = 0,
