@@ -176,7 +176,7 @@ def select_poses(
     workers: str | int = 1,
     progress: Progress | None = None,
 ) -> PoseSelection:
-    """Choose the poses at which a robot's geometry shows best, within its limits and free of collisions.
+    """Choose the poses at which a robot's geometry shows best, within its limits and what a file states.
 
     Args:
         robot, base, tip: as of `calib.load`; or what it returned.

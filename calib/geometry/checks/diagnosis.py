@@ -7,16 +7,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import KDTree
 
-from calib.geometry.fit import PLAUSIBLE
 from calib.geometry.observation import Block
-from calib.geometry.parameters import layout
 from calib.geometry.residuals import Part
 from calib.geometry.result import GeometricFit
-from calib.units import small
 
 FEWEST = 30  # rows below which no pattern is looked for (our choice)
 WORSE = 1.6  # a set-up's errors over the rest's from which on it is worth a word (our choice)
-FAR = 8.0  # plausible deviations (`calib.geometry.fit.PLAUSIBLE`) beyond which a parameter is not credible (our choice)
 CHANCE = 1e-3  # probability that the same rows in another order show such a change (our choice)
 
 
@@ -27,22 +23,6 @@ def diagnose(found: GeometricFit) -> list[str]:
         if len(block.measured) >= FEWEST:
             lines += [*_setup_change(block, part), *_systematic(block, part)]
     return lines
-
-
-def _implausible(found: GeometricFit) -> list[str]:
-    """Name arm parameters that a fit moved further than any sound arm is off: what was fitted is not this robot."""
-    table, before, after = layout(found.start), found.start.chain.values, found.cell.chain.values
-    far = [
-        f"{table.names[k]} by {small(after[k] - before[k], table.units[k])}"
-        for k in range(table.arm)
-        if abs(after[k] - before[k]) > FAR * PLAUSIBLE[table.units[k]]
-    ]
-    if not far:
-        return []
-    return [
-        f"the fit moved {', '.join(far[:6])}{' and others' if len(far) > 6 else ''}: no sound arm is that far from its "
-        "nominal. Are the robot's model, the units, the joint order and the zero positions those of this robot?"
-    ]
 
 
 def lengths(found: GeometricFit) -> list[tuple[Block, Part]]:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from arms import physical
 
 from calib.dynamics import drives, rigid_body
 from calib.dynamics.bodies import bodies_of, standard_parameters, with_payload
@@ -19,18 +20,6 @@ from calib.simulation.loop.references import Reference
 from calib.transforms import displace
 
 HIGH = np.array([2.0, 1.2, 1.2, 2.0, 1.5, 2.0])
-
-
-def physical(count: int, seed: int = 0) -> np.ndarray:
-    """Return standard parameters (count, 10) of bodies that can exist: six point masses each."""
-    rng = np.random.default_rng(seed)
-    rows = []
-    for _ in range(count):
-        points, mass = rng.normal(size=(6, 3)) * 0.2, rng.uniform(0.1, 1.0, 6)
-        second = np.einsum("k,ki,kj->ij", mass, points, points)
-        inertia = np.trace(second) * np.eye(3) - second
-        rows.append([*inertia[np.triu_indices(3)], *(mass @ points), mass.sum()])
-    return np.array(rows)
 
 
 def motley() -> Chain:
