@@ -85,7 +85,7 @@ def select(
         list[str] | None, typer.Option(help="x,y,z of a target in the tip's frame [m]; may be repeated")
     ] = None,
     index: Annotated[str, typer.Option(help="O1 to O5, or cond")] = "O1",
-    method: Annotated[str, typer.Option(help="polish, detmax, local, multistart or tabu")] = "polish",
+    method: Annotated[str | None, typer.Option(help="polish (default), detmax, local, multistart or tabu")] = None,
     starts: Annotated[int, typer.Option(help="random sets that multistart begins at")] = 8,
     evaluations: Annotated[int, typer.Option(help="most evaluations of the index in one local search")] = 5000,
     seconds: Annotated[float | None, typer.Option(help="processor time for the search; without: to its end")] = None,
@@ -106,14 +106,24 @@ def select(
     """Choose the poses at which the geometry of ROBOT shows best."""
     from calib.api.kinematic import select_poses
     from calib.procedure.kinematic_stage import selection
-    from calib.procedure.kinematic_stage.settings import SelectionSettings
+    from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
 
     selection.check_target(out, [robot, existing, constraints])
     targets = tuple(tuple(numbers(text, 3, "--tool")) for text in tool or [])
     sigmas = None if sigma is None else numbers(sigma, 2, "--sigma")
     stated = None if sigmas is None else (sigmas[0], sigmas[1])
     settings = SelectionSettings(
-        kind, targets, index, method, candidates, stated, seed, starts, evaluations, seconds, climbs
+        kind,
+        targets,
+        index,
+        method or DEFAULT_SELECTION.method,
+        candidates,
+        stated,
+        seed,
+        starts,
+        evaluations,
+        seconds,
+        climbs,
     )
     with progress() as show:
         chosen = select_poses(

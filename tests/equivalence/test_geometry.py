@@ -134,20 +134,7 @@ def test_the_same_poses_are_chosen(fitted: Path, files: Path, tmp_path: Path) ->
     out, session = tmp_path / "poses.csv", open_session(fitted)
     device, place = session.settings.instrument, ",".join(map(str, session.settings.instrument.tool))
     sigmas = f"{device.sigma_position},{device.sigma_orientation}"
-    assert not command(
-        "select",
-        files / "robot.toml",
-        "-m",
-        4,
-        "--tool",
-        place,
-        "--sigma",
-        sigmas,
-        "--method",
-        session.settings.poses.method,
-        "--out",
-        out,
-    )
+    assert not command("select", files / "robot.toml", "-m", 4, "--tool", place, "--sigma", sigmas, "--out", out)
     names = load(fitted / "4-fit").joint_names
     chosen = read_poses(session.path("2-poses/poses.csv"), names)
     np.testing.assert_allclose(chosen, read_poses(out, names), atol=1e-6)

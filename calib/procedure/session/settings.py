@@ -36,6 +36,7 @@ from calib.data.poses.fit_options import LOSSES, MODELS
 from calib.errors import SessionError
 from calib.identification.friction.friction_ladder import NAMES as FRICTION
 from calib.identification.methods.registry import METHODS
+from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION
 from poses.indices import Index
 from poses.select import Method
 
@@ -97,8 +98,8 @@ class PosesSection:
     fit: Annotated[int, Whole(1), About("how many poses to choose for the fit")] = 30
     validation: Annotated[int, Whole(0), About("how many more to measure and never fit; 0: no validation")] = 15
     plan: Annotated[Flag, About("false: measured files hold other poses than those chosen here")] = True
-    index: Annotated[str, OneOf(get_args(Index))] = "O1"
-    method: Annotated[str, OneOf(get_args(Method))] = "detmax"
+    index: Annotated[str, OneOf(get_args(Index))] = DEFAULT_SELECTION.index
+    method: Annotated[str, OneOf(get_args(Method))] = DEFAULT_SELECTION.method
     constraints: Annotated[Beside, About("a TOML file beside this one; see `calib formats constraints`")] = ""
 
 
