@@ -1,11 +1,10 @@
 """Distances between the parts of an arm, the floor and obstacles, by Pinocchio and coal.
 
 Shapes come from the URDF's ``<collision>``: boxes, spheres, cylinders, capsules, and meshes by their convex hull (our
-choice: faster and on the safe side). A robot without shapes gets one capsule of a stated radius per body, from the
-body's frame to the next one (`from_chain`): coarse where links bend away from the line between frames.
+choice: faster and on the safe side). A robot without shapes is made of capsules (`calib.robot.capsules`).
 
-Not compared: parts of one body, bodies joined by a joint, the fixed base with floor and obstacles, and pairs that touch
-in at least 95 % of 200 random postures (as MoveIt's setup assistant does); the last are listed in `Collision.excluded`.
+Not compared: parts of one body, bodies joined by a joint, the fixed base with floor and obstacles, and pairs that no
+posture parts (`calib.robot.obstacles.inseparable`); the last are listed in `Collision.excluded`.
 """
 
 from __future__ import annotations
@@ -20,31 +19,13 @@ from scipy.spatial.transform import Rotation
 
 from calib.arrays import shaped
 from calib.errors import RobotError
+from calib.robot.capsules import TARGET
 from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import urdf
 from calib.robot.formats.markup import Node, parse, text
 from calib.robot.formats.urdf_tree import origin
-from calib.robot.formats.urdf_tree import read as read_tree
-from calib.robot.formats.urdf_write import write_new
+from calib.robot.obstacles import SAMPLES, Obstacle, inseparable
 from calib.transforms import pose
-
-ALWAYS = 0.95
-SAMPLES = 200
-
-
-@dataclass(frozen=True, eq=False)
-class Obstacle:
-    """A fixed thing in the arm's base frame.
-
-    Attributes:
-        kind: "box" (size: three edges), "sphere" (radius) or "cylinder" (radius, length along its z) [m].
-        placement: (4, 4), where its middle is.
-    """
-
-    name: str
-    kind: str
-    size: tuple[float, ...]
-    placement: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -65,7 +46,7 @@ class Collision:
 
     Attributes:
         pairs: names of the shapes compared, in the order of the columns of `distances`.
-        excluded: pairs left out because they touch in nearly every posture.
+        excluded: pairs left out because no posture parts them.
         missing: meshes of the URDF that were not found or not readable; their shapes are left out.
     """
 
@@ -76,6 +57,7 @@ class Collision:
     _geometry: Any
     _chain: Chain
     _columns: tuple[Column, ...]
+    _links: int
 
     def distances(self, q: np.ndarray) -> np.ndarray:
         """Return the distances (m, pairs) [m] at joint values q (m, n); negative is the depth of a penetration."""
@@ -113,10 +95,46 @@ class Collision:
                 normals[i, k, 0], points[i, k] = found.normal, (found.getNearestPoint1(), found.getNearestPoint2())
         wrench = np.concatenate(np.broadcast_arrays(normals, np.cross(points - stands[:, ends], normals)), axis=-1)
         wrench[:, :, 0] *= -1.0
+        return np.einsum("mkew,mkewv->mkv", wrench, moved[:, ends], optimize=True) @ self._rates
+
+    @property
+    def _rates(self) -> np.ndarray:
+        """(nv, n) Pinocchio's velocities per joint's."""
         rates = np.zeros((self._model.nv, self._chain.n))
         for column in self._columns:
             rates[column.speed, column.joint] += column.ratio
-        return np.einsum("mkew,mkewv->mkv", wrench, moved[:, ends], optimize=True) @ rates
+        return rates
+
+    def beam(self, q: np.ndarray, start: np.ndarray, slope: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Measure the links against lines of sight; see `calib.robot.capsules.Capsules.beam`."""
+        pin, coal = _libraries()
+        data, placed = self._model.createData(), pin.GeometryData(self._geometry)
+        tip = self._model.frames[self._model.getFrameId(self._chain.tip)].parentJoint
+        shapes = self._geometry.geometryObjects
+        links = [k for k in range(self._links) if shapes[k].parentJoint != tip]
+        distances, gradients = np.empty((len(q), len(links))), np.empty((len(q), len(links), self._chain.n))
+        asked, world = coal.DistanceRequest(True, coal.GJKInitialGuess.DefaultGuess), pin.LOCAL_WORLD_ALIGNED
+        for i, configuration in enumerate(_configurations(self._model, self._columns, q)):
+            pin.computeJointJacobians(self._model, data, configuration)
+            pin.updateGeometryPlacements(self._model, data, self._geometry, placed, configuration)
+            away = end - start[i]
+            length = float(np.linalg.norm(away))
+            turned = Rotation.align_vectors(away[None] / length, [[0.0, 0.0, 1.0]])[0].as_matrix()
+            ray, middle = coal.Capsule(1e-4, length), coal.Transform3s(turned, start[i] + away / 2)
+            for column, k in enumerate(links):
+                found = coal.DistanceResult()
+                there = coal.Transform3s(placed.oMg[k].rotation, placed.oMg[k].translation)
+                distances[i, column] = coal.distance(ray, middle, shapes[k].geometry, there, asked, found)
+                seen, point, normal = found.getNearestPoint1(), found.getNearestPoint2(), found.normal
+                share = float(np.clip((seen - start[i]) @ away / length**2, 0.0, 1.0))
+                joint = shapes[k].parentJoint
+                moved = (
+                    pin.getJointJacobian(self._model, data, joint, world) if joint else np.zeros((6, self._model.nv))
+                )
+                lever = np.cross(point - data.oMi[joint].translation, normal)
+                gradients[i, column] = (normal @ moved[:3] + lever @ moved[3:]) @ self._rates
+                gradients[i, column] -= (1.0 - share) * normal @ slope[i]
+        return distances, gradients
 
     def free(self, q: np.ndarray, margin: float = 0.0) -> np.ndarray:
         """Tell (m,) for which joint values q (m, n) every distance is larger than `margin` [m]."""
@@ -130,6 +148,10 @@ def from_urdf(
     floor: float | None = None,
     obstacles: Sequence[Obstacle] = (),
     mesh_folders: Sequence[str | Path] = (),
+    *,
+    targets: np.ndarray | Sequence[Sequence[float]] = (),
+    margin: float = 0.0,
+    within: bool = True,
     seed: int = 0,
 ) -> Collision:
     """Build the comparison from a URDF's collision shapes; joints off the chain stay at zero.
@@ -140,7 +162,10 @@ def from_urdf(
         floor: height of a floor in the base frame [m]; None for no floor.
         obstacles: in the base frame.
         mesh_folders: where ``package://name/...`` is looked for, besides the URDF's folder and the ones above it.
-        seed: of the random postures.
+        targets: (T, 3) of what is measured, in the tip's frame [m]: each a thin capsule from the tip.
+        margin: the least distance that will be asked for [m]; pairs that never have it are left out.
+        within: False: parts of the arm are not compared with each other.
+        seed: of the random postures that show which pairs those are.
 
     Raises:
         RobotError: where the URDF has no usable collision shape.
@@ -160,31 +185,19 @@ def from_urdf(
                 _attach(model, geometry, link.attributes["name"], name, origin(node, place), shape)
     if geometry.ngeoms == 0:
         lost = f" ({len(missing)} meshes were not found, e.g. {missing[0]})" if missing else ""
-        raise RobotError(f"{path}: no usable <collision> shape{lost}; give mesh_folders, or use capsules (from_chain)")
-    return _finish(model, geometry, chain, floor, obstacles, missing, seed)
+        raise RobotError(f"{path}: no usable <collision> shape{lost}; give mesh_folders, or use capsules")
+    _add_targets(model, geometry, chain, targets)
+    return _finish(model, geometry, chain, floor, obstacles, missing, margin, within, seed)
 
 
-def from_chain(
-    chain: Chain,
-    radius: float,
-    floor: float | None = None,
-    obstacles: Sequence[Obstacle] = (),
-    seed: int = 0,
-) -> Collision:
-    """Build the comparison from capsules of a radius [m] along the lines from each joint frame to the next.
-
-    Bodies whose frame and the next one coincide (in a spherical wrist) have no capsule.
-    """
-    pin, coal = _libraries()
-    source = write_new(chain)
-    tree, plain = read_tree(source, chain.name), urdf.parse(source, chain.name, chain.base, chain.tip)
-    model, geometry = pin.buildModelFromXML(source), pin.GeometryModel()
-    for joint in tree.joints.values():
-        end = joint.origin[:3, 3]
-        if (length := float(np.linalg.norm(end))) > 1e-6:
-            along = Rotation.align_vectors(end[None] / length, [[0.0, 0.0, 1.0]])[0]
-            _attach(model, geometry, joint.parent, joint.parent, pose(along, end / 2), coal.Capsule(radius, length))
-    return _finish(model, geometry, plain, floor, obstacles, [], seed)
+def _add_targets(model: Any, geometry: Any, chain: Chain, targets: np.ndarray | Sequence[Sequence[float]]) -> None:
+    """Hang what is measured on the tip's frame."""
+    _, coal = _libraries()
+    for number, place in enumerate(np.asarray(targets, dtype=float).reshape(-1, 3), 1):
+        if (length := float(np.linalg.norm(place))) > 1e-6:
+            along = Rotation.align_vectors(place[None] / length, [[0.0, 0.0, 1.0]])[0]
+            name = "target" if len(targets) == 1 else f"target {number}"
+            _attach(model, geometry, chain.tip, name, pose(along, place / 2), coal.Capsule(TARGET, length))
 
 
 def _finish(
@@ -194,9 +207,11 @@ def _finish(
     floor: float | None,
     obstacles: Sequence[Obstacle],
     missing: list[str],
+    margin: float,
+    within: bool,
     seed: int,
 ) -> Collision:
-    """Add floor and obstacles, choose the pairs, and drop those that always touch."""
+    """Add floor and obstacles, choose the pairs, and drop those that no posture parts."""
     pin, _ = _libraries()
     own = geometry.ngeoms
     _surround(model, geometry, chain.base, floor, obstacles)
@@ -204,17 +219,18 @@ def _finish(
     for one in range(own):
         for two in range(one + 1, len(carriers)):
             i, j = sorted((carriers[one], carriers[two]))
-            if i != j and (two >= own or model.parents[j] != i):
+            if i != j and (two >= own or (within and model.parents[j] != i)):
                 geometry.addCollisionPair(pin.CollisionPair(one, two))
     columns = _columns(model, chain)
-    kept = Collision(_names(geometry), (), tuple(missing), model, geometry, chain, columns)
+    kept = Collision(_names(geometry), (), tuple(missing), model, geometry, chain, columns, own)
     if not kept.pairs:
         return kept
-    touching = (kept.distances(random_joints(chain, SAMPLES, seed)) <= 0.0).mean(axis=0) >= ALWAYS
-    excluded = tuple(pair for pair, touches in zip(kept.pairs, touching, strict=True) if touches)
-    for index in np.flatnonzero(touching)[::-1]:
+    fixed = np.array([pair.second >= own for pair in geometry.collisionPairs])
+    gone = inseparable(kept.distances(random_joints(chain, SAMPLES, seed)), fixed, margin)
+    excluded = tuple(pair for pair, out in zip(kept.pairs, gone, strict=True) if out)
+    for index in np.flatnonzero(gone)[::-1]:
         geometry.removeCollisionPair(geometry.collisionPairs[int(index)])
-    return Collision(_names(geometry), excluded, tuple(missing), model, geometry, chain, columns)
+    return Collision(_names(geometry), excluded, tuple(missing), model, geometry, chain, columns, own)
 
 
 def _names(geometry: Any) -> tuple[tuple[str, str], ...]:
@@ -246,15 +262,8 @@ def _surround(model: Any, geometry: Any, base: str, floor: float | None, obstacl
 
 def _solid(obstacle: Obstacle) -> Any:
     _, coal = _libraries()
-    makers = {"box": (coal.Box, 3), "sphere": (coal.Sphere, 1), "cylinder": (coal.Cylinder, 2)}
-    if obstacle.kind not in makers:
-        raise RobotError(f"obstacle '{obstacle.name}': kind '{obstacle.kind}' is none of {', '.join(makers)}")
-    maker, count = makers[obstacle.kind]
-    if len(obstacle.size) != count or min(obstacle.size) <= 0:
-        raise RobotError(
-            f"obstacle '{obstacle.name}': a {obstacle.kind} has {count} positive sizes, not {obstacle.size}"
-        )
-    return maker(*map(float, obstacle.size))
+    makers = {"box": coal.Box, "sphere": coal.Sphere, "cylinder": coal.Cylinder}
+    return makers[obstacle.kind](*map(float, obstacle.size))
 
 
 def _columns(model: Any, chain: Chain) -> tuple[Column, ...]:

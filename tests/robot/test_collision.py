@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from arms import motley
 from differences import check
 from robot_oracle import axis, joint, robot
+from scipy.spatial.transform import Rotation
 
 from calib.errors import RobotError
-from calib.robot import collision
+from calib.robot import capsules, collision
 from calib.robot.chain import random_joints
-from calib.robot.collision import Obstacle
+from calib.robot.kinematics import joint_jacobian, sweep
 from calib.robot.load import load
+from calib.robot.obstacles import Obstacle
 from calib.transforms import pose
 
 
@@ -64,7 +67,7 @@ def test_gradients_follow_the_witness_points(arm, balls):
     if arm == "balls":  # a continuous joint, a joint about -z
         found, q = collision.from_urdf(balls, floor=0.1, obstacles=[box]), random_joints(load("ur5"), 6, 1)[:, :3]
     else:
-        found, q = collision.from_chain(load(arm), 0.05, -0.1, [box]), random_joints(load(arm), 6, 1)
+        found, q = capsules.from_chain(load(arm), 0.05, -0.1, [box]), random_joints(load(arm), 6, 1)
     for pose_ in q:
         check(lambda x: found.distances(x[None])[0], lambda x: found.gradients(x[None])[0], pose_)
 
@@ -115,13 +118,92 @@ def test_pairs_that_always_touch_are_left_out_and_listed(tmp_path):
 def test_capsules_along_a_chain():
     chain = load("ur10")
     wall = Obstacle("wall", "box", (0.1, 4.0, 4.0), pose(position=[-1.4, 0, 0]))
-    found = collision.from_chain(chain, 0.05, floor=-0.1, obstacles=[wall])
+    found = capsules.from_chain(chain, 0.05, floor=-0.1, obstacles=[wall])
     distances = dict(zip(found.pairs, found.distances(np.zeros((1, 6)))[0], strict=True))
     # at q = 0 the UR10 lies along -x: the forearm ends at x = -0.612 - 0.5723
     assert distances["elbow_joint_link", "wall"] == pytest.approx(1.35 - 1.1843 - 0.05, abs=1e-6)
     assert distances["shoulder_lift_joint_link", "floor"] == pytest.approx(0.1 + 0.1273 - 0.05, abs=1e-6)
     free = found.free(random_joints(chain, 200), 0.01)
     assert 0.05 < free.mean() < 0.95
+
+
+@pytest.mark.parametrize("arm", ["lwr4plus", "ur5", "rv2sq", "motley"])
+def test_capsules_measure_as_coal_does(arm):
+    """Capsule by capsule, over random postures: against each other, floor, box, sphere and cylinder."""
+    import coal
+
+    chain = motley() if arm == "motley" else load(arm)
+    things = [
+        Obstacle("box", "box", (0.3, 0.4, 0.5), pose(np.eye(3)[[1, 2, 0]], [0.5, 0.1, 0.4])),
+        Obstacle("ball", "sphere", (0.2,), pose(position=[-0.4, 0.3, 0.6])),
+        Obstacle("rod", "cylinder", (0.1, 0.8), pose(np.eye(3)[[2, 0, 1]], [0.0, -0.5, 0.5])),
+    ]
+    found = capsules.from_chain(chain, 0.04, -0.2, things, targets=[(0.05, 0, 0.05)])
+    q = random_joints(chain, 20, 3)
+    distances, lines = found.distances(q), found._lines(q)
+    solids = [coal.Box(0.3, 0.4, 0.5), coal.Sphere(0.2), coal.Cylinder(0.1, 0.8)]
+    assert len(found.world) > 6 and (arm == "motley" or len(found.own) > 1)
+
+    def capsule(i: int, k: int):
+        start, end = lines.start[i, k], lines.end[i, k]
+        turned = Rotation.align_vectors((end - start)[None], [[0.0, 0.0, 1.0]])[0].as_matrix()
+        solid = coal.Capsule(found.radii[k], float(np.linalg.norm(end - start)))
+        return solid, coal.Transform3s(turned, (start + end) / 2)
+
+    for i in range(len(q)):
+        for (one, two), distance in zip(found.own, distances[i], strict=False):
+            oracle = coal.distance(*capsule(i, one), *capsule(i, two), coal.DistanceRequest(), coal.DistanceResult())
+            assert distance == pytest.approx(oracle, abs=1e-6)
+        for (one, thing), distance in zip(found.world, distances[i, len(found.own) :], strict=True):
+            if thing < 0:
+                low = min(lines.start[i, one, 2], lines.end[i, one, 2])
+                assert distance == pytest.approx(low + 0.2 - found.radii[one])
+                continue
+            placed = coal.Transform3s(things[thing].placement[:3, :3], things[thing].placement[:3, 3])
+            asked, got = coal.DistanceRequest(), coal.DistanceResult()
+            oracle = coal.distance(*capsule(i, one), solids[thing], placed, asked, got)
+            if oracle > 0:
+                assert distance == pytest.approx(oracle, abs=1e-5)
+            else:
+                assert distance < 1e-6
+
+
+@pytest.mark.parametrize("arm", ["balls", "lwr4plus", "ur5"])
+def test_lines_of_sight(arm, balls):
+    """The slope of what a line of sight keeps from the links, and a link that stands in the way."""
+    chain = load(str(balls)) if arm == "balls" else load(arm)
+    found = collision.from_urdf(balls) if arm == "balls" else capsules.from_chain(chain)
+    there = np.array([2.0, 1.0, 0.8])
+
+    def beam(q: np.ndarray):
+        walked = sweep(chain, q[None])
+        return found.beam(q[None], walked.position.T, joint_jacobian(chain, walked, walked.position)[:, :3], there)
+
+    for q in random_joints(chain, 4, 2) / 2:
+        check(lambda x: beam(x)[0][0], lambda x: beam(x)[1][0], q)
+    if arm == "balls":  # stretched along x; seen from before the base, the first links stand in the way
+        there = np.array([-2.0, 0.0, 0.5])
+        assert beam(np.zeros(3))[0][0] == pytest.approx([-0.1, -0.1], abs=1e-3)
+        there = np.array([3.0, 2.0, 0.5])
+        assert (beam(np.zeros(3))[0][0] > 0.3).all()
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.01, 0.02, 0.05])
+@pytest.mark.parametrize("radius", [None, 0.03, 0.04, 0.05])
+@pytest.mark.parametrize("arm", ["ur5", "ur10", "panda", "lwr4plus"])
+def test_no_margin_makes_an_arm_infeasible_by_construction(arm, radius, margin):
+    """A UR5's forearm and second wrist link are 0.0947 m apart in every posture, less two radii."""
+    chain = load(arm)
+    found = capsules.from_chain(chain, radius, margin=margin)
+    assert found.free(random_joints(chain, 100, 1), margin).mean() > 0.3
+
+
+def test_an_obstacle_that_is_nearly_always_hit_is_an_obstacle():
+    chain = load("ur5")
+    block = Obstacle("block", "box", (2.0, 2.0, 1.9), pose(position=[0, 0, 1.0]))
+    found = capsules.from_chain(chain, obstacles=[block])
+    assert not found.free(random_joints(chain, 100, 1)).any()
+    assert "block" not in {name for pair in found.excluded for name in pair}
 
 
 def test_continuous_and_mimic_joints_move_the_shapes(tmp_path):

@@ -54,6 +54,7 @@ from calib.errors import RobotError, UsageError
 from calib.geometry.installation import Installation
 from calib.geometry.observability import Observation, Target, TargetJacobian
 from calib.robot.chain import sampling_limits
+from calib.robot.obstacles import Obstacle
 from calib.robot.tables import placement
 from poses import constraints
 from poses.space import PoseConstraint, SearchSpace
@@ -280,18 +281,18 @@ def _instrument(stated: ConstraintsFile, cell: Installation, where: str) -> list
 def _collision(
     stated: ConstraintsFile, cell: Installation, source: Path | None, where: str
 ) -> tuple[Any, float, tuple[str, ...]]:
-    from calib.robot import collision
+    from calib.robot import capsules, collision
 
     table, chain, notes = stated.collision or CollisionTable(), cell.chain, ()
     obstacles = [
-        collision.Obstacle(one.name, one.kind, one.size, placement(one.stated, f"{where}: [[obstacle]] number {k}"))
+        Obstacle(one.name, one.kind, one.size, placement(one.stated, f"{where}: [[obstacle]] number {k}"))
         for k, one in enumerate(stated.obstacle, 1)
     ]
     if source is not None and source.suffix == ".urdf" and "<collision" in source.read_text(encoding="utf-8"):
-        model = collision.from_urdf(source, chain.base, chain.tip, table.floor, obstacles)
+        model = collision.from_urdf(source, chain.base, chain.tip, table.floor, obstacles, margin=table.margin)
         if model.missing:
             notes = (f"collision meshes not found, left out: {', '.join(model.missing[:3])}",)
     else:
-        model = collision.from_chain(chain, table.radius, table.floor, obstacles)
+        model = capsules.from_chain(chain, table.radius, table.floor, obstacles, margin=table.margin)
         notes = (f"no collision shapes in the robot's file: capsules of radius {table.radius:g} m stand for its links",)
     return model, table.margin, notes

@@ -1,0 +1,268 @@
+"""Distances between the links of an arm as capsules, floor and obstacles: batches of poses, no loop over them.
+
+Each body is a capsule along the line from its joint's frame to the next one, the last one's to the tip, and each target
+that it carries a thin one from the tip to the target: coarse where links bend away from these lines. Distances between
+capsules are those of their lines (Ericson 2005, Real-Time Collision Detection, 5.1.9) less the radii.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from calib.arrays import shaped
+from calib.robot.chain import Chain, random_joints, stretched_length
+from calib.robot.kinematics import Sweep, sweep
+from calib.robot.obstacles import SAMPLES, Obstacle, inseparable, nearest_on_lines, signed_distance
+
+LEAST, SHARE = 0.05, 0.05
+"""Radius of a capsule where none is stated: this share of the stretched arm, and no less than [m]. Our choice."""
+TARGET = 0.02
+"""Radius of a target and its stem [m]: a reflector of 1.5 inch is 0.019. Our choice."""
+
+
+def usual_radius(chain: Chain) -> float:
+    """Return the radius [m] of capsules that stand for the links of an arm where none is stated."""
+    return max(LEAST, round(SHARE * stretched_length(chain), 3))
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """The middle lines of the capsules in m poses.
+
+    Attributes:
+        start, end: (m, C, 3) [m].
+        axes, places: (m, K, 3) of the K moving elements: direction, and where they stand.
+    """
+
+    start: np.ndarray
+    end: np.ndarray
+    axes: np.ndarray
+    places: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Capsules:
+    """An arm of capsules and what it is held against; the same methods as `calib.robot.collision.Collision`.
+
+    Attributes:
+        chain: the arm.
+        names: (C,) of the capsules.
+        bodies: (C,) how many moving elements stand before each: 0 is the fixed base.
+        radii: (C,) [m].
+        targets: (T, 3) in the tip's frame [m]; their capsules are the last T.
+        own: (P, 2) which capsules are compared with each other.
+        world: (W, 2) which capsules with which obstacle; obstacle -1 is the floor.
+        floor: its height [m]; None without one.
+        obstacles: in the base frame.
+        excluded: pairs left out because no posture parts them.
+    """
+
+    chain: Chain
+    names: tuple[str, ...]
+    bodies: np.ndarray
+    radii: np.ndarray
+    targets: np.ndarray
+    own: np.ndarray
+    world: np.ndarray
+    floor: float | None
+    obstacles: tuple[Obstacle, ...]
+    excluded: tuple[tuple[str, str], ...] = ()
+    missing: tuple[str, ...] = ()
+
+    @cached_property
+    def pairs(self) -> tuple[tuple[str, str], ...]:
+        """Names of what is compared, in the order of the columns of `distances`."""
+        things = (*(one.name for one in self.obstacles), "floor")
+        own = [(self.names[i], self.names[j]) for i, j in self.own]
+        return (*own, *((self.names[i], things[k]) for i, k in self.world))
+
+    def distances(self, q: np.ndarray) -> np.ndarray:
+        """Return the distances (m, pairs) [m] at joint values q (m, n); negative is the depth of a penetration."""
+        return self._measured(self._lines(q))[0]
+
+    def gradients(self, q: np.ndarray) -> np.ndarray:
+        """Return the derivatives (m, pairs, n) of `distances`: normal times the velocities of the nearest points."""
+        lines = self._lines(q)
+        _, normal, one, two = self._measured(lines)
+        count = len(self.own)
+        slope = self._closing(lines, normal, two, self._second)
+        slope[:, :count] -= self._closing(lines, normal[:, :count], one[:, :count], self.bodies[self.own[:, 0]])
+        return slope @ self._rates
+
+    def free(self, q: np.ndarray, margin: float = 0.0) -> np.ndarray:
+        """Tell (m,) for which joint values q (m, n) every distance is larger than `margin` [m]."""
+        return np.all(self.distances(q) > margin, axis=1)
+
+    def beam(self, q: np.ndarray, start: np.ndarray, slope: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Measure the links against lines of sight from a target that the last body carries.
+
+        Args:
+            q: (m, n).
+            start: (m, 3) where the target is [m], and slope: (m, 3, n) its velocity per joint's.
+            end: (3,) where the instrument stands [m], in the base frame.
+
+        Returns:
+            Distances (m, L) [m] of the L capsules of all other bodies, and their derivatives (m, L, n).
+        """
+        lines = self._lines(q)
+        others = np.flatnonzero(self.bodies < self.bodies.max())
+        shape = (len(q), len(others), 3)
+        first, last = np.broadcast_to(start[:, None], shape), np.broadcast_to(end, shape)
+        along, place = _nearest(first, last, lines.start[:, others], lines.end[:, others])
+        seen = first + along[..., None] * (last - first)
+        link = lines.start[:, others] + place[..., None] * (lines.end - lines.start)[:, others]
+        distance, normal = _apart(seen, link)
+        gradient = self._closing(lines, normal, link, self.bodies[others]) @ self._rates
+        gradient = gradient - (1.0 - along)[..., None] * (normal @ slope)
+        return distance - self.radii[others], gradient
+
+    def _lines(self, q: np.ndarray) -> Lines:
+        q = shaped(q, (None, self.chain.n), f"joint values of '{self.chain.name}'")
+        walked = sweep(self.chain, q)
+        return _lines_of(self.chain, walked, q, self.targets)
+
+    def _measured(self, lines: Lines) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return distances (m, P + W), normals (m, P + W, 3) towards the second body, and the nearest points.
+
+        For the W pairs with the world the second body is the arm's.
+        """
+        m, count = len(lines.start), len(self.own) + len(self.world)
+        normal, one, two = (np.empty((m, count, 3)) for _ in range(3))
+        distance = np.empty((m, count))
+        i, j = self.own.T
+        s, t = _nearest(lines.start[:, i], lines.end[:, i], lines.start[:, j], lines.end[:, j])
+        own = slice(0, len(i))
+        one[:, own] = lines.start[:, i] + s[..., None] * (lines.end - lines.start)[:, i]
+        two[:, own] = lines.start[:, j] + t[..., None] * (lines.end - lines.start)[:, j]
+        distance[:, own], normal[:, own] = _apart(one[:, own], two[:, own])
+        distance[:, own] -= self.radii[i] + self.radii[j]
+        for thing in np.unique(self.world[:, 1]):
+            at = len(i) + np.flatnonzero(self.world[:, 1] == thing)
+            body = self.world[at - len(i), 0]
+            start, end = lines.start[:, body], lines.end[:, body]
+            if thing < 0:
+                two[:, at] = np.where((start[..., 2] < end[..., 2])[..., None], start, end)
+                distance[:, at], normal[:, at] = two[:, at, 2] - (self.floor or 0.0), (0.0, 0.0, 1.0)
+            else:
+                place = nearest_on_lines(self.obstacles[thing], start, end)
+                two[:, at] = start + place[..., None] * (end - start)
+                distance[:, at], normal[:, at] = signed_distance(self.obstacles[thing], two[:, at])
+            distance[:, at] -= self.radii[body]
+        return distance, normal, one, two
+
+    @cached_property
+    def _second(self) -> np.ndarray:
+        return np.concatenate([self.bodies[self.own[:, 1]], self.bodies[self.world[:, 0]]])
+
+    @cached_property
+    def _moving(self) -> tuple[np.ndarray, np.ndarray]:
+        """Whether each moving element turns, and the joint with its ratio as a matrix (K, n)."""
+        moving = [element for element in self.chain.elements if element.joint is not None]
+        rates = np.zeros((len(moving), self.chain.n))
+        for k, element in enumerate(moving):
+            rates[k, element.joint] = element.ratio
+        return np.array([element.axis[0] == "r" for element in moving]), rates
+
+    @property
+    def _rates(self) -> np.ndarray:
+        return self._moving[1]
+
+    def _closing(self, lines: Lines, normal: np.ndarray, point: np.ndarray, bodies: np.ndarray) -> np.ndarray:
+        """Return normal · velocity (m, P, K) of points (m, P, 3) on bodies (P,), per unit of each moving element."""
+        z, o = lines.axes.transpose(0, 2, 1), np.cross(lines.axes, lines.places).transpose(0, 2, 1)
+        turned = np.cross(point, normal) @ z - normal @ o  # u · (z × (p - o))
+        speed = np.where(self._moving[0], turned, normal @ z)
+        return speed * (np.arange(z.shape[2]) < bodies[:, None])
+
+
+def from_chain(
+    chain: Chain,
+    radius: float | None = None,
+    floor: float | None = None,
+    obstacles: Sequence[Obstacle] = (),
+    *,
+    targets: np.ndarray | Sequence[Sequence[float]] = (),
+    margin: float = 0.0,
+    within: bool = True,
+    seed: int = 0,
+) -> Capsules:
+    """Build the comparison from capsules along the lines from each joint frame to the next.
+
+    Bodies whose frame and the next one coincide (in a spherical wrist) have no capsule.
+
+    Args:
+        chain: the arm.
+        radius: of the capsules [m]; None: `usual_radius`.
+        floor: height of a floor in the base frame [m]; None for no floor.
+        obstacles: in the base frame.
+        targets: (T, 3) of what is measured, in the tip's frame [m].
+        margin: the least distance that will be asked for [m]; pairs that never have it are left out.
+        within: False: parts of the arm are not compared with each other.
+        seed: of the random postures that show which pairs those are.
+    """
+    size = usual_radius(chain) if radius is None else radius
+    places = np.asarray(targets, dtype=float).reshape(-1, 3)
+    places = places[np.linalg.norm(places, axis=1) > 1e-6]
+    walked = sweep(chain, np.zeros((1, chain.n)))
+    lines = _lines_of(chain, walked, np.zeros((1, chain.n)), places)
+    length = np.linalg.norm(lines.end - lines.start, axis=2)[0]
+    moving = [element for element in chain.elements if element.joint is not None]
+    first = {element.joint: k for k, element in reversed(list(enumerate(moving)))}
+    named = {
+        k: chain.links[j] if chain.links else f"{chain.joint_names[j]}_link" for j, k in first.items() if j is not None
+    }
+    names = [chain.base, *(named.get(k, f"{element.name}_link") for k, element in enumerate(moving))]
+    names += ["target"] if len(places) == 1 else [f"target {k + 1}" for k in range(len(places))]
+    bodies = np.array([*range(len(moving) + 1), *[len(moving)] * len(places)])
+    radii = np.array([*[size] * (len(moving) + 1), *[TARGET] * len(places)])
+    there = np.flatnonzero(length > 1e-6)
+    own = [(i, j) for i in there for j in there if bodies[j] > bodies[i] + 1 and within]
+    things = [*range(len(obstacles)), *([] if floor is None else [-1])]
+    world = [(i, k) for k in things for i in there if bodies[i]]
+    found = Capsules(
+        chain, tuple(names), bodies, radii, places, np.array(own, dtype=int).reshape(-1, 2),
+        np.array(world, dtype=int).reshape(-1, 2), floor, tuple(obstacles),
+    )  # fmt: skip
+    if not found.pairs:
+        return found
+    fixed = np.arange(len(own) + len(world)) >= len(own)
+    gone = inseparable(found.distances(random_joints(chain, SAMPLES, seed)), fixed, margin, size)
+    excluded = tuple(pair for pair, out in zip(found.pairs, gone, strict=True) if out)
+    return replace(found, own=found.own[~gone[: len(own)]], world=found.world[~gone[len(own) :]], excluded=excluded)
+
+
+def _lines_of(chain: Chain, walked: Sweep, q: np.ndarray, targets: np.ndarray) -> Lines:
+    """Return the lines of base, moving bodies and targets."""
+    moving = [k for k, element in enumerate(chain.elements) if element.joint is not None]
+    axes, places = (part[moving].transpose(2, 0, 1) for part in (walked.directions, walked.origins))
+    begins = places.copy()
+    for k, index in enumerate(moving):
+        element = chain.elements[index]
+        if element.axis[0] == "t":
+            begins[:, k] += axes[:, k] * (element.value + element.ratio * q[:, element.joint])[:, None]
+    m, tip = len(q), walked.position.T[:, None]
+    seen = tip + np.einsum("tc,cdm->mtd", targets, walked.rotation)
+    start = np.concatenate([np.zeros((m, 1, 3)), begins, np.repeat(tip, len(targets), axis=1)], axis=1)
+    return Lines(start, np.concatenate([places, tip, seen], axis=1), axes, places)
+
+
+def _nearest(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return where (...), from 0 to 1, the lines a to b and c to d (..., 3) are nearest to each other."""
+    u, v, w = b - a, d - c, a - c
+    uu, vv, uv = (np.maximum((x * y).sum(-1), least) for x, y, least in ((u, u, 1e-18), (v, v, 1e-18), (u, v, -np.inf)))
+    uw, vw = (u * w).sum(-1), (v * w).sum(-1)
+    across = uu * vv - uv**2
+    s = np.where(across > 1e-12 * uu * vv, np.clip((uv * vw - vv * uw) / np.maximum(across, 1e-30), 0, 1), 0.5)
+    t = np.clip((uv * s + vw) / vv, 0, 1)
+    return np.clip((uv * t - uw) / uu, 0, 1), t
+
+
+def _apart(one: np.ndarray, two: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distances (...) of points (..., 3), and the unit vectors from the first to the second."""
+    away = two - one
+    distance = np.linalg.norm(away, axis=-1)
+    return distance, away / np.maximum(distance, 1e-12)[..., None]

@@ -1,0 +1,106 @@
+"""Fixed things around an arm, how far points and lines are from them, and which pairs no posture can part.
+
+Distances are signed: negative is the depth inside. Those of convex bodies are convex functions of the point, so that
+the nearest point of a line is found by golden sections, inside as outside.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.errors import RobotError
+
+ALWAYS = 0.95
+SAMPLES = 200
+SIZES = {"box": 3, "sphere": 1, "cylinder": 2}
+_GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
+_STEPS = 44  # of the golden section: 0.618^44 is 6e-10 of the line
+
+
+@dataclass(frozen=True, eq=False)
+class Obstacle:
+    """A fixed thing in the arm's base frame.
+
+    Attributes:
+        kind: "box" (size: three edges), "sphere" (radius) or "cylinder" (radius, length along its z) [m].
+        placement: (4, 4), where its middle is.
+    """
+
+    name: str
+    kind: str
+    size: tuple[float, ...]
+    placement: np.ndarray
+
+    def __post_init__(self) -> None:
+        if self.kind not in SIZES:
+            raise RobotError(f"obstacle '{self.name}': kind '{self.kind}' is none of {', '.join(SIZES)}")
+        count = SIZES[self.kind]
+        if len(self.size) != count or min(self.size) <= 0:
+            raise RobotError(
+                f"obstacle '{self.name}': a {self.kind} has {count} positive sizes, not {tuple(self.size)}"
+            )
+
+
+def signed_distance(obstacle: Obstacle, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distances (...) [m] of points (..., 3) from an obstacle, and the outward normals (..., 3)."""
+    rotation = obstacle.placement[:3, :3]
+    local = (points - obstacle.placement[:3, 3]) @ rotation
+    if obstacle.kind == "sphere":
+        length = np.linalg.norm(local, axis=-1, keepdims=True)
+        return length[..., 0] - obstacle.size[0], (local / np.maximum(length, 1e-12)) @ rotation.T
+    if obstacle.kind == "box":
+        beyond, slopes = np.abs(local) - np.array(obstacle.size) / 2, np.sign(local)
+    else:
+        across = np.linalg.norm(local[..., :2], axis=-1)
+        beyond = np.stack([across - obstacle.size[0], np.abs(local[..., 2]) - obstacle.size[1] / 2], axis=-1)
+        slopes = np.concatenate(
+            [local[..., :2] / np.maximum(across, 1e-12)[..., None], np.sign(local[..., 2:])], axis=-1
+        )
+    out = np.maximum(beyond, 0.0)
+    length, deepest = np.linalg.norm(out, axis=-1), beyond.max(axis=-1)
+    inside = beyond == deepest[..., None]
+    share = np.where((deepest > 0.0)[..., None], out / np.maximum(length, 1e-12)[..., None], inside)
+    if obstacle.kind == "cylinder":
+        share = np.repeat(share, (2, 1), axis=-1)
+    return np.where(deepest > 0.0, length, deepest), (share * slopes) @ rotation.T
+
+
+def nearest_on_lines(obstacle: Obstacle, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return where (...), from 0 to 1, the lines from start to end (..., 3) are nearest to an obstacle."""
+    low, high = np.zeros(start.shape[:-1]), np.ones(start.shape[:-1])
+    along = end - start
+
+    def far(place: np.ndarray) -> np.ndarray:
+        return signed_distance(obstacle, start + place[..., None] * along)[0]
+
+    one, two = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+    far_one, far_two = far(one), far(two)
+    for _ in range(_STEPS):
+        left = far_one < far_two
+        low, high = np.where(left, low, one), np.where(left, two, high)
+        fresh = np.where(left, high - _GOLDEN * (high - low), low + _GOLDEN * (high - low))
+        value = far(fresh)
+        one, two = np.where(left, fresh, two), np.where(left, one, fresh)
+        far_one, far_two = np.where(left, value, far_two), np.where(left, far_one, value)
+    return (low + high) / 2
+
+
+def inseparable(distances: np.ndarray, fixed: np.ndarray, margin: float, slack: float = 0.0) -> np.ndarray:
+    """Tell (pairs,) which pairs of shapes no posture parts, by their distances (N, pairs) [m] in random postures.
+
+    Parts of an arm: those nearer than `margin` in at least 95 % of the postures (MoveIt's setup assistant: that touch),
+    or never further apart than margin + slack: neighbours, whose shapes overlap by construction. Against what stands
+    fixed in the world: only pairs that are nearer, at a distance that no joint changes; an obstacle that the arm nearly
+    always hits is an obstacle.
+
+    Args:
+        distances: signed.
+        fixed: (pairs,) whether the pair is one with the world.
+        margin: the least distance that will be asked for [m].
+        slack: what shapes as coarse as these cannot tell [m].
+    """
+    near = (distances <= margin).mean(axis=0) >= ALWAYS
+    highest = distances.max(axis=0)
+    return np.where(fixed, (highest <= margin) & (np.ptp(distances, axis=0) < 1e-6), near | (highest <= margin + slack))
