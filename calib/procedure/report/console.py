@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator
 
 from rich import box
 from rich.console import RenderableType
-from rich.markup import escape
 from rich.table import Table as RichTable
 from rich.text import Text as RichText
 
@@ -29,18 +28,18 @@ def _rich_table(table: Table) -> RichTable:
     """Return a table of `page` as rich's."""
     title = table.title[:1].lower() + table.title[1:]
     result = RichTable(
-        title=escape(title), title_justify="left", caption=escape(table.note) or None, caption_justify="left",
+        title=RichText(title), title_justify="left", caption=RichText(table.note) if table.note else None, caption_justify="left",
         box=box.HEAVY_HEAD,
     )  # fmt: skip
     numbers = set(table.numbers)
     for k, name in enumerate(table.header):
-        result.add_column(escape(name), justify="right" if k in numbers else "left")
+        result.add_column(RichText(name), justify="right" if k in numbers else "left")
     for number, row in enumerate(table.rows):
         if len(row) == 1 and len(table.header) > 1:
             result.add_section()
-            result.add_row(f"[bold]{escape(row[0])}[/]")
+            result.add_row(RichText(row[0], style="bold"))
         else:
-            result.add_row(*map(escape, row), style="bold" if number in table.strong else "")
+            result.add_row(*map(RichText, row), style="bold" if number in table.strong else "")
     return result
 
 

@@ -39,10 +39,10 @@ class Reader(HTMLParser):
             self.found[-1] += data
 
 
-def printed(*blocks, width: int = 200) -> str:
+def printed(*blocks, width: int = 200, markup: bool = False) -> str:
     out = Console(file=StringIO(), width=width, highlight=False)
     for line in console.rendered(blocks):
-        out.print(line, soft_wrap=True)
+        out.print(line, soft_wrap=True, markup=markup)
     assert isinstance(out.file, StringIO)
     return out.file.getvalue()
 
@@ -67,6 +67,7 @@ def test_a_table_has_the_same_cells_on_the_console_and_on_the_page():
     said = [[cell.strip() for cell in re.split("[┃│]", line) if cell.strip()] for line in printed(TABLE).splitlines()]
     on_console = [row for row in said if row in on_page]
     assert on_page == on_console and [HOSTILE] in on_page
+    assert printed(TABLE) == printed(TABLE, markup=True), "a text in brackets is a text, however it is printed"
 
 
 def test_every_text_is_escaped_for_both():

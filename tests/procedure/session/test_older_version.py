@@ -1,0 +1,93 @@
+"""Folders that an older version wrote (``older/``, of commit a217159) open, go on, and give what they gave then."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from both_ways import same
+from sessions import go_on
+from without_figures import run
+
+from calib.procedure.session import steps
+from calib.procedure.session.folder import Session, locked, open_session, verdicts
+
+OLDER = Path(__file__).parent / "older"
+EXPECTED = OLDER / "expected"
+
+
+@pytest.fixture
+def cell(tmp_path: Path) -> Path:
+    shutil.copytree(OLDER / "cell", tmp_path / "cell")
+    return tmp_path / "cell"
+
+
+def _standing(cell: Path) -> dict[str, str]:
+    return {state.step.name: state.kind for state in steps.states(open_session(cell))}
+
+
+def test_an_older_session_stands_where_it_stood_and_goes_on(cell: Path) -> None:
+    standing = _standing(cell)
+    assert set(list(standing.values())[:-2]) == {steps.DONE}, "nothing is made again"
+    assert list(standing)[-2:] == ["export", "certificate"]
+    before = (cell / "8-dynamics/metrics.json").read_bytes()
+    session = open_session(cell)
+    assert go_on(session) is None
+    assert set(_standing(cell).values()) == {steps.DONE}
+    assert (cell / "8-dynamics/metrics.json").read_bytes() == before
+    assert "0.038 mm" in (cell / "certificate.html").read_text().replace("\N{NO-BREAK SPACE}", " ")
+    assert {half: level for half, (level, _) in verdicts(session).items()} == {"geometry": "pass", "dynamics": "pass"}
+    joints = [re.findall(r"(?m)^ *<origin.*", (place / "robot.urdf").read_text()) for place in (EXPECTED, cell / "9-export")]
+    assert len(joints[0]) == 3 and joints[0] == joints[1]
+
+
+def _redone(cell: Path, name: str) -> Session:
+    """Make one step again, and none after it."""
+    session = open_session(cell)
+    step = steps.find(session, name)
+    with locked(session, lambda words: None):
+        step.make(session, lambda words: None)
+    return session
+
+
+def test_validating_an_older_fit_again_gives_its_verdict_and_figures(cell: Path) -> None:
+    old = json.loads((cell / "5-validation/metrics.json").read_text())
+    _redone(cell, "validate")
+    new = json.loads((cell / "5-validation/metrics.json").read_text())
+    assert (new["verdict"], new["reason"]) == (old["verdict"], old["reason"])
+    errors = old["validation"]["validation.csv"]
+    same(errors, {key: new["validation"]["validation.csv"][key] for key in errors})
+
+
+def test_an_older_fit_is_exported_and_compensates_as_it_did(cell: Path, tmp_path: Path) -> None:
+    assert not run("export", cell / "4-fit", "--offsets", tmp_path / "joint_offsets.csv")
+    assert (tmp_path / "joint_offsets.csv").read_bytes() == (EXPECTED / "joint_offsets.csv").read_bytes()
+    where = ("--tool", "0.3,0.05,0.02", "--dof", 3, "--tolerance", "2,100")
+    assert not run("compensate", cell / "4-fit", OLDER / "targets.csv", *where, "--out", tmp_path / "q.csv")
+    for column in ("shoulder [deg]", "elbow [deg]", "left [mm]", "sigma [mm]"):
+        np.testing.assert_allclose(_column(tmp_path / "q.csv", column), _column(EXPECTED / "commands.csv", column), 1e-6)
+
+
+def test_dynamics_identified_on_an_older_fit_are_those_it_gave(cell: Path, tmp_path: Path) -> None:
+    logs = cell / "7-recorded"
+    found, old = tmp_path / "model", json.loads((EXPECTED / "identified.json").read_text())
+    assert not run(
+        "identify", cell / "4-fit", logs / "training.csv", "--validate", logs / "validation.csv", "--friction",
+        "standard", "--out", found,
+    )  # fmt: skip
+    metrics = json.loads((found / "metrics.json").read_text())
+    assert metrics["verdict"] == old["verdict"]
+    errors = metrics["validation"]["validation.csv"]["raw"]["relative_error_percent"]
+    assert errors["total"] == pytest.approx(old["unseen_percent"]["total"], rel=0.02)
+    values, sigma = (_column(EXPECTED / "estimate.csv", name) for name in ("value", "sigma"))
+    assert (np.abs(_column(found / "estimate.csv", "value") - values) < 0.1 * sigma).all()
+
+
+def _column(path: Path, name: str) -> np.ndarray:
+    with path.open(newline="") as file:
+        return np.array([float(row[name]) for row in csv.DictReader(file)])
