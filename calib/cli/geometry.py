@@ -85,7 +85,7 @@ def select(
         list[str] | None, typer.Option(help="x,y,z of a target in the tip's frame [m]; may be repeated")
     ] = None,
     index: Annotated[str, typer.Option(help="O1 to O5, or cond")] = "O1",
-    method: Annotated[str | None, typer.Option(help="polish (default), detmax, local, multistart or tabu")] = None,
+    method: Annotated[str | None, typer.Option(help="detmax (default), polish, local, multistart or tabu")] = None,
     starts: Annotated[int, typer.Option(help="random sets that multistart begins at")] = 8,
     evaluations: Annotated[int, typer.Option(help="most evaluations of the index in one local search")] = 5000,
     seconds: Annotated[float | None, typer.Option(help="processor time for the search; without: to its end")] = None,

@@ -28,8 +28,8 @@ def _rich_table(table: Table) -> RichTable:
     """Return a table of `page` as rich's."""
     title = table.title[:1].lower() + table.title[1:]
     result = RichTable(
-        title=RichText(title), title_justify="left", caption=RichText(table.note) if table.note else None, caption_justify="left",
-        box=box.HEAVY_HEAD,
+        title=RichText(title), title_justify="left", caption=RichText(table.note) if table.note else None,
+        caption_justify="left", box=box.HEAVY_HEAD,
     )  # fmt: skip
     numbers = set(table.numbers)
     for k, name in enumerate(table.header):

@@ -42,7 +42,8 @@ def test_an_older_session_stands_where_it_stood_and_goes_on(cell: Path) -> None:
     assert (cell / "8-dynamics/metrics.json").read_bytes() == before
     assert "0.038 mm" in (cell / "certificate.html").read_text().replace("\N{NO-BREAK SPACE}", " ")
     assert {half: level for half, (level, _) in verdicts(session).items()} == {"geometry": "pass", "dynamics": "pass"}
-    joints = [re.findall(r"(?m)^ *<origin.*", (place / "robot.urdf").read_text()) for place in (EXPECTED, cell / "9-export")]
+    written = (EXPECTED, cell / "9-export")
+    joints = [re.findall(r"(?m)^ *<origin.*", (place / "robot.urdf").read_text()) for place in written]
     assert len(joints[0]) == 3 and joints[0] == joints[1]
 
 
@@ -70,7 +71,8 @@ def test_an_older_fit_is_exported_and_compensates_as_it_did(cell: Path, tmp_path
     where = ("--tool", "0.3,0.05,0.02", "--dof", 3, "--tolerance", "2,100")
     assert not run("compensate", cell / "4-fit", OLDER / "targets.csv", *where, "--out", tmp_path / "q.csv")
     for column in ("shoulder [deg]", "elbow [deg]", "left [mm]", "sigma [mm]"):
-        np.testing.assert_allclose(_column(tmp_path / "q.csv", column), _column(EXPECTED / "commands.csv", column), 1e-6)
+        now, then = (_column(place, column) for place in (tmp_path / "q.csv", EXPECTED / "commands.csv"))
+        np.testing.assert_allclose(now, then, 1e-6)
 
 
 def test_dynamics_identified_on_an_older_fit_are_those_it_gave(cell: Path, tmp_path: Path) -> None:
