@@ -7,6 +7,8 @@ import io
 import json
 import math
 import os
+import re
+import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -28,7 +30,8 @@ def write(path: str | Path, content: str | bytes) -> Path:
     temporary = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+        clear_leftovers(path)
+        handle, temporary = tempfile.mkstemp(dir=path.parent, **staged_name(path))
         with os.fdopen(handle, "wb") as file:
             file.write(data)
             file.flush()
@@ -43,17 +46,96 @@ def write(path: str | Path, content: str | bytes) -> Path:
     return path
 
 
+def staged_name(path: Path) -> dict[str, str]:
+    """Return how what will become `path` is called while it is written: the process stands in it."""
+    return {"prefix": f".{path.name}.{os.getpid()}.", "suffix": ".part"}
+
+
+def clear_leftovers(path: Path) -> None:
+    """Remove what earlier processes left of `path` when they were killed; not what a living one is filling."""
+    pattern = re.compile(rf"\.{re.escape(path.name)}\.(\d+)\.[^.]+\.part")
+    for name in os.listdir(path.parent):
+        found = pattern.fullmatch(name)
+        if found and not _alive(int(found[1])):
+            left = path.parent / name
+            if left.is_dir():
+                shutil.rmtree(left, ignore_errors=True)
+            else:
+                left.unlink(missing_ok=True)
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:
+        return True  # another user's
+    return True
+
+
+def check_target(out: Path, inputs: Iterable[str | Path | None], suffixes: Sequence[str] = ()) -> None:
+    """Refuse, before any work is done, a file that cannot be written, has another suffix, or is read.
+
+    Args:
+        out: the file to write.
+        inputs: what is read; recordings may have their cut (``log.npz@0:9``).
+        suffixes: those that `out` may have; all without any.
+
+    Raises:
+        UsageError: with the file concerned.
+    """
+    if suffixes and out.suffix not in suffixes:
+        raise UsageError(f"{out}: give a file with the suffix {' or '.join(suffixes)}")
+    if _reached(out) and out.is_dir():
+        raise UsageError(f"{out} is a folder; give a file to write to")
+    check_writable(out.absolute().parent)
+    check_not_input([out], inputs)
+
+
+def check_writable(folder: Path) -> None:
+    """Refuse, before any work is done, a folder that cannot be written to, or made.
+
+    Raises:
+        UsageError: with the folder and the reason.
+    """
+    nearest = next(one for one in (folder, *folder.absolute().parents) if _reached(one))
+    try:
+        with tempfile.TemporaryFile(dir=nearest):
+            pass
+    except OSError as error:
+        raise UsageError(f"cannot write to {nearest}: {error.strerror or error}; nothing was changed there") from error
+
+
+def _reached(path: Path) -> bool:
+    """Tell whether something is at `path`; refuse what can never be there.
+
+    Raises:
+        UsageError: for a link to nowhere or to itself, a name too long, a file taken for a folder.
+    """
+    try:
+        path.stat()
+    except (OSError, ValueError) as error:
+        if isinstance(error, FileNotFoundError) and not path.is_symlink():
+            return False
+        why = "a link to nowhere" if isinstance(error, FileNotFoundError) else getattr(error, "strerror", None) or error
+        raise UsageError(f"{str(path)[:200]} cannot be written: {why}; choose another --out") from error
+    return True
+
+
 def check_not_input(targets: Iterable[Path], inputs: Iterable[str | Path | None]) -> None:
     """Refuse, before any work is done, to write onto a file or folder that is read.
 
     Args:
         targets: to be written.
-        inputs: to be read; names that are no path on the disk (robots of the library), and None, are passed over.
+        inputs: to be read, recordings with their cut (``log.npz@0:9``), too; names that are no path on the disk (robots
+            of the library), and None, are passed over.
 
     Raises:
         UsageError: with the file that is both.
     """
-    known = [path for path in (Path(one) for one in inputs if one is not None) if path.exists()]
+    read = (one for path in inputs if path is not None for one in (path, str(path).rpartition("@")[0] or path))
+    known = [path for path in map(Path, read) if os.path.exists(path)]  # False for names that no file can have
     for target in targets:
         if any(same_file(target, path) for path in known):
             raise UsageError(f"{target} is read, and would be written over; choose another --out")

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import tempfile
 from collections.abc import Callable, Collection, Iterable
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 from calib import files
@@ -25,7 +25,7 @@ def check_target(
 
     Args:
         out: where results are to go.
-        ours: names of all files that may be written there.
+        ours: names, or patterns of them (``plot_torque_*.png``), of all files that may be written there.
         marks: those by which an earlier result of the same kind is known.
         what: that kind, for messages.
         inputs: what is read, recordings with their cut (``log.npz@0:9``), too; none of it is written over.
@@ -33,41 +33,40 @@ def check_target(
     Raises:
         UsageError: with the file or folder concerned.
     """
-    _check_folder(out)
-    read = [one for path in inputs if path is not None for one in (path, str(path).rpartition("@")[0] or path)]
-    files.check_not_input([out, *(out / name for name in ours)], read)
-    present = [name for name in ours if (out / name).exists()]
+    if os.path.isfile(out):  # False for names that no file can have
+        raise UsageError(f"{out} is a file; --out needs a folder")
+    files.check_writable(out)
+    files.check_not_input([out, *(out / name for name in ours)], inputs)
+    present = files_of(out, ours)
     if present and not all((out / name).exists() for name in marks):
         raise UsageError(f"{out} holds {', '.join(present)} which no earlier {what} left there; choose another --out")
 
 
-def _check_folder(out: Path) -> None:
-    """Refuse, before any work is done, an `out` that is a file or cannot be written."""
-    if out.exists() and not out.is_dir():
-        raise UsageError(f"{out} is a file; --out needs a folder")
-    folder = out if out.is_dir() else next(parent for parent in out.absolute().parents if parent.exists())
-    try:
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise UsageError(f"cannot write to {folder}: {error.strerror or error}; nothing was changed there") from error
+def files_of(folder: Path, ours: Collection[str]) -> list[str]:
+    """Return the names in a folder that are among `ours`, names or patterns; none where there is no folder."""
+    if not folder.is_dir():
+        return []
+    return sorted(name for name in os.listdir(folder) if any(fnmatchcase(name, one) for one in ours))
 
 
 def write_staged(out: Path, ours: Collection[str], write: Callable[[Path], None]) -> Path:
     """Let `write` fill a temporary folder beside `out`, and move its files there.
 
     A folder that is not there appears whole; in one from an earlier run each file is replaced, its own other files
-    (`ours` and plots, ``plot_*.png``) go, and what else lies there stays.
+    (`ours`, names or patterns) go, and what else lies there stays.
 
     Raises:
         UsageError: where the disk refuses.
     """
+    given = out
     try:
+        out = out.resolve()  # ``.`` and ``..`` have no name to stage under
         out.parent.mkdir(parents=True, exist_ok=True)
-        _clear_leftovers(out)
-        staging = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}.{os.getpid()}.", suffix=".part"))
-    except OSError as error:
-        raise UsageError(f"cannot write beside {out}: {error.strerror or error}; nothing was changed there") from error
+        files.clear_leftovers(out)
+        staging = Path(tempfile.mkdtemp(dir=out.parent, **files.staged_name(out)))
+    except (OSError, RuntimeError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise UsageError(f"cannot write beside {out}: {reason}; nothing was changed there") from error
     try:
         write(staging)
         os.chmod(staging, 0o777 & ~_umask())
@@ -75,38 +74,20 @@ def write_staged(out: Path, ours: Collection[str], write: Callable[[Path], None]
             _move_files(staging, out, ours)
         else:
             os.replace(staging, out)
+    except OSError as error:
+        raise UsageError(f"cannot write {out}: {error.strerror or error}; nothing was changed there") from error
     finally:
         shutil.rmtree(staging, ignore_errors=True)
-    return out
-
-
-def _clear_leftovers(out: Path) -> None:
-    """Remove what earlier runs for the same target left when they were killed; not what a living one is filling."""
-    pattern = re.compile(rf"\.{re.escape(out.name)}\.(\d+)\.[^.]+\.part")
-    for path in out.parent.iterdir():
-        found = pattern.fullmatch(path.name)
-        if found and path.is_dir() and not _alive(int(found[1])):
-            shutil.rmtree(path, ignore_errors=True)
-
-
-def _alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:
-        return True  # another user's
-    return True
+    return given
 
 
 def _move_files(staging: Path, out: Path, ours: Collection[str]) -> None:
     """Replace the files of an earlier run one by one, the metrics last, since they say that the rest is there."""
     fresh = sorted(path.name for path in staging.iterdir())
-    stale = {name for name in ours if name not in fresh} | {path.name for path in out.glob("plot_*.png")} - set(fresh)
     try:
         for name in sorted(fresh, key=lambda name: name == METRICS):
             os.replace(staging / name, out / name)
-        for name in stale:
+        for name in set(files_of(out, ours)) - set(fresh):
             (out / name).unlink(missing_ok=True)
     except OSError as error:
         raise UsageError(f"cannot write to {out}: {error.strerror or error}") from error

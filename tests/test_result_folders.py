@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib import estimate_files
+from calib import estimate_files, files
 from calib.errors import RobotError, UsageError
 from calib.folders import METRICS, check_target, write_staged
 
@@ -38,6 +38,36 @@ def test_leftovers_of_killed_runs_go_and_those_of_living_ones_stay(tmp_path: Pat
         folder.mkdir()
     write_staged(tmp_path / "out", (METRICS,), lambda folder: (folder / METRICS).touch())
     assert not dead.exists() and living.exists() and other.exists() and (tmp_path / "out" / METRICS).exists()
+
+
+def test_a_killed_write_of_a_file_leaves_nothing_for_long(tmp_path: Path) -> None:
+    gone = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True)
+    dead, living = (tmp_path / f".a.csv.{pid}.x.part" for pid in (gone.stdout.strip(), os.getpid()))
+    for path in (dead, living):
+        path.touch()
+    files.write(tmp_path / "a.csv", "1")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [living.name, "a.csv"]
+
+
+def test_figures_of_others_stay_and_stale_ones_of_ours_go(tmp_path: Path) -> None:
+    ours = (METRICS, "plot_torque_[0-9]*.png", "plot_map.png")
+    for name in (METRICS, "plot_mine.png", "plot_torque_12.png", "plot_map.png", "plot_torque_mine.png"):
+        (tmp_path / name).touch()
+    write_staged(tmp_path, ours, lambda folder: (folder / METRICS).touch())
+    assert sorted(path.name for path in tmp_path.iterdir()) == [METRICS, "plot_mine.png", "plot_torque_mine.png"]
+    (tmp_path / "plot_map.png").touch()
+    (tmp_path / METRICS).unlink()
+    with pytest.raises(UsageError, match=r"holds plot_map\.png"):
+        check_target(tmp_path, ours, (METRICS,), "fit")
+
+
+def test_links_that_lead_nowhere_are_no_targets(tmp_path: Path) -> None:
+    for name, aim in (("dangling", "absent"), ("loop", "loop")):
+        (tmp_path / name).symlink_to(tmp_path / aim)
+        with pytest.raises(UsageError, match=name):
+            check_target(tmp_path / name, (METRICS,), (METRICS,), "fit")
+    with pytest.raises(UsageError, match="too long"):
+        files.check_target(tmp_path / ("x" * 300), [])
 
 
 def test_a_covariance_comes_back_by_names_of_any_kind(tmp_path: Path) -> None:

@@ -34,9 +34,10 @@ def export(
     """
     into = Path(into)
     with saved(result) as place:
-        if is_identified(place):
+        identified = is_identified(place)
+        delivery.check_into(into, place, optional(urdf), dynamics.WRITTEN if identified else delivery.WRITTEN)
+        if identified:
             return tuple(dynamics.deliver_dynamics(place, optional(urdf), into))
-        into.mkdir(parents=True, exist_ok=True)
         return tuple(delivery.deliver(place, _source_of(place) if urdf is None else Path(urdf), into))
 
 

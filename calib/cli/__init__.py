@@ -1,5 +1,6 @@
 """The command ``calib``: commands only, no mathematics. Exit codes: 0 done (the verdict is pass or marginal), 1 done
-but the verdict is fail, 2 input or usage, 3 not identifiable or not converged."""
+but the verdict is fail, 2 input or usage, 3 not identifiable or not converged, 4 an error that nobody foresaw (what is
+needed to mend it stands in a file, see `calib.bug_reports`), 130 interrupted."""
 
 from __future__ import annotations
 
@@ -15,6 +16,10 @@ from calib.cli import dynamics, geometry, motion, session
 for _pool in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_pool, "1")
 
+EXIT_CODES = (
+    "Exit codes: 0 done (the verdict is pass or marginal), 1 the verdict is fail, 2 input or usage, 3 not identifiable "
+    "or not converged, 4 an error that nobody foresaw: calib-bug-….txt says where."
+)
 INTERRUPTED = "interrupted; nothing was left half-written"
 RESUMED = ("next", "redo", "demo")  # keep what they have done; every other command starts over
 
@@ -24,6 +29,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # a unit in brackets is a unit, not a style
     help="Calibrate a robot: choose poses, fit the geometry, validate on unseen poses, export.",
+    epilog=EXIT_CODES,
 )
 
 _FLAGS = ("--debug", "--help", "--line", "--plots", "--no-plots", "--refit-frames", "--no-refit-frames")
@@ -59,13 +65,27 @@ def run(arguments: list[str] | None = None) -> int:
         return 2
     except (KeyboardInterrupt, typer.Abort):
         return _interrupted(given)
+    except SystemExit:  # Typer's, where whoever read the output has gone
+        return 141  # as a shell says of SIGPIPE
     except Exception as error:
-        from calib.errors import exit_code
-
-        code = exit_code(error)
-        if code is None or os.environ.get("CALIB_DEBUG"):
+        if os.environ.get("CALIB_DEBUG"):
             raise
+        return _failed(error, given)
+
+
+def _failed(error: Exception, given: list[str]) -> int:
+    """Say what went wrong, and return the exit code that it has."""
+    from calib.errors import exit_code
+
+    if (code := exit_code(error)) is not None:
         return _complain(str(error), code)
+    if isinstance(error, OSError) and error.filename is not None:
+        return _complain(f"{error.filename}: {error.strerror or error}", 2)
+    if isinstance(error, MemoryError):
+        return _complain(f"the memory does not suffice ({error}): is a number or a file larger than meant?", 2)
+    from calib import bug_reports
+
+    return _complain(bug_reports.report(error, given), bug_reports.CODE)
 
 
 def _spread(arguments: list[str]) -> list[str]:

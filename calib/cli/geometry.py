@@ -45,7 +45,8 @@ def fit(
 ) -> None:
     """Fit the geometry of ROBOT to measured poses, and say how far to trust it.
 
-    Exit codes: 0 the verdict is pass or marginal, 1 fail, 2 input or usage, 3 not identifiable or not converged.
+    Exit codes: 0 the verdict is pass or marginal, 1 fail, 2 input or usage, 3 not identifiable or not converged, 4 an
+    error that nobody foresaw.
     Pass means that on poses it has not seen the calibrated arm is better than the nominal one, or that there is nothing
     to gain; that it is good enough is said only with --tolerance.
     """
@@ -105,10 +106,10 @@ def select(
 ) -> None:
     """Choose the poses at which the geometry of ROBOT shows best."""
     from calib.api.kinematic import select_poses
-    from calib.procedure.kinematic_stage import selection
+    from calib.files import check_target
     from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
 
-    selection.check_target(out, [robot, existing, constraints])
+    check_target(out, [robot, existing, constraints])
     targets = tuple(tuple(numbers(text, 3, "--tool")) for text in tool or [])
     sigmas = None if sigma is None else numbers(sigma, 2, "--sigma")
     stated = None if sigmas is None else (sigmas[0], sigmas[1])
@@ -156,13 +157,13 @@ def export(
     from calib.procedure.export import geometry
 
     if into:
-        from calib.procedure.export import dynamics
+        from calib.procedure.export import delivery, dynamics
         from calib.procedure.export.identified import check_identified
 
         if out or ur_kinematics or offsets:
             raise UsageError("--into writes all files into one folder; leave --out, --ur-kinematics and --offsets out")
         check_identified(folder)
-        geometry.check_targets(urdf, [into / name for name in dynamics.WRITTEN])
+        delivery.check_into(into, folder, urdf, dynamics.WRITTEN)
         with progress() as show:
             show("all parameters, and each file read back")
             lines = dynamics.deliver_dynamics(folder, urdf, into)
@@ -173,7 +174,7 @@ def export(
             "nothing to write: give --urdf SOURCE.urdf --out FILE.urdf, --ur-kinematics, --offsets or --into"
         )
     found = geometry.read(folder)
-    geometry.check_targets(urdf, [path for path in (out, ur_kinematics, offsets) if path])
+    geometry.check_targets(folder, urdf, [path for path in (out, ur_kinematics, offsets) if path])
     if urdf and out:
         read = geometry.export_urdf(found, urdf, out, for_corrections)
         say(f"{out}: joint origins of {urdf} calibrated, all else kept; base link and flange stay where the source has "
@@ -220,11 +221,13 @@ def compensate(
 ) -> None:
     """Turn nominal targets into the joint commands that put the real tool there."""
     from calib.api import kinematic
-    from calib.procedure.kinematic_stage import compensation, compensation_file
+    from calib.files import check_target
+    from calib.procedure.export.geometry import results
+    from calib.procedure.kinematic_stage import compensation
 
     may = numbers(tolerance, 2, "--tolerance")
     fitted = compensation.read(folder)
-    compensation_file.check_out(out, targets, fitted)
+    check_target(out, [targets, *results(fitted.folder)])
     with progress() as show:
         found = kinematic.compensate(
             fitted, targets, frame=frame, tool=tool, dof=dof, tolerance=(1e-3 * may[0], 1e-3 * may[1]), seed=seed,

@@ -214,10 +214,14 @@ def view(
 ) -> None:
     """Show in Rerun: the robot, pose errors, poses as they were chosen, motions with their limits, torques."""
     from calib.errors import UsageError
+    from calib.files import check_target
     from calib.procedure.report import viewer
 
     if save is None and spawn is False:
         raise UsageError("nothing to do: give --save FILE.rrd, or leave --no-spawn out")
+    if save:
+        inside = folder.iterdir() if folder.is_dir() else ()
+        check_target(save, [folder, robot, *(path for path in inside if path.suffix != ".rrd")])
     scene = viewer.write(folder, save, robot) if save else None
     if save:
         size = f"{1e-6 * save.stat().st_size:.1f} MB"

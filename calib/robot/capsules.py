@@ -16,7 +16,7 @@ import numpy as np
 from calib.arrays import shaped
 from calib.robot.chain import Chain, random_joints, stretched_length
 from calib.robot.kinematics import Sweep, sweep
-from calib.robot.obstacles import SAMPLES, Obstacle, inseparable, nearest_on_lines, signed_distance
+from calib.robot.obstacles import SAMPLES, Obstacle, check_reachable, inseparable, nearest_on_lines, signed_distance
 
 LEAST, SHARE = 0.05, 0.05
 """Radius of a capsule where none is stated: this share of the stretched arm, and no less than [m]. Our choice."""
@@ -230,7 +230,9 @@ def from_chain(
     if not found.pairs:
         return found
     fixed = np.arange(len(own) + len(world)) >= len(own)
-    gone = inseparable(found.distances(random_joints(chain, SAMPLES, seed)), fixed, margin, size)
+    distances = found.distances(random_joints(chain, SAMPLES, seed))
+    check_reachable(found.pairs, distances, fixed, size)
+    gone = inseparable(distances, fixed, margin, size)
     excluded = tuple(pair for pair, out in zip(found.pairs, gone, strict=True) if out)
     return replace(found, own=found.own[~gone[: len(own)]], world=found.world[~gone[len(own) :]], excluded=excluded)
 

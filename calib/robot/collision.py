@@ -4,7 +4,8 @@ Shapes come from the URDF's ``<collision>``: boxes, spheres, cylinders, capsules
 choice: faster and on the safe side). A robot without shapes is made of capsules (`calib.robot.capsules`).
 
 Not compared: parts of one body, bodies joined by a joint, the fixed base with floor and obstacles, and pairs that no
-posture parts (`calib.robot.obstacles.inseparable`); the last are listed in `Collision.excluded`.
+posture parts (`calib.robot.obstacles.inseparable`); the last are listed in `Collision.excluded`. A floor or an obstacle
+that a link never leaves is refused (`calib.robot.obstacles.check_reachable`).
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import urdf
 from calib.robot.formats.markup import Node, parse, text
 from calib.robot.formats.urdf_tree import origin
-from calib.robot.obstacles import SAMPLES, Obstacle, inseparable
+from calib.robot.obstacles import SAMPLES, Obstacle, check_reachable, inseparable
 from calib.transforms import pose
 
 
@@ -226,7 +227,9 @@ def _finish(
     if not kept.pairs:
         return kept
     fixed = np.array([pair.second >= own for pair in geometry.collisionPairs])
-    gone = inseparable(kept.distances(random_joints(chain, SAMPLES, seed)), fixed, margin)
+    distances = kept.distances(random_joints(chain, SAMPLES, seed))
+    check_reachable(kept.pairs, distances, fixed)
+    gone = inseparable(distances, fixed, margin)
     excluded = tuple(pair for pair, out in zip(kept.pairs, gone, strict=True) if out)
     for index in np.flatnonzero(gone)[::-1]:
         geometry.removeCollisionPair(geometry.collisionPairs[int(index)])

@@ -6,6 +6,7 @@ the nearest point of a line is found by golden sections, inside as outside.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,7 @@ from calib.errors import RobotError
 
 ALWAYS = 0.95
 SAMPLES = 200
+TOUCH = 0.01  # by which a turret may reach into what it stands on [m] (our choice)
 SIZES = {"box": 3, "sphere": 1, "cylinder": 2}
 _GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 _STEPS = 44  # of the golden section: 0.618^44 is 6e-10 of the line
@@ -104,3 +106,33 @@ def inseparable(distances: np.ndarray, fixed: np.ndarray, margin: float, slack: 
     near = (distances <= margin).mean(axis=0) >= ALWAYS
     highest = distances.max(axis=0)
     return np.where(fixed, (highest <= margin) & (np.ptp(distances, axis=0) < 1e-6), near | (highest <= margin + slack))
+
+
+def check_reachable(
+    pairs: Sequence[tuple[str, str]], distances: np.ndarray, fixed: np.ndarray, slack: float = 0.0
+) -> None:
+    """Refuse a floor or an obstacle that a link never leaves: a size or a place is wrong, no pose would be found.
+
+    A link at a distance that no joint changes, the turret of an arm, may touch what it stands on: by as much as shapes
+    this coarse cannot tell.
+
+    Args:
+        pairs: names of link and thing.
+        distances: (N, pairs) [m] in random postures, signed.
+        fixed: (pairs,) whether the pair is one with the world.
+        slack: what shapes as coarse as these cannot tell [m].
+
+    Raises:
+        RobotError: naming links and things.
+    """
+    highest, moves = distances.max(axis=0), np.ptp(distances, axis=0) >= 1e-6
+    buried = np.flatnonzero(fixed & (highest <= np.where(moves, 0.0, -slack - TOUCH)))
+    if not len(buried):
+        return
+    shown = ", ".join(f"link '{pairs[k][0]}' in '{pairs[k][1]}'" for k in buried[:3])
+    more = f" and {len(buried) - 3} more" if len(buried) > 3 else ""
+    raise RobotError(
+        f"in each of {len(distances)} random postures there is {shown}{more}: nothing keeps clear of that. Sizes and "
+        "places are in m (or say \"20 mm\"), in the arm's base frame, which may lie above the floor; an obstacle's xyz "
+        "is its middle; where capsules stand for the links, [collision] radius may be too large"
+    )

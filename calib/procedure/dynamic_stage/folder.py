@@ -39,9 +39,10 @@ OURS = (
     calibrated.ROBOT, MODEL, ESTIMATE, COVARIANCE, information.INFORMATION, INSTRUMENTAL,
     METRICS, "drive_gains.csv",
     "torques_1.csv", calibrated.COVARIANCE, geometry_tables.EFFECTS, geometry_tables.SENSITIVITY,
-    geometry_tables.GEOMETRIES,
+    geometry_tables.GEOMETRIES, "plot_torque_[0-9]*.png",
+    *(f"plot_{name}.png" for name in ("residuals", "friction", "geometries", "geometry_effects")),
 )  # fmt: skip
-"""Files of an earlier identification that a new one replaces; besides plots, ``plot_*.png``."""
+"""Files of an earlier identification that a new one replaces."""
 UNSEEN = 1  # schema of the report on unseen motion
 POINTS = 400  # samples per curve of the certificate (our choice)
 TORQUE_RATE = 100.0  # of torques_1.csv [Hz]

@@ -29,8 +29,9 @@ DESIGN = (METRICS, coefficients.SAMPLES, coefficients.NAME)
 PLAN = (METRICS, coefficients.PLANNED, "trajectory.yaml", "trajectory.json")
 """Files by which an earlier run's folder is known."""
 REHEARSAL = "rehearsal.csv"
-ALL = (*DESIGN, *PLAN[1:], coefficients.RUN, "front.csv", "approach.csv", REHEARSAL)
-"""Files of an earlier run that a new one replaces; besides plots, ``plot_*.png``."""
+FIGURES = tuple(f"plot_{name}.png" for name in ("motion", "path", "history", "front", "profile"))
+ALL = (*DESIGN, *PLAN[1:], coefficients.RUN, "front.csv", "approach.csv", REHEARSAL, *FIGURES)
+"""Files of an earlier run that a new one replaces."""
 MESSAGES = 100.0  # points per second of the ROS message, whose controllers interpolate (our choice)
 
 

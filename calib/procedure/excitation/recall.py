@@ -14,10 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
-from calib.data.recordings.recording import Joints, Recording, parse_cut
+from calib.data.recordings.recording import Joints, Recording
 from calib.data.recordings.recording_files import read_recording
 from calib.data.signals.resampling import resample
 from calib.errors import MeasurementError, UsageError
+from calib.folders import METRICS
 from calib.procedure.excitation import coefficients
 from calib.procedure.excitation.coefficients import Periodic
 from trajectories.errors import BadInput
@@ -51,9 +52,7 @@ class AveragedMotion:
 
 def check_target(out: Path, folder: Path, log: str) -> None:
     """Refuse, before any work is done, a name that is not a recording's, or that of the log or the designed motion."""
-    files.check_not_input([out], [folder, folder / coefficients.NAME, log, parse_cut(log)[0]])
-    if out.suffix not in SUFFIXES or out.is_dir():
-        raise UsageError(f"--out {out}: give a file with the suffix {' or '.join(SUFFIXES)}")
+    files.check_target(out, [folder, *(folder / name for name in (coefficients.NAME, METRICS)), log], SUFFIXES)
 
 
 def find(folder: Path, log: str, skip: int = 0) -> AveragedMotion:

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from calib import files
 from calib.errors import RobotError, UsageError
+from calib.folders import check_target, write_staged
 from calib.procedure.export import geometry
+from calib.procedure.export.geometry import results
 from calib.procedure.kinematic_stage.folder import CORRECTED_URDF, FORMULA, TERMS, URDF
 from calib.robot.calibrated import ROBOT
 from calib.robot.formats.markup import with_comment
 
 COPIED = (ROBOT, TERMS, FORMULA)
+OFFSETS, UR_KINEMATICS = "joint_offsets.csv", "ur_kinematics.yaml"
+WRITTEN = (*COPIED, URDF, CORRECTED_URDF, OFFSETS, UR_KINEMATICS)
+MARKS = (OFFSETS, "parameters.json")  # by which an earlier export is known, of a geometry or of dynamics
 FIRST = "verdict fail: "  # how a README.txt of ours begins; another's is left alone
 
 
@@ -28,18 +32,35 @@ def deliver(fit: Path, source: Path, out: Path) -> list[str]:
     Returns:
         What was written, in words.
     """
+    notes: list[str] = []
+    write_staged(out, WRITTEN, lambda staging: notes.extend(_write(fit, source, staging)))
+    return notes
+
+
+def check_into(into: Path, folder: Path, urdf: Path | None, written: Sequence[str]) -> None:
+    """Refuse, before any work is done, a folder for exports that cannot be one, or holds what is read or another's.
+
+    Args:
+        into: where `written` is to go.
+        folder: of the fit or the identification; urdf: the description to edit.
+        written: names of the files.
+
+    Raises:
+        UsageError: with the file or folder concerned.
+    """
+    earlier = any((into / mark).exists() for mark in MARKS)
+    check_target(into, written, () if earlier else ("parameters.json",), "export", [urdf, *results(folder)])
+
+
+def _write(fit: Path, source: Path, out: Path) -> list[str]:
     for name in COPIED:
         if (fit / name).exists():
             files.write(out / name, (fit / name).read_bytes())
-        elif (out / name).exists():
-            os.unlink(out / name)
     found = geometry.read(fit)
     given = source.suffix == ".urdf"
     urdfs = {URDF: found.chain}
     if found.corrections is not None:
         urdfs[CORRECTED_URDF] = found.corrections.chain
-    else:
-        (out / CORRECTED_URDF).unlink(missing_ok=True)
     read = ""
     for name, chain in urdfs.items():
         if given:
@@ -52,15 +73,15 @@ def deliver(fit: Path, source: Path, out: Path) -> list[str]:
         "the given URDF with calibrated joint origins, all else kept" if given else "written from the calibrated table"
     )
     notes = [f"robot.urdf: {made}; {read}"]
-    geometry.export_offsets(found, out / "joint_offsets.csv")
+    geometry.export_offsets(found, out / OFFSETS)
     notes.append("robot.toml, joint_offsets.csv")
     try:
-        geometry.export_ur_kinematics(found, out / "ur_kinematics.yaml")
+        geometry.export_ur_kinematics(found, out / UR_KINEMATICS)
         flange = geometry.flange_note(found)
-        words = "ur_kinematics.yaml: for kinematics_params_file of ur_description"
+        words = f"{UR_KINEMATICS}: for kinematics_params_file of ur_description"
         notes.append(f"{words}; {flange}" if flange else words)
     except (RobotError, UsageError):  # no UR arm
-        (out / "ur_kinematics.yaml").unlink(missing_ok=True)
+        pass
     if found.corrections is not None:
         left = geometry.without_corrections(fit)
         words = f"{TERMS}: what a URDF cannot hold, on top of {CORRECTED_URDF}; formula in {FORMULA}"

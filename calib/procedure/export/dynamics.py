@@ -26,6 +26,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from calib import files
+from calib.folders import write_staged
 from calib.procedure.export.identified import IdentifiedRobot, consistency_lines, drive_notes, read
 from calib.procedure.export.masses import MJCF, as_mjcf, as_urdf
 from calib.procedure.export.parameters import parameters
@@ -51,22 +52,23 @@ def deliver_dynamics(identified: Path, source: Path | None, out: Path) -> list[s
         What was written, and what to know of it, in words.
 
     Raises:
-        RobotError: where a file does not read back as the robot; files before it are whole, it is not written.
+        RobotError: where a file does not read back as the robot; nothing is written.
     """
     given = read(identified)
     content, encoding = (urdf_write.write_new(given.chain), "utf-8") if source is None else text(source)
     where = "the chain's own URDF" if source is None else str(source)
     edited, notes = as_urdf(given, content, where, given.chain if source is None else nominal_of(given.robot))
     model = as_mjcf(given)
-    out.mkdir(parents=True, exist_ok=True)
-    files.write(out / URDF, edited.encode(encoding))
-    files.write(out / MJCF, model)
-    _export_drives(given, out / "drives.csv")
-    files.write_json(out / "parameters.json", parameters(given))
-    if source is None:
-        (out / "joint_origins.yaml").unlink(missing_ok=True)
-    else:
-        files.write(out / "joint_origins.yaml", joint_origins(content, edited, where))
+
+    def write(staging: Path) -> None:
+        files.write(staging / URDF, edited.encode(encoding))
+        files.write(staging / MJCF, model)
+        _export_drives(given, staging / "drives.csv")
+        files.write_json(staging / "parameters.json", parameters(given))
+        if source is not None:
+            files.write(staging / "joint_origins.yaml", joint_origins(content, edited, where))
+
+    write_staged(out, WRITTEN, write)
     lines = [
         "robot.urdf: joint origins, masses and friction; Pinocchio reads the same poses and torques to 1e-9",
         "robot.xml: MJCF with armature, damping and frictionloss; Pinocchio reads the same poses and torques to 1e-9",

@@ -9,7 +9,9 @@ import numpy as np
 
 from calib import files
 from calib.errors import RobotError, UsageError
-from calib.procedure.kinematic_stage.folder import FitFolder
+from calib.folders import files_of
+from calib.procedure.dynamic_stage import folder as identification
+from calib.procedure.kinematic_stage.folder import OURS, FitFolder
 from calib.robot import calibrated
 from calib.robot.calibrated import CalibratedChain, nominal_of
 from calib.robot.chain import Chain, random_joints
@@ -58,13 +60,19 @@ def without_corrections(folder: Path) -> str:
     )
 
 
-def check_targets(source: Path | None, targets: Sequence[Path]) -> None:
-    """Refuse to write over the source, or two files into one."""
+def check_targets(folder: Path, source: Path | None, targets: Sequence[Path]) -> None:
+    """Refuse, before any work is done, files that cannot be written, are read or are a result, or are one file."""
     for number, target in enumerate(targets):
         if source is not None and files.same_file(source, target):
             raise UsageError(f"{target} is the source URDF, which stays as it is; give another name to write to")
+        files.check_target(target, [source, *results(folder)])
         if any(files.same_file(target, other) for other in targets[:number]):
             raise UsageError(f"{target} is to be written twice; give each file a name of its own")
+
+
+def results(folder: Path) -> list[Path]:
+    """Return the files of a fit's or an identification's folder that make it one: no export replaces them."""
+    return [folder / name for name in files_of(folder, (*OURS, *identification.OURS))]
 
 
 def export_urdf(robot: CalibratedChain, source: Path, out: Path, for_corrections: bool = False) -> str:

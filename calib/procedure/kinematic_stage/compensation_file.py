@@ -10,7 +10,6 @@ from calib import files
 from calib.data.poses.target_files import Targets
 from calib.errors import UsageError
 from calib.procedure.kinematic_stage.compensation import Commands, Fitted
-from calib.procedure.kinematic_stage.folder import OURS
 
 SHOWN = 20  # targets that a message lists
 COLUMNS = (
@@ -42,14 +41,6 @@ def write(commands: Commands, fitted: Fitted, targets: Targets, out: Path, parti
         cells = [None if np.isnan(value) else 1e3 * float(value) for value in numbers]
         rows.append((k + 1, *q, "reached" if good else "not reached", *cells, unseen, commands.reason[k]))
     return files.write_table(out, header, rows)
-
-
-def check_out(out: Path, targets: Path, fitted: Fitted) -> None:
-    """Refuse to write over the targets, or over a file of the fit."""
-    inside = out.resolve().parent == fitted.folder.resolve() and out.name in OURS
-    if out.is_dir() or inside or (out.exists() and targets.exists() and out.samefile(targets)):
-        what = "a folder" if out.is_dir() else "a file of the fit" if inside else "the file of targets"
-        raise UsageError(f"--out {out} is {what}; give another file to write to")
 
 
 def lines(commands: Commands, targets: Targets, fitted: Fitted) -> list[str]:

@@ -31,13 +31,17 @@ from calib.robot.formats import urdf_write
 
 T = TypeVar("T")
 URDF, CORRECTED_URDF = "robot.urdf", "robot_for_corrections.urdf"
+RESIDUALS = "residuals.csv"
 TERMS, FORMULA = "joint_corrections.csv", "joint_corrections.txt"
+FIGURES = (
+    "position", "orientation", "distance", "ladder", "singular_values", "joints", "map", "parameters", "correlations",
+)  # fmt: skip
 OURS = (
     calibrated.ROBOT, URDF, CORRECTED_URDF,
-    ESTIMATE, COVARIANCE, calibrated.COVARIANCE, "residuals.csv", TERMS,
-    FORMULA, REPORT, CERTIFICATE, METRICS,
+    ESTIMATE, COVARIANCE, calibrated.COVARIANCE, RESIDUALS, TERMS,
+    FORMULA, REPORT, CERTIFICATE, METRICS, *(f"plot_{name}.png" for name in FIGURES),
 )  # fmt: skip
-"""Files of an earlier fit that a new one replaces; besides plots, ``plot_*.png``."""
+"""Files of an earlier fit that a new one replaces."""
 
 SCHEMA = 2  # of metrics.json; 1 had no findings, and in a session's 5-validation not the notes of the fit
 IN_SESSION, VALIDATED = "4-fit", "5-validation"  # what these folders are called in a session
@@ -88,7 +92,7 @@ class FitFolder:
     @property
     def residuals(self) -> Path:
         """A row per measured one."""
-        return self.path / "residuals.csv"
+        return self.path / RESIDUALS
 
     @property
     def tables(self) -> tuple[Path, Path]:
@@ -175,7 +179,7 @@ def _read(kind: type[T], path: Path) -> T:
 
 def check_fit_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
     """Refuse, before any work is done, a folder that is not for a fit, or that holds one of its inputs."""
-    check_target(out, OURS, (METRICS,), "fit", inputs)
+    check_target(out, OURS, (METRICS, calibrated.ROBOT, RESIDUALS), "fit", inputs)
 
 
 def write_folder(outcome: Outcome, out: Path, plots: Callable[[Outcome, Path], None] | None = None) -> Path:
@@ -206,7 +210,7 @@ def _write_all(outcome: Outcome, folder: Path) -> None:
     table = estimate_table(fit, outcome.climb.nominal.cell)
     write_estimate(folder, HEADER, table.rows())
     write_covariance(folder / COVARIANCE, table.names, table.covariance)
-    write_residuals(outcome, folder / "residuals.csv")
+    write_residuals(outcome, folder / RESIDUALS)
     files.write_json(folder / METRICS, metrics(outcome))
 
 

@@ -54,6 +54,7 @@ from calib.errors import RobotError, UsageError
 from calib.geometry.installation import Installation
 from calib.geometry.observability import Observation, Target, TargetJacobian
 from calib.robot.chain import sampling_limits
+from calib.robot.formats.markup import text
 from calib.robot.obstacles import Obstacle
 from calib.robot.tables import placement
 from poses import constraints
@@ -288,11 +289,19 @@ def _collision(
         Obstacle(one.name, one.kind, one.size, placement(one.stated, f"{where}: [[obstacle]] number {k}"))
         for k, one in enumerate(stated.obstacle, 1)
     ]
-    if source is not None and source.suffix == ".urdf" and "<collision" in source.read_text(encoding="utf-8"):
-        model = collision.from_urdf(source, chain.base, chain.tip, table.floor, obstacles, margin=table.margin)
-        if model.missing:
-            notes = (f"collision meshes not found, left out: {', '.join(model.missing[:3])}",)
-    else:
-        model = capsules.from_chain(chain, table.radius, table.floor, obstacles, margin=table.margin)
-        notes = (f"no collision shapes in the robot's file: capsules of radius {table.radius:g} m stand for its links",)
+    try:
+        if source is not None and source.suffix == ".urdf" and "<collision" in text(source)[0]:
+            model = collision.from_urdf(source, chain.base, chain.tip, table.floor, obstacles, margin=table.margin)
+            if model.missing:
+                notes = (f"collision meshes not found, left out: {', '.join(model.missing[:3])}",)
+        else:
+            model = capsules.from_chain(chain, table.radius, table.floor, obstacles, margin=table.margin)
+            words = f"capsules of radius {table.radius:g} m stand for its links"
+            notes = (f"no collision shapes in the robot's file: {words}",)
+    except RobotError as error:
+        raise UsageError(f"{where}: {error}") from error
+    if model.excluded:
+        pairs = ", ".join(" with ".join(pair) for pair in model.excluded[:3])
+        more = f" and {len(model.excluded) - 3} more" if len(model.excluded) > 3 else ""
+        notes = (*notes, f"not watched, since no posture parts them: {pairs}{more}")
     return model, table.margin, notes

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
-from calib import files
 from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.plans import read_poses, write_poses
 from calib.errors import UsageError
@@ -93,13 +92,6 @@ def choose(
     )  # fmt: skip
     found = select_poses(None, m, search, space=space, existing=before, map=map, progress=progress)
     return Chosen(chain, found, len(jacobian.free), value, tuple(notes))
-
-
-def check_target(out: Path, inputs: Sequence[object]) -> None:
-    """Refuse, before any work is done, a folder, or a file that is read (of the inputs only names and paths count)."""
-    if out.is_dir():
-        raise UsageError(f"{out} is a folder; --out needs a file")
-    files.check_not_input([out], [one for one in inputs if isinstance(one, str | Path)])
 
 
 def write(chosen: Chosen, path: Path) -> Path:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -15,7 +14,7 @@ from rich.console import RenderableType
 from rich.markup import escape
 from rich.table import Table
 
-from calib import files
+from calib import bug_reports, files
 from calib.errors import CalibError, TaskLost, UsageError, exit_code
 from calib.procedure.dynamic_stage.metrics import UnseenReport
 from calib.procedure.session import instructions, steps
@@ -98,11 +97,9 @@ def run_one(folder: Path, command: str = "calib run", plots: bool = True) -> Fle
         outcome = _go_on(folder, said.append, command, plots)
     except Exception as error:  # a robot that fails must not stop the others
         code = exit_code(error)
-        words = str(error) if code is not None else f"{type(error).__name__}: {error} (see {LOG})"
-        if code is None:
-            said.append(traceback.format_exc())
+        words = str(error) if code is not None else bug_reports.report(error, command.split()[1:], folder)
         said.append(f"failed: {words}")
-        outcome = FleetRow(str(folder), FAILED, words=words, code=code or 1)
+        outcome = FleetRow(str(folder), FAILED, words=words, code=bug_reports.CODE if code is None else code)
     if (folder / SETTINGS).exists():
         with suppress(CalibError):  # a full disk, a folder that cannot be written: said already
             files.write(folder / LOG, "\n".join(said) + "\n")
@@ -170,5 +167,5 @@ def summary(outcomes: Sequence[FleetRow], seconds: float) -> str:
 
 
 def worst_code(outcomes: Sequence[FleetRow]) -> int:
-    """Return the exit code of all: of the first kind that occurred out of 3, 2 (they failed), 1 (verdict fail), 0."""
+    """Return the exit code of all: the first that occurred of 4, 3, 2 (they failed), 1 (verdict fail), 0."""
     return max((one.code for one in outcomes), default=0)

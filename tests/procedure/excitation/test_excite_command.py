@@ -21,6 +21,7 @@ from calib.data.recordings.recording_files import read_recording
 from calib.dynamics import base, drives
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
+from calib.errors import UsageError
 from calib.procedure.excitation import coefficients, design
 from calib.procedure.excitation import folder as motion_folder
 from calib.procedure.excitation.inputs import identifiable, read_model, read_prior
@@ -219,12 +220,12 @@ def test_a_motion_folder_is_written_whole(tmp_path):
     def full(designed: design.Designed, folder: Path) -> None:
         raise OSError(28, "No space left on device")
 
-    with pytest.raises(OSError):
+    with pytest.raises(UsageError, match="No space left on device; nothing was changed"):
         motion_folder.write_design(designed, tmp_path / "e", full)
     assert list(tmp_path.iterdir()) == []
     motion_folder.write_design(designed, tmp_path / "e")
     before = {path.name: path.read_bytes() for path in (tmp_path / "e").iterdir()}
-    with pytest.raises(OSError):
+    with pytest.raises(UsageError, match="No space left on device; nothing was changed"):
         motion_folder.write_design(replace(designed, condition={"raw": 1.0}), tmp_path / "e", full)
     assert {path.name: path.read_bytes() for path in (tmp_path / "e").iterdir()} == before
 

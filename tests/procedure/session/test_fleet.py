@@ -49,8 +49,10 @@ def test_a_failing_verdict_is_code_1(cells: Path) -> None:
 def test_an_unforeseen_error_stops_none_either(cells: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fleet.steps, "run_next", lambda *given: 1 / 0)
     one = fleet.run_one(cells / "a")
-    assert one.state == fleet.FAILED and one.code == 1 and "ZeroDivisionError" in one.words
-    assert "Traceback" in (cells / "a/run.log").read_text() and not (cells / "a/session.lock").exists()
+    assert one.state == fleet.FAILED and one.code == 4 and "ZeroDivisionError" in one.words
+    (report,) = (cells / "a").glob("calib-bug-*.txt")
+    assert "Traceback" in report.read_text() and report.name in (cells / "a/run.log").read_text()
+    assert not (cells / "a/session.lock").exists()
 
 
 def test_a_robot_whose_process_dies_is_one_that_failed(cells: Path) -> None:

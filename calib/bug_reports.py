@@ -1,0 +1,58 @@
+"""What is left of an error that nobody foresaw: one message, and a file that can be sent to whoever mends it.
+
+The file holds the command, versions, and where the program stood; of a person's data only what the error's own message
+quotes.
+"""
+
+from __future__ import annotations
+
+import platform
+import shlex
+import tempfile
+import traceback
+from collections.abc import Sequence
+from datetime import datetime
+from importlib import metadata
+from pathlib import Path
+
+from calib import files
+from calib.errors import CalibError
+
+CODE = 4
+"""Exit code of an error that nobody foresaw."""
+PACKAGES = ("armature-calib", "numpy", "scipy", "numba", "pin", "pydantic", "typer", "matplotlib", "cvxpy")
+
+
+def report(error: BaseException, command: Sequence[str], folder: Path | None = None) -> str:
+    """Write what is needed to mend an unforeseen error, and return what to say of it, in one line.
+
+    Args:
+        error: with its traceback.
+        command: the words after ``calib``.
+        folder: where the file is to go; by default the current one, or the system's for temporary files.
+    """
+    name = f"calib-bug-{datetime.now():%Y%m%d-%H%M%S}-{id(error) % 9973}.txt"
+    content = "\n".join([f"calib {shlex.join(command)}", *_versions(), "", *traceback.format_exception(error)])
+    said = f"an error that nobody foresaw: {_short(error)}"
+    for place in (Path() if folder is None else folder, Path(tempfile.gettempdir())):
+        try:
+            path = files.write(place / name, content)
+        except CalibError:
+            continue
+        return f"{said}; {path} says where: please send it in. Was every input what it should be?"
+    return f"{said}; --debug shows where. Was every input what it should be?"
+
+
+def _short(error: BaseException, most: int = 200) -> str:
+    words = " ".join(f"{type(error).__name__}: {error}".split())
+    return words if len(words) <= most else f"{words[:most]}…"
+
+
+def _versions() -> list[str]:
+    found = [f"Python {platform.python_version()}, {platform.platform()}"]
+    for name in PACKAGES:
+        try:
+            found.append(f"{name} {metadata.version(name)}")
+        except metadata.PackageNotFoundError:
+            found.append(f"{name} is not installed")
+    return found

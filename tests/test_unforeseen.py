@@ -1,0 +1,62 @@
+"""Errors that nobody foresaw: one message, a code of their own, and a file for whoever mends them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from calib import cli
+
+
+def failing(error: BaseException):
+    def describe(topic: str) -> str:
+        raise error
+
+    return describe
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("CALIB_DEBUG", raising=False)
+
+
+@pytest.mark.parametrize(
+    "error, code, words",
+    [
+        (KeyError("axis"), 4, "an error that nobody foresaw: KeyError: 'axis'; calib-bug-"),
+        (PermissionError(13, "Permission denied", "/x/y.csv"), 2, "/x/y.csv: Permission denied"),
+        (MemoryError("Unable to allocate 373. GiB"), 2, "Unable to allocate 373. GiB"),
+        (BrokenPipeError(32, "Broken pipe"), 141, ""),
+    ],
+)
+def test_whatever_happens_is_one_line_and_a_code(error, code, words, monkeypatch, capsys, tmp_path) -> None:
+    monkeypatch.setattr("calib.procedure.formats.describe", failing(error))
+    assert cli.run(["formats", "mdh"]) == code
+    said = capsys.readouterr().err
+    assert words in said and said.count("\n") <= 1 and "Traceback" not in said
+    reports = list(tmp_path.glob("calib-bug-*.txt"))
+    assert len(reports) == (code == 4)
+    if reports:
+        text = reports[0].read_text()
+        assert text.startswith("calib formats mdh\nPython ") and "in describe" in text and "numpy " in text
+
+
+def test_a_report_goes_elsewhere_where_the_folder_cannot_be_written(monkeypatch, capsys, tmp_path) -> None:
+    other = tmp_path / "other"
+    other.mkdir()
+    gone = tmp_path / "gone"
+    gone.write_text("a file, not a folder")
+    from calib import bug_reports
+
+    monkeypatch.setattr("tempfile.tempdir", str(other))
+    words = bug_reports.report(ValueError("x"), ["fit"], gone)
+    assert str(other) in words and len(list(other.iterdir())) == 1
+
+
+def test_debug_shows_the_traceback(monkeypatch) -> None:
+    monkeypatch.setenv("CALIB_DEBUG", "1")
+    monkeypatch.setattr("calib.procedure.formats.describe", failing(KeyError("axis")))
+    with pytest.raises(KeyError):
+        cli.run(["formats", "mdh"])
