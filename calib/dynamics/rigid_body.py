@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib.arrays import shaped
-from calib.dynamics.bodies import REVOLUTE, Bodies
+from calib.dynamics.bodies import PRISMATIC, REVOLUTE, Bodies, with_gravity
 from calib.errors import CalibError
 
 
@@ -37,6 +37,44 @@ def fill_regressor(bodies: Bodies, q: np.ndarray, v: np.ndarray, a: np.ndarray, 
         amount = np.where(bodies.kinds[:, None] == REVOLUTE, np.remainder(amount, 2 * np.pi), amount)
     v, a = np.ascontiguousarray(v.T), np.ascontiguousarray(a.T)
     kernels.regressor(bodies.links, bodies.constants, bodies.order, amount, v, a, out)
+
+
+def energies(bodies: Bodies, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Return kinetic and potential energy per unit of each standard parameter, (N, 10 B).
+
+        ½ q̇ᵀ [Y(q, 0, q̇) - Y(q, 0, 0)] - [0, gᵀ R, gᵀ p],    R, p the body's frame in the base
+
+    (Gautier 1997, with Y the regressor of the torques, so that M(q) q̇ = [Y(q, 0, q̇) - Y(q, 0, 0)] chi.)
+
+    Args:
+        q, v: (N, n) [rad or m, and per s].
+    """
+    still = np.zeros_like(np.asarray(v, dtype=float))
+    moved = regressor(with_gravity(bodies, np.zeros(3)), q, still, v)
+    result = 0.5 * np.einsum("nj,njc->nc", v, moved)
+    for i, frame in enumerate(frames(bodies, q)):
+        result[:, 10 * i + 6 : 10 * i + 9] -= np.einsum("nji,j->ni", frame[:, :3, :3], bodies.gravity)
+        result[:, 10 * i + 9] -= frame[:, :3, 3] @ bodies.gravity
+    return result
+
+
+def frames(bodies: Bodies, q: np.ndarray) -> np.ndarray:
+    """Return the bodies' frames in the base, (B, N, 4, 4)."""
+    result = np.empty((bodies.count, len(q), 4, 4))
+    for i, parent in enumerate(bodies.parents):
+        placed = bodies.placements[i] if parent < 0 else result[parent] @ bodies.placements[i]
+        own = np.tile(np.eye(4), (len(q), 1, 1))
+        if bodies.coordinates[i] >= 0:
+            amount, axis = bodies.scales[i] * q[:, bodies.coordinates[i]], int(bodies.axes[i])
+            if bodies.kinds[i] == PRISMATIC:
+                own[:, axis, 3] = amount
+            else:
+                one, two = (axis + 1) % 3, (axis + 2) % 3
+                own[:, one, one] = own[:, two, two] = np.cos(amount)
+                own[:, two, one] = np.sin(amount)
+                own[:, one, two] = -own[:, two, one]
+        result[i] = placed @ own
+    return result
 
 
 def regressor_gradient(

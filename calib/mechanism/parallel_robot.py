@@ -1,0 +1,179 @@
+"""What a parallel robot is: legs from the base to a platform, each a serial chain whose end the platform holds.
+
+    closure of leg k:   tip_k(q_k) = P · attachment_k        (six equations where the leg is rigid with the platform,
+                                                              three where a spherical joint ends it)
+
+Nothing is planar or symmetric by construction: a planar robot is one whose loops leave x, y and rz. The virtual tree of
+the papers (Khalil & Ibrahim 2007; Briot, Gautier & Krut 2013) is all legs side by side, and the free platform.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from calib.arrays import frozen
+from calib.errors import RobotError
+from calib.robot.chain import GRAVITY, Chain, Joint
+
+COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
+FORCES = ("N", "N", "N", "N m", "N m", "N m")
+ENDS = ("rigid", "spherical")
+
+
+@dataclass(frozen=True, eq=False)
+class Leg:
+    """One serial chain from the base to the platform.
+
+    Attributes:
+        name: of the leg.
+        chain: its joints, from the robot's base to its end; the first element holds its place in the base.
+        actuated: which of its joints have a motor and an encoder.
+        home: (n,) joint values near those that close its loop at the platform's home: they choose the branch.
+        attachment: (4, 4) where the platform holds its end, in the platform's frame.
+        end: ``rigid``: the last link is the platform, all passive joints are in the chain; ``spherical``: a joint of
+            three freedoms ends it, which the chain leaves out.
+    """
+
+    name: str
+    chain: Chain
+    actuated: tuple[int, ...]
+    home: np.ndarray
+    attachment: np.ndarray
+    end: str = "rigid"
+
+    def __post_init__(self) -> None:
+        if self.end not in ENDS:
+            raise RobotError(f"leg '{self.name}': its end '{self.end}' is neither {' nor '.join(ENDS)}")
+        home = np.atleast_1d(np.asarray(self.home, dtype=float))
+        if home.shape != (self.chain.n,):
+            raise RobotError(f"leg '{self.name}': home has {home.size} values for its {self.chain.n} joints")
+        if self.chain.n > self.held:
+            raise RobotError(
+                f"leg '{self.name}': {self.chain.n} joints behind a {self.end} end leave motions that no loop "
+                f"determines; at most {self.held} can be solved for"
+            )
+        object.__setattr__(self, "home", frozen(home))
+        object.__setattr__(self, "attachment", frozen(self.attachment))
+
+    @property
+    def held(self) -> int:
+        """How many equations its closure has."""
+        return 6 if self.end == "rigid" else 3
+
+    @property
+    def bodies(self) -> int:
+        """How many of its links are bodies of their own: the last one of a rigid end is the platform."""
+        return self.chain.n - (self.end == "rigid")
+
+
+@dataclass(frozen=True, eq=False)
+class ParallelRobot:
+    """Legs and the platform they hold.
+
+    Attributes:
+        name: of the robot.
+        legs: in the order of the file; actuated joints are numbered through them.
+        freedom: the platform's independent coordinates, of `COORDINATES`: position of its frame's origin [m] and
+            roll-pitch-yaw from the base's axes [rad], both from `home`; v and forces along them are parts of its twist
+            and wrench, in the base's axes.
+        home: (4, 4) the platform's home in the base.
+        lower, upper: (r,) box of platform coordinates in which states are drawn and motions designed.
+        platform: (10,) its standard parameters about its frame; None where unknown.
+        gravity: (3,) in the base frame [m/s²].
+    """
+
+    name: str
+    legs: tuple[Leg, ...]
+    freedom: tuple[str, ...]
+    home: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    platform: np.ndarray | None = None
+    gravity: np.ndarray = field(default_factory=lambda: np.array(GRAVITY))
+
+    def __post_init__(self) -> None:
+        for key in ("home", "lower", "upper", "gravity"):
+            object.__setattr__(self, key, frozen(getattr(self, key)))
+        if self.platform is not None:
+            object.__setattr__(self, "platform", frozen(self.platform))
+        names = [leg.name for leg in self.legs]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise RobotError(f"robot '{self.name}': two legs are called '{twice[0]}'")
+        unknown = [name for name in self.freedom if name not in COORDINATES]
+        if unknown or not self.freedom or len(set(self.freedom)) < len(self.freedom):
+            raise RobotError(
+                f"robot '{self.name}': freedom {', '.join(self.freedom) or 'is empty'}; it names the platform's "
+                f"independent coordinates, each once, of {', '.join(COORDINATES)}"
+            )
+        if self.n < self.r:
+            raise RobotError(
+                f"robot '{self.name}': {self.n} actuated joints cannot hold a platform of {self.r} freedoms "
+                f"({', '.join(self.freedom)})"
+            )
+        if self.lower.shape != (self.r,) or self.upper.shape != (self.r,) or not (self.lower < self.upper).all():
+            raise RobotError(
+                f"robot '{self.name}': the platform's limits need one lower and one higher upper value per coordinate "
+                f"({', '.join(self.freedom)}); found {self.lower.tolist()} and {self.upper.tolist()}"
+            )
+
+    @property
+    def r(self) -> int:
+        """Freedoms of the platform."""
+        return len(self.freedom)
+
+    @property
+    def n(self) -> int:
+        """Actuated joints."""
+        return sum(len(leg.actuated) for leg in self.legs)
+
+    @property
+    def redundant(self) -> bool:
+        """Whether it has more actuators than freedoms."""
+        return self.n > self.r
+
+    @cached_property
+    def selected(self) -> np.ndarray:
+        """(r,) which parts of the platform's twist are the independent ones."""
+        return np.array([COORDINATES.index(name) for name in self.freedom])
+
+    @cached_property
+    def starts(self) -> np.ndarray:
+        """(L + 1,) where each leg's joints begin among all joints of the tree; the last entry is their number."""
+        return np.concatenate([[0], np.cumsum([leg.chain.n for leg in self.legs])]).astype(int)
+
+    @cached_property
+    def actuated(self) -> np.ndarray:
+        """(n,) the actuated ones among all joints of the tree."""
+        return np.array([self.starts[k] + j for k, leg in enumerate(self.legs) for j in leg.actuated], dtype=int)
+
+    @property
+    def joints(self) -> tuple[Joint, ...]:
+        """The actuated joints."""
+        return tuple(leg.chain.joints[j] for leg in self.legs for j in leg.actuated)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Of the actuated joints."""
+        return tuple(joint.name for joint in self.joints)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """What the tree's joints are numbered with: joint j of leg k is ``jk``, as in the papers (``j.k`` above 9)."""
+        wide = len(self.legs) > 9 or max(leg.chain.n for leg in self.legs) > 9
+        return tuple(
+            f"{j + 1}.{k + 1}" if wide else f"{j + 1}{k + 1}"
+            for k, leg in enumerate(self.legs)
+            for j in range(leg.chain.n)
+        )
+
+    @property
+    def platform_label(self) -> str:
+        """What the platform's parameters are numbered with: the number after the legs' last joints."""
+        return str(max(leg.chain.n for leg in self.legs) + 1)
+
+    def with_legs(self, legs: tuple[Leg, ...]) -> ParallelRobot:
+        """Return the robot on other legs: another geometry."""
+        return replace(self, legs=legs)
