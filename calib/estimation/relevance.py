@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-from scipy.linalg.lapack import dpotri  # type: ignore[attr-defined]
+from scipy.linalg.lapack import dtrtri  # type: ignore[attr-defined]
 
 EXACT = 1e-7  # ‖y - W x‖ relative to ‖y‖ below which a fit counts as perfect: WᵀW knows no better
 OUTWEIGHED = 2.0  # a group is out once its prior is this many times as precise as the data on its columns (our choice)
@@ -70,10 +70,13 @@ def relevance(data: Gram, groups: np.ndarray, start: np.ndarray, iterations: int
     information = np.bincount(family, np.diag(data.square), count + 1) / members
     beta, alive = 1.0, np.ones(count + 1, dtype=bool)
     index, solution, effective = np.arange(len(groups)), np.zeros(len(groups)), 0.0
+    square = data.square
     for _ in range(iterations):
-        index = np.flatnonzero(alive[family])
+        inside = np.flatnonzero(alive[family[index]])
+        if len(inside) < len(index):
+            index, square = index[inside], square.take(inside, 0).take(inside, 1)
         own = family[index]
-        solution, variance = _posterior(data, index, lam[own], beta)
+        solution, variance = _posterior(square, data.cross[index], lam[own], beta)
         told = np.where(own < count, 1.0 - lam[own] * variance, 0.0)
         gamma = np.bincount(own, told, count + 1)
         size = np.bincount(own, solution**2, count + 1)
@@ -81,7 +84,7 @@ def relevance(data: Gram, groups: np.ndarray, start: np.ndarray, iterations: int
         alive[:count] &= (lam < OUTWEIGHED * beta * np.maximum(information, 1e-300))[:count]
         effective = float(gamma.sum())
         misfit = data.total - 2.0 * solution @ data.cross[index]
-        misfit += solution @ data.square[np.ix_(index, index)] @ solution
+        misfit += solution @ square @ solution
         least = EXACT**2 * max(data.total, 1e-300)  # what rounding leaves of a perfect fit
         beta = max(data.rows - effective - int((~ridged).sum()), 1.0) / max(float(misfit), least)
     values, ridge = np.zeros(len(groups)), np.where(ridged, 0.0, np.inf)
@@ -91,13 +94,15 @@ def relevance(data: Gram, groups: np.ndarray, start: np.ndarray, iterations: int
     return Relevance(values, ridge, effective, float(1.0 / np.sqrt(beta)))
 
 
-def _posterior(data: Gram, index: np.ndarray, penalty: np.ndarray, beta: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and variances of x[index], with columns scaled to unit information first."""
-    square = data.square[np.ix_(index, index)]
+def _posterior(
+    square: np.ndarray, cross: np.ndarray, penalty: np.ndarray, beta: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and variances of x from WᵀW and Wᵀy, with columns scaled to unit information first."""
     scale = 1.0 / np.sqrt(np.maximum(beta * np.diag(square) + penalty, 1e-300))
-    system = beta * square * np.outer(scale, scale)
-    system[np.diag_indices(len(index))] += penalty * scale**2
-    factor = scipy.linalg.cho_factor(system + 1e-12 * np.eye(len(index)), lower=True, check_finite=False)
-    solution = scale * scipy.linalg.cho_solve(factor, scale * beta * data.cross[index], check_finite=False)
-    inverse, _ = dpotri(factor[0], lower=1)
-    return solution, np.diag(inverse) * scale**2
+    system = square * scale[:, None]
+    system *= beta * scale
+    system.flat[:: len(scale) + 1] += penalty * scale**2 + 1e-12
+    factor = scipy.linalg.cholesky(system.T, lower=True, overwrite_a=True, check_finite=False)
+    solution = scale * scipy.linalg.cho_solve((factor, True), scale * beta * cross, check_finite=False)
+    inverse, _ = dtrtri(factor, lower=1, overwrite_c=1)  # of the triangle: the variances need no more
+    return solution, np.einsum("ij,ij->j", inverse, inverse) * scale**2

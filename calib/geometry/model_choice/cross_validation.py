@@ -76,7 +76,7 @@ class FoldStatistics:
         """Return statistics, ridge groups and first sizes for geometry and terms: of all rows, or without a fold."""
         data = self.total if fold is None else self.training[fold]
         index = np.concatenate([np.arange(self.rigid), self.rigid + terms])
-        square = data.square[np.ix_(index, index)]
+        square = data.square.take(index, 0).take(index, 1)
         square[np.arange(self.rigid), np.arange(self.rigid)] += 1.0 / self.plausible**2
         _, groups = np.unique(self.groups[terms], return_inverse=True) if len(terms) else (None, np.array([], int))
         groups = np.concatenate([np.full(self.rigid, -1), groups])
@@ -89,7 +89,7 @@ class FoldStatistics:
         squares = []
         for fold, held in enumerate(self.held_out):
             x = relevance(*self.problem(terms, fold), iterations=8).values
-            square = held.square[np.ix_(index, index)]
+            square = held.square.take(index, 0).take(index, 1)
             squares.append(held.total - 2.0 * x @ held.cross[index] + x @ square @ x)
         return UnseenErrors(np.array(squares), self.rows)
 
