@@ -168,8 +168,9 @@ class TorqueLimit:
 
     def slopes(self, motion: SampledMotion, weights: np.ndarray) -> np.ndarray:
         k = len(self.joints)
-        G = np.zeros((*motion.q.shape, len(self.parameters)))
-        G[:, self.joints] = (weights[:, :k] - weights[:, k:])[:, :, None] * self.parameters
+        signed = np.zeros(motion.q.shape)
+        signed[:, self.joints] = weights[:, :k] - weights[:, k:]
+        G = signed[:, :, None] * self.parameters
         if self.covariance is not None:
             Y = self.regressor(motion.q, motion.v, motion.a)[:, self.joints]
             seen = Y @ self.covariance

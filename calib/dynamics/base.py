@@ -123,10 +123,7 @@ class BaseModel:
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the slopes of Σ weights · regressor by q, v, a, each (N, n); weights (N, rows, b)."""
-        weights = shaped(weights, (len(q), self.model.rows, self.base.b), "weights of the regressor")
-        full = np.zeros((len(q), self.model.rows, self.model.p))
-        full[:, :, self.base.kept] = weights
-        return self.model.regressor_gradient(q, v, a, full)
+        return self.model.regressor_gradient(q, v, a, weights, self.base.kept)
 
 
 def random_samples(

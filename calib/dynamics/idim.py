@@ -120,20 +120,28 @@ class IdentificationModel:
         return self.torque_rows.observe(out.transpose(2, 1, 0), self.sides, q, v)
 
     def regressor_gradient(
-        self, q: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
+        self, q: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray, columns: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the slopes of Σ weights · regressor(q, v, a) by q, v and a, each (N, n), exactly; all bodies carried.
 
         Args:
-            weights: (N, rows, p).
+            weights: (N, rows, c).
+            columns: (c,) of the regressor, which the weights are of, rising; None: all p.
         """
-        weights = shaped(weights, (len(q), self.rows, self.p), "weights of the regressor")
-        weights, first = self.torque_rows.fold(weights, self.sides), self.inertial
+        kept, sides = np.arange(self.p) if columns is None else np.asarray(columns), self.sides
+        weights = shaped(weights, (len(q), self.rows, len(kept)), "weights of the regressor")
+        weights, bodies = self.torque_rows.fold(weights, [sides[k] for k in kept]), int((kept < self.inertial).sum())
         out = np.zeros((3, *np.shape(q)))
-        if first:
-            out[:] = rigid_body.regressor_gradient(self.bodies, q, v, a, weights[:, :, :first])
+        if bodies:
+            inertial = weights[:, :, :bodies]
+            if bodies < self.inertial:
+                inertial = np.zeros((len(q), self.n, self.inertial))
+                inertial[:, :, kept[:bodies]] = weights[:, :, :bodies]
+            out[:] = rigid_body.regressor_gradient(self.bodies, q, v, a, inertial)
         motions = [np.ascontiguousarray(np.asarray(x, dtype=float).T) for x in (q, v, a)]
-        drives.slopes(self.columns, motions, weights[:, :, first:].transpose(2, 1, 0), [out[0].T, out[1].T, out[2].T])
+        offered = self.columns
+        terms = [offered[k - self.inertial] for k in kept[bodies:]]
+        drives.slopes(terms, motions, weights[:, :, bodies:].transpose(2, 1, 0), [out[0].T, out[1].T, out[2].T])
         return out[0], out[1], out[2]
 
     def acting(self) -> np.ndarray:

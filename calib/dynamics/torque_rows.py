@@ -164,11 +164,11 @@ class TorqueRows:
         """
         if self.projection is not None:
             raise CalibError(f"rows '{self.name}' are projected by a map that depends on the state: no slopes")
+        seen = [np.array([side in block.sides for side in sides], dtype=bool) for block in self.blocks]
+        if len(seen) == 1 and seen[0].all():
+            return weights
         n = weights.shape[1] // len(self.blocks)
-        parts = [
-            weights[:, k * n : (k + 1) * n] * np.array([side in block.sides for side in sides], dtype=float)
-            for k, block in enumerate(self.blocks)
-        ]
+        parts = [weights[:, k * n : (k + 1) * n] * used for k, used in enumerate(seen)]
         return np.add.reduce(parts[::-1])
 
     def target(self, motor: np.ndarray, sensor: np.ndarray | None, q: np.ndarray, v: np.ndarray) -> np.ndarray:
