@@ -104,7 +104,7 @@ class GeometryFit:
         from calib.procedure.report import figures
         from calib.procedure.report.fit_report import collect
 
-        return {name: drawn.figure for name, drawn in figures.captioned(collect(self.outcome)).items()}
+        return {name: shown.make() for name, shown in figures.captioned(collect(self.outcome)).items()}
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as ``metrics.json`` holds them."""

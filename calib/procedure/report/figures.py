@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -26,9 +27,9 @@ DRAWN = 300  # points per curve of the excitation
 
 
 class Captioned(NamedTuple):
-    """A figure, what it shows in a sentence, and whether it takes the page's width."""
+    """What makes a figure, what it shows in a sentence, and whether it takes the page's width."""
 
-    figure: Figure
+    make: Callable[[], Figure]
     caption: str
     wide: bool = False
 
@@ -46,39 +47,41 @@ def captioned(report: Report) -> dict[str, Captioned]:
     for nature in ("position", "orientation", "distance"):
         if nature in proof.calibrated:
             sizes = [np.array(arm[nature]) for arm in (proof.nominal, proof.calibrated)]
-            figure = geometry_figures.error_histogram(sizes[0], sizes[1], nature, report.noise.get(nature))
-            result[nature] = Captioned(figure, f"{nature.capitalize()} errors before and after, {label}; dashed: rms.")
+            make = partial(geometry_figures.error_histogram, sizes[0], sizes[1], nature, report.noise.get(nature))
+            result[nature] = Captioned(make, f"{nature.capitalize()} errors before and after, {label}; dashed: rms.")
     rungs = [rung for rung in report.metrics.ladder if rung.cross_validated_mm is not None]
     if len(rungs) > 1:
         result["ladder"] = _ladder(report, rungs)
     if report.singular_values:
-        figure = geometry_figures.singular_values(np.array(report.singular_values), report.rank)
+        make = partial(geometry_figures.singular_values, np.array(report.singular_values), report.rank)
         words = "Singular values of the scaled observation matrix: filled ones carry a parameter, open ones none."
-        result["singular_values"] = Captioned(figure, words)
+        result["singular_values"] = Captioned(make, words)
     if proof.q:
         result |= _over_workspace(report, proof, label)
     arm = [row for row in report.parameters if row.group == "arm"]
     if arm:
         change = np.array([row.value - row.nominal for row in arm])
         sigma = np.array([row.sigma for row in arm])
-        figure = geometry_figures.parameter_changes([row.name for row in arm], [row.unit for row in arm], change, sigma)
-        result["parameters"] = Captioned(figure, "What the fit changed in the arm. Grey: less than two sigmas.", True)
+        names, units = [row.name for row in arm], [row.unit for row in arm]
+        make = partial(geometry_figures.parameter_changes, names, units, change, sigma)
+        result["parameters"] = Captioned(make, "What the fit changed in the arm. Grey: less than two sigmas.", True)
     if len(report.correlated.names) > 1:
         matrix = np.array(report.correlated.matrix)
-        figure = geometry_figures.correlation_map(report.correlated.names, matrix, 0.0)
-        result["correlations"] = Captioned(figure, "Parameters that the data tell apart least.")
+        make = partial(geometry_figures.correlation_map, report.correlated.names, matrix, 0.0)
+        result["correlations"] = Captioned(make, "Parameters that the data tell apart least.")
     return result
 
 
 def _ladder(report: Report, rungs: Sequence[LadderStep]) -> Captioned:
-    figure = geometry_figures.ladder(
+    make = partial(
+        geometry_figures.ladder,
         [rung.model for rung in rungs],
         [rung.parameters for rung in rungs],
         [1e-3 * (rung.cross_validated_mm or 0.0) for rung in rungs],
         [not rung.note for rung in rungs],
         report.noise.get("position"),
     )
-    return Captioned(figure, "The ladder of models: error on rows left out. Filled: kept; open: left out.", True)
+    return Captioned(make, "The ladder of models: error on rows left out. Filled: kept; open: left out.", True)
 
 
 def _over_workspace(report: Report, proof: RowErrors, label: str) -> dict[str, Captioned]:
@@ -86,13 +89,13 @@ def _over_workspace(report: Report, proof: RowErrors, label: str) -> dict[str, C
     nature = "position" if "position" in proof.calibrated else "distance"
     before, after = (np.array(arm[nature]) for arm in (proof.nominal, proof.calibrated))
     q, points = np.array(proof.q), np.array(proof.points)
-    joints = geometry_figures.residuals_by_joint(q, before, after, report.joints, report.prismatic, nature)
+    joints = partial(geometry_figures.residuals_by_joint, q, before, after, report.joints, report.prismatic, nature)
     return {
         "joints": Captioned(
             joints, f"Errors against each joint, {label}: a trend is something no parameter holds.", True
         ),
         "map": Captioned(
-            geometry_figures.error_map(points, after), f"Remaining error over the workspace, {label}.", True
+            partial(geometry_figures.error_map, points, after), f"Remaining error over the workspace, {label}.", True
         ),
     }
 
@@ -126,8 +129,8 @@ def _judged(unseen: UnseenReport) -> list[Picture]:
     name, white = next(iter(unseen.autocorrelation.items()))
     many = len(unseen.rows) > dynamics_figures.FEW
     width = WIDE if many else HALF
-    bars = dynamics_figures.errors_by_row(sides[0], sides[1], unseen.rows)
-    drawn = dynamics_figures.autocorrelations(white.values, white.bound, unseen.rows, "What is left", width)
+    bars = partial(dynamics_figures.errors_by_row, sides[0], sides[1], unseen.rows)
+    drawn = partial(dynamics_figures.autocorrelations, white.values, white.bound, unseen.rows, "What is left", width)
     shares = f"Share of each torque that the model leaves, on the training motion and on {where}."
     rest = f"Autocorrelation of what is left below the band on {name}; dashed: white noise."
     return [picture(bars, shares, many), picture(drawn, rest, many)]
@@ -146,9 +149,9 @@ def _torques(unseen: UnseenReport) -> list[Picture]:
         )
         raw = {**unseen.fit, **unseen.validation}[curves.name].raw.relative_error_percent
         title = f"{curves.name}: {percent(raw.total)} of the torque unexplained"
-        figure = dynamics_figures.torques(t, measured, predicted, unseen.rows, unseen.units, title, raw.joints)
+        make = partial(dynamics_figures.torques, t, measured, predicted, unseen.rows, unseen.units, title, raw.joints)
         words = f"Torques on {curves.name}, {seen}: measured, predicted, and what is left."
-        result.append(picture(figure, words, True))
+        result.append(picture(make, words, True))
     return result
 
 
@@ -174,8 +177,7 @@ def _excitation(excitation: Path) -> list[Picture]:
     )
     names, none = motion.joint_names, np.full(q.shape[1], np.inf)
     series = [(each, -none, none, title) for each, title in ((q, "position"), (v, "velocity"))]
-    figure = motion_figures.motion_sheet(t, series, ("rad", "rad/s"), names)
-    return [picture(figure, words, True)]
+    return [picture(partial(motion_figures.motion_sheet, t, series, ("rad", "rad/s"), names), words, True)]
 
 
 def _significance(found: DynamicReport) -> Picture:
@@ -184,6 +186,7 @@ def _significance(found: DynamicReport) -> Picture:
 
     known = [row for row in found.estimate if row.sigma]
     sigma = np.array([row.sigma or np.nan for row in known])
-    figure = dynamics_figures.significance([row.name for row in known], np.array([row.value for row in known]), sigma)
+    values = np.array([row.value for row in known])
+    make = partial(dynamics_figures.significance, [row.name for row in known], values, sigma)
     words = "How far each parameter is from zero, in its σ; grey, below the dashed line: not told from zero."
-    return picture(figure, words, True)
+    return picture(make, words, True)

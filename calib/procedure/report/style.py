@@ -8,8 +8,10 @@ that a ``$`` in a name is a ``$``.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Iterator, Mapping
+import pickle
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -189,6 +191,16 @@ def save_all(figures: Mapping[str, Figure], folder: Path) -> None:
         save(figure, folder / f"plot_{name}.png")
 
 
-def picture(figure: Figure, caption: str, wide: bool = False) -> Picture:
-    """Draw a figure for a page, and for a file of its own."""
-    return Picture(png(figure), caption, wide)
+def picture(make: Callable[[], Figure], caption: str, wide: bool = False) -> Picture:
+    """Draw a figure for a page, and for a file of its own.
+
+    Args:
+        make: the function that makes it and its arguments (`functools.partial`); what was drawn of the same ones before
+            is taken again: a session's certificate shows much that its steps drew.
+    """
+    return Picture(_drawn(pickle.dumps(make)), caption, wide)
+
+
+@lru_cache(maxsize=32)
+def _drawn(make: bytes) -> bytes:
+    return png(pickle.loads(make)())

@@ -7,6 +7,7 @@ made later shows the same.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -39,7 +40,7 @@ def from_folder(folder: Path) -> dict[str, Picture]:
             "torque noise; calibrated: with the geometry's uncertainty). Below: how far the nominal one's estimate "
             "is off, in the calibrated one's sigmas."
         )
-        result["geometries"] = picture(geometries(rows), words, True)
+        result["geometries"] = picture(partial(geometries, rows), words, True)
     known = [row for row in _read(GeometricEffect, folder / EFFECTS) if row.sigma is not None]
     if known:
         words = (
@@ -47,7 +48,7 @@ def from_folder(folder: Path) -> dict[str, Picture]:
             "it moves most, in that parameter's sigma from torque noise. Below the dashed line no sigma grows by more "
             "than 1 %."
         )
-        result["effects"] = picture(effects(known[:TOP]), words)
+        result["effects"] = picture(partial(effects, known[:TOP]), words)
     return result
 
 

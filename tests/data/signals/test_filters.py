@@ -54,6 +54,19 @@ def test_a_cutoff_beyond_nyquist_is_refused(cutoff):
         low_pass(sine(1.0), RATE, cutoff)
 
 
+@pytest.mark.parametrize("order", [1, 2, 3, 4, 5])
+@pytest.mark.parametrize("share", [0.01, 0.1, 0.3, 0.49])
+@pytest.mark.parametrize("count", [1, 2, 7, 1200])
+def test_low_pass_is_scipys(order, share, count):
+    from scipy.signal import butter, sosfiltfilt
+
+    x = np.random.default_rng(order).normal(3.0, 1.0, (count, 2, 3)).cumsum(axis=0)
+    pad = min(count - 1, int(3 / share) + 1)
+    expected = sosfiltfilt(butter(order, share, fs=1.0, output="sos"), x, axis=0, padtype="odd", padlen=pad)
+    lost = 1e-12 + 1e-13 / share**2  # by scipy's initial state, which divides by the sum of a
+    np.testing.assert_allclose(low_pass(x, 1.0, share, order), expected, rtol=1e-12, atol=lost)
+
+
 @pytest.mark.parametrize(
     ("width", "first", "second"), [(1, 1 / 6, 1 / 12), (2, 1 / 30, 1 / 90), (4, 1 / 630, 1 / 3150)]
 )
