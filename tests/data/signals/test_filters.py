@@ -63,7 +63,7 @@ def test_low_pass_is_scipys(order, share, count):
     x = np.random.default_rng(order).normal(3.0, 1.0, (count, 2, 3)).cumsum(axis=0)
     pad = min(count - 1, int(3 / share) + 1)
     expected = sosfiltfilt(butter(order, share, fs=1.0, output="sos"), x, axis=0, padtype="odd", padlen=pad)
-    lost = 1e-12 + 1e-13 / share**2  # by scipy's initial state, which divides by the sum of a
+    lost = 1e-13 / min(share, 0.5 - share) ** 2  # where the poles come near 1 (scipy's initial state feels it) or -1
     np.testing.assert_allclose(low_pass(x, 1.0, share, order), expected, rtol=1e-12, atol=lost)
 
 
