@@ -26,7 +26,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
 
 from calib.arrays import frozen
 from calib.data.signals.filtering import low_pass
@@ -200,17 +199,12 @@ class WaveCrossValidation:
         unit, power = float(np.trace(whole)) / len(whole), float(residual @ residual)
         if unit == 0.0:
             return 0.0, RIDGES[-1]
-        result = []
-        for ridge in RIDGES:
-            gained = 0.0
-            for square, own in zip(squares, crosses):
-                left = whole - square
-                left[np.diag_indices(len(left))] += ridge * unit
-                x = scipy.linalg.solve(left, cross - own, assume_a="pos", overwrite_a=True, check_finite=False)
-                gained += float(2.0 * x @ own - x @ square @ x)
-            result.append(gained / power)
+        left = (whole - np.array(squares)) + (np.array(RIDGES) * unit)[:, None, None, None] * np.eye(len(whole))
+        x = np.linalg.solve(left, (cross - np.array(crosses))[..., None])[..., 0]
+        gained = 2.0 * np.einsum("rfk,fk->r", x, crosses) - np.einsum("rfk,fkl,rfl->r", x, squares, x, optimize=True)
+        result = gained / power
         best = int(np.argmax(result))
-        return result[best], RIDGES[best]
+        return float(result[best]), RIDGES[best]
 
     def fit(self, waves: Sequence[Wave], nodes: tuple[float, ...], ridge: float) -> tuple[np.ndarray, np.ndarray]:
         """Return what the waves leave (N,), and their columns' values (k,)."""

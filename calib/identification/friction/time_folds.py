@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
 from calib.estimation.relevance import Gram, relevance
-from calib.estimation.triangles import Triangles, residual_squares, select
+from calib.estimation.triangles import Triangles, select
 from calib.identification.rows import pool
 
 ITERATIONS = 12
@@ -34,22 +35,58 @@ class CrossValidation:
     inflation: np.ndarray
     group: np.ndarray
     prior: np.ndarray | None = None
+    _known: dict[bytes, np.ndarray] = field(default_factory=dict, init=False)
 
     def errors(self, columns: np.ndarray) -> np.ndarray:
         """Return the squared errors (blocks, rows) on each block of the model with these columns, fitted to the others.
 
         Squares are of samples, not whitened; blocks that a recording's gaps left empty hold zeros.
         """
-        chosen = select(self.data, columns)
-        group = self.group[columns]
+        columns = np.asarray(columns, dtype=int)
+        key = columns.tobytes()
+        if key not in self._known:
+            fitted = self._fitted if (self.group[columns] < 0).all() else self._drawn
+            self._known[key] = self._errors(columns, fitted(columns))
+        return self._known[key].copy()
+
+    def _errors(self, columns: np.ndarray, values: list[np.ndarray]) -> np.ndarray:
+        """Return the squared errors of values (k,) per block."""
         result = np.zeros((self.blocks, self.rows))
-        prior = None if self.prior is None else self.prior[:, np.append(columns, -1)]
-        for block in range(self.blocks):
-            others = [other for other in range(self.blocks) if other != block]
-            values = estimate(pool(chosen, self.rows, others), self.std, self.inflation, group, prior)[0]
-            squares = residual_squares(chosen, values).reshape(-1, self.rows)
-            result[block] = squares[block]
+        for block, own in enumerate(values):
+            x = np.zeros(self.data.parameters)
+            x[columns] = own
+            factors = self.data.factors[block * self.rows : (block + 1) * self.rows]
+            result[block] = np.sum((factors @ np.append(x, -1.0)) ** 2, axis=1)
         return result
+
+    def _fitted(self, columns: np.ndarray) -> list[np.ndarray]:
+        """Return least squares on the blocks beside each one, from their triangles."""
+        chosen, group = select(self.data, columns), self.group[columns]
+        prior = None if self.prior is None else self.prior[:, np.append(columns, -1)]
+        folds = [[other for other in range(self.blocks) if other != block] for block in range(self.blocks)]
+        pooled = (pool(chosen, self.rows, others) for others in folds)
+        return [estimate(data, self.std, self.inflation, group, prior)[0] for data in pooled]
+
+    def _drawn(self, columns: np.ndarray) -> list[np.ndarray]:
+        """Return the estimates with ridges on the blocks beside each one: these need no more than [W y]ᵀ[W y]."""
+        index, blocks = np.append(columns, self.data.parameters), np.arange(self.blocks)
+        squares = self._squares.take(index, 1).take(index, 2)
+        known = 0.0 if self.prior is None else self.prior[:, index].T @ self.prior[:, index]
+        samples = self.counts()
+        found = []
+        for block in range(self.blocks):
+            whole = squares[blocks != block].sum(axis=0) + known
+            rows = int(np.sum(samples[blocks != block].sum(axis=0) / self.inflation))
+            found.append(_drawn(whole, rows, self.group[columns])[0])
+        return found
+
+    @cached_property
+    def _squares(self) -> np.ndarray:
+        """(blocks, p + 1, p + 1) [W y]ᵀ[W y] of each block, its rows whitened."""
+        factors = self.data.factors[: self.blocks * self.rows]
+        weight = np.tile(1.0 / (self.std**2 * self.inflation), self.blocks)
+        squares = (factors.transpose(0, 2, 1) * weight[:, None, None]) @ factors
+        return squares.reshape(self.blocks, self.rows, *squares.shape[1:]).sum(axis=1)
 
     def counts(self) -> np.ndarray:
         """Return the number of samples (blocks, rows)."""
@@ -68,21 +105,20 @@ def estimate(
     stacked = (data.factors * weight[:, None, None]).reshape(-1, data.parameters + 1)
     if prior is not None:
         stacked = np.vstack([stacked, prior])
-    size = np.sqrt(np.sum(stacked[:, :-1] ** 2, axis=0))
-    scale = np.where(size > 0.0, size, 1.0)
-    scaled = stacked[:, :-1] / scale
     if (group < 0).all():
-        return np.linalg.lstsq(scaled, stacked[:, -1], rcond=1e-10)[0] / scale, np.full(len(group), np.inf)
-    target = stacked[:, -1]
-    rows = int(np.sum(data.rows / inflation))
-    unit = np.sqrt(max(rows, 1))
-    scaled, scale = scaled * unit, scale / unit
-    square = scaled.T @ scaled
-    free = group < 0
-    square[np.diag_indices(len(group))] += np.where(
-        free, 1e-9 * rows, 0.0
-    )  # a free direction without data stays at zero
-    found = relevance(
-        Gram(square, scaled.T @ target, float(target @ target), rows), group, np.ones(len(group)), ITERATIONS
-    )
+        size = np.sqrt(np.sum(stacked[:, :-1] ** 2, axis=0))
+        scale = np.where(size > 0.0, size, 1.0)
+        found = np.linalg.lstsq(stacked[:, :-1] / scale, stacked[:, -1], rcond=1e-10)[0]
+        return found / scale, np.full(len(group), np.inf)
+    return _drawn(stacked.T @ stacked, int(np.sum(data.rows / inflation)), group)
+
+
+def _drawn(square: np.ndarray, rows: int, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return values and prior standard deviations (p,) from [W y]ᵀ[W y] (p + 1, p + 1) of so many rows."""
+    size = np.sqrt(np.diag(square)[:-1])
+    scale = np.where(size > 0.0, size, 1.0) / np.sqrt(max(rows, 1))
+    scaled = square[:-1, :-1] / (scale[:, None] * scale)
+    scaled[np.diag_indices(len(group))] += np.where(group < 0, 1e-9 * rows, 0.0)  # free, without data: stays at zero
+    data = Gram(scaled, square[:-1, -1] / scale, float(square[-1, -1]), rows)
+    found = relevance(data, group, np.ones(len(group)), ITERATIONS)
     return found.values / scale, np.where(np.isfinite(found.ridge), found.ridge / scale, np.inf)
