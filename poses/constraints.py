@@ -42,6 +42,16 @@ def reach(
     return PoseConstraint("reach", partial(_reach, tool, most, point), slope)
 
 
+def distance(
+    tool: Tool, least: float, most: float, centre: ArrayLike, jacobian: ToolJacobian | None = None
+) -> PoseConstraint:
+    """Keep the tool's point from `least` to `most` [m] away from a place (3,) [m]: an instrument's range."""
+    point = np.asarray(centre, dtype=float)
+    limits = tuple((sign, bound) for sign, bound in ((-1.0, least), (1.0, most)) if np.isfinite(bound))
+    slope = None if jacobian is None else partial(_distance_gradient, tool, jacobian, limits, point)
+    return PoseConstraint("range of the instrument", partial(_distance, tool, limits, point), slope)
+
+
 def orientation(
     tool: Tool,
     camera: ArrayLike,
@@ -108,6 +118,17 @@ def _reach(tool, most, centre, q):
 
 def _reach_gradient(tool, jacobian, centre, q):
     return 2 * np.einsum("mi,min->mn", tool(q)[1] - centre, jacobian(q)[:, :3])[:, None]
+
+
+def _distance(tool, limits, centre, q):
+    away = np.linalg.norm(tool(q)[1] - centre, axis=1)
+    return np.stack([sign * (away - bound) for sign, bound in limits], axis=1)
+
+
+def _distance_gradient(tool, jacobian, limits, centre, q):
+    away = tool(q)[1] - centre
+    row = np.einsum("mi,min->mn", away / np.linalg.norm(away, axis=1, keepdims=True), jacobian(q)[:, :3])
+    return np.stack([sign * row for sign, _ in limits], axis=1)
 
 
 def _orientation(tool, camera, roll, pitch, q):

@@ -62,7 +62,7 @@ class PoseSelection:
 
     def __str__(self) -> str:
         lines = [f"{words:38} {number}" for words, number in selection.table(self.chosen)]
-        return "\n".join([*lines, *(f"note: {note}" for note in self.chosen.notes)])
+        return "\n".join([*lines, *selection.kept(self.chosen), *(f"note: {note}" for note in self.chosen.notes)])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -176,13 +176,16 @@ def select_poses(
     workers: str | int = 1,
     progress: Progress | None = None,
 ) -> PoseSelection:
-    """Choose the poses at which a robot's geometry shows best, within its limits and what a file states.
+    """Choose the poses at which a robot's geometry shows best, that it can drive, and that an instrument can see.
+
+    With no file poses keep away from joint limits, from the arm itself and from the floor it stands on; what was not
+    checked is listed. ``SelectionSettings.without`` names what need not be kept.
 
     Args:
         robot, base, tip: as of `calib.load`; or what it returned.
         count: how many poses.
         settings: what is measured, targets, index, method, sigmas, seed.
-        constraints: TOML file of what the poses keep beside joint limits (``calib formats constraints``).
+        constraints: TOML file of where the arm may go, and where the instrument stands (``calib formats constraints``).
         existing: CSV of poses measured before, which count.
         workers: local processes, or the address of a Dask scheduler.
         progress: called with a few words now and then.

@@ -94,6 +94,13 @@ def select(
         int, typer.Option(help="searches for feasible poses beyond the bound; 0: it covers the candidates only")
     ] = 0,
     constraints: Annotated[Path | None, typer.Option(help="TOML, see calib formats constraints")] = None,
+    without: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="self-collision, floor, joint-margin, view: not to be kept; instrument, box, obstacles: not there; may "
+            "be repeated"
+        ),
+    ] = None,
     candidates: Annotated[int, typer.Option(help="poses to choose from")] = 2000,
     existing: Annotated[Path | None, typer.Option(help="CSV of poses measured before, which count")] = None,
     sigma: Annotated[

@@ -77,23 +77,25 @@ class Observation:
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """Where the first target is, in the arm's base: q (m, n) -> rotation (m, 3, 3), position (m, 3) [m]."""
+    """Where a target is, in the arm's base: q (m, n) -> rotation (m, 3, 3), position (m, 3) [m]."""
 
     cell: Installation
+    number: int = 0
 
     def __call__(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        poses = see(self.cell, q).poses()
+        poses = see(self.cell, q, 0, self.number).poses()
         return poses[:, :3, :3], poses[:, :3, 3]
 
 
 @dataclass(frozen=True, eq=False)
 class TargetJacobian:
-    """Velocity and angular velocity of the first target per joint velocity: q (m, n) -> (m, 6, n)."""
+    """Velocity and angular velocity of a target per joint velocity: q (m, n) -> (m, 6, n)."""
 
     cell: Installation
+    number: int = 0
 
     def __call__(self, q: np.ndarray) -> np.ndarray:
-        seen = see(self.cell, q)
+        seen = see(self.cell, q, 0, self.number)
         return joint_jacobian(self.cell.chain, seen.walked, seen.point)
 
 

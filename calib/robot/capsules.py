@@ -16,7 +16,15 @@ import numpy as np
 from calib.arrays import shaped
 from calib.robot.chain import Chain, random_joints, stretched_length
 from calib.robot.kinematics import Sweep, sweep
-from calib.robot.obstacles import SAMPLES, Obstacle, check_reachable, inseparable, nearest_on_lines, signed_distance
+from calib.robot.obstacles import (
+    SAMPLES,
+    Obstacle,
+    Wall,
+    check_reachable,
+    inseparable,
+    nearest_on_lines,
+    signed_distance,
+)
 
 LEAST, SHARE = 0.05, 0.05
 """Radius of a capsule where none is stated: this share of the stretched arm, and no less than [m]. Our choice."""
@@ -55,8 +63,8 @@ class Capsules:
         radii: (C,) [m].
         targets: (T, 3) in the tip's frame [m]; their capsules are the last T.
         own: (P, 2) which capsules are compared with each other.
-        world: (W, 2) which capsules with which obstacle; obstacle -1 is the floor.
-        floor: its height [m]; None without one.
+        world: (W, 2) which capsules with which of walls and obstacles, walls first.
+        walls: the floor among them.
         obstacles: in the base frame.
         excluded: pairs left out because no posture parts them.
     """
@@ -68,7 +76,7 @@ class Capsules:
     targets: np.ndarray
     own: np.ndarray
     world: np.ndarray
-    floor: float | None
+    walls: tuple[Wall, ...]
     obstacles: tuple[Obstacle, ...]
     excluded: tuple[tuple[str, str], ...] = ()
     missing: tuple[str, ...] = ()
@@ -76,7 +84,7 @@ class Capsules:
     @cached_property
     def pairs(self) -> tuple[tuple[str, str], ...]:
         """Names of what is compared, in the order of the columns of `distances`."""
-        things = (*(one.name for one in self.obstacles), "floor")
+        things = [one.name for one in (*self.walls, *self.obstacles)]
         own = [(self.names[i], self.names[j]) for i, j in self.own]
         return (*own, *((self.names[i], things[k]) for i, k in self.world))
 
@@ -103,7 +111,7 @@ class Capsules:
         Args:
             q: (m, n).
             start: (m, 3) where the target is [m], and slope: (m, 3, n) its velocity per joint's.
-            end: (3,) where the instrument stands [m], in the base frame.
+            end: (3,) where the instrument stands [m], in the base frame; or (m, 3).
 
         Returns:
             Distances (m, L) [m] of the L capsules of all other bodies, and their derivatives (m, L, n).
@@ -111,7 +119,7 @@ class Capsules:
         lines = self._lines(q)
         others = np.flatnonzero(self.bodies < self.bodies.max())
         shape = (len(q), len(others), 3)
-        first, last = np.broadcast_to(start[:, None], shape), np.broadcast_to(end, shape)
+        first, last = np.broadcast_to(start[:, None], shape), np.broadcast_to(np.atleast_2d(end)[:, None], shape)
         along, place = _nearest(first, last, lines.start[:, others], lines.end[:, others])
         seen = first + along[..., None] * (last - first)
         link = lines.start[:, others] + place[..., None] * (lines.end - lines.start)[:, others]
@@ -144,13 +152,15 @@ class Capsules:
             at = len(i) + np.flatnonzero(self.world[:, 1] == thing)
             body = self.world[at - len(i), 0]
             start, end = lines.start[:, body], lines.end[:, body]
-            if thing < 0:
-                two[:, at] = np.where((start[..., 2] < end[..., 2])[..., None], start, end)
-                distance[:, at], normal[:, at] = two[:, at, 2] - (self.floor or 0.0), (0.0, 0.0, 1.0)
+            if thing < len(self.walls):
+                wall = self.walls[thing]
+                two[:, at] = np.where((start @ wall.normal < end @ wall.normal)[..., None], start, end)
+                distance[:, at], normal[:, at] = two[:, at] @ wall.normal - wall.offset, wall.normal
             else:
-                place = nearest_on_lines(self.obstacles[thing], start, end)
+                obstacle = self.obstacles[thing - len(self.walls)]
+                place = nearest_on_lines(obstacle, start, end)
                 two[:, at] = start + place[..., None] * (end - start)
-                distance[:, at], normal[:, at] = signed_distance(self.obstacles[thing], two[:, at])
+                distance[:, at], normal[:, at] = signed_distance(obstacle, two[:, at])
             distance[:, at] -= self.radii[body]
         return distance, normal, one, two
 
@@ -185,6 +195,7 @@ def from_chain(
     floor: float | None = None,
     obstacles: Sequence[Obstacle] = (),
     *,
+    walls: Sequence[Wall] = (),
     targets: np.ndarray | Sequence[Sequence[float]] = (),
     margin: float = 0.0,
     within: bool = True,
@@ -199,6 +210,7 @@ def from_chain(
         radius: of the capsules [m]; None: `usual_radius`.
         floor: height of a floor in the base frame [m]; None for no floor.
         obstacles: in the base frame.
+        walls: that it does not pass.
         targets: (T, 3) of what is measured, in the tip's frame [m].
         margin: the least distance that will be asked for [m]; pairs that never have it are left out.
         within: False: parts of the arm are not compared with each other.
@@ -221,11 +233,11 @@ def from_chain(
     radii = np.array([*[size] * (len(moving) + 1), *[TARGET] * len(places)])
     there = np.flatnonzero(length > 1e-6)
     own = [(i, j) for i in there for j in there if bodies[j] > bodies[i] + 1 and within]
-    things = [*range(len(obstacles)), *([] if floor is None else [-1])]
-    world = [(i, k) for k in things for i in there if bodies[i]]
+    planes = (*([] if floor is None else [Wall("floor", np.array([0.0, 0.0, 1.0]), floor)]), *walls)
+    world = [(i, k) for k in range(len(planes) + len(obstacles)) for i in there if bodies[i]]
     found = Capsules(
         chain, tuple(names), bodies, radii, places, np.array(own, dtype=int).reshape(-1, 2),
-        np.array(world, dtype=int).reshape(-1, 2), floor, tuple(obstacles),
+        np.array(world, dtype=int).reshape(-1, 2), planes, tuple(obstacles),
     )  # fmt: skip
     if not found.pairs:
         return found
@@ -238,7 +250,7 @@ def from_chain(
 
 
 def _lines_of(chain: Chain, walked: Sweep, q: np.ndarray, targets: np.ndarray) -> Lines:
-    """Return the lines of base, moving bodies and targets."""
+    """Return the lines of base (from what it stands on), moving bodies and targets."""
     moving = [k for k, element in enumerate(chain.elements) if element.joint is not None]
     axes, places = (part[moving].transpose(2, 0, 1) for part in (walked.directions, walked.origins))
     begins = places.copy()
@@ -248,7 +260,8 @@ def _lines_of(chain: Chain, walked: Sweep, q: np.ndarray, targets: np.ndarray) -
             begins[:, k] += axes[:, k] * (element.value + element.ratio * q[:, element.joint])[:, None]
     m, tip = len(q), walked.position.T[:, None]
     seen = tip + np.einsum("tc,cdm->mtd", targets, walked.rotation)
-    start = np.concatenate([np.zeros((m, 1, 3)), begins, np.repeat(tip, len(targets), axis=1)], axis=1)
+    stand = np.broadcast_to([0.0, 0.0, min(chain.floor, 0.0)], (m, 1, 3))
+    start = np.concatenate([stand, begins, np.repeat(tip, len(targets), axis=1)], axis=1)
     return Lines(start, np.concatenate([places, tip, seen], axis=1), axes, places)
 
 

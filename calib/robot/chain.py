@@ -90,6 +90,7 @@ class Chain:
             frame right after the joint's moving element [kg m², kg m, kg]; None where unknown.
         gravity: (3,) in the base frame [m/s²].
         links: names of the n links behind the joints (URDF), for messages and export.
+        floor: height of what the arm stands on, in the base frame [m]: nothing of it goes below where nobody says more.
     """
 
     name: str
@@ -101,6 +102,7 @@ class Chain:
     inertias: np.ndarray | None = None
     gravity: np.ndarray = field(default_factory=lambda: np.array(GRAVITY))
     links: tuple[str, ...] = ()
+    floor: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "tail", frozen(self.tail))

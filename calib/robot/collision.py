@@ -25,7 +25,7 @@ from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import urdf
 from calib.robot.formats.markup import Node, parse, text
 from calib.robot.formats.urdf_tree import origin
-from calib.robot.obstacles import SAMPLES, Obstacle, check_reachable, inseparable
+from calib.robot.obstacles import SAMPLES, Obstacle, Wall, check_reachable, inseparable
 from calib.transforms import pose
 
 
@@ -115,10 +115,11 @@ class Collision:
         links = [k for k in range(self._links) if shapes[k].parentJoint != tip]
         distances, gradients = np.empty((len(q), len(links))), np.empty((len(q), len(links), self._chain.n))
         asked, world = coal.DistanceRequest(True, coal.GJKInitialGuess.DefaultGuess), pin.LOCAL_WORLD_ALIGNED
+        ends = np.broadcast_to(end, start.shape)
         for i, configuration in enumerate(_configurations(self._model, self._columns, q)):
             pin.computeJointJacobians(self._model, data, configuration)
             pin.updateGeometryPlacements(self._model, data, self._geometry, placed, configuration)
-            away = end - start[i]
+            away = ends[i] - start[i]
             length = float(np.linalg.norm(away))
             turned = Rotation.align_vectors(away[None] / length, [[0.0, 0.0, 1.0]])[0].as_matrix()
             ray, middle = coal.Capsule(1e-4, length), coal.Transform3s(turned, start[i] + away / 2)
@@ -150,6 +151,7 @@ def from_urdf(
     obstacles: Sequence[Obstacle] = (),
     mesh_folders: Sequence[str | Path] = (),
     *,
+    walls: Sequence[Wall] = (),
     targets: np.ndarray | Sequence[Sequence[float]] = (),
     margin: float = 0.0,
     within: bool = True,
@@ -163,6 +165,7 @@ def from_urdf(
         floor: height of a floor in the base frame [m]; None for no floor.
         obstacles: in the base frame.
         mesh_folders: where ``package://name/...`` is looked for, besides the URDF's folder and the ones above it.
+        walls: that it does not pass.
         targets: (T, 3) of what is measured, in the tip's frame [m]: each a thin capsule from the tip.
         margin: the least distance that will be asked for [m]; pairs that never have it are left out.
         within: False: parts of the arm are not compared with each other.
@@ -188,7 +191,8 @@ def from_urdf(
         lost = f" ({len(missing)} meshes were not found, e.g. {missing[0]})" if missing else ""
         raise RobotError(f"{path}: no usable <collision> shape{lost}; give mesh_folders, or use capsules")
     _add_targets(model, geometry, chain, targets)
-    return _finish(model, geometry, chain, floor, obstacles, missing, margin, within, seed)
+    planes = [*([] if floor is None else [Wall("floor", np.array([0.0, 0.0, 1.0]), floor)]), *walls]
+    return _finish(model, geometry, chain, planes, obstacles, missing, margin, within, seed)
 
 
 def _add_targets(model: Any, geometry: Any, chain: Chain, targets: np.ndarray | Sequence[Sequence[float]]) -> None:
@@ -205,7 +209,7 @@ def _finish(
     model: Any,
     geometry: Any,
     chain: Chain,
-    floor: float | None,
+    walls: Sequence[Wall],
     obstacles: Sequence[Obstacle],
     missing: list[str],
     margin: float,
@@ -215,7 +219,7 @@ def _finish(
     """Add floor and obstacles, choose the pairs, and drop those that no posture parts."""
     pin, _ = _libraries()
     own = geometry.ngeoms
-    _surround(model, geometry, chain.base, floor, obstacles)
+    _surround(model, geometry, chain.base, walls, obstacles)
     carriers = [shape.parentJoint for shape in geometry.geometryObjects]
     for one in range(own):
         for two in range(one + 1, len(carriers)):
@@ -250,13 +254,13 @@ def _attach(model: Any, geometry: Any, link: str, name: str, placed: np.ndarray,
     geometry.addGeometryObject(pin.GeometryObject(name, frame.parentJoint, index, placement, shape))
 
 
-def _surround(model: Any, geometry: Any, base: str, floor: float | None, obstacles: Sequence[Obstacle]) -> None:
-    """Add the floor and the obstacles to the fixed world, which is where the base is at zero joints."""
+def _surround(model: Any, geometry: Any, base: str, walls: Sequence[Wall], obstacles: Sequence[Obstacle]) -> None:
+    """Add walls and obstacles to the fixed world, which is where the base is at zero joints."""
     pin, coal = _libraries()
     data = model.createData()
     pin.framesForwardKinematics(model, data, pin.neutral(model))
     stand = data.oMf[model.getFrameId(base)]
-    things = [] if floor is None else [("floor", coal.Halfspace(np.array([0.0, 0.0, 1.0]), floor), np.eye(4))]
+    things: list[Any] = [(wall.name, coal.Halfspace(wall.normal, wall.offset), np.eye(4)) for wall in walls]
     things += [(obstacle.name, _solid(obstacle), obstacle.placement) for obstacle in obstacles]
     for name, shape, placed in things:
         placement = stand * pin.SE3(placed[:3, :3], placed[:3, 3])

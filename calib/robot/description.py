@@ -7,6 +7,7 @@ other chain is written element by element::
     base = "base_link"
     tip = "tool0"
     gravity = [0.0, 0.0, -9.81]
+    floor = 0.0                      # height of what it stands on [m]; left out where 0
 
     [[joint]]                        # the actuated joints, in the order of q
     name = "shoulder_pan_joint"
@@ -46,7 +47,7 @@ from calib.robot.chain import GRAVITY, Chain, Element, Joint
 from calib.robot.tables import check_keys, dumps, load, number, placement, placement_table, vector, word
 
 EXTRA = ("station", "tool", "deflection", "truth", "provenance")
-_TOP = ("name", "base", "tip", "gravity", "source", "joint", "element", "tail")
+_TOP = ("name", "base", "tip", "gravity", "floor", "source", "joint", "element", "tail")
 _LIMITS = ("lower", "upper", "velocity", "effort")
 _JOINT = ("name", "kind", *_LIMITS, "link", "inertia")
 _ELEMENT = tuple(field.name for field in fields(Element))
@@ -123,6 +124,7 @@ def _from_elements(table: Mapping[str, Any], where: str) -> Chain:
         inertias=None if inertias[0] is None else np.array(inertias),
         gravity=vector(table.get("gravity", list(GRAVITY)), 3, f"{where}, gravity"),
         links=tuple(links) if all(links) else (),
+        floor=number(table.get("floor", 0.0), f"{where}, floor", "length"),
     )
 
 
@@ -153,6 +155,7 @@ def _element(entry: Mapping[str, Any], n: int, where: str) -> Element:
 def _to_elements(chain: Chain) -> dict[str, Any]:
     table: dict[str, Any] = {"name": chain.name, "base": chain.base, "tip": chain.tip}
     table["gravity"] = chain.gravity.tolist()
+    table |= {"floor": chain.floor} if chain.floor else {}
     table["joint"], table["element"] = [], []
     for index, joint in enumerate(chain.joints):
         entry: dict[str, Any] = {"name": joint.name, "kind": joint.kind}

@@ -17,6 +17,7 @@ The file, in TOML (numbers as in `calib.robot.tables`; angles in rad, lengths in
     base = "base"                    # names of the two ends, optional
     tip = "flange"
     gravity = [0, 0, -9.81]          # in the base frame [m/s²], optional
+    floor = 0                        # height of what it stands on, in the base frame [m], optional
     source = "where the numbers come from"
     propose_beta = false             # keep the rows as they are written; default true, see above
 
@@ -55,7 +56,7 @@ from calib.robot.tables import check_keys, load, number, placement, placement_ta
 
 PARALLEL = 0.05
 AXES = {"alpha": "rx", "d": "tx", "beta": "ry", "r": "tz", "theta": "rz"}
-TOP = ("name", "base", "tip", "gravity", "source", "propose_beta", "joint", "tail")
+TOP = ("name", "base", "tip", "gravity", "floor", "source", "propose_beta", "joint", "tail")
 KINDS = ("revolute", "prismatic", "fixed")
 _LIMITS = ("lower", "upper", "velocity", "effort")
 _ROW = ("name", "kind", "index", "alpha", "d", "beta", "theta", "r", *_LIMITS, "inertia")
@@ -111,6 +112,7 @@ def from_table(table: Mapping[str, Any], where: str, propose_beta: bool = True) 
         tip=word(table, "tip", where, "tip"),
         tail=placement(table["tail"], f"{where}, [tail]") if "tail" in table else None,
         gravity=vector(table["gravity"], 3, f"{where}, gravity") if "gravity" in table else None,
+        floor=number(table.get("floor", 0.0), f"{where}, floor", "length"),
         propose_beta=propose_beta and proposed,
     )
 
@@ -122,6 +124,7 @@ def chain(
     tip: str = "tip",
     tail: np.ndarray | None = None,
     gravity: np.ndarray | None = None,
+    floor: float = 0.0,
     propose_beta: bool = True,
 ) -> Chain:
     """Return the chain of MDH rows.
@@ -130,6 +133,7 @@ def chain(
         rows: base to tip.
         tail: (4, 4), what follows the last row.
         gravity: (3,) in the base frame [m/s²].
+        floor: see `Chain`.
         propose_beta: add ``beta`` to moving rows whose axis is nearly parallel to the moving one before.
     """
     moving = [row for row in rows if row.kind != "fixed"]
@@ -154,6 +158,7 @@ def chain(
         tail=np.eye(4) if tail is None else tail,
         inertias=np.array([row.inertia for row in moving], dtype=float) if all(known) else None,
         gravity=np.array(GRAVITY) if gravity is None else gravity,
+        floor=floor,
     )
 
 
@@ -192,6 +197,7 @@ def to_table(chain: Chain) -> dict[str, Any]:
     """Return the table (schema above) that `from_table` reads back exactly."""
     table: dict[str, Any] = {"name": chain.name, "base": chain.base, "tip": chain.tip}
     table |= {"gravity": chain.gravity.tolist(), "propose_beta": False}
+    table |= {"floor": chain.floor} if chain.floor else {}
     table["joint"] = [_entry(row, index + 1) for index, row in enumerate(rows(chain))]
     if not np.array_equal(chain.tail, np.eye(4)):
         table["tail"] = placement_table(chain.tail)

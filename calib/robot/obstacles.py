@@ -45,6 +45,15 @@ class Obstacle:
             )
 
 
+@dataclass(frozen=True, eq=False)
+class Wall:
+    """A half-space: what the arm keeps normal · x ≥ offset of, normal (3,) a unit vector in its base frame."""
+
+    name: str
+    normal: np.ndarray
+    offset: float
+
+
 def signed_distance(obstacle: Obstacle, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the distances (...) [m] of points (..., 3) from an obstacle, and the outward normals (..., 3)."""
     rotation = obstacle.placement[:3, :3]

@@ -169,13 +169,13 @@ def test_capsules_measure_as_coal_does(arm):
             oracle = coal.distance(*capsule(i, one), *capsule(i, two), coal.DistanceRequest(), coal.DistanceResult())
             assert distance == pytest.approx(oracle, abs=1e-6)
         for (one, thing), distance in zip(found.world, distances[i, len(found.own) :], strict=True):
-            if thing < 0:
+            if thing == 0:  # the floor
                 low = min(lines.start[i, one, 2], lines.end[i, one, 2])
                 assert distance == pytest.approx(low + 0.2 - found.radii[one])
                 continue
-            placed = coal.Transform3s(things[thing].placement[:3, :3], things[thing].placement[:3, 3])
+            placed = coal.Transform3s(things[thing - 1].placement[:3, :3], things[thing - 1].placement[:3, 3])
             asked, got = coal.DistanceRequest(), coal.DistanceResult()
-            oracle = coal.distance(*capsule(i, one), solids[thing], placed, asked, got)
+            oracle = coal.distance(*capsule(i, one), solids[thing - 1], placed, asked, got)
             if oracle > 0:
                 assert distance == pytest.approx(oracle, abs=1e-5)
             else:

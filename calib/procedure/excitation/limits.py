@@ -1,8 +1,9 @@
 """The limits file of excitation: where the arm may go, how fast, and with which torques.
 
-TOML; every table is optional. ``[joints]``, ``[target]`` (height, axis_distance, reach, of the tip), ``[collision]``
-and ``[[obstacle]]`` are those of pose selection (`calib.procedure.kinematic_stage.pose_limits`). Besides, per joint or
-``all``::
+TOML; every table is optional. ``without``, ``[joints]``, ``[target]`` (height, axis_distance, reach, of the tip),
+``[collision]`` and ``[[obstacle]]`` are those of pose selection (`calib.procedure.kinematic_stage.pose_limits`), and so
+is what is kept where nothing is stated: self-collision, the floor, a margin to the joint limits. A plan through stated
+waypoints keeps what is stated only. Besides, per joint or ``all``::
 
     [velocity]                       # moduli; default the robot's own
     q1 = "90 deg/s"
@@ -50,7 +51,7 @@ from calib.config import (
 )  # fmt: skip
 from calib.errors import UsageError
 from calib.geometry.observability import targets_of
-from calib.procedure.kinematic_stage.pose_limits import ConstraintsFile, Limits, Point, limits_of
+from calib.procedure.kinematic_stage.pose_limits import DEFAULTS, ConstraintsFile, Limits, Point, limits_of
 from calib.robot.chain import Chain
 from calib.robot.kinematics import joint_frames, joint_jacobian, sweep
 from poses.space import PoseConstraint
@@ -131,19 +132,26 @@ class MotionLimits:
         return next(own, BoxLimit(0, -free, free))
 
 
-def read_motion_limits(path: Path | None, chain: Chain, source: Path | None = None) -> MotionLimits:
-    """Read the limits of a motion.
+def read_motion_limits(
+    path: Path | None, chain: Chain, source: Path | None = None, given_way: bool = False
+) -> MotionLimits:
+    """Read the limits of a motion; where nothing else is stated it keeps what poses keep (`limits_of`).
 
     Args:
-        path: the file; None for the robot's own limits alone.
+        path: the file; None for the robot's own limits and the defaults alone.
         source: the robot's file, for its collision shapes.
+        given_way: the motion goes where its user says: what is not stated is not kept, since capsules and a floor that
+            we think of should not forbid a way that somebody knows.
 
     Raises:
         UsageError: for an unknown key or a value that a key cannot have.
     """
     stated = LimitsFile() if path is None else parse(LimitsFile, read_toml(path), str(path))
     where, own = str(path or "limits"), stated.torque
-    found = limits_of(stated, targets_of(chain), source, where)
+    without = ()
+    if given_way:
+        without = ("joint-margin", "floor") if stated.collision or stated.obstacle else DEFAULTS
+    found = limits_of(stated, targets_of(chain), source, where, without, seen=False)
     speeds, efforts = (np.array([getattr(j, key) for j in chain.joints]) for key in ("velocity", "effort"))
     velocity = _per_joint(stated.velocity, f"{where}: velocity", chain, speeds, ("angular speed", "speed"))
     acceleration = _per_joint(stated.acceleration, f"{where}: acceleration", chain)
@@ -160,7 +168,10 @@ def read_motion_limits(path: Path | None, chain: Chain, source: Path | None = No
     constraints += _places(stated, found, points)
     if found.collision is not None:
         constraints.append(_clearance(found))
-    notes = found.notes if found.collision is not None else (*found.notes, _unchecked(path))
+    notes = (*found.notes, *([f"kept: {', '.join(found.checked)}"] if found.checked else []))
+    notes += (f"NOT checked: {', '.join(found.unchecked)}",) if found.unchecked else ()
+    if found.collision is None:
+        notes = (*found.notes, _unchecked(path))
     return MotionLimits(tuple(constraints), torque, margin, deviations, friction, stated.frequency.resonance, notes)
 
 

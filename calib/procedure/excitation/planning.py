@@ -127,7 +127,7 @@ def plan(
     say = progress or (lambda words: None)
     _check(settings)
     chain, source = load_rigid(robot, waypoints, base, tip)
-    known = read_motion_limits(limits, chain, source)
+    known = read_motion_limits(limits, chain, source, given_way=True)
     law, notes, uncertain = _law(chain, model, settings.payloads, drives, known)
     lower, upper, bounds = _bounds(chain, known, law)
     arm = chain if model is None else read_dynamics(model)[0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -34,13 +34,16 @@ class Chosen:
         selection: see `poses.select`.
         parameters: how many the measurements can tell.
         existing: index of the poses measured before alone; None without them, or where they are too few.
-        notes: what a user should know.
+        checked, unchecked: what the poses were held against, and what they could not be, in words.
+        notes: what else a user should know.
     """
 
     chain: Chain
     selection: Selection
     parameters: int
     existing: float | None
+    checked: tuple[str, ...]
+    unchecked: tuple[str, ...]
     notes: tuple[str, ...]
 
 
@@ -73,13 +76,11 @@ def choose(
     chain, source = load_robot(robot, existing, FitOptions(), base, tip)
     cell = targets_of(chain, settings.tools)
     jacobian = observation(cell, settings.kind, settings.sigmas, settings.seed)
-    limits = read_limits(constraints, cell, source)
+    limits = read_limits(constraints, cell, source, settings.without)
     space = limits.space(jacobian)
     index, method = cast(Any, settings.index), cast(Any, settings.method)  # checked by `select_poses`
     before = value = None
     notes = list(limits.notes)
-    if limits.collision is None:
-        notes.append("collisions and the floor are NOT checked: name a constraints file with [collision]")
     if existing is not None:
         q = read_poses(existing, chain.joint_names, kinds=joint_kinds(chain), limits=(chain.lower, chain.upper))
         before = jacobian(q)
@@ -91,13 +92,29 @@ def choose(
         seconds=np.inf if settings.seconds is None else settings.seconds, climbs=settings.climbs,
     )  # fmt: skip
     found = select_poses(None, m, search, space=space, existing=before, map=map, progress=progress)
-    return Chosen(chain, found, len(jacobian.free), value, tuple(notes))
+    assert found.q is not None
+    found = replace(found, q=fewest_turns(chain, found.q, limits.lower, limits.upper))
+    return Chosen(chain, found, len(jacobian.free), value, limits.checked, limits.unchecked, tuple(notes))
+
+
+def fewest_turns(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Return the same poses (m, n) with every revolute joint at the turn nearest to the middle of its range."""
+    middle = (lower + upper) / 2
+    turns = np.where([joint.kind == "revolute" for joint in chain.joints], np.round((q - middle) / (2 * np.pi)), 0.0)
+    moved = q - 2 * np.pi * turns
+    return np.where((moved >= lower) & (moved <= upper), moved, q)
 
 
 def write(chosen: Chosen, path: Path) -> Path:
     """Write the chosen poses under the joints' names [rad or m]."""
     assert chosen.selection.q is not None
     return write_poses(path, chosen.selection.q, chosen.chain.joint_names, kinds=joint_kinds(chosen.chain))
+
+
+def kept(chosen: Chosen) -> list[str]:
+    """Return lines on what the poses were held against, and on what they were not."""
+    lines = [f"kept: {', '.join(chosen.checked)}"] if chosen.checked else []
+    return lines + ([f"NOT checked: {', '.join(chosen.unchecked)}"] if chosen.unchecked else [])
 
 
 def bound_words(found: Selection) -> str:

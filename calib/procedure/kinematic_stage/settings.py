@@ -72,6 +72,8 @@ class SelectionSettings:
         evaluations: most evaluations of the index in one local search.
         seconds: of processor time for the search; None lets it end by itself.
         climbs: searches for feasible poses beyond the bound; 0 bounds the candidates and the chosen poses only.
+        without: defaults that poses need not keep, and what the cell does not have
+            (`calib.procedure.kinematic_stage.pose_limits`).
     """
 
     kind: str = "pose"
@@ -85,6 +87,7 @@ class SelectionSettings:
     evaluations: int = 5000
     seconds: float | None = None
     climbs: int = 0
+    without: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for option, least in (("starts", 1), ("evaluations", 1), ("climbs", 0)):

@@ -104,9 +104,7 @@ def select(session: Session, say: Say) -> list[str]:
     if wanted.validation:
         write_poses(session.path(f"2-poses/{UNSEEN}"), chosen.validation, names, unit="deg", kinds=kinds)
         notes.append(f"{len(chosen.validation)} poses for validation, at random")
-    if not wanted.constraints:
-        notes.append("only joint limits were kept: look at every pose, or name a constraints file")
-    notes += chosen.record["notes"]
+    notes += [*chosen.kept, *chosen.record["notes"]]
     files.write_json(session.path(SELECTION), chosen.record)
     return notes
 

@@ -20,11 +20,12 @@ from poses.space import is_feasible
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Poses for the fit (m, n) and for validation (v, n) [rad or m], and how they came about."""
+    """Poses for the fit (m, n) and for validation (v, n) [rad or m], how they came about, and what they keep."""
 
     fit: np.ndarray
     validation: np.ndarray
     words: str
+    kept: tuple[str, ...]
     record: dict[str, Any]
 
 
@@ -62,9 +63,12 @@ def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], N
         "parameters": chosen.parameters,
         "seconds": found.seconds,
         "seed": settings.seed,
+        "checked": list(chosen.checked),
+        "unchecked": list(chosen.unchecked),
         "notes": list(chosen.notes),
     }
-    return Plan(found.q, _unseen(session, robot_file, chain, wanted.validation), words, record)
+    unseen = _unseen(session, robot_file, chain, wanted.validation)
+    return Plan(found.q, unseen, words, tuple(selection.kept(chosen)), record)
 
 
 def _unseen(session: Session, robot_file: Any, chain: Chain, count: int) -> np.ndarray:
@@ -77,4 +81,5 @@ def _unseen(session: Session, robot_file: Any, chain: Chain, count: int) -> np.n
     jacobian = observation(cell, session.settings.instrument.measures)
     space = limits.space(jacobian)
     stream = np.random.default_rng([session.settings.seed, 1])
-    return draw_candidates(limits.lower, limits.upper, count, lambda q: is_feasible(space, q), seed=stream)
+    q = draw_candidates(limits.lower, limits.upper, count, lambda q: is_feasible(space, q), seed=stream)
+    return selection.fewest_turns(chain, q, limits.lower, limits.upper)

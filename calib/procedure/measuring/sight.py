@@ -1,0 +1,156 @@
+"""Whether an instrument sees its targets: cone of acceptance, range, and no link of the arm in between.
+
+With several targets (reflectors on one plate, each with a direction of its own) a pose counts if one of them is seen,
+and only the rows of those that are seen count in the observation Jacobian: what faces away tells nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from calib.geometry.installation import Installation
+from calib.geometry.observability import Observation, Target, TargetJacobian
+from calib.robot.chain import Chain, random_joints
+from calib.robot.obstacles import ALWAYS, SAMPLES
+from poses import constraints
+from poses.space import PoseConstraint, constraint_gradient
+
+BEAM = 0.01
+"""Least distance of a link from the line of sight [m]: about the radius of a tracker's beam. Our choice."""
+NEAREST = 2
+"""Links that are looked at per line of sight: the nearest ones. Our choice; where two change places, both are there."""
+SEEN = 1e-6
+"""What a constraint may be broken by where a target still counts as seen."""
+
+
+@dataclass(frozen=True, eq=False)
+class Behind:
+    """What links of the arm take from a line of sight: `BEAM` less the distances of the nearest, (m, `NEAREST`).
+
+    Attributes:
+        arm: with a method ``beam``, see `calib.robot.capsules.Capsules.beam`.
+        links: which of its links are looked at: not those that the target sits on or beside in every posture, which
+            the direction it faces is there for.
+    """
+
+    arm: Any
+    target: Target
+    velocity: TargetJacobian
+    instrument: np.ndarray
+    links: np.ndarray
+
+    def __call__(self, q: np.ndarray) -> np.ndarray:
+        return self._nearest(q)[0]
+
+    def gradient(self, q: np.ndarray) -> np.ndarray:
+        """Return the derivatives (m, `NEAREST`, n)."""
+        return self._nearest(q)[1]
+
+    def _nearest(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        found = self.arm.beam(q, self.target(q)[1], self.velocity(q)[:, :3], self.instrument)
+        distances, slopes = (part[:, self.links] for part in found)
+        order = np.argsort(distances, axis=1)[:, :NEAREST]
+        rows = np.arange(len(q))[:, None]
+        return BEAM - distances[rows, order], -slopes[rows, order]
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """The lines of sight from an instrument to the targets of an arm.
+
+    Attributes:
+        targets: for each target what it takes to be seen.
+    """
+
+    targets: tuple[tuple[PoseConstraint, ...], ...]
+
+    def constraints(self) -> tuple[PoseConstraint, ...]:
+        """Return what a pose has to keep: all that the only target needs, or all that the best of several needs."""
+        if len(self.targets) == 1:
+            return self.targets[0]
+        return (PoseConstraint("line of sight to one of the targets", self._best, self._best_gradient),)
+
+    def visible(self, q: np.ndarray) -> np.ndarray:
+        """Tell (m, T) which targets are seen at poses q (m, n)."""
+        return self._values(q).max(axis=2) <= SEEN
+
+    def _values(self, q: np.ndarray) -> np.ndarray:
+        """Return what each target breaks (m, T, k)."""
+        return np.stack([np.concatenate([c.function(q) for c in parts], axis=1) for parts in self.targets], axis=1)
+
+    def _best(self, q: np.ndarray) -> np.ndarray:
+        values = self._values(q)
+        return values[np.arange(len(q)), values.max(axis=2).argmin(axis=1)]
+
+    def _best_gradient(self, q: np.ndarray) -> np.ndarray:
+        values = self._values(q)
+        best, result = values.max(axis=2).argmin(axis=1), np.zeros((len(q), values.shape[2], q.shape[1]))
+        for number in np.unique(best):
+            own = best == number
+            slopes = [constraint_gradient(c, q[own]) for c in self.targets[number]]
+            result[own] = np.concatenate(slopes, axis=1)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class SeenOnly:
+    """An observation Jacobian (`calib.geometry.observability.Observation`) whose unseen targets' rows are zero."""
+
+    of: Observation
+    sight: Sight
+
+    def __call__(self, q: np.ndarray) -> np.ndarray:
+        return self.of(q) * self._mask(q)
+
+    def product(self, q: np.ndarray, G: np.ndarray) -> np.ndarray:
+        """Return Σ G[i] · ∂J[i]/∂q (m, n); which targets are seen does not change in a small step."""
+        return self.of.product(q, G * self._mask(q))
+
+    def _mask(self, q: np.ndarray) -> np.ndarray:
+        return np.repeat(self.sight.visible(q), 6 if self.of.full else 3, axis=1)[:, :, None]
+
+
+def sight_of(
+    cell: Installation,
+    instrument: np.ndarray,
+    facing: Sequence[Sequence[float]],
+    half_angle: float | None,
+    span: tuple[float, float],
+    arm: Any | None,
+) -> Sight | None:
+    """Return what it takes to see the targets of an arm; None where nothing is asked.
+
+    Args:
+        cell: the arm with its T targets.
+        instrument: (3,) where it stands in the arm's base [m].
+        facing: (T, 3) the direction each target faces, in its own frame; a single one for all.
+        half_angle: of the cone of acceptance [rad]; None: all around.
+        span: least and largest distance [m].
+        arm: what may stand in the way (`Behind`); None: nothing does.
+    """
+    directions = [*facing] * (len(cell.tools) if len(facing) == 1 else 1)
+    found = []
+    for number, direction in enumerate(directions):
+        target, velocity, parts = Target(cell, number), TargetJacobian(cell, number), list[PoseConstraint]()
+        if half_angle is not None:
+            parts.append(constraints.line_of_sight(target, instrument, direction, half_angle, velocity))
+        if span[0] > 0.0 or np.isfinite(span[1]):
+            parts.append(constraints.distance(target, span[0] or -np.inf, span[1], instrument, velocity))
+        if arm is not None:
+            links = _beside(arm, cell.chain, target)
+            behind = Behind(arm, target, velocity, np.asarray(instrument, dtype=float), links)
+            parts.append(PoseConstraint("view past the arm", behind, behind.gradient))
+        found.append(tuple(parts))
+    return Sight(tuple(found)) if found and found[0] else None
+
+
+def _beside(arm: Any, chain: Chain, target: Target) -> np.ndarray:
+    """Return the indices of links that are not beside the target, however the arm moves."""
+    q = random_joints(chain, SAMPLES)
+    place = target(q)[1]
+    distances = arm.beam(q, place, np.zeros((len(q), 3, chain.n)), place + 1e-6)[0]
+    return np.flatnonzero((distances <= BEAM).mean(axis=0) < ALWAYS)
