@@ -97,8 +97,8 @@ def select(
     without: Annotated[
         list[str] | None,
         typer.Option(
-            help="self-collision, floor, joint-margin, view: not to be kept; instrument, box, obstacles: not there; may "
-            "be repeated"
+            help="self-collision, floor, joint-margin, view: not kept; instrument, box, obstacles: not there; may be "
+            "repeated"
         ),
     ] = None,
     candidates: Annotated[int, typer.Option(help="poses to choose from")] = 2000,

@@ -168,6 +168,7 @@ def test_results_have_a_short_representation_and_readers_take_names(fitted, cell
     assert len(calib.read_poses(cell / "measured.csv", "ur5")[0]) == 60
 
 
-def test_poses_chosen_without_constraints_say_that_collisions_are_not_checked():
+def test_poses_chosen_without_constraints_say_what_they_keep_and_what_is_not_checked():
     chosen = calib.select_poses("ur5", 8, calib.SelectionSettings(method="detmax", candidates=200))
-    assert "NOT checked" in str(chosen)
+    assert "kept: 1 % of each joint's range to its limits, self-collision" in str(chosen)
+    assert "NOT checked: line of sight (the instrument's place is not known), walls" in str(chosen)

@@ -179,12 +179,12 @@ class ObstacleTable(PlacedTable):
 
 
 def _span_or_margin(value: Any) -> Any:
-    """Take a list of two numbers, or a number (the margin)."""
-    number_or_text = isinstance(value, str | int | float) and not isinstance(value, bool)
+    """Take a list of two numbers or texts with units, or one (the margin)."""
     pair = isinstance(value, list | tuple) and len(value) == 2
-    if not number_or_text and not pair:
+    parts = value if pair else (value,)
+    if not all(isinstance(part, str | int | float) and not isinstance(part, bool) for part in parts):
         raise ValueError(f"expected a list of 2 numbers, lower and upper, found {shown(value)}")
-    return tuple(value) if isinstance(value, list | tuple) else value
+    return tuple(parts) if pair else value
 
 
 @strict

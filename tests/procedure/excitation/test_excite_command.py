@@ -58,12 +58,12 @@ def test_the_motion_keeps_its_limits_and_is_written_for_a_controller(cell, calib
     played = ("--start", stands, "--repeat", 2, "--slower", 3, "--plots")
     code, out, err = calib("excite", "lwr4plus", "--limits", "limits.toml", "--out", "e", *QUICK, *played)
     assert code == 0, err
-    assert "collisions are NOT checked: limits.toml has no [collision]" in out
+    assert "self-collision (capsules" in out and "NOT checked: walls of the cell (not known), obstacles" in out
     assert "64 columns" in out and "every limit is kept" in out and "the approach and 2 periods" in out
     metrics = json.loads(Path("e/metrics.json").read_text())
     assert {"condition_number", "objective", "feasible", "margins", "seconds", "evaluations", "history"} <= set(metrics)
     assert metrics["feasible"] is True and metrics["condition_number"]["normalised"] < 12
-    assert set(metrics["margins"]) == {"position", "velocity", "acceleration", "torque", "workspace"}
+    assert set(metrics["margins"]) == {"position", "velocity", "acceleration", "torque", "workspace", "clearance"}
     assert all(one["margin"] >= 0 for one in metrics["margins"].values())
     for name in ("plot_motion.png", "plot_path.png", "plot_history.png"):
         assert (Path("e") / name).stat().st_size > 5000

@@ -86,7 +86,8 @@ def test_chosen_poses_keep_the_constraints(cell, calib):
     assert (np.abs(q[:, 0]) <= np.pi / 2).all()
     for constraint in limits.constraints:
         assert (constraint.function(q) <= 1e-8).all(), constraint.name
-    assert len(limits.constraints) == 5
+    assert len(limits.constraints) == 4
+    assert limits.sight is not None and limits.sight.visible(q).all()
     assert limits.collision is not None
     assert (limits.collision.distances(q) >= limits.clearance - 1e-8).all()
     # and they do exclude something
@@ -105,7 +106,7 @@ def test_the_gradients_of_the_constraints_are_those_of_central_differences(cell)
         slope = np.asarray(constraint.gradient(q))
         assert np.abs(slope - central_difference(constraint.function, q).transpose(0, 2, 1)).max() < 1e-7
         checked += 1
-    assert checked == 6  # height, axis, reach, orientation, sight, collision
+    assert checked == 7  # height, axis, reach, orientation, collision, cone of sight, view past the arm
 
 
 def test_existing_poses_count(cell, calib):
