@@ -7,6 +7,7 @@ raise their own subclasses of `ValueError`.
 from __future__ import annotations
 
 import difflib
+import shlex
 import sys
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
@@ -93,6 +94,11 @@ class TaskLost(CalibError):
 
 class SessionError(CalibError):
     """A session folder that is busy, damaged, or not in the state a command needs."""
+
+
+def command_line(*words: object, program: str = "calib") -> str:
+    """Return a command as a shell takes it: ``calib next 'cell 7'``."""
+    return shlex.join([program, *map(str, words)])
 
 
 def suggestion(word: str, words: Collection[str]) -> str:

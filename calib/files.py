@@ -119,7 +119,7 @@ def _reached(path: Path) -> bool:
         if isinstance(error, FileNotFoundError) and not path.is_symlink():
             return False
         why = "a link to nowhere" if isinstance(error, FileNotFoundError) else getattr(error, "strerror", None) or error
-        raise UsageError(f"{str(path)[:200]} cannot be written: {why}; choose another --out") from error
+        raise UsageError(f"{str(path)[:200]} cannot be written: {why}; choose another (--out)") from error
     return True
 
 
@@ -138,7 +138,7 @@ def check_not_input(targets: Iterable[Path], inputs: Iterable[str | Path | None]
     known = [path for path in map(Path, read) if os.path.exists(path)]  # False for names that no file can have
     for target in targets:
         if any(same_file(target, path) for path in known):
-            raise UsageError(f"{target} is read, and would be written over; choose another --out")
+            raise UsageError(f"{target} is read, and would be written over; write it elsewhere (--out)")
 
 
 def same_file(one: Path, other: Path) -> bool:

@@ -34,12 +34,12 @@ def check_target(
         UsageError: with the file or folder concerned.
     """
     if os.path.isfile(out):  # False for names that no file can have
-        raise UsageError(f"{out} is a file; --out needs a folder")
+        raise UsageError(f"{out} is a file; results go into a folder (--out)")
     files.check_writable(out)
     files.check_not_input([out, *(out / name for name in ours)], inputs)
     present = files_of(out, ours)
     if present and not all((out / name).exists() for name in marks):
-        raise UsageError(f"{out} holds {', '.join(present)} which no earlier {what} left there; choose another --out")
+        raise UsageError(f"{out} holds {', '.join(present)} which no earlier {what} left there; choose another (--out)")
 
 
 def files_of(folder: Path, ours: Collection[str]) -> list[str]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from calib.api.reading import listed, optional
 from calib.api.rendering import as_text, data_frame
+from calib.arguments import checked
 from calib.data.recordings.recording import Recording
 from calib.estimation.estimate import Estimate
 from calib.identification.identify_options import IdentifyOptions, read_options
@@ -92,6 +93,7 @@ class DynamicsModel:
         return as_text(self.renderables())
 
 
+@checked
 def identify_dynamics(
     robot: str | Path | CalibratedChain,
     recordings: Recorded | Sequence[Recorded],

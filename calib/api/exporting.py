@@ -7,11 +7,14 @@ from pathlib import Path
 from calib.api.dynamic import DynamicsModel
 from calib.api.kinematic import GeometryFit
 from calib.api.reading import optional, saved
-from calib.procedure.export import delivery, dynamics
+from calib.arguments import checked
+from calib.errors import RobotError, UsageError
+from calib.procedure.export import delivery, dynamics, geometry
 from calib.procedure.export.identified import is_identified
 from calib.robot.load import resolve
 
 
+@checked
 def export(
     result: GeometryFit | DynamicsModel | str | Path, into: str | Path, *, urdf: str | Path | None = None
 ) -> tuple[str, ...]:
@@ -43,6 +46,8 @@ def export(
 
 def _source_of(place: Path) -> Path:
     """Return the description that a fit's folder says it was made from."""
-    from calib.robot.calibrated import read
-
-    return resolve(read(place).source)
+    source = geometry.read(place).source
+    try:
+        return resolve(source)
+    except RobotError as error:
+        raise UsageError(f"{place} was fitted from {source}, which is not there: name its URDF (urdf)") from error

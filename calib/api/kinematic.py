@@ -12,6 +12,7 @@ import numpy as np
 
 from calib.api.reading import listed, optional, saved
 from calib.api.rendering import as_text, data_frame
+from calib.arguments import checked
 from calib.data.poses.fit_options import FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.target_files import Targets, read_targets
@@ -49,9 +50,9 @@ class PoseSelection:
         """Write the poses as CSV under the joints' names [rad or m]."""
         return selection.write(self.chosen, Path(path))
 
-    def to_dict(self) -> dict[str, str]:
-        """Return what the selection came to, in words and numbers."""
-        return dict(selection.table(self.chosen))
+    def to_dict(self) -> dict[str, Any]:
+        """Return what the selection came to: index, its value, that of random sets, efficiency, seconds, notes."""
+        return selection.record(self.chosen)
 
     def to_dataframe(self) -> Any:
         """Return the joint values as a pandas DataFrame, a row per pose."""
@@ -164,6 +165,7 @@ class JointCommands:
         return "\n".join(compensation_file.lines(self.commands, self.targets, self.fitted))
 
 
+@checked
 def select_poses(
     robot: str | Path | CalibratedChain,
     count: int = 30,
@@ -204,6 +206,7 @@ def select_poses(
     return PoseSelection(replace(chosen, notes=(*chosen.notes, *map(str, lost))))
 
 
+@checked
 def fit_geometry(
     robot: str | Path | CalibratedChain,
     measured: Measured | Sequence[Measured],
@@ -242,6 +245,7 @@ def fit_geometry(
     return GeometryFit(fit.run(given, chosen, wanted, progress), chosen, wanted)
 
 
+@checked
 def compensate(
     fitted: GeometryFit | compensation.Fitted | str | Path,
     targets: Targets | str | Path,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from calib.api.dynamic import DynamicsModel
 from calib.api.reading import optional, saved
+from calib.arguments import checked
 from calib.errors import as_ours
 from calib.procedure.excitation import design, folder, planning
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, DEFAULT_PLAN, ExcitationSettings, PlanSettings
@@ -92,6 +93,7 @@ class MotionPlan:
         return "\n".join(folder.plan_lines(self.planned))
 
 
+@checked
 def design_excitation(
     robot: str | Path | CalibratedChain,
     settings: ExcitationSettings = DEFAULT_DESIGN,
@@ -130,6 +132,7 @@ def design_excitation(
     return ExcitationDesign(replace(designed, notes=(*designed.notes, *map(str, lost))))
 
 
+@checked
 def plan_motion(
     robot: str | Path | CalibratedChain,
     waypoints: str | Path,

@@ -8,6 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from calib.arguments import checked
 from calib.data.poses.fit_options import FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements
 from calib.data.recordings.recording import Recording
@@ -18,6 +19,7 @@ from calib.robot.calibrated import CalibratedChain
 from calib.robot.load import load_calibrated
 
 
+@checked
 def load(robot: str | Path, *, base: str | None = None, tip: str | None = None) -> CalibratedChain:
     """Load a robot from a file, a folder or the library.
 
@@ -35,6 +37,7 @@ def load(robot: str | Path, *, base: str | None = None, tip: str | None = None) 
     return load_calibrated(robot, base, tip)
 
 
+@checked
 def read_poses(
     path: str | Path, robot: str | Path | CalibratedChain, *, options: FitOptions | str | Path | None = None
 ) -> tuple[PoseMeasurements, ...]:
@@ -55,7 +58,10 @@ def read_poses(
     return tuple(inputs.read_file(Path(path), _loaded(robot).complete, chosen))
 
 
-def read_recording(path: str | Path, robot: CalibratedChain, *, options: RecordingOptions | None = None) -> Recording:
+@checked
+def read_recording(
+    path: str | Path, robot: str | Path | CalibratedChain, *, options: RecordingOptions | None = None
+) -> Recording:
     """Read a log of joint positions and torques (or currents) from npz, CSV, a ROS bag or MCAP.
 
     Args:

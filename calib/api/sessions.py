@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from calib.api.reading import listed, optional
+from calib.arguments import checked
 from calib.procedure.session import commands, fleet
 
 
+@checked
 def new_session(
     folder: str | Path,
     robot: str | Path,
@@ -51,6 +53,7 @@ def new_session(
     return made.folder
 
 
+@checked
 def run_sessions(
     folders: str | Path | Sequence[str | Path],
     *,

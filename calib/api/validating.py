@@ -9,6 +9,7 @@ from typing import Any, overload
 from calib.api.dynamic import DynamicsModel, Recorded
 from calib.api.kinematic import GeometryFit, Measured
 from calib.api.reading import listed
+from calib.arguments import checked
 from calib.procedure.dynamic_stage import identify
 from calib.procedure.dynamic_stage import inputs as recorded
 from calib.procedure.kinematic_stage import fit
@@ -19,7 +20,8 @@ from calib.procedure.kinematic_stage import inputs as measured
 def validate(result: GeometryFit, unseen: Measured | Sequence[Measured]) -> GeometryFit: ...
 @overload
 def validate(result: DynamicsModel, unseen: Recorded | Sequence[Recorded]) -> DynamicsModel: ...
-def validate(result: Any, unseen: Any) -> Any:
+@checked
+def validate(result: GeometryFit | DynamicsModel, unseen: Measured | Recorded | Sequence[Measured | Recorded]) -> Any:
     """Hold a result against poses or motion it has not seen, and judge it anew.
 
     Args:

@@ -153,27 +153,24 @@ def export(
     ur_kinematics: Annotated[Path | None, typer.Option(help="write ur_description's kinematics YAML")] = None,
     offsets: Annotated[Path | None, typer.Option(help="write a CSV of joint offsets")] = None,
     into: Annotated[
-        Path | None, typer.Option(help="folder for all forms of an identified robot: calib formats exports")
+        Path | None, typer.Option(help="folder for all forms, with identified dynamics: calib formats exports")
     ] = None,
     for_corrections: Annotated[
         bool, typer.Option("--for-corrections", help="the URDF that joint_corrections.csv belongs to, worse without it")
     ] = False,
 ) -> None:
-    """Write the calibrated geometry, and with --into the identified dynamics, for other programs."""
+    """Write the calibrated geometry, with --into in all forms and with identified dynamics, for other programs."""
     from calib.errors import UsageError
     from calib.procedure.export import geometry
 
     if into:
-        from calib.procedure.export import delivery, dynamics
-        from calib.procedure.export.identified import check_identified
+        from calib.api.exporting import export as export_all
 
         if out or ur_kinematics or offsets:
             raise UsageError("--into writes all files into one folder; leave --out, --ur-kinematics and --offsets out")
-        check_identified(folder)
-        delivery.check_into(into, folder, urdf, dynamics.WRITTEN)
         with progress() as show:
-            show("all parameters, and each file read back")
-            lines = dynamics.deliver_dynamics(folder, urdf, into)
+            show("all forms, and each file read back")
+            lines = export_all(folder, into, urdf=urdf)
         say_written(lines, into)
         return
     if (urdf is None) != (out is None) or not (urdf or ur_kinematics or offsets):

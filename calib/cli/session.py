@@ -50,6 +50,7 @@ def new(
     session). Without --robot or --instrument, at a terminal, it asks.
     """
     from calib.api.sessions import new_session
+    from calib.errors import command_line
     from calib.procedure.session.questions import Answers, checked
 
     given = Answers(robot, instrument, tool, limits, dynamics, tuple(payload or ()), torques)
@@ -58,7 +59,7 @@ def new(
     made = new_session(
         folder, poses=poses, validation=validation, base=base or "", tip=tip or "", seed=seed, **checked(given)
     )
-    say(f"made {made}; next: calib next {made}")
+    say(f"made {made}; next: {command_line('next', made)}")
 
 
 def _asked(given: Answers) -> Answers:
@@ -107,7 +108,7 @@ def formats(
 @app.command("next")
 def next_step(folder: Folder, plots: Plots = True) -> None:
     """Do what can be done in a session, then say what to do at the robot."""
-    _go_on(folder, f"calib next {folder}", plots=plots)
+    _go_on(folder, "next", plots=plots)
 
 
 @app.command()
@@ -117,7 +118,7 @@ def redo(
     plots: Plots = True,
 ) -> None:
     """Make a step of a session again, and all that rests on it."""
-    _go_on(folder, f"calib redo {folder} {step}", step, plots)
+    _go_on(folder, "redo", step, plots)
 
 
 @app.command()
@@ -141,6 +142,7 @@ def demo(
     plots: Plots = True,
 ) -> None:
     """Calibrate a simulated robot with simulated instruments, and compare with the hidden truth."""
+    from calib.errors import command_line
     from calib.procedure.session import demo as demonstration
 
     with told() as (say, progress):
@@ -154,12 +156,9 @@ def demo(
     if found.results:
         say(f"{found.seconds:.1f} s, {found.memory:.0f} MB. Look at")
     for words, name in found.results:
-        how = (
-            f"  (rerun {found.session.folder / name}, or calib view {found.session.folder})"
-            if words == "to play"
-            else ""
-        )
-        say(f"  {words:15} {found.session.folder / name}{how}")
+        place, folder = found.session.folder / name, found.session.folder
+        how = f"  ({command_line(place, program='rerun')}, or {command_line('view', folder)})"
+        say(f"  {words:15} {place}{how if words == 'to play' else ''}")
     exit_failed(found.verdict)
 
 
@@ -195,10 +194,12 @@ def run(
 
 
 def _go_on(folder: Path, command: str, again: str = "", plots: bool = True) -> None:
+    from calib.errors import command_line
     from calib.procedure.session import commands
 
+    typed = command_line(command, folder, *([again] if again else []))
     with told() as (say, progress):
-        stop = commands.go_on(folder, say, progress, command, again, plots)
+        stop = commands.go_on(folder, say, progress, typed, again, plots)
     say(*stop.lines)
     exit_failed(stop.verdict)
 
@@ -213,7 +214,7 @@ def view(
     robot: Annotated[str | None, typer.Option(help="the arm to draw, where the folder does not say")] = None,
 ) -> None:
     """Show in Rerun: the robot, pose errors, poses as they were chosen, motions with their limits, torques."""
-    from calib.errors import UsageError
+    from calib.errors import UsageError, command_line
     from calib.files import check_target
     from calib.procedure.report import viewer
 
@@ -225,7 +226,7 @@ def view(
     scene = viewer.write(folder, save, robot) if save else None
     if save:
         size = f"{1e-6 * save.stat().st_size:.1f} MB"
-        say(f"{save}: {size}; rerun {save} shows it")
+        say(f"{save}: {size}; {command_line(save, program='rerun')} shows it")
     if spawn or (spawn is None and save is None):
         scene = viewer.spawn(folder, robot)
     for note in scene.notes if scene else ():

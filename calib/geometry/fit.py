@@ -95,7 +95,7 @@ def _enough(cell: Installation, blocks: list[Block], unknowns: int) -> None:
         poses = sum(len(block.measured) for block in blocks)
         raise MeasurementError(
             f"{poses} poses give {numbers} numbers, too few for {unknowns} unknowns; measure more poses (some 20 to 40 "
-            "for a full geometry), or ask for a smaller model (--model offsets, --model frames)",
+            "for a full geometry), or ask for a smaller model ('offsets' or 'frames')",
             blocks[0].measured.file,
         )
 

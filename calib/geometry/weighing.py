@@ -81,7 +81,7 @@ class Weigher:
         if rows < unknown and self.prior is None:
             raise MeasurementError(
                 f"{rows} measured numbers cannot determine {unknown} unknowns; measure more poses, or fit a smaller "
-                "model (--model frames or offsets)",
+                "model ('frames' or 'offsets')",
                 self.blocks[0].measured.file,
             )
         share = max(1.0 - unknown / rows, 0.05)

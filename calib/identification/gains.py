@@ -121,7 +121,14 @@ def identify_gains(
             told = ", ".join(f"{name} = {value:g}" for name, value in known.items())
             told = told if reference is None else f"gain of joint {reference + 1} = 1"
             return DriveGains(frozen(gain), frozen(covariance), names, frozen(values), frozen(std), told)
-    raise NotConverged("the drive gains do not settle; is the payload felt by every joint?", gain)
+    if reference is None:
+        raise NotConverged("the drive gains do not settle; is the payload felt by every joint?", gain)
+    raise NotConverged(
+        f"without gains or a payload of known mass, currents tell gains only by how joints act on each other, relative "
+        f"to joint {reference + 1}; this motion does not tell them. State the gains (options file: gains), or record "
+        "runs without and with a payload ([gain_identification])",
+        gain,
+    )
 
 
 def _start(body: np.ndarray, load: np.ndarray, current: np.ndarray) -> np.ndarray:

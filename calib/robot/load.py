@@ -34,9 +34,7 @@ def load(
 def _check_ends(path: Path, chain: Chain, base: str | None, tip: str | None) -> Chain:
     for option, wanted, found in (("base", base, chain.base), ("tip", tip, chain.tip)):
         if wanted is not None and wanted != found:
-            raise RobotError(
-                f"{path}: its {option} is '{found}', not '{wanted}'; --base and --tip choose links of a URDF"
-            )
+            raise RobotError(f"{path}: its {option} is '{found}', not '{wanted}'; base and tip choose links of a URDF")
     return chain
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import planted_motion as planted
 import pytest
+from without_figures import run
 
 import calib
 from calib import cli
@@ -50,6 +51,53 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def model(logs: Path) -> calib.DynamicsModel:
     train, other = logs / "train.npz", logs / "other.npz"
     return calib.identify_dynamics(logs / "robot.toml", train, validate=other, friction="standard")
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (
+            lambda: calib.fit_geometry("ur5", "a.csv", 0.25),
+            "fit_geometry: settings: expected FitSettings or None",
+        ),
+        (
+            lambda: calib.fit_geometry("ur5", "a.csv", holdout=0.25),
+            "fit_geometry: .*keyword argument 'holdout'",
+        ),
+        (lambda: calib.load(5), "load: robot: expected a text or a path, found 5"),
+        (lambda: calib.read_poses("a.csv", None), "read_poses: robot: expected a text, a path or CalibratedChain"),
+        (lambda: calib.select_poses("ur5", "40"), "select_poses: count: expected a whole number, found '40'"),
+        (lambda: calib.select_poses("ur5", True), "select_poses: count: expected a whole number, found True"),
+        (lambda: calib.identify_dynamics("ur5", ["a.npz", 3]), "identify_dynamics: recordings: expected"),
+        (lambda: calib.compensate("fit", "t.csv", start="0,0"), "compensate: start: expected several, each a number"),
+        (
+            lambda: calib.compensate("fit", "t.csv", tolerance=(1.0,)),
+            "compensate: tolerance: expected 2 values, each",
+        ),
+        (lambda: calib.validate("fit", "b.csv"), "validate: result: expected GeometryFit or DynamicsModel"),
+        (lambda: calib.new_session("s", "ur5", "cmm", poses=4.5), "new_session: poses: expected a whole number"),
+        (lambda: calib.new_session("s", "ur5", "cmm", periode=4.5), "no key 'periode' .did you mean 'period'"),
+        (lambda: calib.ExcitationSettings(period="a"), "ExcitationSettings: period: expected a number, found 'a'"),
+        (lambda: calib.ExcitationSettings(goals="raw=35"), "ExcitationSettings: goals: expected several, each a text"),
+        (lambda: calib.PlanSettings(lines=1), "PlanSettings: lines: expected True or False, found 1"),
+        (
+            lambda: calib.SelectionSettings(tools=(1.0, 2.0, 3.0)),
+            "SelectionSettings: tools: expected several, each",
+        ),
+        (lambda: calib.FitSettings(tolerance="0.1"), "FitSettings: tolerance: expected a number or None, found '0.1'"),
+        (lambda: calib.FitSettings(tolerance=0.0), "tolerance 0 mm: expected a length above 0"),
+        (lambda: calib.FitSettings(stations="two"), "^stations two: expected one of each, one"),
+    ],
+)
+def test_an_argument_of_another_type_is_refused_by_its_name(call, words):
+    with pytest.raises(calib.CalibError, match=words):
+        call()
+
+
+def test_numbers_and_sequences_of_numpy_are_numbers_and_sequences():
+    start, tool = np.zeros(6), np.array([[0.1, 0.0, 0.0]])
+    assert calib.ExcitationSettings(period=np.float32(5), seed=np.int64(3), start=start, goals=["raw=35"]).seed == 3
+    assert calib.SelectionSettings(tools=tool, seconds=2).tools is tool  # type: ignore[arg-type]
 
 
 def test_at_most_25_names_all_documented():
@@ -121,12 +169,20 @@ def test_recordings_in_memory_and_later_validation(model, logs):
     assert judged.verdict.level == model.verdict.level
 
 
-def test_export_and_compensation_take_results_in_memory(fitted, model, cell, logs, tmp_path):
+def test_export_and_compensation_take_results_in_memory(fitted, model, cell, logs, tmp_path, monkeypatch):
     written = calib.export(fitted, tmp_path / "geometry")
     assert (tmp_path / "geometry/robot.urdf").is_file() and any("robot.urdf" in line for line in written)
     calib.export(model, tmp_path / "dynamics")
     assert (tmp_path / "dynamics/robot.xml").is_file()
     (tmp_path / "targets.csv").write_text("q1,q2,q3,q4,q5,q6\n0.3,-1.2,1.6,-1.1,-1.4,0.5\n")
+    assert fitted.save(tmp_path / "fit", plots=False)
+    monkeypatch.chdir(tmp_path)
+    assert not run("export", "fit", "--into", "by_command")
+    names = sorted(path.name for path in (tmp_path / "geometry").iterdir())
+    assert names == sorted(path.name for path in Path("by_command").iterdir())
+    assert all((Path("geometry") / name).read_bytes() == (Path("by_command") / name).read_bytes() for name in names)
+    assert run("export", "fit", "--into", "fit") == 2 and run("export", "nowhere", "--into", "out") == 2
+    assert not Path("out").exists()
     commands = calib.compensate(fitted, tmp_path / "targets.csv")
     assert commands.commands.reached.all() and "1 of 1" not in str(commands)
     assert commands.save(tmp_path / "commands.csv").is_file()
@@ -151,7 +207,7 @@ def test_a_session_in_python_is_the_commands_session(tmp_path, monkeypatch, caps
 def test_wrong_settings_are_refused_where_they_are_made():
     with pytest.raises(calib.CalibError, match=r"holdout 1\.5"):
         calib.FitSettings(holdout=1.5)
-    with pytest.raises(calib.CalibError, match="--model geometri"):
+    with pytest.raises(calib.CalibError, match="model geometri: expected one of"):
         calib.FitSettings(model="geometri")
 
 
@@ -172,3 +228,5 @@ def test_poses_chosen_without_constraints_say_what_they_keep_and_what_is_not_che
     chosen = calib.select_poses("ur5", 8, calib.SelectionSettings(method="detmax", candidates=200))
     assert "kept: 1 % of each joint's range to its limits, self-collision" in str(chosen)
     assert "NOT checked: line of sight (the instrument's place is not known), walls" in str(chosen)
+    found = json.loads(json.dumps(chosen.to_dict()))
+    assert found["random_baseline"] < found["value"] and 0.9 < found["efficiency"] <= 1.0

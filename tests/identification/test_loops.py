@@ -89,7 +89,7 @@ def test_iv_is_right_where_noisy_positions_bias_least_squares(robot, tmp_path, c
         assert test["durbin_wu_hausman"]["least_squares_biased"] and test["valid"] and not test["instruments_weak"]
         assert test["largest_shift_sigma"] > 3.0 and max(test["distance_percent"]) < 2.0
     assert found["iv"]["method"] == "iv" and found["wls"]["method"] == "wls"
-    assert "least squares is biased" in text and "--method iv is not" in text
+    assert "least squares is biased" in text and "method 'iv' is not" in text
     table = list(csv.DictReader((results["wls"][1] / "instrumental.csv").open()))
     assert [row["name"] for row in table] == [
         row["name"] for row in csv.DictReader((results["iv"][1] / "estimate.csv").open())
@@ -115,7 +115,7 @@ def test_without_noise_in_the_positions_least_squares_stands(robot, tmp_path):
     code, out = identify(robot, tmp_path, log(tmp_path, "train.csv", 1), GAINS, "wls")
     found = json.loads((out / "metrics.json").read_text())
     assert code == 0 and found["loop"]["largest_shift_sigma"] < 3.0 and found["loop"]["valid"]
-    assert not any("--method iv" in line for line in found["warnings"])
+    assert not any("method 'iv'" in line for line in found["warnings"])
 
 
 def test_the_controller_may_be_read_from_the_log(robot, tmp_path, capsys):

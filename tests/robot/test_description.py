@@ -234,5 +234,5 @@ def test_what_is_no_robot(robot, message, tmp_path, monkeypatch):
 
 def test_base_and_tip_of_a_table_cannot_be_chosen():
     assert load("ur5", "base", "tool0").name == "ur5"
-    with pytest.raises(RobotError, match="its tip is 'tool0', not 'flange'; --base and --tip choose links of a URDF"):
+    with pytest.raises(RobotError, match="its tip is 'tool0', not 'flange'; base and tip choose links of a URDF"):
         load("ur5", tip="flange")

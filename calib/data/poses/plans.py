@@ -122,7 +122,8 @@ def _explain(
     joint = int(np.argmax(np.abs(q[worst] - plan[index[worst]])))
     count = int((distance <= near).sum())
     message = f"only {count} of {len(q)} rows are planned poses; the nearest differs here by {distance[worst]:.3g}"
-    return MeasurementError(f"{message}: is it the right plan?", measured.file, int(rows[worst]), names[joint])
+    advice = "is it the right plan? Where other poses were measured on purpose, set plan = false under [poses]"
+    return MeasurementError(f"{message}: {advice} in session.toml", measured.file, int(rows[worst]), names[joint])
 
 
 def _best_order(plan: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

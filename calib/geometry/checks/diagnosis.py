@@ -60,7 +60,7 @@ def _setup_change(block: Block, part: Part) -> list[str]:
     return [
         f"{_name(block)}: rows {bad[0]}–{bad[1]} fit worse than the rest ({1e3 * worse:.2f} "
         f"against {1e3 * rest:.2f} mm rms) and behave like another set-up: was the instrument, the tool or the robot's "
-        "mastering touched, or was it cold? Fit them apart (two files, --stations each) or leave them out."
+        "mastering touched, or was it cold? Fit them apart (two files, stations 'each') or leave them out."
     ]
 
 

@@ -80,9 +80,7 @@ def folds_by_name(name: str, measured: Sequence[PoseMeasurements], seed: int = 0
         UsageError: for another name, or for leaving out each of more than `MOST` poses.
     """
     if name == "poses" and sum(len(block) for block in measured) > MOST:
-        raise UsageError(
-            f"--folds poses leaves out every pose once, which is for {MOST} rows at most; take --folds random"
-        )
+        raise UsageError(f"folds 'poses' leaves out every pose once, which is for {MOST} rows at most; take 'random'")
     ways = {
         "transfer": lambda: transfer_folds(measured, seed),
         "regions": lambda: region_folds(measured, seed=seed),
@@ -90,7 +88,7 @@ def folds_by_name(name: str, measured: Sequence[PoseMeasurements], seed: int = 0
         "poses": lambda: random_folds(measured, None, seed),
     }
     if name not in ways:
-        raise UsageError(f"--folds {name}: expected one of {', '.join(ways)}")
+        raise UsageError(f"folds {name}: expected one of {', '.join(ways)}")
     return ways[name]()
 
 

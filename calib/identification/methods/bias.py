@@ -115,7 +115,7 @@ def _words(found: Instrumental) -> list[str]:
     p = f"p = {found.verdict.p:.2g}" if found.verdict.p > 0.0 else "p < 1e-300"
     if shift.max() < SMALL:
         return [f"least squares is biased ({p}), but by little: {named}"]
-    return [f"least squares is biased (Durbin, Wu, Hausman: {p}), off {named}: --method iv is not"]
+    return [f"least squares is biased (Durbin, Wu, Hausman: {p}), off {named}: method 'iv' is not"]
 
 
 def _blurred(test: LoopTest) -> list[str]:

@@ -101,7 +101,7 @@ def _judge_totals(
     """Return the verdict by rules 1 to 5; `standing`: there were recordings in which the robot stands."""
     own = max((found.raw.total for found in fit.values()), default=np.nan)
     if not validation:
-        why = "there is no unseen motion: --validate"
+        why = "there is no unseen motion: validate on another recording (--validate)"
         if repeated:
             why = "the validation motion repeats the training motion"
         elif standing:

@@ -241,7 +241,7 @@ def _front(
     """Sweep the first torque goal (default: the wrist) between what this motion has and what it can reach alone."""
     goals = (one.goal.objective for one in wanted)
     slack = next((one for one in goals if isinstance(one, TorqueSlack)), None)
-    slack = slack or torque_slack(wrist(given.chain.n), given, "--front")
+    slack = slack or torque_slack(wrist(given.chain.n), given, "front")
     motion = problem.basis().motion(found.x)
     begin = slack.evaluate(motion, problem.regressor(motion.q, motion.v, motion.a)).value
     bare = replace(problem, goals=())

@@ -150,7 +150,7 @@ def read_model(chain: Chain, folder: Path | None, sets: str, limits: MotionLimit
         notes.append("the robot's masses are not known: torques are not limited")
     friction = limits.friction is not None
     if values is not None and not friction:
-        notes.append("friction is not known (no --model, no [friction]): torques are predicted without it")
+        notes.append("friction is not known (no model, no [friction]): torques are predicted without it")
     model = IdentificationModel(bodies_of(chain), terms)
     return _dynamics(model, values, None, friction, tuple(notes))
 
@@ -221,20 +221,20 @@ def _read_locked(texts: Sequence[str], chain: Chain, limits: BoxLimit) -> dict[i
     for text in [part.strip() for word in texts for part in word.split(",")]:
         name, _, amount = (part.strip() for part in text.partition("="))
         if name not in known:
-            raise UsageError(f"--lock {text}: '{name}' is no joint; there are {', '.join(chain.joint_names)}")
+            raise UsageError(f"lock {text}: '{name}' is no joint; there are {', '.join(chain.joint_names)}")
         j = known[name]
         try:
             value = float(amount) if amount else None
         except ValueError:
-            raise UsageError(f"--lock {text}: '{amount}' is not a number") from None
+            raise UsageError(f"lock {text}: '{amount}' is not a number") from None
         lower, upper = limits.lower[j], limits.upper[j]
         if value is not None and not lower <= value <= upper:
             raise UsageError(
-                f"--lock {text}: {chain.joint_names[j]} at {value:g} is beyond its limits {lower:.4g} to {upper:.4g}"
+                f"lock {text}: {chain.joint_names[j]} at {value:g} is beyond its limits {lower:.4g} to {upper:.4g}"
             )
         found[j] = value
     if len(found) == chain.n:
-        raise UsageError("--lock: every joint is locked; nothing is left to move")
+        raise UsageError("lock: every joint is locked; nothing is left to move")
     return found
 
 
@@ -282,7 +282,7 @@ def _designed(folder: Path, chain: Chain) -> tuple[np.ndarray, np.ndarray, np.nd
     found = coefficients.read(folder)
     if found.joint_names != tuple(chain.joint_names):
         raise UsageError(
-            f"--existing {folder}: a motion of {', '.join(found.joint_names)}; {chain.name} has "
+            f"existing {folder}: a motion of {', '.join(found.joint_names)}; {chain.name} has "
             f"{', '.join(chain.joint_names)}"
         )
     count = max(1000, round(50 * found.period))

@@ -159,7 +159,11 @@ def read_motion_limits(
     amounts = {key: value for key, value in own.items() if key not in MARGINS}
     torque = _per_joint(amounts, f"{where}: torque", chain, efforts, ("torque", "force"))
     margin = number(own["margin"], f"{where}: torque.margin") if "margin" in own else None
+    if margin is not None and not 0.0 <= margin < 1.0:
+        raise UsageError(f"{where}: torque.margin: expected a share of the limit, from 0 to below 1, found {margin:g}")
     deviations = number(own.get("deviations", 2.0), f"{where}: torque.deviations")
+    if not 0.0 <= deviations < np.inf:
+        raise UsageError(f"{where}: torque.deviations: expected 0 or more, found {deviations:g}")
     points = _points(stated.point, chain, where)
     friction = _friction(stated.friction, chain, where)
     linear = [joint.kind == "prismatic" for joint in chain.joints]
@@ -178,7 +182,7 @@ def read_motion_limits(
 def _unchecked(path: Path | None) -> str:
     """Return what nothing keeps the motion from."""
     if path is None:
-        return "collisions and floor are NOT checked, the tool may pass the table: name them with --limits"
+        return "collisions and floor are NOT checked, the tool may pass the table: state them in a limits file"
     return f"collisions are NOT checked: {path} has no [collision] (its floor = … keeps off the floor)"
 
 

@@ -205,11 +205,11 @@ def _check_places(path: JointPath, known: MotionLimits) -> None:
 
 def _check(settings: PlanSettings) -> None:
     if not (np.isfinite(settings.rate) and settings.rate > 0):
-        raise UsageError(f"--rate {settings.rate:g}: expected a number of samples per second above zero")
+        raise UsageError(f"rate {settings.rate:g}: expected a number of samples per second above zero")
     if settings.shorten < 0:
-        raise UsageError(f"--shorten {settings.shorten}: expected a number of timings, 0 for none")
+        raise UsageError(f"shorten {settings.shorten}: expected a number of timings, 0 for none")
     if settings.shorten and settings.lines:
-        raise UsageError("--shorten changes the path between waypoints; a straight --line leaves nothing to change")
+        raise UsageError("shorten changes the path between waypoints; straight lines (--line) leave nothing to change")
     check_slower(settings.slower)
 
 
@@ -219,7 +219,7 @@ def _law(
     """Return the dynamics: identified, or the robot's inertias with stated drives; None without any."""
     if folder is not None:
         if drives_file is not None:
-            raise UsageError("--model and --drives both say what the drives are; take one of them away")
+            raise UsageError("model and drives both say what the drives are; take one of them away")
         law, unsure = _identified(chain, folder, payloads)
         return law, () if unsure else ("the model states no covariance: torques have no margin for it",), unsure
     try:
@@ -234,9 +234,7 @@ def _law(
     linear = [joint.kind == "prismatic" for joint in chain.joints]
     model = IdentificationModel(bodies_of(chain), standard([" ".join(DRIVES)] * chain.n, linear=linear))
     missing = [what for what, key in (("motor inertia", "Ia"), ("friction", "Fc")) if key not in stated]
-    note = (
-        f"{' and '.join(missing)} not known (no --model, no --drives): planned without, a real robot needs more torque"
-    )
+    note = f"{' and '.join(missing)} not known (no model, no drives): planned without, a real robot needs more torque"
     law = of_standard(model, np.concatenate([standard_parameters(chain), values.ravel()]))
     return law, (note,) if missing else (), None
 
@@ -279,7 +277,7 @@ def _bounds(chain: Chain, known: MotionLimits, law: PathDynamics | None) -> tupl
         raise UsageError(f"torque margin {margin:g}: expected a share of the limits from 0 to below 1")
     torque = known.torque * (1 - margin) if law is not None else free
     if not any(np.isfinite(x).any() for x in (*sizes, torque)):
-        raise UsageError(f"robot '{chain.name}' has no limits of speed, acceleration or torque; give --limits")
+        raise UsageError(f"robot '{chain.name}' has no limits of speed, acceleration or torque; state them (limits)")
     return known.positions.lower, known.positions.upper, TimingLimits(sizes[0], sizes[1], torque)
 
 

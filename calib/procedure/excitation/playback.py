@@ -50,7 +50,7 @@ class Playback:
 def check_playback(settings: ExcitationSettings, given: ExcitationInputs) -> None:
     """Refuse, before the search, what could not be played."""
     if settings.repeat < 1:
-        raise UsageError(f"--repeat {settings.repeat}: expected 1 period or more")
+        raise UsageError(f"repeat {settings.repeat}: expected 1 period or more")
     check_slower(settings.slower)
     if settings.start is not None:
         _check_start(np.asarray(settings.start, dtype=float), given.chain, given.limits)
@@ -59,7 +59,7 @@ def check_playback(settings: ExcitationSettings, given: ExcitationInputs) -> Non
 def check_slower(factor: float) -> None:
     """Refuse a rehearsal that is faster than the motion."""
     if not (np.isfinite(factor) and factor >= 1):
-        raise UsageError(f"--slower {factor:g}: a rehearsal runs a factor of 1 or more slower")
+        raise UsageError(f"slower {factor:g}: a rehearsal runs a factor of 1 or more slower")
 
 
 def play(family: Family, found: SearchResult, given: ExcitationInputs, settings: ExcitationSettings) -> Playback:
@@ -138,10 +138,10 @@ def _check_start(start: np.ndarray, chain: Chain, known: MotionLimits) -> None:
     """Refuse a pose (n,) that the robot cannot be in."""
     limits = known.positions
     if start.shape != (chain.n,):
-        raise UsageError(f"--start: expected {chain.n} joint values, found {start.size}")
+        raise UsageError(f"start: expected {chain.n} joint values, found {start.size}")
     for name, value, lower, upper in zip(chain.joint_names, start, limits.lower, limits.upper):
         if not lower <= value <= upper:
-            raise UsageError(f"--start: {name} at {value:g} is beyond its limits {lower:.4g} to {upper:.4g}")
+            raise UsageError(f"start: {name} at {value:g} is beyond its limits {lower:.4g} to {upper:.4g}")
 
 
 def _place(limit: MotionConstraint, track: Setpoints) -> str:
@@ -153,7 +153,7 @@ def _place(limit: MotionConstraint, track: Setpoints) -> str:
         return ""
     k, column = (int(i) for i in np.unravel_index(np.argmax(values), values.shape))
     words = (
-        f"on the straight way from --start, {limit.name} ({limit.labels[column]}) is broken by "
+        f"on the straight way from start, {limit.name} ({limit.labels[column]}) is broken by "
         f"{values[k, column]:.3g} {limit.unit} at t = {track.times[rows[k]]:.3g} s"
     )
     if isinstance(limit, Clearance):

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from calib.arguments import checked
 
+
+@checked
 @dataclass(frozen=True)
 class ExcitationSettings:
     """How an exciting motion is designed and played.
@@ -51,6 +54,7 @@ class ExcitationSettings:
 DEFAULT_DESIGN = ExcitationSettings()
 
 
+@checked
 @dataclass(frozen=True)
 class PlanSettings:
     """How a motion through waypoints is planned.

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from calib.dynamics.bodies import Bodies, bodies_of, with_gravity
-from calib.errors import UsageError
 from calib.identification.friction.drive_table import Drives, drive_table
 from calib.identification.model_file import MODEL, refuse_currents
 from calib.identification.possible.information import Information
@@ -50,15 +49,6 @@ class IdentifiedRobot:
 def is_identified(folder: Path) -> bool:
     """Say whether a folder is that of an identification."""
     return (folder / MODEL).is_file()
-
-
-def check_identified(folder: Path) -> None:
-    """Refuse a folder that holds no identification, where its dynamics are asked for."""
-    if not is_identified(folder):
-        raise UsageError(
-            f"{folder} holds no identified dynamics (dynamics.json); give the folder that calib identify has written, "
-            "or leave --into out"
-        )
 
 
 def read(folder: Path) -> IdentifiedRobot:

@@ -93,7 +93,7 @@ def _link_bodies(given: IdentifiedRobot, tree: UrdfTree, own: Chain) -> tuple[di
             raise RobotError(
                 f"{tree.where}: link '{joint.child}' would have to be no possible body, since what hangs on it "
                 f"({', '.join(loose)}) is heavier than what was identified: are the drives' gains "
-                "known? Correct those masses, or leave --urdf out for all other files"
+                "known? Correct those masses, or leave the URDF out (--urdf) for all other files"
             )
     return links, notes
 

@@ -146,11 +146,11 @@ def placements(fitted: Fitted, frame: str = "base", tool: str = "flange") -> tup
 def _station(fitted: Fitted, frame: str) -> int:
     names = fitted.cell.station_names
     if frame not in ("nominal", *names):
-        raise UsageError(f"--frame {frame}: expected base, nominal, or a station of the fit ({', '.join(names)})")
+        raise UsageError(f"frame {frame}: expected base, nominal, or a station of the fit ({', '.join(names)})")
     if set(names) - set(fitted.nominal.station_names):
         raise UsageError(
             f"{fitted.folder} does not say where the nominal robot stood (it was fitted from an earlier fit's folder, "
-            "by an earlier version, or without an instrument): --frame base is left"
+            "by an earlier version, or without an instrument): frame 'base' is left"
         )
     return 0 if frame == "nominal" else names.index(frame)
 
@@ -166,7 +166,7 @@ def _tool(cell: Installation, tool: str) -> np.ndarray:
         values = []
     if len(values) not in (3, 6) or not np.isfinite(values).all():
         names = ", ".join(cell.tool_names)
-        raise UsageError(f"--tool {tool}: expected flange, a tool of the fit ({names}), or x,y,z[,roll,pitch,yaw]")
+        raise UsageError(f"tool {tool}: expected flange, a tool of the fit ({names}), or x,y,z[,roll,pitch,yaw]")
     return from_xyz_rpy(values[:3], values[3:] or [0.0, 0.0, 0.0])
 
 
@@ -230,9 +230,9 @@ def _dof(targets: Targets, chain: Chain, asked: int | None) -> tuple[int, tuple[
     given = 3 if targets.position is not None and targets.rotation is None else given
     able = 6 if chain.n >= 6 else 5 if chain.n == 5 else 3
     if asked not in (None, *inverse.DOF):
-        raise UsageError(f"--dof {asked}: expected 6, 5 (free to turn about the tool's z), or 3")
+        raise UsageError(f"dof {asked}: expected 6, 5 (free to turn about the tool's z), or 3")
     if asked is not None and asked > given:
-        raise UsageError(f"{targets.file}: has positions without an orientation: --dof {asked} needs qx qy qz qw")
+        raise UsageError(f"{targets.file}: has positions without an orientation: dof {asked} needs qx qy qz qw")
     dof = asked or min(given, able)
     what = {6: "position and orientation", 5: "position and the direction of the tool's z axis", 3: "position only"}
     why = f", all that {chain.n} joints can do" if asked is None and able < given else ""
@@ -318,8 +318,8 @@ def _frame_words(fitted: Fitted, frame: str) -> str:
     if frame not in ("base", "nominal"):
         return f"targets are in the instrument's frame, station '{frame}'"
     words = {
-        "base": "targets are in the calibrated robot's base, as robot.toml has it (--frame base)",
-        "nominal": "targets are in the nominal robot's base where it fits the measurements best (--frame nominal)",
+        "base": "targets are in the calibrated robot's base, as robot.toml has it (frame 'base')",
+        "nominal": "targets are in the nominal robot's base where it fits the measurements best (frame 'nominal')",
     }[frame]
     if set(fitted.cell.station_names) - set(fitted.nominal.station_names) or not len(fitted.nominal.stations):
         return words
@@ -341,5 +341,5 @@ def _turn_words(fitted: Fitted, dof: int) -> tuple[str, ...]:
 def _tool_words(tool: str) -> str:
     """Say which tool stands at the targets."""
     if tool == "flange":
-        return "what stands there is the flange (--tool)"
+        return "what stands there is the flange (tool 'flange')"
     return f"what stands there is the tool '{tool}'"

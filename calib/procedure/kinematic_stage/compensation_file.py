@@ -27,7 +27,7 @@ def write(commands: Commands, fitted: Fitted, targets: Targets, out: Path, parti
     if len(lost) and (not partial or len(lost) == len(commands.q)):
         shown = [f"  target {k + 1}: {commands.reason[k]}" for k in lost[:SHOWN]]
         shown += [f"  and {len(lost) - SHOWN} more"] if len(lost) > SHOWN else []
-        advice = "" if len(lost) == len(commands.q) else "\n--partial writes the others, with these rows left empty"
+        advice = "" if len(lost) == len(commands.q) else "\npartial (--partial) writes the others, these rows empty"
         head = f"{targets.file}: {len(lost)} of {len(commands.q)} targets are not reached; nothing was written"
         raise UsageError("\n".join([head, *shown]) + advice)
     names = targets.columns or fitted.cell.chain.joint_names

@@ -185,8 +185,8 @@ def _moved_between(nominal: Installation, blocks: Sequence[PoseMeasurements], se
         return []
     return [
         f"with one station for all {len(own)} files the nominal arm is off by {1e3 * before:.3g} mm rms, with one for "
-        f"each by {1e3 * after:.3g} mm: the instrument seems to have been moved; give --stations each (in a "
-        'session: stations = "each" in session.toml)'
+        f"each by {1e3 * after:.3g} mm: the instrument seems to have been moved; fit them with "
+        "stations 'each' (--stations each; in a session: stations in session.toml)"
     ]
 
 

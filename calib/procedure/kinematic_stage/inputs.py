@@ -291,19 +291,19 @@ def _shared(block: PoseMeasurements, fit: Sequence[PoseMeasurements], notes: lis
     if block.has_instrument:
         stations = [other.station for other in fit if other.has_instrument]
         if not stations:
-            raise UsageError(f"{block.file}: no fit file places the instrument; give --refit-frames")
+            raise UsageError(f"{block.file}: no fit file places the instrument; refit its frames (--refit-frames)")
         if block.station not in stations:
             block = replace(block, station=stations[0])
             notes.append(
                 f"{block.file} is predicted from the station of the fit '{stations[0]}': if the instrument stood "
-                "elsewhere, give --refit-frames"
+                "elsewhere, refit frames there (--refit-frames)"
             )
     known = {name for other in fit for name in other.tool_names}
     if not set(block.tool_names) <= known:
         if len(block.tool_names) != len(first.tool_names):
             found = ", ".join(block.tool_names)
             raise UsageError(
-                f"{block.file}: tool {found} is none of the fit's ({', '.join(sorted(known))}); --refit-frames"
+                f"{block.file}: tool {found} is none of the fit's ({', '.join(sorted(known))}); refit_frames"
             )
         block = replace(block, tool_names=first.tool_names)
     return block

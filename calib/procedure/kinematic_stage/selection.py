@@ -125,6 +125,26 @@ def bound_words(found: Selection) -> str:
     return f"of all feasible poses, as far as {climbs} searches for better ones can tell; loose by at most {gap:.2g} %"
 
 
+def record(chosen: Chosen) -> dict[str, Any]:
+    """Return what the selection came to, numbers as numbers; `table` says it in words."""
+    found = chosen.selection
+    return {
+        "index": found.index,
+        "method": found.method,
+        "parameters": chosen.parameters,
+        "value": found.value,
+        "start": float(found.history[0]),
+        "random_baseline": found.random_baseline,
+        "existing": chosen.existing,
+        "efficiency": found.efficiency,
+        "efficiency_covers": bound_words(found),
+        "seconds": found.seconds,
+        "checked": list(chosen.checked),
+        "unchecked": list(chosen.unchecked),
+        "notes": list(chosen.notes),
+    }
+
+
 def table(chosen: Chosen) -> list[tuple[str, str]]:
     """Return what the selection came to, as pairs of words and numbers."""
     found = chosen.selection

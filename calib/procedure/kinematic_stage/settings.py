@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from calib.arguments import checked
 from calib.data.poses.fit_options import LOSSES, MODELS
 from calib.errors import UsageError
 
 
+@checked
 @dataclass(frozen=True)
 class FitSettings:
     """How a geometry is fitted and judged.
@@ -45,15 +47,16 @@ class FitSettings:
             ("tools", ("one", "each")),
         ):
             if (value := getattr(self, option)) not in allowed:
-                raise UsageError(f"--{option} {value}: expected one of {', '.join(name for name in allowed if name)}")
+                raise UsageError(f"{option} {value}: expected one of {', '.join(name for name in allowed if name)}")
         if not 0.0 <= self.holdout < 1.0:
-            raise UsageError(f"--holdout {self.holdout:g}: expected a share from 0 to below 1")
+            raise UsageError(f"holdout {self.holdout:g}: expected a share from 0 to below 1")
         if self.tolerance is not None and not 0.0 < self.tolerance < float("inf"):
-            raise UsageError(f"--tolerance {1e3 * self.tolerance:g}: expected a length above 0, in mm")
+            raise UsageError(f"tolerance {1e3 * self.tolerance:g} mm: expected a length above 0")
         if self.seed < 0:
-            raise UsageError(f"--seed {self.seed}: expected a whole number from 0")
+            raise UsageError(f"seed {self.seed}: expected a whole number from 0")
 
 
+@checked
 @dataclass(frozen=True)
 class SelectionSettings:
     """How poses to measure are chosen.
@@ -92,9 +95,9 @@ class SelectionSettings:
     def __post_init__(self) -> None:
         for option, least in (("starts", 1), ("evaluations", 1), ("climbs", 0)):
             if (value := getattr(self, option)) < least:
-                raise UsageError(f"--{option} {value}: expected at least {least}")
+                raise UsageError(f"{option} {value}: expected at least {least}")
         if self.seconds is not None and not self.seconds > 0.0:
-            raise UsageError(f"--seconds {self.seconds:g}: expected a time above 0")
+            raise UsageError(f"seconds {self.seconds:g}: expected a time above 0")
 
 
 DEFAULT_SELECTION = SelectionSettings()

@@ -154,7 +154,7 @@ def elsewhere(fit: Comparison, validation: Mapping[str, Comparison]) -> list[str
     usual = float(np.median(fit.errors[0].main)) if len(fit.errors[0].main) else np.inf
     return [
         f"{name}: nominal errors of {1e3 * np.median(found.errors[0].main):.3g} mm look like an instrument (or "
-        f"tool) that stood elsewhere; give {OWN_FRAMES}"
+        f"tool) that stood elsewhere; {OWN_FRAMES}"
         for name, found in validation.items()
         if np.median(found.errors[0].main) > ELSEWHERE * usual
     ]

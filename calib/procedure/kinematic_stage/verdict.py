@@ -16,7 +16,7 @@ TRANSFER = 3.0  # unseen errors this many times the fit's own: the fit does not 
 OUTLIERS = 0.05  # more rows than this share that do not fit: something is wrong with the measurements or the model
 TURNED = 5.0  # rms of the calibrated arm's orientations [deg] that no calibrated arm has
 ELSEWHERE = 0.10  # of the reach: errors of both arms that say where the instrument stood, and nothing of the arms
-OWN_FRAMES = '--refit-frames (in a session: validation_frames = "own" in session.toml)'
+OWN_FRAMES = 'refit their frames (--refit-frames; in a session: validation_frames = "own" in session.toml)'
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,8 @@ def judge(
             return verdict
     if not found:
         return Verdict(
-            "marginal", "there are no unseen poses: errors on fitted poses say little of others; --holdout 0.25"
+            "marginal",
+            "there are no unseen poses: errors on fitted poses say little of others; hold some out (--holdout 0.25)",
         )
     worst = max(found, key=lambda proof: proof.after)
     if unexplained:
@@ -150,11 +151,11 @@ def _elsewhere(proofs: Mapping[str, Comparison], reach: float) -> Verdict | None
             continue
         found = f"{name} is not judged: rms {1e3 * before:.0f} mm nominal, {1e3 * after:.0f} mm calibrated"
         if comparison.shares_frames:
-            return Verdict("fail", f"{found}: the instrument or tool stood elsewhere; give {OWN_FRAMES}")
+            return Verdict("fail", f"{found}: the instrument or tool stood elsewhere; {OWN_FRAMES}")
         return Verdict(
             "fail",
             f"{found}, wherever instrument and tool are placed: is it this robot, are units, joint order and signs "
-            "right, and did instrument and tool stay where they were (else one file each, --stations each)?",
+            "right, and did instrument and tool stay where they were (else one file each, stations 'each')?",
         )
     return None
 

@@ -25,7 +25,8 @@ WORDS = {"pass": "PASS", "marginal": "MARGINAL", "fail": "FAIL"}
 EDITED = "edited by hand"
 SHORT = 12  # hexadecimal digits of a SHA-256 on the first sheet
 LISTED = 6  # files on the first sheet
-LONG = 64  # letters of a line of the setup on the first sheet
+LONG = (400, 200, 100, 64)  # letters of a line of the setup on the first sheet: as many as all lines together
+SETUP = 1000  # leave room for, in letters
 REASON = 560  # letters of a reason on the first sheet; the whole of a longer one stands behind it
 BEHIND = ("session made", "pose plan", "seed", "command")  # labels of the setup that the first sheet leaves out
 CONVENTIONS = (
@@ -72,7 +73,9 @@ def certificate(
     filed = sorted(files, key=lambda row: row[1] != EDITED)  # what was edited by hand is not hidden among the rest
     first: dict[str, str] = {}
     for label, value in setup:
-        first.setdefault(label, shortened(value))
+        if label not in BEHIND:
+            first.setdefault(label, value)
+    most = next((one for one in LONG if sum(min(one, len(value)) for value in first.values()) <= SETUP), LONG[-1])
     marks = [(name, role, digest[:SHORT]) for name, role, _, digest in filed[:LISTED]]
     if len(files) > LISTED:
         marks.append((f"and {len(files) - LISTED} more, see Files", "", ""))
@@ -82,7 +85,7 @@ def certificate(
         title,
         subtitle,
         issued,
-        [(label, value) for label, value in first.items() if label not in BEHIND],
+        [(label, shortened(value, most)) for label, value in first.items()],
         behind,
         marks,
     )
@@ -96,7 +99,7 @@ def _fitting(section: Section) -> Section:
     return replace(section, reason=short, blocks=[Text("Reason in full", [section.reason]), *section.blocks])
 
 
-def shortened(text: str, most: int = LONG) -> str:
+def shortened(text: str, most: int) -> str:
     """Return a text cut at a word, with an ellipsis, where it is longer than `most` letters."""
     return text if len(text) <= most else f"{text[: most - 1].rsplit(' ', 1)[0]} …"
 

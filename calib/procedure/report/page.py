@@ -123,7 +123,8 @@ class Page:
     @property
     def tight(self) -> bool:
         """Whether there is so much to say on the first sheet that it has to be set small."""
-        return sum(len(section.reason) for section in self.judged) + 60 * len(self.setup) > 1400
+        lines = sum(max(60, len(value)) for _, value in self.setup)
+        return sum(len(section.reason) for section in self.judged) + lines > 1400
 
     @property
     def judged(self) -> list[Section]:

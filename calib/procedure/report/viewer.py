@@ -88,7 +88,7 @@ def spawn(folder: str | Path, robot: str | None = None) -> Scene:
     try:
         recording.spawn(default_blueprint=_blueprint(scene))
     except Exception as error:
-        raise CalibError(f"Rerun's window did not open ({error}); --save FILE.rrd writes it to a file") from error
+        raise CalibError(f"Rerun's window did not open ({error}); calib view --save FILE.rrd writes a file") from error
     _send(recording, scene)
     recording.flush()
     return scene

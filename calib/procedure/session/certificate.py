@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import datetime
 from pathlib import Path
 
 from calib import files
+from calib.errors import command_line
 from calib.folders import CERTIFICATE
 from calib.procedure.excitation.coefficients import SAMPLES
 from calib.procedure.kinematic_stage.folder import SCHEMA, URDF
@@ -108,13 +108,13 @@ def _setup(session: Session, found: fit_report.Report) -> list[tuple[str, str]]:
         ("description", settings.robot.given),
         ("instrument", f"{instrument.name}, measures {instrument.measures}{stated}{turning}"),
         ("session made", settings.created.replace("T", " ")),
-        ("measurements", _dated([*fitted[0], *fitted[1]])),
+        ("measurements", _named([*fitted[0], *fitted[1]])),
         ("pose plan", _session_plan(session)),
         ("model", found.metrics.model),
         ("tolerance", certificate.tolerance(settings.fit.tolerance_mm)),
         *_dynamic_setup(session),
         ("seed", str(settings.seed)),
-        ("command", f"calib next {session.folder.name}"),
+        ("command", command_line("next", session.folder.name)),
         ("toolkit", certificate.versions()),
     ]
 
@@ -132,18 +132,16 @@ def _dynamic_setup(session: Session) -> list[tuple[str, str]]:
     }
     loads = ", ".join(f"{label} {mass:g} kg" for label, mass in wanted.payloads.items())
     rows = [
-        ("recordings", _dated([*training, *unseen])),
+        ("recordings", _named([*training, *unseen])),
         ("torques", torques[wanted.torques]),
         ("tolerance of torque", f"{allowed:g} % on unseen motion" if allowed else "none was given: pass below 10 %"),
     ]
     return [*rows, ("payloads", loads)] if loads else rows
 
 
-def _dated(paths: list[Path]) -> str:
-    """Return names of files, and the day of the last."""
-    when = max((path.stat().st_mtime for path in paths), default=0.0)
-    day = datetime.fromtimestamp(when).strftime("%Y-%m-%d %H:%M") if when else "unknown"
-    return f"{', '.join(path.name for path in paths)}; files of {day}"
+def _named(paths: list[Path]) -> str:
+    """Return names of files; when they were measured no file says, and a copy's date says when it was copied."""
+    return ", ".join(path.name for path in paths)
 
 
 def _session_plan(session: Session) -> str:

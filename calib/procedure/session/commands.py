@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,9 @@ from rich.console import RenderableType
 from rich.markup import escape
 from rich.table import Table
 
-from calib.errors import UsageError
+from calib.arguments import checked
+from calib.config import check_keys
+from calib.errors import UsageError, command_line
 from calib.folders import CERTIFICATE
 from calib.procedure.excitation.limits import read_motion_limits
 from calib.procedure.kinematic_stage.folder import URDF
@@ -41,6 +43,7 @@ class Stop:
     verdict: str = ""
 
 
+@checked
 @dataclass(frozen=True)
 class NewSession:
     """What a new session is about.
@@ -73,8 +76,9 @@ class NewSession:
 def begin(folder: Path, wanted: NewSession) -> Session:
     """Make a session in the new folder `folder`, for a robot, which is read once to see that it can be."""
     if wanted.poses < 1 or wanted.validation < 0:
-        words = f"--poses {wanted.poses} --validation {wanted.validation}"
+        words = f"poses {wanted.poses}, validation {wanted.validation}"
         raise UsageError(f"{words}: at least one pose, and no fewer than 0")
+    check_keys(wanted.motion, [key.name for key in fields(DynamicsSection)], "keys of [dynamics]")
     device, source = instrument_named(wanted.instrument), resolve(wanted.robot)
     chain = load(wanted.robot, wanted.base or None, wanted.tip or None)
     copied, named = ({}, "") if wanted.limits is None else ({LIMITS: wanted.limits}, LIMITS)
@@ -136,4 +140,4 @@ def status_lines(folder: Path) -> Iterator[RenderableType]:
     elif ahead.kind == steps.WAITING:
         yield from (escape(line) for line in instructions.asks(session, ahead))
     else:
-        yield escape(f"next: calib next {folder}")
+        yield escape(f"next: {command_line('next', folder)}")

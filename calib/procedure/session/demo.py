@@ -13,7 +13,7 @@ import numpy as np
 
 from calib import files
 from calib.data.poses.plans import read_poses
-from calib.errors import SessionError, UsageError
+from calib.errors import SessionError, UsageError, command_line
 from calib.estimate_files import read_estimate
 from calib.folders import CERTIFICATE
 from calib.geometry import installation_file
@@ -113,7 +113,8 @@ def stopped(session: Session, waiting: steps.State) -> tuple[str, ...]:
     folder = session.folder
     return (
         *asks(session, waiting),
-        f"(or let the simulated cell do it: calib demo --bring {folder}; then: calib next {folder})",
+        f"(or let the simulated cell do it: {command_line('demo', '--bring', folder)}; "
+        f"then: {command_line('next', folder)})",
     )
 
 
@@ -177,9 +178,9 @@ def bring_what_waits(folder: Path, say: Say) -> None:
             _compare_with_truth(session, virtual_cell(session.settings.robot.given, session.settings.seed), say)
             return
         if waiting.kind != steps.WAITING:
-            raise UsageError(f"{folder} waits for nothing; next: calib next {folder}")
+            raise UsageError(f"{folder} waits for nothing; next: {command_line('next', folder)}")
         _bring_for(session, waiting.step.name, say)
-    say(f"next: calib next {folder}")
+    say(f"next: {command_line('next', folder)}")
 
 
 def _bring_for(session: Session, step: str, say: Say) -> None:

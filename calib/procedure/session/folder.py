@@ -35,7 +35,8 @@ from typing import Any
 
 from calib import files
 from calib.config import Text, parse
-from calib.errors import CalibError, SessionError
+from calib.errors import CalibError, SessionError, command_line
+from calib.folders import CERTIFICATE, METRICS
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.session.settings import SCHEMA, SessionSettings, check_schema, read_settings, written
@@ -142,7 +143,7 @@ def create(
     staging = folder.parent / f".{folder.name}.part"
     try:
         if (folder / SETTINGS).exists():
-            raise SessionError(f"{folder} is a session already; go on with: calib next {folder}")
+            raise SessionError(f"{folder} is a session already; go on with: {command_line('next', folder)}")
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise SessionError(f"{folder} is not empty; give a new folder")
         shutil.rmtree(staging, ignore_errors=True)
@@ -166,6 +167,19 @@ def create(
     return open_session(folder)
 
 
+def _no_session(folder: Path) -> str:
+    """Say what a folder is that is no session, and what to call."""
+    identified = IdentificationFolder(folder).model.exists()
+    if not identified and not FitFolder(folder).report.exists():
+        return f"{folder} is no session (no session.toml); make one with: {command_line('new', folder)}"
+    what, where = ("an identification", METRICS) if identified else ("a fit", CERTIFICATE)
+    return (
+        f"{folder} is the result of {what}, no session: verdict and figures are in its {where}; "
+        f"{command_line('view', folder)} shows it, {command_line('export', folder, '--into', 'DIR')} writes the robot "
+        "for other programs"
+    )
+
+
 def open_session(folder: Path, plots: bool = True) -> Session:
     """Read the session in `folder`.
 
@@ -174,7 +188,7 @@ def open_session(folder: Path, plots: bool = True) -> Session:
     """
     path = folder / SETTINGS
     if not path.exists():
-        raise SessionError(f"{folder} is no session (no session.toml); make one with: calib new {folder}")
+        raise SessionError(_no_session(folder))
     return Session(folder, read_settings(path), plots=plots)
 
 

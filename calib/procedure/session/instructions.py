@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from calib.errors import SessionError
+from calib.errors import SessionError, command_line
 from calib.procedure.excitation.coefficients import RUN, SAMPLES
 from calib.procedure.session import dynamics_steps, geometry_steps
 from calib.procedure.session.folder import UNSEEN, Session
@@ -19,7 +19,8 @@ def asks(session: Session, state: State) -> tuple[str, str]:
         target = "measured.csv" if name == "poses" else UNSEEN
         both = name == "poses" and not geometry_steps.measured_files(session)[1]
         return _at_the_robot(session, name, both), _form(session, target, both)
-    return f"step {state.step.name} needs {state.words}", f"put it into {session.folder} and run calib next again"
+    again = f"put it into {session.folder} and run {command_line('next', session.folder)} again"
+    return f"step {state.step.name} needs {state.words}", again
 
 
 def _at_the_robot(session: Session, name: str, both: bool) -> str:
@@ -54,7 +55,7 @@ def _form(session: Session, target: str, both: bool) -> str:
     if both and session.settings.poses.validation:
         files.append(str(session.path(f"3-measured/{UNSEEN}")))
     each = f"Bring {' and '.join(files)}, one row per pose: {columns}{quaternion} (calib formats measurements)"
-    return f"{each}; then: calib next {session.folder}"
+    return f"{each}; then: {command_line('next', session.folder)}"
 
 
 def _play(session: Session, step: str) -> str:
@@ -99,7 +100,7 @@ def _log(session: Session, step: str) -> str:
     return (
         f"Bring {files}, one row per sample: t [s], {', '.join(columns)}; currents are i_{first} [A] …; .npz and ROS "
         "bags "
-        f"are read, too (calib formats recordings); then: calib next {session.folder}"
+        f"are read, too (calib formats recordings); then: {command_line('next', session.folder)}"
     )
 
 

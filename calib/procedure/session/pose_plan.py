@@ -53,20 +53,7 @@ def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], N
         f"{len(found.q)} poses by {found.method}, {found.index} = {found.value:.4g}, {gain:.2f} times the best of 1000 "
         f"random sets, {100 * found.efficiency:.1f} % of the convex bound ({selection.bound_words(found)})"
     )
-    record = {
-        "words": words,
-        "index": found.index,
-        "method": found.method,
-        "value": found.value,
-        "efficiency": found.efficiency,
-        "random_baseline": found.random_baseline,
-        "parameters": chosen.parameters,
-        "seconds": found.seconds,
-        "seed": settings.seed,
-        "checked": list(chosen.checked),
-        "unchecked": list(chosen.unchecked),
-        "notes": list(chosen.notes),
-    }
+    record = {"words": words, **selection.record(chosen), "seed": settings.seed}
     unseen = _unseen(session, robot_file, chain, wanted.validation)
     return Plan(found.q, unseen, words, tuple(selection.kept(chosen)), record)
 

@@ -75,7 +75,7 @@ def ends(
     """
     if base is None:
         if len(tree.roots) > 1:
-            raise RobotError(f"{tree.where}: several roots: {', '.join(tree.roots)}; choose one with --base")
+            raise RobotError(f"{tree.where}: several roots: {', '.join(tree.roots)}; choose one as base (--base)")
         base = tree.roots[0]
     tree.link(base, "base")
     if tip is None:
@@ -163,25 +163,25 @@ def _check_path(tree: UrdfTree, path: list[JointTag], base: str, tip: str, joint
     """Refuse paths that are no serial arm, or not the arm the measurements were taken with."""
     actuated = [joint.name for joint in path if joint.actuated]
     if not actuated:
-        raise RobotError(f"{tree.where}: no actuated joint between '{base}' and '{tip}'; choose other --base or --tip")
+        raise RobotError(f"{tree.where}: no actuated joint between '{base}' and '{tip}'; choose another base or tip")
     passed: set[str] = set()
     for joint in path:
         place = f"{tree.where}, line {joint.node.line}, joint '{joint.name}'"
         if joint.kind in ("floating", "planar"):
-            raise RobotError(f"{place}: type '{joint.kind}' cannot be part of an arm; choose --base behind it")
+            raise RobotError(f"{place}: type '{joint.kind}' cannot be part of an arm; choose a base behind it (--base)")
         passed.add(joint.name)
         if not joint.moves or joint.actuated:
             continue
         leader, ratio, _ = drive(tree, joint)
         if leader not in passed:
             side = "comes after it" if leader in actuated else f"is not between '{base}' and '{tip}'"
-            raise RobotError(f"{place}: the joint it mimics, '{leader}', {side}; choose other --base or --tip")
+            raise RobotError(f"{place}: the joint it mimics, '{leader}', {side}; choose another base or tip")
         if ratio == 0.0 or tree.joints[leader].kind == "fixed":
             raise RobotError(f"{place}: it mimics '{leader}' but can never move; make it fixed")
     if joint_names and (extra := [name for name in actuated if name not in joint_names]):
         raise RobotError(
             f"{tree.where}: between '{base}' and '{tip}' there are joints the measurements do not name: "
-            f"{', '.join(extra)}; choose --base and --tip, or make them fixed at their value"
+            f"{', '.join(extra)}; choose base and tip (--base, --tip), or make them fixed at their value"
         )
     if joint_names and (absent := [name for name in joint_names if name not in actuated]):
         held = ", ".join(actuated)
@@ -208,13 +208,13 @@ def _longest(tree: UrdfTree, base: str) -> str:
         ]
     most = max(best.values())
     if most == 0:
-        raise RobotError(f"{tree.where}: no actuated joint hangs on '{base}'; choose another --base")
+        raise RobotError(f"{tree.where}: no actuated joint hangs on '{base}'; choose another base (--base)")
     found = [link for link, count in best.items() if count == most]
     found = [link for link in found if not any(_hangs(tree, other, link) for other in found if other != link)]
     if len(found) > 1:
         raise RobotError(
             f"{tree.where}: several chains with {most} actuated joints, to the links {', '.join(found)}; "
-            f"choose one with --tip (and --base)"
+            f"choose one as tip (--tip), or a base (--base)"
         )
     return found[0]
 

@@ -116,7 +116,7 @@ class UrdfTree:
         link = tip
         while link != base:
             if link not in self.above:
-                raise RobotError(f"{self.where}: link '{tip}' does not hang on '{base}'; choose other --base or --tip")
+                raise RobotError(f"{self.where}: link '{tip}' does not hang on '{base}'; choose another base or tip")
             result.append(self.above[link])
             link = result[-1].parent
         return result[::-1]

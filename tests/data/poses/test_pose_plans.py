@@ -82,6 +82,6 @@ def test_the_cause_is_found(plan, spoil, words, column):
 
 def test_another_plan(plan):
     other = np.random.default_rng(9).uniform(-2, 2, (30, 4))
-    with pytest.raises(MeasurementError, match=r"only 0 of 30 rows are planned poses.*right plan") as error:
+    with pytest.raises(MeasurementError, match=r"only 0 of 30 rows are planned poses.*right plan.*plan = f") as error:
         check_against(plan, measured(other))
     assert error.value.row is not None

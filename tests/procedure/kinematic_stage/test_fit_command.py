@@ -141,8 +141,8 @@ def test_one_station_for_an_instrument_that_was_moved_is_said(cell, calib):
     moved = from_xyz_rpy([1.8, -0.8, 0.5], [0.1, -0.2, 2.2])
     file, other = cell.write("a.csv", cell.measure(40)), cell.write("b.csv", cell.measure(40, 1, moved))
     start = ("fit", "ur5", file, other, "--model", "geometry", "--out", "done")
-    assert "give --stations each" in calib(*start, "--stations", "one")[1]
-    assert "give --stations each" not in calib(*start)[1]
+    assert "with stations 'each'" in calib(*start, "--stations", "one")[1]
+    assert "with stations 'each'" not in calib(*start)[1]
 
 
 def test_rows_that_count_twice_are_said_and_copies_prove_nothing(cell, calib):

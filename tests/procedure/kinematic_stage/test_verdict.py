@@ -56,7 +56,7 @@ DEFAULTS = {"model": "geometry", "asked": "auto", "cross_validated": 1e-4, "outl
         ({"a": rows(1.0, 0.1, turned=4.0)}, {}, "pass", "on a, unseen"),
         ({"a": rows(1.0, 0.1, turned=6.0)}, {}, "fail", "off by 6° rms"),
         # both arms far off say where the instrument stood, not what the arm is
-        ({"a": rows(150.0, 149.0)}, {"reach": 1.0}, "fail", "stood elsewhere; give --refit-frames"),
+        ({"a": rows(150.0, 149.0)}, {"reach": 1.0}, "fail", "stood elsewhere; refit their frames"),
         ({"a": rows(150.0, 149.0, shares_frames=False)}, {"reach": 1.0}, "fail", "is it this robot"),
         ({"a": rows(150.0, 0.1)}, {"reach": 1.0}, "pass", "on a, unseen"),
         # nothing to gain, like beside like

@@ -257,14 +257,17 @@ def test_a_damaged_record_is_said_and_can_be_thrown_away(finished: Session) -> N
     assert kinds(finished)["describe"] == steps.READY
 
 
-def test_commands_and_their_exit_codes(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    folder = str(tmp_path / "cell")
+def test_commands_and_their_exit_codes(finished: Session, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    folder = str(tmp_path / "a cell")
     new = ["new", folder, "--robot", "ur5", "--instrument", "tracker", "--poses", "15", "--validation", "0"]
     assert cli.run(new) == 0
     assert cli.run(new) == 2 and "already" in capsys.readouterr().err
     assert cli.run(["status", folder]) == 0 and "describe" in capsys.readouterr().out
-    assert cli.run(["next", folder]) == 0 and "measured.csv" in capsys.readouterr().out
+    assert cli.run(["next", folder]) == 0 and f"then: calib next '{folder}'" in capsys.readouterr().out
     assert cli.run(["next", str(tmp_path)]) == 2 and "no session" in capsys.readouterr().err
+    assert cli.run(["status", str(finished.folder / "4-fit")]) == 2
+    said = capsys.readouterr().err
+    assert "is the result of a fit, no session" in said and "calib export" in said and "calib view" in said
     assert cli.run(["redo", folder, "nothing"]) == 2
     assert cli.run(["new", str(tmp_path / "b"), "--robot", "ur55", "--instrument", "tracker"]) == 2
     assert cli.run(["new", str(tmp_path / "b"), "--robot", "ur5", "--instrument", "ruler"]) == 2

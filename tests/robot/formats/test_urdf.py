@@ -151,8 +151,8 @@ def test_joint_names_choose_the_chain():
 @pytest.mark.parametrize(
     "options, message",
     [
-        ({}, r"several chains with 3 actuated joints, to the links left2, right2; choose one with --tip"),
-        ({"joint_names": ["l1", "l2"]}, r"joints the measurements do not name: torso; choose --base and --tip"),
+        ({}, r"several chains with 3 actuated joints, to the links left2, right2; choose one as tip"),
+        ({"joint_names": ["l1", "l2"]}, r"joints the measurements do not name: torso; choose base and tip"),
         ({"joint_names": ["torso", "l1", "r1"]}, r"joint '[lr]1' is not between 'base' and '(left|right)1'"),
         (
             {"joint_names": ["torso", "l11"]},
@@ -179,7 +179,7 @@ BASE = '<robot name="x"><link name="a"/><link name="b"/><link name="c"/>\n'
         ("<robot><link name='a'></robot>", r"bad, line 1, column 25: not XML \(mismatched tag\)"),
         ("", r"not XML \(no element found\)"),
         ("<sdf/>", r"the root element is <sdf>, a URDF has <robot>"),
-        (BASE + "</robot>", r"several roots: a, b, c; choose one with --base"),
+        (BASE + "</robot>", r"several roots: a, b, c; choose one as base"),
         ("<robot name='x'/>", r"no <link> found"),
         ("<robot name='x'><link name='a'/></robot>", r"no actuated joint \(revolute, continuous or prismatic\) found"),
         ("<robot name='x'><link name='a'/><link name='a'/></robot>", r"line 1: a second link named 'a'"),
