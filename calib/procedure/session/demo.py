@@ -36,7 +36,7 @@ FIT, VALIDATION, AGAIN = 40, 20, 3
 DRIFT = 10e-6  # how far the simulated instrument wanders over a series [m]
 MOTION = {"period": 10.0, "starts": 2, "evaluations": 150, "repeats": 2, "torques": "both"}  # little effort, for time
 SIMULATED = "simulated cell: {note}; nothing was measured on a robot"
-LOGS = (("training", 2), ("validation", 3))  # and the numbers of their noise
+LOGS = (("training", 2, 240.0), ("validation", 3, 480.0))  # numbers of their noise, how long the arm ran before [s]
 
 
 @dataclass(frozen=True)
@@ -208,10 +208,10 @@ def bring(session: Session, cell: Cell, seed: int) -> None:
     kinds = [joint.kind for joint in cell.nominal.joints]
     for number, (plan, name) in enumerate((("poses", "measured"), ("validation", "validation"))):
         q = read_poses(session.path(f"2-poses/{plan}.csv"), cell.nominal.joint_names, kinds=kinds)
-        seen = wandering(measure(cell, q, np.random.default_rng([seed, number])), DRIFT, seed)
+        seen = wandering(measure(cell, q, np.random.default_rng([seed, number]), warm=number * FIT), DRIFT, seed)
         measured_files.write(seen, session.path(f"3-measured/{name}.csv"))
         if plan == "poses":
-            again = measure(cell, q[:AGAIN], np.random.default_rng([seed, 7]))
+            again = measure(cell, q[:AGAIN], np.random.default_rng([seed, 7]), warm=len(q))
             measured_files.write(wandering(again, DRIFT, seed, begin=1.0), session.path("3-measured/drift.csv"))
 
 
@@ -226,10 +226,10 @@ def bring_logs(session: Session, arm: MovingArm, seed: int) -> None:
     """Let the simulated arm play the designed motions, and log them."""
     _mark(session, arm.note)
     motions = dynamics_steps.designed_motions(session)
-    for name, number in LOGS:
+    for name, number, running in LOGS:
         if name not in motions:
             continue
         t = np.arange(round(motions[name].period * motions[name].rate) + 1) / motions[name].rate
         reference = play(t, *motions[name].orders(t), motions[name].repeat)
-        recorded = record(arm, reference, np.random.default_rng([seed, number]))
+        recorded = record(arm, reference, np.random.default_rng([seed, number]), running)
         measured_files.write_log(recorded, session.path(f"7-recorded/{name}.csv"))

@@ -2,7 +2,8 @@
 
     y_i = S_true · arm_true(q_i + δ(q_i)) · X_true · noise,     q_recorded = q_i + encoder noise,
 
-δ being what no rigid geometry holds (compliance under gravity, gear harmonics). With LEDs on the base the instrument
+δ being what no rigid geometry holds: compliance under gravity and gear harmonics, which a richer model can, and what
+none can (`unmodelled`). With LEDs on the base the instrument
 sees the base, too, and reports the tool in the base LEDs' frame: B_i⁻¹ y_i, so that both frames' noises count and the
 base's orientation noise acts with the lever between the two.
 """
@@ -21,6 +22,7 @@ from calib.dynamics.gravity import gravity_torques
 from calib.geometry.installation import Installation, see
 from calib.robot.chain import Chain
 from calib.robot.deflection import evaluate
+from calib.simulation.cells.unmodelled import PositionErrors, displacements, drooping
 from calib.transforms import invert, pose
 
 
@@ -58,30 +60,39 @@ class Cell:
         truth: what it is, where it stands, what the tool is, and how its joints deflect; hidden from a calibration.
         instrument: what measures.
         note: what the truth is made of, in a sentence.
+        unmodelled: errors that no parameter of a calibration holds.
     """
 
     nominal: Chain
     truth: Installation
     instrument: SimulatedInstrument = field(default_factory=SimulatedInstrument)
     note: str = ""
+    unmodelled: PositionErrors = field(default_factory=PositionErrors)
 
 
-def true_poses(cell: Cell, q: np.ndarray, hidden: bool = True) -> np.ndarray:
+def true_poses(cell: Cell, q: np.ndarray, hidden: bool = True, warm: float = np.inf) -> np.ndarray:
     """Return the tool's poses (m, 4, 4) in the station's frame, without noise.
 
     Args:
         cell: the cell.
-        q: (m, n) joint values [rad or m].
-        hidden: with the deflections; without, the rigid truth.
+        q: (m, n) joint values in the order in which the arm takes them [rad or m].
+        hidden: with deflections and unmodelled errors; without, the rigid truth.
+        warm: how many poses the arm has moved to before; infinite for a warm arm.
     """
     q = shaped(q, (None, cell.truth.chain.n), "joint values")
     arm = cell.truth.chain
     torque = np.zeros(q.shape) if arm.inertias is None else gravity_torques(arm, q)
     bases = evaluate(cell.truth.deflection, q, torque)
-    return see(cell.truth, q, bases=bases if hidden else np.zeros_like(bases)).poses()
+    if not hidden:
+        return see(cell.truth, q, bases=np.zeros_like(bases)).poses()
+    beyond = displacements(cell.unmodelled, arm, q, torque, warm)
+    seen = see(cell.truth, q, bases=bases, given=beyond).poses()
+    return drooping(cell.unmodelled, arm, seen, cell.truth.stations[0])
 
 
-def measure(cell: Cell, q: np.ndarray, seed: int | np.random.Generator = 0, file: str = "simulated") -> Positions:
+def measure(
+    cell: Cell, q: np.ndarray, seed: int | np.random.Generator = 0, file: str = "simulated", warm: float = np.inf
+) -> Positions:
     """Measure the poses q (m, n) [rad or m] once each, in their order.
 
     Args:
@@ -89,12 +100,13 @@ def measure(cell: Cell, q: np.ndarray, seed: int | np.random.Generator = 0, file
         q: where the robot is sent; the encoders' reading of it is what is recorded.
         seed: of the noise.
         file: the name the measurement carries.
+        warm: how many poses the arm has moved to before; infinite for a warm arm.
 
     Returns:
         Poses (or positions), with the sigmas that the instrument's maker states, drift and outliers not included.
     """
     rng, instrument = np.random.default_rng(seed), cell.instrument
-    seen = _noisy(true_poses(cell, q), instrument, rng)
+    seen = _noisy(true_poses(cell, q, warm=warm), instrument, rng)
     sigma, sigma_rotation = _stated(instrument, np.zeros((len(q), 3)))
     if instrument.base_frame is not None:
         base = cell.truth.stations[0] @ instrument.base_frame

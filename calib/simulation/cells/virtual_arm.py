@@ -2,8 +2,9 @@
 
     tau_l = Y(q, v, a) φ + Fvl v + Fcl sign(v) + offl,    tau = tau_l + Ia a + Fvm v + Fcm sign(v) + offm,
 
-the first seen by sensors behind the gears, the second by the motors. True inertias are the library's, made wrong body
-by body in a way that keeps every one possible, so that the nominal masses, which a calibration is told, are off.
+the first seen by sensors behind the gears, the second by the motors, each plus what no model holds (`unmodelled`).
+True inertias are the library's, made wrong body by body in a way that keeps every one possible, so that the nominal
+masses, which a calibration is told, are off.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from calib.robot import library
 from calib.robot.chain import Chain, random_joints
 from calib.simulation.cells import known_robots
 from calib.simulation.cells.cell import Cell
+from calib.simulation.cells.unmodelled import TorqueErrors, cable_torques, gear_torques
 from calib.simulation.loop.closed_loop import Plant, Sensing, inertia_diagonal, simulate
 from calib.simulation.loop.controllers import Controller, pd, with_feedforward
 from calib.simulation.loop.references import Reference
@@ -32,6 +34,8 @@ BANDWIDTH, DAMPING, CUTOFF = 8.0, 0.8, 60.0  # of the joint controller, and of i
 KNOWN = 0.8  # share of the friction that the controller feeds forward
 SIGMA_Q, SIGMA_LINK, SIGMA_MOTOR = 1e-5, 0.003, 0.005  # encoders [rad]; torques as logged, of their limits (our choice)
 REST = 1.0  # at rest before and after a motion [s]
+UNMODELLED = TorqueErrors(memory=0.3, warming=0.1, ripple=0.005, cable=0.0005, push=0.001)  # our choice
+PUSH_BAND = 20.0  # [Hz]
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +48,7 @@ class MovingArm:
         gains: of the controller, which feeds forward what `believed` needs at low accelerations.
         effort: (n,) limits that the noise of the torques is a share of [N m or N].
         note: what the truth is made of.
+        unmodelled: torques that no parameter of an identification holds.
     """
 
     chain: Chain
@@ -53,20 +58,23 @@ class MovingArm:
     gains: Controller
     effort: np.ndarray
     note: str
+    unmodelled: TorqueErrors
 
 
-def moving_arm(cell: Cell, robot: str, seed: int = 0) -> MovingArm:
+def moving_arm(cell: Cell, robot: str, seed: int = 0, unmodelled: TorqueErrors | None = None) -> MovingArm:
     """Return the true arm of a cell as it moves.
 
     Args:
         cell: whose true geometry it has.
         robot: its name in the library.
         seed: of what is wrong with the nominal masses.
+        unmodelled: torques that no model holds; None for the usual ones (`UNMODELLED`).
 
     Raises:
         CalibError: where the library holds no masses for it.
     """
     nominal = cell.nominal
+    beyond = UNMODELLED if unmodelled is None else unmodelled
     if nominal.inertias is None:
         raise CalibError(f"the library holds no masses for {robot}, so that its motion cannot be simulated")
     rng = np.random.default_rng([seed, 71])
@@ -84,12 +92,12 @@ def moving_arm(cell: Cell, robot: str, seed: int = 0) -> MovingArm:
     omega = 2 * np.pi * BANDWIDTH
     note = (
         f"masses off their nominal by {2 * MASS:.0%}, centres by {1e3 * SHIFT:g} mm (1 sigma); {source}; torque noise "
-        f"{SIGMA_MOTOR:.1%} (motors) and {SIGMA_LINK:.1%} (sensors) of the limits"
+        f"{SIGMA_MOTOR:.1%} (motors) and {SIGMA_LINK:.1%} (sensors) of the limits{beyond.note}"
     )
     return MovingArm(
         chain, plant, IdentificationModel(plant.bodies, plant.terms, LINK),
         Plant(bodies_of(nominal), tuple(terms), told),
-        replace(pd(omega**2 * inertia, 2 * DAMPING * omega * inertia), cutoff=CUTOFF), effort, note,
+        replace(pd(omega**2 * inertia, 2 * DAMPING * omega * inertia), cutoff=CUTOFF), effort, note, beyond,
     )  # fmt: skip
 
 
@@ -109,8 +117,16 @@ def play(t: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray, repeats: in
     return Reference(np.arange(len(parts[0])) / rate, *parts)
 
 
-def record(arm: MovingArm, reference: Reference, seed: int | np.random.Generator = 0) -> Recording:
+def record(
+    arm: MovingArm, reference: Reference, seed: int | np.random.Generator = 0, running: float = np.inf
+) -> Recording:
     """Let the arm follow a motion, and log encoders, motors' torques and torque sensors.
+
+    Args:
+        arm: what moves.
+        reference: what it is to follow.
+        seed: of the noise.
+        running: for how long the arm has moved before [s]; infinite for a warm one.
 
     Raises:
         NotConverged: where the loop is unstable.
@@ -118,7 +134,9 @@ def record(arm: MovingArm, reference: Reference, seed: int | np.random.Generator
     rng = np.random.default_rng(seed)
     slow = replace(reference, a=0.0 * reference.a)
     controller = with_feedforward(arm.gains, feed_forward(arm.believed, slow))
-    run = simulate(arm.plant, controller, reference, Sensing(SIGMA_Q), rng)
+    sensing = Sensing(SIGMA_Q, push=arm.unmodelled.push * arm.effort, push_band=PUSH_BAND)
+    beyond = _unmodelled(arm, reference.q, reference.v, reference.a, running + reference.t)
+    run = simulate(arm.plant, controller, reference, sensing, rng, push=-beyond)
     noise = [sigma * arm.effort * rng.normal(size=run.q.shape) for sigma in (SIGMA_LINK, SIGMA_MOTOR)]
     sensed = _held(link_torque(arm, run.q, run.v, run.a)) + noise[0]
     motor = _held(run.torque) + noise[1]
@@ -137,16 +155,35 @@ def _held(torque: np.ndarray) -> np.ndarray:
 
 
 def true_torque(arm: MovingArm, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-    """Return the motors' torques (N, n) without noise [N m or N]."""
-    model = IdentificationModel(arm.plant.bodies, arm.plant.terms)
-    return np.einsum("kij,j->ki", model.regressor(q, v, a), arm.plant.parameters)
+    """Return the torques (N, n) of a warm arm's motors without noise [N m or N], along a finely sampled motion."""
+    return _modelled(arm, q, v, a) + _unmodelled(arm, q, v, a, np.full(len(q), np.inf))
 
 
 def link_torque(arm: MovingArm, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
     """Return the torques behind the gears (N, n) without noise [N m or N]."""
     whole = IdentificationModel(arm.plant.bodies, arm.plant.terms)
     shared = np.isin(whole.names, arm.link.names)
-    return np.einsum("kij,j->ki", arm.link.regressor(q, v, a), arm.plant.parameters[shared])
+    model = np.einsum("kij,j->ki", arm.link.regressor(q, v, a), arm.plant.parameters[shared])
+    return model + cable_torques(arm.unmodelled, q, arm.effort)
+
+
+def _modelled(arm: MovingArm, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+    """Return the motors' torques (N, n) by the plant's own model [N m or N]."""
+    model = IdentificationModel(arm.plant.bodies, arm.plant.terms)
+    return np.einsum("kij,j->ki", model.regressor(q, v, a), arm.plant.parameters)
+
+
+def _unmodelled(arm: MovingArm, q: np.ndarray, v: np.ndarray, a: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Return what the motors bring up besides (N, n) [N m or N]; t (N,) since the arm was cold [s]."""
+    parameters = dict(zip((one.name for one in arm.plant.terms), arm.plant.parameters[arm.plant.inertial :]))
+    viscous, coulomb = (
+        np.array([parameters[f"{name}l{j + 1}"] + parameters[f"{name}m{j + 1}"] for j in range(arm.chain.n)])
+        for name in ("Fv", "Fc")
+    )
+    friction = viscous * v + coulomb * np.sign(v)
+    drive = _modelled(arm, q, v, a) if arm.unmodelled.ripple else np.zeros_like(q)
+    beyond = gear_torques(arm.unmodelled, q, drive, coulomb, friction, t)
+    return beyond + cable_torques(arm.unmodelled, q, arm.effort)
 
 
 def _drives(robot: str, chain: Chain, effort: np.ndarray) -> tuple[np.ndarray, str]:

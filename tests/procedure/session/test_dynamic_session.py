@@ -16,7 +16,7 @@ from calib.errors import MeasurementError
 from calib.identification.model_file import read_dynamics
 from calib.procedure.session import commands, demo, instructions, steps
 from calib.procedure.session.commands import NewSession, begin
-from calib.procedure.session.folder import Session, open_session
+from calib.procedure.session.folder import Session, open_session, verdict_of
 from calib.simulation.cells.truth import torque_errors
 from calib.simulation.cells.virtual_cells import virtual_cell
 
@@ -113,16 +113,21 @@ def test_it_ends_in_one_certificate_of_both(whole: Session) -> None:
     own = found["validation"]["validation.csv"]
     assert "<inertia " in whole.path("9-export/robot.urdf").read_text() and whole.path("9-export/robot.xml").exists()
     assert "What was exported" in page
-    assert own["evidence"] and own["raw"]["relative_error_percent"]["total"] < 10.0
-    assert own["filtered"]["relative_error_percent"]["total"] < 3.0
+    assert own["evidence"] and verdict_of(whole) == "marginal"  # errors that no model holds remain
 
 
 @pytest.mark.slow
-def test_the_parameters_are_those_of_the_hidden_arm(whole: Session) -> None:
+def test_the_unexplained_share_is_the_error_against_the_hidden_arm(whole: Session) -> None:
+    # The truth holds friction with memory, warming gears, cables: what the certificate says of unseen motion (filtered,
+    # with noise) is what it is without noise on yet another motion.
     cell = virtual_cell("lwr4plus", 1)
     chain, dynamics = read_dynamics(whole.identification.path)
     found = torque_errors(cell, demo.arm_of(whole, cell), dynamics.model, dynamics.values, chain)
-    assert found.identified < 1.5 < found.nominal
+    report = json.loads(whole.path("8-dynamics/unseen/report.json").read_text())
+    stated = report["validation"]["validation.csv"]["filtered"]["relative_error_percent"]["total"]
+    print(found, stated)
+    assert found.identified < found.nominal
+    assert found.identified / 1.5 < stated < 1.5 * found.identified
 
 
 @pytest.mark.slow
