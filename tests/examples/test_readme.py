@@ -58,7 +58,7 @@ def test_blocks_are_found_and_short() -> None:
 @pytest.mark.slow
 def test_its_script_runs(at_a_cell: Path, capsys: pytest.CaptureFixture) -> None:
     exec(compile(SCRIPTS[0], "README.md", "exec"), {})
-    assert "verdict: pass" in capsys.readouterr().out
+    assert "verdict: marginal" in capsys.readouterr().out  # its cell hides what no rigid geometry explains
     made = ("poses.csv", "motion/trajectory.csv", "calibrated/robot.urdf", "commands.csv")
     assert all((at_a_cell / name).exists() for name in made)
 

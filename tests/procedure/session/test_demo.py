@@ -28,7 +28,9 @@ def test_demo_of_the_lwr4plus(tmp_path: Path, capsys: pytest.CaptureFixture) -> 
         assert str(out / name) in said.replace("\n", "") and (out / name).exists()
     assert "hidden truth" in said
     assert {state.kind for state in steps.states(open_session(out))} == {steps.DONE}
-    nominal, calibrated = map(float, re.findall(r"([\d.]+) mm", (out / "truth.txt").read_text())[:2])
+    said_of_truth = re.search(r"([\d.]+) mm rms with the nominal arm, ([\d.]+) mm", (out / "truth.txt").read_text())
+    assert said_of_truth
+    nominal, calibrated = map(float, said_of_truth.groups())
     assert calibrated < nominal / 8
     stated = re.search(r"([\d.]+) mm with, ([\d.]+) mm without", README)
     found = json.loads((out / "5-validation/metrics.json").read_text())["validation"]["validation.csv"]
