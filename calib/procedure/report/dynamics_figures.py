@@ -23,6 +23,7 @@ from calib.procedure.report.style import (
     MARK,
     QUIET,
     WIDE,
+    label_ticks,
     legend,
     log_axis,
     room,
@@ -158,7 +159,7 @@ def errors_by_row(fitted: Sequence[float], unseen: Sequence[float], rows: Sequen
             (-0.19, fitted, BEFORE, "training motion"), (0.19, unseen, AFTER, "unseen motion"),
         ):  # fmt: skip
             axis.hlines(place + shift, 0.0, shares, colors=colour, linewidth=5.0, label=label)
-        axis.set_yticks(place, rows, fontsize=size)
+        label_ticks(axis.yaxis, place, rows, size)
         axis.set(xlabel="torque unexplained [%]", ylim=(len(rows) - 0.5, -0.5))
         axis.set_xlim(left=0.0)
         axis.grid(axis="x")
@@ -255,7 +256,7 @@ def significance(names: Sequence[str], values: np.ndarray, sigma: np.ndarray) ->
         axis.vlines(np.arange(len(names)), 0.1, share, colors=colours, linewidth=thick)
         axis.axhline(2.0, color=MARK, linewidth=0.7, linestyle="--")
         log_axis(axis.yaxis, 0.1, 2.0 * share.max(initial=2.0))
-        axis.set_xticks(np.arange(len(names)), names, rotation=90, fontsize=size)
+        label_ticks(axis.xaxis, np.arange(len(names)), names, size, rotation=90)
         axis.set(ylabel="|value| / σ", xlim=(-0.7, len(names) - 0.3))
         axis.set_title(f"{int((share > 2).sum())} of {len(names)} parameters differ from zero by two sigmas", color=INK)
     return figure

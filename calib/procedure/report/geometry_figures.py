@@ -22,6 +22,7 @@ from calib.procedure.report.style import (
     QUIET,
     WIDE,
     colour_scale,
+    label_ticks,
     log_axis,
     number,
     room,
@@ -190,7 +191,7 @@ def parameter_changes(
             plot.axvline(0.0, color=QUIET, linewidth=0.7)
             plot.hlines(y, 0.0, value, colors=[AFTER if one else PALE for one in clear], linewidth=min(thick, 9.0))
             plot.errorbar(value, y, xerr=spread, fmt="none", ecolor=MARK, elinewidth=0.9, capsize=1.8)
-            plot.set_yticks(y, [names[k] for k in panel], fontsize=7)
+            label_ticks(plot.yaxis, y, [names[k] for k in panel], 7)
             plot.set(xlabel=f"calibrated - nominal [{unit}], bars ±2σ", ylim=(-0.6, len(panel) - 0.4))
             plot.set_title(
                 f"{int(clear.sum())} of {len(panel)} {'lengths' if unit == 'mm' else 'angles'} clearly changed"
@@ -267,7 +268,7 @@ def ladder(
             axes.axhline(1e3 * noise, color=INK, linewidth=0.9, linestyle=":")
             axes.text(-0.45, 1.05e3 * noise, "instrument", color=INK, fontsize=6.5, va="bottom")
         log_axis(axes.yaxis, 0.7 * min(errors.min(), 1e3 * (noise or np.inf)), 2.4 * errors.max())
-        axes.set_xticks(x, [f"{model}\n{count}" for model, count in zip(models, parameters)], fontsize=7)
+        label_ticks(axes.xaxis, x, [f"{model}\n{count}" for model, count in zip(models, parameters)], 7)
         axes.set(ylabel="error on rows left out [mm]", xlabel="model, parameters", xlim=(-0.5, len(models) - 0.5))
         if len(taken):
             chosen = str(models[int(taken[-1])]).removeprefix("+ ")
@@ -321,8 +322,8 @@ def correlation_map(names: Sequence[str], correlation: np.ndarray, threshold: fl
     with styled():
         figure, (axes,) = sheet(width=HALF, height=side + margin + 0.3, left=margin, bottom=margin, right=0.72, top=0.3)
         image = axes.imshow(block, cmap="PuOr", vmin=-1.0, vmax=1.0, aspect="auto")
-        axes.set_xticks(range(len(labels)), labels, rotation=90, fontsize=6.5)
-        axes.set_yticks(range(len(labels)), labels, fontsize=6.5)
+        label_ticks(axes.xaxis, range(len(labels)), labels, 6.5, rotation=90)
+        label_ticks(axes.yaxis, range(len(labels)), labels, 6.5)
         if len(labels) <= 10:
             for i, j in np.ndindex(*block.shape):
                 dark = abs(block[i, j]) > 0.6

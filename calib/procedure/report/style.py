@@ -3,13 +3,17 @@
 A figure is drawn once, as PNG: the same bytes stand in a folder as a file and on a page as an image. Margins are given
 in inches, since measuring every label to find them takes longer than to draw it; text is never read as mathematics, so
 that a ``$`` in a name is a ``$``.
+
+Scales are drawn at once: grid, ticks and labels in three strokes, from what an axis says of itself (locator, formatter,
+`Axis.get_tick_params`). matplotlib makes five artists for every tick and lays all labels out twice to find where the
+axis' own label goes, which was two thirds of a figure's time; a figure that a person takes on has its ticks as ever.
 """
 
 from __future__ import annotations
 
 import io
 import pickle
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -17,11 +21,16 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.axis import XAxis, YAxis
+from matplotlib.axis import Axis, XAxis, YAxis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.font_manager import findfont, get_font
+from matplotlib.path import Path as Strokes
+from matplotlib.text import Text
+from matplotlib.ticker import FixedFormatter, FixedLocator, NullLocator
+from matplotlib.transforms import IdentityTransform
 from PIL import Image
 
 from calib import files
@@ -49,6 +58,7 @@ STYLE: Any = {
     "axes.axisbelow": True,
     "text.color": INK,
     "text.parse_math": False,
+    "text.hinting": "none",  # of no use at this many dots per inch
     "xtick.color": QUIET,
     "ytick.color": QUIET,
     "xtick.labelcolor": INK,
@@ -121,8 +131,26 @@ def log_axis(axis: XAxis | YAxis, low: float, high: float, most: int = 7) -> Non
     ticks = (powers[:, None] * ([1.0, 2.0, 5.0] if high < 100.0 * low else [1.0])).ravel()
     ticks = ticks[(low <= ticks) & (ticks <= high)]
     ticks = ticks[:: max(1, -(-len(ticks) // most))]
-    axis.set_ticks(ticks, labels=[number(tick) for tick in ticks])
-    axis.set_ticks([], minor=True)
+    label_ticks(axis, ticks, [number(tick) for tick in ticks])
+    axis.set_minor_locator(NullLocator())
+
+
+def label_ticks(axis: Axis, places: Any, labels: Sequence[str], size: float | None = None, rotation: float = 0) -> None:
+    """Put ticks with these labels at these places, all within view, without making a tick.
+
+    Args:
+        places: (k,) data coordinates.
+        labels: (k,).
+        size: of the letters [pt].
+        rotation: of the labels [deg].
+    """
+    places = np.asarray(places, dtype=float)
+    axis.set_major_locator(FixedLocator(places))
+    axis.set_major_formatter(FixedFormatter(labels))
+    if len(places):
+        axis.set_view_interval(places.min(), places.max())
+    given: dict[str, Any] = {} if size is None else {"labelsize": size}
+    axis.set_tick_params(rotation=rotation, **given)
 
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -164,12 +192,119 @@ def thinned(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return t[kept], values[kept]
 
 
+@contextmanager
+def _at_once(figure: Figure) -> Iterator[None]:
+    """Have the plain axes of a figure drawn at once; those with ticks elsewhere or in between stay as they are."""
+    plain = [
+        axis for axes in figure.axes if axes.axison for axis in (axes.xaxis, axes.yaxis) if axis.get_visible()
+        if not {"top", "right"} & {side for side, shown in axis.get_tick_params().items() if shown}
+        if not len(axis.get_minorticklocs())
+    ]  # fmt: skip
+    scales = [axis.axes.add_artist(_Scale(axis)) for axis in plain]
+    for axis in plain:
+        axis.set_visible(False)
+    try:
+        yield
+    finally:
+        for axis, scale in zip(plain, scales):
+            scale.remove()
+            axis.set_visible(True)
+
+
+class _Scale(Artist):
+    """What draws an axis below its axes or at their left."""
+
+    def __init__(self, axis: Axis) -> None:
+        super().__init__()
+        self._axis = axis
+        self.set_zorder(axis.get_zorder())
+
+    def draw(self, renderer: Any) -> None:
+        axis, axes = self._axis, self._axis.axes
+        across = isinstance(axis, XAxis)
+        given: Any = axis.get_tick_params()
+        style: Any = matplotlib.rcParams
+        low, high = np.sort(axis.get_view_interval())
+        places = np.asarray(axis.get_majorticklocs())
+        labels = axis.get_major_formatter().format_ticks(list(places))
+        if axis.get_major_formatter().get_offset():
+            axis.set_visible(True)
+            axis.draw(renderer)
+            axis.set_visible(False)
+            return
+        slack = 1e-10 * (high - low)
+        seen = (places >= low - slack) & (places <= high + slack)
+        labels = [label for label, here in zip(labels, seen) if here]
+        still = np.full(int(seen.sum()), (axes.get_ylim() if across else axes.get_xlim())[0])
+        points = np.column_stack([places[seen], still] if across else [still, places[seen]])
+        place = axes.transData.transform(points)[:, 0 if across else 1]
+        box, pixel = axes.bbox, renderer.points_to_pixels(1.0)
+        start, end = (box.y0, box.y1) if across else (box.x0, box.x1)
+        key = "xtick" if across else "ytick"
+        long = style[f"{key}.major.size"]
+        if given.get("gridOn"):
+            _strokes(renderer, place, start, end, across, style["grid.color"], style["grid.linewidth"])
+        if given.get("bottom" if across else "left", True):
+            width = style[f"{key}.major.width"]
+            _strokes(renderer, place, start - long * pixel, start, across, style[f"{key}.color"], width)
+        if given.get("labelbottom" if across else "labelleft", True):
+            pad = long + given.get("pad", style[f"{key}.major.pad"])
+            start = self._write(renderer, labels, place, start - pad * pixel, across, given)
+        if axis.label.get_text():
+            away = start - axis.labelpad * pixel
+            axis.label.set_position((0.5, away) if across else (away, 0.5))
+            axis.label.draw(renderer)
+
+    def _write(
+        self, renderer: Any, labels: Sequence[str], place: np.ndarray, level: float, across: bool, given: Any
+    ) -> float:
+        """Draw the labels at a level [px]; return where they end, beyond which the axis' own label stands."""
+        axes: Axes = self._axis.axes
+        style: Any = matplotlib.rcParams
+        key = "xtick" if across else "ytick"
+        _, vertical, horizontal = (axes.get_xaxis_text1_transform if across else axes.get_yaxis_text1_transform)(0.0)
+        text = Text(
+            va=vertical, ha=horizontal, rotation=given.get("rotation", 0), color=style[f"{key}.labelcolor"],
+            fontsize=given.get("labelsize", style[f"{key}.labelsize"]), transform=IdentityTransform(),
+        )  # fmt: skip
+        text.set_figure(axes.figure)
+        furthest = level
+        for label, where in zip(labels, place):
+            if label:
+                text.set_text(label)
+                text.set_position((where, level) if across else (level, where))
+                text.draw(renderer)
+                box = text.get_window_extent(renderer)
+                furthest = min(furthest, box.y0 if across else box.x0)
+        return furthest
+
+
+def _strokes(
+    renderer: Any, place: np.ndarray, start: float, end: float, across: bool, colour: str, width: float
+) -> None:
+    """Draw parallel lines from start to end, one at every place, in display coordinates [px]; width in points."""
+    if not len(place):
+        return
+    ends = np.empty((2 * len(place), 2))
+    ends[:, 0 if across else 1] = np.repeat(place, 2)
+    ends[:, 1 if across else 0] = np.tile([start, end], len(place))
+    codes = np.tile(np.array([Strokes.MOVETO, Strokes.LINETO], dtype=Strokes.code_type), len(place))
+    context = renderer.new_gc()
+    context.set_foreground(colour)
+    context.set_linewidth(width)
+    context.set_capstyle("butt")
+    context.set_snap(True)
+    renderer.draw_path(context, Strokes(ends, codes), IdentityTransform())
+    context.restore()
+
+
 def png(figure: Figure, dpi: float = DPI) -> bytes:
     """Draw a figure and return it as PNG."""
     with styled():
         figure.set_dpi(dpi)
         canvas = FigureCanvasAgg(figure)
-        canvas.draw()
+        with _at_once(figure):
+            canvas.draw()
     colours = Image.fromarray(np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., :3]))
     image = colours.quantize(COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
     palette = np.array(image.getpalette(), dtype=np.uint8)

@@ -14,12 +14,26 @@ from typing import TypeVar
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 
 from calib import files
 from calib.procedure.dynamic_stage.geometry_tables import EFFECTS, GEOMETRIES, LEAST
 from calib.procedure.dynamic_stage.metrics import GeometricEffect, TwoGeometries
 from calib.procedure.report.page import Picture
-from calib.procedure.report.style import AFTER, BEFORE, MARK, QUIET, WIDE, legend, number, picture, room, sheet, styled
+from calib.procedure.report.style import (
+    AFTER,
+    BEFORE,
+    MARK,
+    QUIET,
+    WIDE,
+    label_ticks,
+    legend,
+    number,
+    picture,
+    room,
+    sheet,
+    styled,
+)
 from calib.records import read_rows
 from calib.units import small
 
@@ -87,8 +101,8 @@ def geometries(rows: Sequence[TwoGeometries]) -> Figure:
         for axis in (above, below):
             axis.set_xlim(-0.7, len(rows) - 0.3)
             axis.grid(axis="y")
-        above.set_xticks(x, [])
-        below.set_xticks(x, [row.name for row in rows], rotation=90, fontsize=6.5)
+        label_ticks(above.xaxis, x, [""] * len(x))
+        label_ticks(below.xaxis, x, [row.name for row in rows], 6.5, rotation=90)
         moved = int((np.abs(size) > 2.0).sum())
         legend(figure, above, f"{moved} of {len(rows)} parameters move by two sigmas with the geometry")
     return figure
@@ -102,8 +116,8 @@ def _symlog(axes: Axes, linear: float) -> None:
     powers = linear * 10.0 ** np.arange(0, max(1, int(np.log10(most / linear)) + 1))
     powers = powers[:: -(-len(powers) // 3)]
     ticks = [tick for tick in (*-powers[::-1], 0.0, *powers) if low <= tick <= high]
-    axes.set_yticks(ticks, [number(tick) for tick in ticks])
-    axes.set_yticks([], minor=True)
+    label_ticks(axes.yaxis, ticks, [number(tick) for tick in ticks])
+    axes.yaxis.set_minor_locator(NullLocator())
 
 
 def effects(rows: Sequence[GeometricEffect]) -> Figure:
@@ -118,7 +132,7 @@ def effects(rows: Sequence[GeometricEffect]) -> Figure:
         axis.axvline(LEAST, color=MARK, linewidth=0.7, linestyle="--")
         for place, value, row in zip(places, size, rows):
             axis.text(value, place, f" {row.parameter}", va="center", fontsize=6.5)
-        axis.set_yticks(places, labels, fontsize=7)
+        label_ticks(axis.yaxis, places, labels, 7)
         axis.set(xlabel="shift [σ of torque noise]", ylim=(-0.7, len(rows) - 0.3))
         axis.set_xlim(left=0.0)
         legend(figure, None, f"{int((size > LEAST).sum())} of these {len(rows)} geometric errors matter")
