@@ -1,7 +1,8 @@
 """How far an installation's predictions lie from what was measured: the numbers a certificate prints.
 
     position      |y - p| where positions are measured; |mean of the socket's points - p| for sockets; distance from the
-                  plane for planes [m]
+                  plane for planes; for images the rms over its corners of what separates seen and predicted, across
+                  the line of sight at the corner's distance [m]
     orientation   angle of R_y Rᵀ [rad]
     distance      | |p_a - p_b| - known | for distances, bars and sockets a known distance apart; for sockets without
                   one, the deviation of |m_a - m_b| from its mean over the fixture's positions [m]
@@ -26,6 +27,7 @@ NATURE = {
     "position": "position",
     "consistency": "position",
     "plane": "position",
+    "pixel": "position",
     "orientation": "orientation",
     "distance": "distance",
 }
@@ -67,7 +69,7 @@ def errors(cell: Installation, measured: Sequence[PoseMeasurements], torques: To
     found: dict[str, list[np.ndarray]] = {"position": [], "orientation": [], "distance": []}
     for block in prepare(cell, measured, torques):
         for part in observe(cell, block, _NONE):
-            found[NATURE[part.label]].append(np.linalg.norm(part.value, axis=0))
+            found[NATURE[part.label]].append(part.sizes())
         if isinstance(block.measured, Sockets) and not block.measured.links:
             found["distance"].append(_socket_spread(predict(cell, block).point, block.measured))
     joined = {name: np.concatenate(sizes) if sizes else np.zeros(0) for name, sizes in found.items()}

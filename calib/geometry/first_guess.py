@@ -5,7 +5,9 @@ With the arm's poses A_i = (R_i, a_i) from the nominal chain:
 * full pose  B_i = S A_i X: rotations by Shah (2013, "Solving the robot-world/hand-eye calibration problem using the
   Kronecker product"), then the two translations linearly;
 * position   S⁻¹ y_i = R_i t + a_i: linear in S's rotation (9 numbers), its offset and t; the 9 are projected on SO(3);
-* sockets    R_i t + a_i constant within each group: linear in t.
+* sockets    R_i t + a_i constant within each group: linear in t;
+* images     the board's pose in each (PnP), and of three closed forms for B_i = S A_i X the best
+             (`calib.geometry.hand_eye`).
 
 Each guess then gets a few robust Gauss–Newton steps on the frames alone (`calib.geometry.fit`).
 """
@@ -19,12 +21,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions, Sockets, take
+from calib.data.poses.pixels import Pixels
 from calib.errors import MeasurementError
+from calib.geometry.camera_guess import place_camera, seen_target
+from calib.geometry.hand_eye import average_pose, place_pose
 from calib.geometry.installation import Installation
+from calib.geometry.optics import BoardShape, Optics
 from calib.robot.chain import Chain
 from calib.robot.deflection import Deflection
 from calib.robot.kinematics import forward
-from calib.transforms import invert, orthonormal, pose
+from calib.transforms import invert, pose
 
 WRONG_UNIT = 15.0  # measured over predicted spread of the positions (our choice)
 UNITS = {
@@ -69,6 +75,7 @@ def install(chain: Chain, measured: Sequence[PoseMeasurements], known: Deflectio
         station_names,
         tool_names,
         known=known or Deflection(),
+        optics=_optics(measured),
     )
 
 
@@ -102,7 +109,7 @@ def check_scale(block: PoseMeasurements, arm: np.ndarray) -> None:
 
 def _rank(block: PoseMeasurements) -> int:
     """Return how far behind others a block's kind is in telling where instrument and target stand."""
-    telling = (Poses, Positions, Sockets)
+    telling = (Poses, Pixels, Positions, Sockets)
     return next((rank for rank, kind in enumerate(telling) if isinstance(block, kind)), len(telling))
 
 
@@ -131,6 +138,44 @@ def _guess_from_poses(
 
 
 @_guess.register
+def _guess_from_images(
+    block: Pixels, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
+) -> Guess:
+    found = place_camera(block, arm)
+    if station is None and tool is None:
+        return found.placed.station, found.placed.tool
+    seen, own = seen_target(block.mounting, found.poses), arm[found.rows]
+    if station is not None:
+        return station, average_pose(invert(own) @ invert(station) @ seen)
+    return average_pose(seen @ invert(own @ tool)), np.asarray(tool)
+
+
+def _optics(measured: Sequence[PoseMeasurements]) -> Optics:
+    """Return the cameras and boards of all images; of several blocks by one camera the first says its lens.
+
+    Raises:
+        MeasurementError: for images whose camera is not known, or one camera with images of two sizes.
+    """
+    lenses, boards, free = {}, {}, set[str]()
+    for block in measured:
+        if not isinstance(block, Pixels):
+            continue
+        if block.lens is None or not block.mounting:
+            raise MeasurementError("lens and mounting of the camera are not known (see complete_camera)", block.file)
+        lens = lenses.setdefault(block.camera, block.lens)
+        if lens.size != block.lens.size or lens.model != block.lens.model:
+            raise MeasurementError(
+                f"camera '{block.camera}' took images of {lens.size} and of {block.lens.size} pixels: are these two "
+                "cameras? Give --tools each (a camera in the hand) or --stations each, or name them in the options",
+                block.file,
+            )
+        boards.setdefault(block.target, BoardShape())
+        for name in block.free:
+            free.add(f"{block.camera if name in lens.names else block.target}.{name}")
+    return Optics(tuple(lenses.values()), tuple(lenses), tuple(boards.values()), tuple(boards), frozenset(free))
+
+
+@_guess.register
 def _guess_from_positions(
     block: Positions, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
 ) -> Guess:
@@ -152,36 +197,6 @@ def _enough(block: PoseMeasurements, rows: np.ndarray, needed: int) -> None:
             "poses, and a calibration some 20 or more; measure more poses",
             block.file,
         )
-
-
-def average_pose(poses: np.ndarray) -> np.ndarray:
-    """Return the mean (4, 4) of poses (m, 4, 4): chordal mean of the rotations, median of the positions."""
-    return pose(orthonormal(poses[:, :3, :3].mean(axis=0)), np.median(poses[:, :3, 3], axis=0))
-
-
-def place_pose(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Solve B_i = S A_i X for S and X (Shah 2013).
-
-    Args:
-        arm: (m, 4, 4) poses A_i of the tip in the base.
-        seen: (m, 4, 4) poses B_i of the target in the station's frame.
-
-    Returns:
-        station (4, 4) and tool (4, 4).
-    """
-    a, b = arm[:, :3, :3], seen[:, :3, :3]
-    # vec(R_S R_A R_X) = vec(R_B): the sum of R_B ⊗ R_A has vec(R_S) and vec(R_X) as its first singular pair
-    kernel = np.einsum("mij,mkl->ikjl", b, a).reshape(9, 9)
-    u, _, vt = np.linalg.svd(kernel)
-    station_rotation, tool_transposed = u[:, 0].reshape(3, 3), vt[0].reshape(3, 3)
-    station_rotation = orthonormal(station_rotation * np.sign(np.linalg.det(station_rotation)))
-    tool_rotation = orthonormal(tool_transposed * np.sign(np.linalg.det(tool_transposed))).T
-    # y_i - R_S a_i = R_S R_i t + p_S
-    turned = station_rotation @ a
-    matrix = np.concatenate([turned, np.broadcast_to(np.eye(3), turned.shape)], axis=2).reshape(-1, 6)
-    target = (seen[:, :3, 3] - arm[:, :3, 3] @ station_rotation.T).reshape(-1)
-    solution = np.linalg.lstsq(matrix, target, rcond=1e-9)[0]
-    return pose(station_rotation, solution[3:]), pose(tool_rotation, solution[:3])
 
 
 def _place_position(

@@ -187,7 +187,7 @@ def fit_with_prior(
         if settled is not None:
             return weigher.result(settled)
     assert solution is not None
-    weigher.sigmas, weigher.weights = weigher.used
+    weigher.sigmas, weigher.weights, weigher.noises = weigher.used
     return weigher.result(solution)
 
 
@@ -243,7 +243,8 @@ def placed_on(
     cell: Installation, block: PoseMeasurements, torques: Sequence[np.ndarray | None] | None, settings: Settings
 ) -> Installation:
     """Return an arm, deflections included, with base and tool placement fitted on a block and nothing else."""
-    start = replace(install(cell.chain, [block], cell.known), deflection=cell.deflection)
+    start = install(cell.chain, [block], cell.known)
+    start = replace(start, deflection=cell.deflection, optics=start.optics.like(cell.optics))
     return polish_frames(start, [block], settings, torques).cell
 
 

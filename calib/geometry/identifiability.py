@@ -21,14 +21,16 @@ def observation_matrix(cell: Installation, blocks: Sequence[Block], columns: np.
     for block in blocks:
         for part in observe(cell, block, columns):
             scale = part.sigma
-            if scale is None:
+            if part.label == "pixel":
+                scale = np.asarray(part.per_length)
+            elif scale is None:
                 scale = np.full(part.value.shape, 1.0 / _reach(cell) if part.label == "orientation" else 1.0)
             elif part.label != "orientation":
                 scale = scale / np.median(scale)
             else:
                 scale = scale / np.median(scale) / _reach(cell)
-            rows.append((part.jacobian / scale).reshape(len(columns), -1))
-    return np.concatenate(rows, axis=1).T
+            rows.append(part.whitened(scale)[1])
+    return np.concatenate(rows)
 
 
 def _reach(cell: Installation) -> float:
@@ -50,7 +52,7 @@ def _preference(cell: Installation, columns: np.ndarray) -> list[np.ndarray]:
     kinds: list[list[int]] = [[], [], [], [], []]
     for place, column in enumerate(columns):
         group = table.group(int(column))
-        if group in ("station", "tool"):
+        if group in ("station", "tool", "optics"):
             kinds[0].append(place)
         elif group == "deflection":
             kinds[4].append(place)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from calib.arrays import frozen
+from calib.geometry.optics import Optics, View
 from calib.robot.chain import Chain
 from calib.robot.deflection import Deflection, extra_displacements
 from calib.robot.kinematics import Sweep, sweep
@@ -25,6 +26,7 @@ class Installation:
         station_names, tool_names: S and T strings.
         deflection: what q does not say (stiffness, coupling, harmonics), to be fitted.
         known: deflections found earlier, which stay as they are.
+        optics: cameras and boards, where images were taken.
     """
 
     chain: Chain
@@ -34,6 +36,7 @@ class Installation:
     tool_names: tuple[str, ...] = ("tool",)
     deflection: Deflection = field(default_factory=Deflection)
     known: Deflection = field(default_factory=Deflection)
+    optics: Optics = field(default_factory=Optics)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "stations", frozen(self.stations))
@@ -58,11 +61,13 @@ class Seen:
         walked: the pass along the chain, in the station's frame.
         point: (3, m) target positions [m].
         rotation: (3, 3, m) target rotations, ``rotation[c]`` being column c.
+        view: the camera and the board of images; None for other instruments.
     """
 
     walked: Sweep
     point: np.ndarray
     rotation: np.ndarray
+    view: View | None = None
 
     def poses(self) -> np.ndarray:
         """Return the target poses (m, 4, 4) in the station's frame."""

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.pixels import Pixels
 from calib.errors import UsageError
 from calib.geometry.installation import Installation, Seen, see
 from calib.geometry.parameters import layout_counts
+from calib.geometry.pixel_residuals import view_of
 from calib.geometry.residuals import Part, parts
 from calib.robot import deflection
 from calib.robot.kinematics import element_jacobian
@@ -71,6 +73,8 @@ def predict(cell: Installation, block: Block) -> Seen:
 def observe(cell: Installation, block: Block, free: np.ndarray) -> list[Part]:
     """Return the residual parts of a block with their Jacobian with respect to the parameters `free` (f,)."""
     seen = predict(cell, block)
+    if isinstance(block.measured, Pixels):
+        seen = replace(seen, view=view_of(cell, block.measured, free))
     return parts(block.measured, seen, target_jacobian(cell, seen, free, block.station, block.tool, block.bases))
 
 
@@ -78,10 +82,10 @@ def target_jacobian(
     cell: Installation, seen: Seen, free: np.ndarray, station: int, tool: np.ndarray, bases: np.ndarray | None = None
 ) -> np.ndarray:
     """Return [v; ω] of the targets per unit of each free parameter, (f, 6, m); see `Block` for the last three."""
-    arm, stations, tools, _ = layout_counts(cell)
+    arm, stations, tools, terms, _ = layout_counts(cell)
     m = seen.point.shape[1]
     jacobian = np.zeros((len(free), 6, m))
-    section = np.searchsorted(np.cumsum([arm, stations, tools]), free, side="right")
+    section = np.searchsorted(np.cumsum([arm, stations, tools, terms]), free, side="right")
     in_arm = np.flatnonzero(section == 0)
     if len(in_arm) == len(free):
         return element_jacobian(cell.chain, seen.walked, seen.point, free)
@@ -124,12 +128,8 @@ def stack(found: Sequence[Part], sigmas: Sequence[np.ndarray]) -> tuple[np.ndarr
         found: parts of all blocks.
         sigmas: one array per part, broadcastable to its value (rows, m).
     """
-    residual = np.concatenate([(part.value / sigma).ravel() for part, sigma in zip(found, sigmas)])
-    f = found[0].jacobian.shape[0]
-    matrix = np.empty((f, len(residual)))
-    start = 0
-    for part, sigma in zip(found, sigmas):
-        stop = start + part.value.size
-        np.divide(part.jacobian, sigma, out=matrix[:, start:stop].reshape(part.jacobian.shape))
-        start = stop
+    edges = np.cumsum([0, *(part.height for part in found)])
+    residual, matrix = np.empty(edges[-1]), np.empty((len(found[0].jacobian), edges[-1]))
+    for part, sigma, start, stop in zip(found, sigmas, edges, edges[1:]):
+        part.fill(residual[start:stop], matrix[:, start:stop], sigma)
     return residual, matrix.T

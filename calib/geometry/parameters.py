@@ -1,7 +1,7 @@
 """The vector of everything a geometric fit may move, its names, and how a step is taken.
 
 Order: arm elements (K), six per station (x y z rx ry rz, in the station-to-base placement's own axes), six per tool (in
-the target's own axes), deflection coefficients (E).
+the target's own axes), deflection coefficients (E), and of images the lenses' values and the boards' shapes.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ class ParameterLayout:
 
     Attributes:
         names, units: one per parameter.
-        arm, stations, tools, terms: how many of each.
+        arm, stations, tools, terms: how many of each; the rest is optics.
+        moving: positions of the optics that may be fitted.
     """
 
     names: tuple[str, ...]
@@ -32,11 +33,12 @@ class ParameterLayout:
     stations: int
     tools: int
     terms: int
+    moving: tuple[int, ...] = ()
 
     def group(self, index: int) -> str:
-        """Return 'arm', 'station', 'tool' or 'deflection' for a position in the vector."""
-        edges = np.cumsum([self.arm, self.stations, self.tools])
-        return ("arm", "station", "tool", "deflection")[int(np.searchsorted(edges, index, side="right"))]
+        """Return 'arm', 'station', 'tool', 'deflection' or 'optics' for a position in the vector."""
+        edges = np.cumsum([self.arm, self.stations, self.tools, self.terms])
+        return ("arm", "station", "tool", "deflection", "optics")[int(np.searchsorted(edges, index, side="right"))]
 
     @property
     def arm_index(self) -> np.ndarray:
@@ -44,7 +46,9 @@ class ParameterLayout:
 
     @property
     def frame_index(self) -> np.ndarray:
-        return np.arange(self.arm, self.arm + self.stations + self.tools)
+        """Placements, and what of cameras and boards is fitted: all that is not the robot's."""
+        placed = np.arange(self.arm, self.arm + self.stations + self.tools)
+        return np.concatenate([placed, np.array(self.moving, dtype=int)])
 
     @property
     def station_index(self) -> np.ndarray:
@@ -56,7 +60,8 @@ class ParameterLayout:
 
     @property
     def term_index(self) -> np.ndarray:
-        return np.arange(self.arm + self.stations + self.tools, len(self.names))
+        start = self.arm + self.stations + self.tools
+        return np.arange(start, start + self.terms)
 
     def find(self, names: list[str] | tuple[str, ...]) -> np.ndarray:
         """Return positions by name.
@@ -78,13 +83,17 @@ def layout(cell: Installation) -> ParameterLayout:
     terms = cell.deflection.terms
     element_units = dict(zip(cell.chain.names, cell.chain.units))
     return ParameterLayout(
-        names=(*cell.chain.names, *frames, *deflection.names(cell.deflection, cell.chain)),
-        units=(*cell.chain.units, *(units * (len(frames) // 6)), *(_unit(element_units, term) for term in terms)),
+        names=(*cell.chain.names, *frames, *deflection.names(cell.deflection, cell.chain), *cell.optics.names),
+        units=(
+            *cell.chain.units, *(units * (len(frames) // 6)), *(_unit(element_units, term) for term in terms),
+            *cell.optics.units,
+        ),
         arm=len(cell.chain.elements),
         stations=6 * len(cell.stations),
         tools=6 * len(cell.tools),
         terms=len(terms),
-    )
+        moving=tuple((len(cell.chain.elements) + len(frames) + len(terms) + cell.optics.moving).tolist()),
+    )  # fmt: skip
 
 
 def _unit(units: dict[str, str], term: deflection.Term) -> str:
@@ -96,7 +105,7 @@ def step(cell: Installation, free: np.ndarray, change: np.ndarray) -> Installati
     where = layout_counts(cell)
     full = np.zeros(sum(where))
     full[free] = change
-    arm, stations, tools, terms = np.split(full, np.cumsum(where)[:-1])
+    arm, stations, tools, terms, optics = np.split(full, np.cumsum(where)[:-1])
     stations, tools = stations.reshape(-1, 6), tools.reshape(-1, 6)
     return replace(
         cell,
@@ -106,18 +115,21 @@ def step(cell: Installation, free: np.ndarray, change: np.ndarray) -> Installati
         deflection=cell.deflection.with_coefficients(np.asarray(cell.deflection.coefficients) + terms)
         if len(terms)
         else cell.deflection,
+        optics=cell.optics.with_values(cell.optics.values + optics) if optics.any() else cell.optics,
     )
 
 
-def layout_counts(cell: Installation) -> tuple[int, int, int, int]:
-    """Return how many parameters the arm, stations, tools and deflection have."""
-    return len(cell.chain.elements), 6 * len(cell.stations), 6 * len(cell.tools), len(cell.deflection.terms)
+def layout_counts(cell: Installation) -> tuple[int, int, int, int, int]:
+    """Return how many parameters the arm, stations, tools, deflection and optics have."""
+    frames = 6 * len(cell.stations), 6 * len(cell.tools)
+    return len(cell.chain.elements), *frames, len(cell.deflection.terms), len(cell.optics)
 
 
 def parameter_values(cell: Installation) -> np.ndarray:
     """Return the full parameter vector; frames count from their present placement, hence zeros."""
-    _, stations, tools, _ = layout_counts(cell)
-    return np.concatenate([cell.chain.values, np.zeros(stations + tools), np.asarray(cell.deflection.coefficients)])
+    _, stations, tools, _, _ = layout_counts(cell)
+    terms = np.asarray(cell.deflection.coefficients)
+    return np.concatenate([cell.chain.values, np.zeros(stations + tools), terms, cell.optics.values])
 
 
 def fixed_parameters(start: Installation, options: FitOptions) -> np.ndarray:

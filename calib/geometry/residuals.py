@@ -24,7 +24,7 @@ class Part:
     """Residuals of one nature: all in one unit.
 
     Attributes:
-        label: ``position``, ``orientation``, ``consistency``, ``distance`` or ``plane``.
+        label: ``position``, ``orientation``, ``consistency``, ``distance``, ``plane`` or ``pixel``.
         value: (rows, m) [m] or [rad].
         jacobian: (f, rows, m) derivative of the prediction.
         sigma: (rows, m) stated standard deviations; None where they are to be estimated.
@@ -38,6 +38,39 @@ class Part:
     sigma: np.ndarray | None
     nuisances: int
     index: np.ndarray
+
+    @property
+    def height(self) -> int:
+        """How many rows it has in a least-squares problem."""
+        return self.value.size
+
+    def fill(self, residual: np.ndarray, matrix: np.ndarray, scale: np.ndarray) -> None:
+        """Write residual (height,) and W (f, height), divided by a scale that is broadcast to `value`."""
+        residual[:] = (self.value / scale).ravel()
+        np.divide(self.jacobian, scale, out=matrix.reshape(self.jacobian.shape))
+
+    def whitened(self, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return residual (height,) and W (height, f), divided by a scale."""
+        residual, matrix = np.empty(self.height), np.empty((len(self.jacobian), self.height))
+        self.fill(residual, matrix, scale)
+        return residual, matrix.T
+
+    @property
+    def per_length(self) -> np.ndarray | float:
+        """What divides residuals in a length's stead into [m]; 1 for those that are lengths."""
+        return 1.0
+
+    def sizes(self) -> np.ndarray:
+        """Return the length of each measured row's residual [m] or [rad]."""
+        return np.linalg.norm(self.value, axis=0)
+
+    def row_weights(self, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return measured rows and a weight of each, of weights (m,) per column."""
+        return self.index, weight
+
+    def per_row(self) -> Part:
+        """Return the part with one column per measured row, in a unit of its nature."""
+        return self
 
 
 @singledispatch

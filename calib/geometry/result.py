@@ -11,8 +11,10 @@ from calib.estimation import robust
 from calib.estimation.base_columns import ColumnSplit
 from calib.estimation.estimate import Estimate
 from calib.estimation.nonlinear import Solution
+from calib.geometry.image_noise import ImageNoise
 from calib.geometry.installation import Installation, merged
 from calib.geometry.observation import Block
+from calib.geometry.pixel_residuals import PixelPart
 from calib.geometry.residuals import Part
 from calib.robot.calibrated import CalibratedChain, CorrectedChain
 from calib.robot.chain import Chain
@@ -107,11 +109,20 @@ def used_sigmas(found: GeometricFit) -> list[dict[str, float]]:
     return result
 
 
+def used_noises(found: GeometricFit) -> list[ImageNoise | None]:
+    """Return per block the noise of its images; None where there are none."""
+    result: list[ImageNoise | None] = [None] * len(found.blocks)
+    for piece in found.pieces:
+        if isinstance(piece.part, PixelPart):
+            result[piece.block] = piece.part.noise
+    return result
+
+
 def row_weights(found: GeometricFit) -> list[np.ndarray]:
     """Return per block the smallest robust weight of each row's parts (m,); 1 without a robust loss."""
     result = [np.ones(len(block.measured)) for block in found.blocks]
     for piece in found.pieces:
-        np.minimum.at(result[piece.block], piece.part.index, piece.weight)
+        np.minimum.at(result[piece.block], *piece.part.row_weights(piece.weight))
     return result
 
 
@@ -123,7 +134,7 @@ def outliers(found: GeometricFit, threshold: float = 4.0) -> list[tuple[str, int
     """
     result = []
     for piece in found.pieces:
-        measured, part = found.blocks[piece.block].measured, piece.part
+        measured, part = found.blocks[piece.block].measured, piece.part.per_row()
         size = np.sqrt(np.mean(part.value**2, axis=0)) / max(robust.spread(part.value), 1e-15)
         rows = measured.rows[part.index]
         result += [(measured.file, int(rows[i]), part.label, float(size[i])) for i in np.flatnonzero(size > threshold)]

@@ -10,13 +10,15 @@ from calib.errors import MeasurementError, UsageError
 from calib.estimation import robust
 from calib.estimation.estimate import Estimate
 from calib.estimation.nonlinear import Solution, covariance
+from calib.geometry.image_noise import ImageNoise, estimate_noise
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, observe, stack
 from calib.geometry.parameters import layout, parameter_values
+from calib.geometry.pixel_residuals import PixelPart
 from calib.geometry.residuals import Part
 from calib.geometry.result import GeometricFit, Piece
 
-START_SIGMA = {"position": 1e-3, "orientation": 1e-3, "consistency": 1e-3, "distance": 1e-3, "plane": 1e-3}
+START_SIGMA = dict.fromkeys(("position", "orientation", "consistency", "distance", "plane"), 1e-3) | {"pixel": 0.3}
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,8 @@ class Weigher:
         self.prior = prior if prior is not None and np.isfinite(prior).any() else None
         self.sigmas: list[np.ndarray] = []
         self.weights: list[np.ndarray] = []
-        self.used = self.sigmas, self.weights
+        self.noises: list[ImageNoise | None] = []
+        self.used = self.sigmas, self.weights, self.noises
 
     def parts(self, state: Installation, free: np.ndarray | None = None) -> list[Part]:
         """Return the residual parts of all blocks, with their Jacobian for `free`."""
@@ -72,6 +75,13 @@ class Weigher:
         found = [observe(state, block, chosen) for block in self.blocks]
         self.owners = [number for number, own in enumerate(found) for _ in own]
         return [part for own in found for part in own]
+
+    def noisy(self, found: list[Part]) -> list[Part]:
+        """Return parts of images with the noise that they are whitened by."""
+        return [
+            replace(part, noise=noise) if isinstance(part, PixelPart) else part
+            for part, noise in zip(found, self.noises)
+        ]
 
     def update(self, state: Installation, first: bool) -> None:
         """Set sigmas and weights from the residuals at a state."""
@@ -88,6 +98,13 @@ class Weigher:
         loss = "none" if self.settings.loss == "auto" else self.settings.loss
         robustly = loss != "none"
         self.sigmas = [_sigma(part, share, first and not robustly, robustly) for part in found]
+        self.noises = [None] * len(found)
+        for k, part in enumerate(found):
+            if isinstance(part, PixelPart):
+                unknowns = len(self.free) // len(found)
+                noise = estimate_noise(part.own_poses(self.sigmas[k]), unknowns, loss, self.settings.loss_scale)
+                self.noises[k] = part.spread_over(noise)
+                self.sigmas[k] = noise.factor * self.sigmas[k]
         self.weights = [
             robust.weights(_size(part, sigma), loss, self.settings.loss_scale)
             for part, sigma in zip(found, self.sigmas)
@@ -98,20 +115,21 @@ class Weigher:
 
         A common factor on all sigmas changes nothing but the scale, unless a prior stands against them.
         """
-        before, weights = self.used = self.sigmas, self.weights
+        before, weights, noises = self.used = self.sigmas, self.weights, self.noises
         self.update(solution.state, first=False)
         ratios = [float(np.mean(new / old)) for new, old in zip(self.sigmas, before)]
         steady = all(np.abs(new - old).max(initial=0.0) < 0.02 for new, old in zip(self.weights, weights))
-        common = ratios[0] if self.prior is None else 1.0
+        common = ratios[0] if self.prior is None and not any(noises) else 1.0
+        steady = steady and all(a is None or b is None or a.near(b) for a, b in zip(self.noises, noises))
         if not steady or any(abs(ratio / common - 1.0) > 0.02 for ratio in ratios):
             return None
-        if self.prior is not None:
-            self.sigmas, self.weights = before, weights
+        if self.prior is not None or any(noises):
+            self.sigmas, self.weights, self.noises = before, weights, noises
             return solution
         return replace(solution, factor=solution.factor / common, cost=solution.cost / common**2)
 
     def linearise(self, state: Installation) -> tuple[np.ndarray, np.ndarray]:
-        found = self.parts(state)
+        found = self.noisy(self.parts(state))
         scales = [sigma / np.sqrt(weight) for sigma, weight in zip(self.sigmas, self.weights)]
         residual, matrix = stack(found, scales)
         if self.prior is not None:
@@ -123,7 +141,7 @@ class Weigher:
 
     def result(self, solution: Solution) -> GeometricFit:
         state = solution.state
-        found = self.parts(state)
+        found = self.noisy(self.parts(state))
         table = layout(state)
         rows = sum(part.value.size for part in found)
         dof = rows - len(self.free) - sum(part.nuisances for part in found)
@@ -155,5 +173,6 @@ def _sigma(part: Part, share: float, start: bool, robustly: bool) -> np.ndarray:
 
 
 def _size(part: Part, sigma: np.ndarray) -> np.ndarray:
-    """Return each row's residual in sigmas, root mean square over its components (m,)."""
-    return np.sqrt(np.mean((part.value / sigma) ** 2, axis=0))
+    """Return each row's residual in sigmas, root mean square over its components (m,); a corner's within its image."""
+    value = part.within(sigma) if isinstance(part, PixelPart) else part.value
+    return np.sqrt(np.mean((value / sigma) ** 2, axis=0))

@@ -46,7 +46,7 @@ from calib.robot import mdh
 from calib.robot.chain import GRAVITY, Chain, Element, Joint
 from calib.robot.tables import check_keys, dumps, load, number, placement, placement_table, vector, word
 
-EXTRA = ("station", "tool", "deflection", "truth", "provenance")
+EXTRA = ("station", "tool", "camera", "board", "deflection", "truth", "provenance")
 _TOP = ("name", "base", "tip", "gravity", "floor", "source", "joint", "element", "tail")
 _LIMITS = ("lower", "upper", "velocity", "effort")
 _JOINT = ("name", "kind", *_LIMITS, "link", "inertia")

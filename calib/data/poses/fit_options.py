@@ -31,8 +31,13 @@ TOML; every key is optional, and a key that is none of these is refused. Lengths
     tool_position = ["back_left", "high"]
     [prior]                          # standard deviation of a parameter about its nominal
     theta2 = 1e-3
-    [files."day2.csv"]               # for this file only: keys down to socket_pairs, columns, units, sigma, where
-    kind = "pose"
+    [camera]                         # of folders of images
+    mounting = "in hand"             # or "to hand" (the arm carries the board); found out where not stated
+    intrinsics = "fit"               # with the geometry, or given; default: given where there is a camera.yaml
+    model = "pinhole"                # or fisheye, of a lens that is found from the images
+    board = ["scale", "bend"]        # what of the print is fitted; scale needs another instrument beside
+    [files."day2.csv"]               # for this file only: keys down to socket_pairs, columns, units, sigma, where,
+    kind = "pose"                    # camera
 """
 
 from __future__ import annotations
@@ -92,6 +97,17 @@ class Sigma:
 
 @strict
 @dataclass(frozen=True)
+class CameraOptions:
+    """[camera]: how images are understood."""
+
+    mounting: Annotated[str, OneOf(("auto", "in hand", "to hand"))] = "auto"
+    intrinsics: Annotated[str, OneOf(("auto", "given", "fit"))] = "auto"
+    model: Annotated[str, OneOf(("pinhole", "fisheye"))] = "pinhole"
+    board: Annotated[tuple[Annotated[str, OneOf(("scale", "bend"))], ...], Expect("a list of scale, bend")] = ()
+
+
+@strict
+@dataclass(frozen=True)
 class FileOptions:
     """How one measurement file is to be read; the defaults leave everything to its header. Keys as in the file.
 
@@ -116,6 +132,7 @@ class FileOptions:
     socket_distance: Annotated[float, Real(above=0, most=10.0, unit="m")] | None = None
     socket_pairs: Annotated[tuple[tuple[Label, Label], ...], Expect('pairs of socket labels, [["0", "1"]]')] = ()
     check_limits: Flag = True
+    camera: CameraOptions = field(default_factory=CameraOptions)
 
 
 @strict

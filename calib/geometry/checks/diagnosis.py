@@ -27,7 +27,7 @@ def diagnose(found: GeometricFit) -> list[str]:
 
 def lengths(found: GeometricFit) -> list[tuple[Block, Part]]:
     """Return per block its first part, which is in metres for every kind of measurement."""
-    first = {piece.block: piece.part for piece in reversed(found.pieces)}
+    first = {piece.block: piece.part.per_row() for piece in reversed(found.pieces)}
     return [(block, first[number]) for number, block in enumerate(found.blocks)]
 
 

@@ -15,16 +15,18 @@ import numpy as np
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.estimation.relevance import Gram, gram, relevance
 from calib.geometry.fit import plausible_deviation
+from calib.geometry.image_noise import ImageNoise
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.folds import Folds
 from calib.geometry.observation import observe, prepare
 from calib.geometry.parameters import layout
-from calib.geometry.result import GeometricFit, row_weights, used_sigmas
+from calib.geometry.pixel_residuals import PixelPart
+from calib.geometry.result import GeometricFit, row_weights, used_noises, used_sigmas
 from calib.robot.chain import Chain
 from calib.robot.deflection import Deflection, Term
 
 CHUNK = 1000  # poses observed at once
-METRES = ("position", "consistency", "distance", "plane")
+METRES = ("position", "consistency", "distance", "plane", "pixel")
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +129,7 @@ def fold_statistics(
     cell = replace(found.cell, deflection=Deflection(terms, np.zeros(len(terms)), reference))
     free = np.concatenate([found.free, layout(cell).term_index])
     scales, weights = used_sigmas(found), row_weights(found)
+    noises = used_noises(found)
     rigid = len(found.free)
     each: list[Gram] = []
     held_out, rows = [], []
@@ -134,24 +137,21 @@ def fold_statistics(
     for fold in range(folds.count):
         inside = [np.flatnonzero(members == fold) for members in folds.members]
         metric, whitened, count = _statistics(
-            cell, measured, inside, free, scales, weights, torques, folds.kind == "stations"
+            cell, measured, inside, free, scales, weights, noises, torques, folds.kind == "stations"
         )
         held_out.append(metric)
         rows.append(count)
         if not pooled:
             outside = [np.flatnonzero(members != fold) for members in folds.members]
-            whitened = _statistics(cell, measured, outside, free, scales, weights, torques, False)[1]
+            whitened = _statistics(cell, measured, outside, free, scales, weights, noises, torques, False)[1]
         each.append(whitened)
     if pooled:
         total = sum(each[1:], each[0])
         training = [_without(total, part) for part in each]
     else:
-        total, training = (
-            _statistics(cell, measured, [np.arange(len(b)) for b in measured], free, scales, weights, torques, False)[
-                1
-            ],
-            each,
-        )
+        every = [np.arange(len(b)) for b in measured]
+        total = _statistics(cell, measured, every, free, scales, weights, noises, torques, False)[1]
+        training = each
     wide = plausible_deviation(found.cell, found.free) if found.prior is None else found.prior
     plausible = np.where(np.isfinite(wide), wide, 10.0)
     return FoldStatistics(rigid, groups, sizes, plausible, training, held_out, np.array(rows), total)
@@ -168,6 +168,7 @@ def _statistics(
     free: np.ndarray,
     scales: Sequence[dict[str, float]],
     weights: Sequence[np.ndarray],
+    noises: Sequence[ImageNoise | None],
     torques: Sequence[np.ndarray | None] | None,
     replace_station: bool,
 ) -> tuple[Gram, Gram, float]:
@@ -186,11 +187,14 @@ def _statistics(
             ready = prepare(cell, [part_block], [None if torque is None else torque[piece]])
             for part in observe(cell, ready[0], free):
                 weight = weights[number][piece][part.index]
-                root = np.broadcast_to(np.sqrt(weight), part.value.shape).ravel()
-                residual, matrix = root * part.value.ravel(), (root * part.jacobian.reshape(p, -1)).T
-                sigma = scales[number][part.label]
-                whitened = whitened + gram(residual / sigma, matrix / sigma)
+                if isinstance(part, PixelPart) and (noise := noises[number]) is not None:
+                    part = replace(part, noise=replace(noise, weight=np.ones(len(piece))))
+                root = 1.0 / np.sqrt(weight)
+                own = gram(*part.whitened(root * scales[number][part.label]))
+                whitened = whitened + replace(own, rows=part.value.size)
                 if part.label in METRES:
+                    bare = replace(part, noise=None) if isinstance(part, PixelPart) else part
+                    residual, matrix = bare.whitened(root * part.per_length)
                     count += float(weight.sum())
                     if replace_station:
                         frames.append((residual, matrix))

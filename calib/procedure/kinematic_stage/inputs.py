@@ -9,9 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from calib.data.poses.fit_options import FitOptions, check_files
+from calib.data.poses.image_folders import JOINTS, is_image_folder, read_images
 from calib.data.poses.measurements import PoseMeasurements, take
+from calib.data.poses.pixels import Pixels
 from calib.data.poses.pose_files import joint_columns, read_measurements
 from calib.errors import MeasurementError, UsageError
+from calib.geometry.camera_guess import complete_camera
 from calib.geometry.checks.copied_rows import repeated
 from calib.geometry.checks.orientations import check_orientations
 from calib.geometry.checks.repeatability import repeated_rows
@@ -139,7 +142,7 @@ def with_unseen(
     unseen, notes, fit = dict(given.unseen), list[str](), given.fit
     files = {Path(block.file).resolve() for block in fit}
     for each in validate:
-        for block in _blocks(each, given.chain, options):
+        for block in _blocks(each, given.chain, options, fit):
             again = _path(each).resolve() in files
             if again:
                 notes.append(f"{block.file} is a fit file too: its errors there say nothing of unseen poses")
@@ -168,7 +171,8 @@ def load_robot(
     names: list[str] = []
     if measured is not None and tip is None:
         known = read_tree(text(source)[0], str(source)).joints
-        wanted = [*joint_columns(measured), *options.for_file(measured).columns]
+        table = measured / JOINTS if measured.is_dir() else measured
+        wanted = [*joint_columns(table), *options.for_file(measured).columns]
         names = [name for name in dict.fromkeys(wanted) if name in known and known[name].actuated]
     return load(robot, base, tip, names or None), source
 
@@ -188,23 +192,38 @@ def load_rigid(
     return (chain if found.corrections is None else found.chain), source
 
 
-def read_file(path: Path, chain: Chain, options: FitOptions) -> list[PoseMeasurements]:
-    """Read one measurement file for a chain, held against its limits, its size and its orientations."""
+def read_file(
+    path: Path, chain: Chain, options: FitOptions, like: Sequence[PoseMeasurements] = ()
+) -> list[PoseMeasurements]:
+    """Read one measurement file, or a folder of images, for a chain, held against its limits and what it can see.
+
+    Args:
+        path, chain, options: what, for whom, and how.
+        like: blocks read before; images of the same size are taken to be by the same camera.
+    """
     limits, kinds = (chain.lower, chain.upper), joint_kinds(chain)
+    if is_image_folder(path):
+        images = read_images(path, chain.joint_names, options.for_file(path), kinds=kinds, limits=limits)
+        return _checked([images], chain, like)
     return _checked(
         read_measurements(path, chain.joint_names, options.for_file(path), kinds=kinds, limits=limits), chain
     )
 
 
-def _blocks(each: Path | PoseMeasurements, chain: Chain, options: FitOptions) -> list[PoseMeasurements]:
-    return read_file(each, chain, options) if isinstance(each, (str, Path)) else _checked([each], chain)
+def _blocks(
+    each: Path | PoseMeasurements, chain: Chain, options: FitOptions, like: Sequence[PoseMeasurements] = ()
+) -> list[PoseMeasurements]:
+    return read_file(each, chain, options, like) if isinstance(each, (str, Path)) else _checked([each], chain, like)
 
 
 def _path(each: Path | PoseMeasurements) -> Path:
     return Path(each) if isinstance(each, (str, Path)) else Path(each.file or "measured")
 
 
-def _checked(blocks: list[PoseMeasurements], chain: Chain) -> list[PoseMeasurements]:
+def _checked(
+    blocks: list[PoseMeasurements], chain: Chain, like: Sequence[PoseMeasurements] = ()
+) -> list[PoseMeasurements]:
+    blocks = [complete_camera(chain, each, like) if isinstance(each, Pixels) else each for each in blocks]
     for block in blocks:
         check_scale(block, forward(chain, block.q))  # unseen files, too: the fit looks at its own only
         check_orientations(chain, block)

@@ -37,8 +37,9 @@ def named_outliers(found: GeometricFit) -> list[Outlier]:
     """Return rows of the fit beyond four robust sigmas, worst first; several targets of one row count once."""
     sizes: dict[tuple[str, int, str], float] = {}
     for block in found.blocks:
-        for part in observe(found.cell, block, np.array([], dtype=int)):
-            for row, size in zip(_file_rows(block.measured)[part.index], np.linalg.norm(part.value, axis=0)):
+        for each in observe(found.cell, block, np.array([], dtype=int)):
+            part = each.per_row()
+            for row, size in zip(_file_rows(block.measured)[part.index], part.sizes()):
                 key = block.measured.file, int(row), part.label
                 sizes[key] = max(float(size), sizes.get(key, 0.0))
     result: dict[tuple[str, int, str], Outlier] = {}

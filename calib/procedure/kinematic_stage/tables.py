@@ -59,6 +59,7 @@ def estimate_table(found: GeometricFit, nominal: Installation) -> EstimateTable:
     full[found.free, np.arange(len(found.free))] = 1.0
     values, before = parameter_values(found.cell), np.zeros(len(table.names))
     before[: table.arm] = nominal.chain.values
+    before[len(before) - len(nominal.optics) :] = nominal.optics.values
     start = table.arm
     for after, first in zip((*found.cell.stations, *found.cell.tools), (*nominal.stations, *nominal.tools)):
         block = slice(start, start + 6)
@@ -166,12 +167,13 @@ def _residual_rows(label: str, comparison: Comparison, named: set, weights: dict
         measured, m = block.measured, len(block.measured)
         columns = {nature: np.full((len(names), m), np.nan) for nature, names in COMPONENTS.items()}
         for part in observe(cell, block, _NONE):
-            nature = NATURE[part.label]
-            columns[nature][: len(part.value), part.index] = ERRORS[nature][0] * part.value
+            nature, own = NATURE[part.label], part.per_row()
+            columns[nature][: len(own.value), own.index] = ERRORS[nature][0] * own.value
         first = np.full(m, np.nan)
         for part in observe(nominal, before, _NONE):
-            if NATURE[part.label] == "position" or np.isnan(first[part.index]).all():
-                first[part.index] = 1e3 * np.linalg.norm(part.value, axis=0)
+            own = part.per_row()
+            if NATURE[part.label] == "position" or np.isnan(first[own.index]).all():
+                first[own.index] = 1e3 * own.sizes()
         sizes = _row_sizes(columns)
         for i in range(m):
             key = _key(measured, i)

@@ -12,6 +12,7 @@ import numpy as np
 
 from calib import files
 from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.pixels import Pixels
 from calib.errors import UsageError
 from calib.estimation.estimate import strong_correlations
 from calib.geometry.observation import predict, prepare
@@ -189,7 +190,7 @@ def _correlated(names: Sequence[str], covariance: np.ndarray, most: int = 12) ->
 def _noise(blocks: Sequence[PoseMeasurements]) -> dict[str, float | None]:
     result: dict[str, float | None] = {}
     for nature, name in (("position", "sigma"), ("orientation", "sigma_rotation")):
-        found = [(block, getattr(block, name, None)) for block in blocks]
+        found = [(block, None if isinstance(block, Pixels) else getattr(block, name, None)) for block in blocks]
         # a kind with one number per row states it for each axis
         stated = [np.broadcast_to(s.reshape(len(block), -1), (len(block), 3)) for block, s in found if s is not None]
         whole = len(stated) == len(blocks)

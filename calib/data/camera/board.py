@@ -1,0 +1,128 @@
+"""A printed board as a rigid table of corners, and its file ``board.toml``.
+
+The board's frame lies in its upper left corner as printed: x to the right, y down, z into the paper, so that a board
+held upright before a camera has the camera's own axes. Corners are numbered as OpenCV numbers them: row by row the
+inner corners of a ChArUco board and a chessboard; of an AprilTag grid four per tag, from its upper left clockwise.
+Squares are counted, not inner corners::
+
+    kind = "charuco"                 # charuco, chessboard, apriltag
+    columns = 9                      # squares (or tags) across and down
+    rows = 7
+    square = 0.03                    # side of a square (or of a tag) [m], as measured on the print
+    marker = 0.021                   # side of a marker [m]; apriltag: the gap between two tags
+    dictionary = "5x5_100"           # of the markers: 4x4_50 … 7x7_1000, apriltag_36h11 …
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+
+from calib import files
+from calib.config import OneOf, Real, Whole, parse, read_toml, strict
+
+KINDS = ("charuco", "chessboard", "apriltag")
+DICTIONARIES = (
+    *(f"{bits}x{bits}_{count}" for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
+    "apriltag_16h5", "apriltag_25h9", "apriltag_36h10", "apriltag_36h11",
+)  # fmt: skip
+FILE = "board.toml"
+
+
+@strict
+@dataclass(frozen=True)
+class Board:
+    """A board; see the module."""
+
+    kind: Annotated[str, OneOf(KINDS)] = "charuco"
+    columns: Annotated[int, Whole(2)] = 9
+    rows: Annotated[int, Whole(2)] = 7
+    square: Annotated[float, Real(above=0, most=2.0, quantity="length")] = 0.03
+    marker: Annotated[float, Real(least=0, most=2.0, quantity="length")] = 0.0
+    dictionary: Annotated[str, OneOf(DICTIONARIES)] = "5x5_100"
+
+    def __post_init__(self) -> None:
+        if max(self.columns, self.rows) > 100:
+            raise ValueError(f"{self.columns} x {self.rows} squares: more than 100 in a row cannot be told apart")
+        if self.kind == "charuco" and not 0.3 * self.square <= self.marker <= 0.9 * self.square:
+            raise ValueError(
+                f"marker = {self.marker:g}: of a charuco board the markers lie in the white squares, so that marker "
+                f"has to be between 0.3 and 0.9 of square = {self.square:g}"
+            )
+        if self.kind == "apriltag" and not 0.05 * self.square <= self.marker <= 2.0 * self.square:
+            raise ValueError(
+                f"marker = {self.marker:g}: of an apriltag grid this is the gap between two tags; 0.05 to 2 times "
+                f"square = {self.square:g}"
+            )
+        if self.kind == "chessboard" and (self.columns + self.rows) % 2 == 0:
+            raise ValueError(
+                f"{self.columns} x {self.rows} squares look the same upside down; an even and an odd number do not"
+            )
+        if self.kind == "chessboard" and min(self.columns, self.rows) < 4:
+            raise ValueError("a chessboard needs 4 squares each way at least")
+        if self.tags > (count := dictionary_size(self.dictionary)):
+            raise ValueError(f"{self.tags} markers are needed, the dictionary {self.dictionary} has {count}")
+
+    @property
+    def tags(self) -> int:
+        """How many markers it has."""
+        count = self.columns * self.rows
+        return {"charuco": count // 2, "apriltag": count, "chessboard": 0}[self.kind]
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Width and height of the pattern [m]."""
+        if self.kind == "apriltag":
+            pitch = self.square + self.marker
+            return self.columns * pitch - self.marker, self.rows * pitch - self.marker
+        return self.columns * self.square, self.rows * self.square
+
+    @property
+    def words(self) -> str:
+        """The board in a few words."""
+        what = {"charuco": "ChArUco", "chessboard": "chessboard", "apriltag": "AprilTag grid"}[self.kind]
+        return f"{what} {self.columns} x {self.rows}, {1e3 * self.square:g} mm"
+
+
+def corners(board: Board) -> np.ndarray:
+    """Return the corner table (K, 3) [m]; see the module for their order."""
+    if board.kind == "apriltag":
+        pitch, side = board.square + board.marker, board.square
+        first = [(column * pitch, row * pitch) for row in range(board.rows) for column in range(board.columns)]
+        own = [(0.0, 0.0), (side, 0.0), (side, side), (0.0, side)]
+        return np.array([(x + a, y + b, 0.0) for x, y in first for a, b in own])
+    across, down = np.meshgrid(np.arange(1, board.columns), np.arange(1, board.rows))
+    return board.square * np.column_stack([across.ravel(), down.ravel(), np.zeros(across.size)])
+
+
+def dictionary_size(name: str) -> int:
+    """Return how many markers a dictionary has."""
+    known = {"apriltag_16h5": 30, "apriltag_25h9": 35, "apriltag_36h10": 2320, "apriltag_36h11": 587}
+    return known[name] if name in known else int(name.rsplit("_", 1)[1])
+
+
+def read_board(path: str | Path) -> Board:
+    """Read ``board.toml``, or the one in a folder.
+
+    Raises:
+        UsageError: for a key or a value that cannot be.
+    """
+    path = Path(path) / FILE if Path(path).is_dir() else Path(path)
+    return parse(Board, read_toml(path), str(path))
+
+
+def write_board(board: Board, path: str | Path) -> Path:
+    """Write ``board.toml``."""
+    comment = {"apriltag": "the gap between two tags [m]", "charuco": "side of a marker [m]"}.get(board.kind, "unused")
+    lines = [
+        f'kind = "{board.kind}"',
+        f"columns = {board.columns}".ljust(32) + "# squares (tags) across",
+        f"rows = {board.rows}".ljust(32) + "# and down",
+        f"square = {board.square!r}".ljust(32) + "# side of a square (tag) [m]: put in what you measure on the print",
+        f"marker = {board.marker!r}".ljust(32) + f"# {comment}",
+        f'dictionary = "{board.dictionary}"',
+    ]
+    return files.write(path, "\n".join(lines) + "\n")

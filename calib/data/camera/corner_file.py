@@ -1,0 +1,77 @@
+"""``corners.csv``: what was found in the images of a folder, one row per corner; and why others are of no use.
+
+Columns ``image``, ``corner``, ``u [px]``, ``v [px]``, ``sigma [px]``; an image without a usable board has one row with
+its ``problem`` and nothing else. Written beside the images, so that they are looked at once; a file that another
+program has written is read as well (without ``sigma``: 0.1 px).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from calib import files
+from calib.data.camera.board import Board, corners
+from calib.data.camera.detection import Detection
+from calib.errors import MeasurementError
+
+FILE = "corners.csv"
+HEADER = ("image", "corner", "u [px]", "v [px]", "sigma [px]", "edge [px]", "problem")
+USUAL = 0.1  # sigma where a file states none [px]; our choice
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Detections of a folder by image name, and the images' width and height (0, 0 where unknown)."""
+
+    images: dict[str, Detection]
+    size: tuple[int, int] = (0, 0)
+
+
+def write_corners(path: Path, found: Found) -> Path:
+    """Write ``corners.csv``."""
+    rows: list[list[object]] = [["", "", *found.size, None, None, "size of the images"]]
+    for name, one in found.images.items():
+        edge = None if np.isnan(one.edge) else one.edge
+        if one.problem:
+            rows.append([name, None, None, None, None, edge, one.problem])
+        rows += [
+            [name, int(k), float(one.pixel[k, 0]), float(one.pixel[k, 1]), float(one.sigma[k]), edge, ""]
+            for k in np.flatnonzero(one.seen)
+        ]
+    return files.write_table(path, HEADER, rows)
+
+
+def read_corners(path: Path, board: Board) -> Found:
+    """Read ``corners.csv`` for a board.
+
+    Raises:
+        MeasurementError: for corners that the board does not have.
+    """
+    import csv
+
+    count, images, size = len(corners(board)), dict[str, Detection](), (0, 0)
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        rows = list(csv.DictReader(file))
+    for number, row in enumerate(rows, 1):
+        cells = {(key or "").split("[")[0].strip(): (value or "").strip() for key, value in row.items()}
+        name, problem = cells.get("image", ""), cells.get("problem", "")
+        try:
+            if not name and problem:
+                size = int(float(cells["u"])), int(float(cells["v"]))
+                continue
+            if name not in images:
+                images[name] = Detection(
+                    np.full((count, 2), np.nan), np.full(count, np.nan), problem, float(cells.get("edge") or "nan")
+                )
+            if problem or not cells.get("corner"):
+                continue
+            k, place = int(cells["corner"]), (float(cells["u"]), float(cells["v"]))
+        except (KeyError, ValueError) as error:
+            raise MeasurementError(f"expected image, corner, u, v ({error})", path, number) from error
+        if not 0 <= k < count:
+            raise MeasurementError(f"corner {k}: the board ({board.words}) has {count}", path, number, "corner")
+        images[name].pixel[k], images[name].sigma[k] = place, float(cells.get("sigma") or USUAL)
+    return Found(images, size)

@@ -1,0 +1,68 @@
+"""Image files as a sensor gave them: grey, 8 bits, never turned."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from calib.errors import MeasurementError
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".webp")
+
+
+def read_image(path: Path) -> np.ndarray:
+    """Return an image (height, width) as 8-bit grey.
+
+    An EXIF orientation is not followed: it turns the picture for people, and would turn the camera's axes with it.
+
+    Raises:
+        MeasurementError: for a file that is missing, empty or damaged.
+    """
+    try:
+        return decode(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise MeasurementError(f"cannot be read as an image ({error}): was it copied whole?", path) from error
+
+
+def decode(content: bytes) -> np.ndarray:
+    """Return a compressed image's grey levels (height, width), 8 bits; see `read_image`.
+
+    Raises:
+        ValueError: where it is none.
+    """
+    if not content:
+        raise ValueError("the file is empty")
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        found = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    except cv2.error as error:
+        raise ValueError(str(error)) from error
+    finally:
+        cv2.utils.logging.setLogLevel(before)
+    if found is None:
+        raise ValueError("no image format that is known, or cut short")
+    return to_grey(found)
+
+
+def to_grey(image: np.ndarray) -> np.ndarray:
+    """Return 8-bit grey levels (height, width) of any image; more than 8 bits are spread over what the image uses."""
+    if image.ndim == 3:
+        image = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_BGR2GRAY)
+    if image.dtype == np.uint8:
+        return image
+    values = image.astype(np.float32)
+    low, high = np.percentile(values[::7, ::7], [0.1, 99.9])
+    return np.clip((values - low) * (255.0 / max(float(high - low), 1e-9)), 0, 255).astype(np.uint8)
+
+
+def write_image(path: Path, image: np.ndarray) -> Path:
+    """Write an image by its suffix."""
+    from calib import files
+
+    done, content = cv2.imencode(path.suffix, image)
+    if not done:
+        raise MeasurementError("cannot be written as an image", path)
+    return files.write(path, content.tobytes())

@@ -1,0 +1,186 @@
+"""How a camera maps points to pixels: pinhole with Brown–Conrady distortion, and fisheye; with exact derivatives.
+
+A point (X, Y, Z) [m] in the camera's frame (x right, y down, z forward) has a = X/Z, b = Y/Z, r² = a² + b²:
+
+    pinhole   s = (1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ + k6 r⁶)   (Brown 1971; OpenCV's rational model)
+              x = a s + 2 p1 a b + p2 (r² + 2 a²),  y = b s + p1 (r² + 2 b²) + 2 p2 a b
+    fisheye   θ = atan r,  x = a θ(1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸) / r   (Kannala & Brandt 2006; OpenCV's)
+    pixel     u = fx x + cx,  v = fy y + cy; the centre of the first pixel is (0, 0)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.arrays import frozen
+from calib.errors import CalibError
+
+NAMES = {
+    "pinhole": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "fisheye": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+}
+PLAIN = 9  # values of a pinhole without the rational model's denominator
+ITERATIONS = 20  # of the inverse; Newton's, so that a handful does
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """The intrinsics of one camera.
+
+    Attributes:
+        model: ``pinhole`` or ``fisheye``.
+        values: fx fy cx cy [px] and the distortion's coefficients, as `NAMES`; a pinhole has 9 or 12.
+        size: width and height of its images [px].
+    """
+
+    model: str
+    values: np.ndarray
+    size: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        values = frozen(self.values)
+        if self.model not in NAMES or len(values) not in {"pinhole": (9, 12), "fisheye": (8,)}[self.model]:
+            raise CalibError(f"no camera model '{self.model}' with {len(values)} values; there are pinhole and fisheye")
+        if not np.isfinite(values).all() or min(values[:2]) <= 0.0:
+            raise CalibError(f"camera: focal lengths {values[0]:g}, {values[1]:g} px cannot be")
+        object.__setattr__(self, "values", values)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the values."""
+        return NAMES[self.model][: len(self.values)]
+
+    def with_values(self, values: np.ndarray) -> Lens:
+        """Return the lens with other values."""
+        return replace(self, values=values)
+
+
+def pinhole(focal: float, size: tuple[int, int], distortion: tuple[float, ...] = ()) -> Lens:
+    """Return a pinhole with square pixels and its principal point in the middle.
+
+    Args:
+        focal: [px].
+        size: width and height [px].
+        distortion: k1 k2 p1 p2 k3, from the first on.
+    """
+    middle = 0.5 * (size[0] - 1), 0.5 * (size[1] - 1)
+    return Lens("pinhole", np.array([focal, focal, *middle, *distortion, *[0.0] * (5 - len(distortion))]), size)
+
+
+def project(lens: Lens, points: np.ndarray) -> np.ndarray:
+    """Return pixels (N, 2) of points (N, 3) [m] before the camera."""
+    return _projected(lens, points, False)[0]
+
+
+def project_with_slopes(lens: Lens, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return pixels (N, 2), ∂pixel/∂point (N, 2, 3) [px/m] and ∂pixel/∂values (N, 2, k)."""
+    return _projected(lens, points, True)
+
+
+def _projected(lens: Lens, points: np.ndarray, slopes: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    depth = points[:, 2]
+    plane = points[:, :2] / depth[:, None]
+    bend = _fisheye if lens.model == "fisheye" else _brown_conrady
+    bent, across, by_value = bend(plane, lens.values[4:], slopes)
+    focal = lens.values[:2]
+    pixel = bent * focal + lens.values[2:4]
+    if not slopes:
+        return pixel, np.empty(0), np.empty(0)
+    by_point = np.empty((len(points), 2, 3))
+    by_point[:, :, :2] = across / depth[:, None, None]
+    by_point[:, :, 2] = -np.einsum("nij,nj->ni", across, plane) / depth[:, None]
+    result = np.zeros((len(points), 2, len(lens.values)))
+    result[:, 0, 0], result[:, 1, 1] = bent[:, 0], bent[:, 1]
+    result[:, 0, 2] = result[:, 1, 3] = 1.0
+    result[:, :, 4:] = by_value * focal[:, None]
+    return pixel, by_point * focal[:, None], result
+
+
+def _brown_conrady(plane: np.ndarray, k: np.ndarray, slopes: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return bent coordinates (N, 2), their derivative by the plain ones (N, 2, 2) and by k (N, 2, len(k))."""
+    a, b = plane[:, 0], plane[:, 1]
+    square = a * a + b * b
+    k1, k2, p1, p2, k3 = k[:5]
+    k4, k5, k6 = k[5:] if len(k) > 5 else (0.0, 0.0, 0.0)
+    above = 1.0 + square * (k1 + square * (k2 + square * k3))
+    below = 1.0 + square * (k4 + square * (k5 + square * k6))
+    scale = above / below
+    tangent = np.stack([2 * p1 * a * b + p2 * (square + 2 * a * a), p1 * (square + 2 * b * b) + 2 * p2 * a * b], axis=1)
+    bent = plane * scale[:, None] + tangent
+    if not slopes:
+        return bent, np.empty(0), np.empty(0)
+    steep = (k1 + square * (2 * k2 + 3 * k3 * square)) / below
+    steep -= scale * (k4 + square * (2 * k5 + 3 * k6 * square)) / below
+    across = np.empty((len(plane), 2, 2))
+    across[:, 0, 0] = scale + 2 * a * a * steep + 2 * p1 * b + 6 * p2 * a
+    across[:, 1, 1] = scale + 2 * b * b * steep + 6 * p1 * b + 2 * p2 * a
+    across[:, 0, 1] = across[:, 1, 0] = 2 * a * b * steep + 2 * p1 * a + 2 * p2 * b
+    columns = [square / below, square**2 / below, None, None, square**3 / below]
+    columns += [-scale * square**power / below for power in (1, 2, 3)][: len(k) - 5]
+    by_value = np.empty((len(plane), 2, len(k)))
+    for place, column in enumerate(columns):
+        if column is not None:
+            by_value[:, :, place] = plane * column[:, None]
+    by_value[:, :, 2] = np.stack([2 * a * b, square + 2 * b * b], axis=1)
+    by_value[:, :, 3] = np.stack([square + 2 * a * a, 2 * a * b], axis=1)
+    return bent, across, by_value
+
+
+def _fisheye(plane: np.ndarray, k: np.ndarray, slopes: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return as `_brown_conrady`."""
+    r = np.maximum(np.linalg.norm(plane, axis=1), 1e-12)
+    angle = np.arctan(r)
+    powers = angle[:, None] ** np.array([2, 4, 6, 8])
+    long = angle * (1.0 + powers @ k)
+    scale = long / r
+    bent = plane * scale[:, None]
+    if not slopes:
+        return bent, np.empty(0), np.empty(0)
+    steep = (1.0 + (powers * np.array([3, 5, 7, 9])) @ k) / (1.0 + r * r)  # d long / d r
+    unit = plane / r[:, None]
+    across = scale[:, None, None] * np.eye(2) + (steep - scale)[:, None, None] * unit[:, :, None] * unit[:, None, :]
+    return bent, across, unit[:, :, None] * (angle[:, None] * powers)[:, None, :]
+
+
+def rays(lens: Lens, pixels: np.ndarray) -> np.ndarray:
+    """Return X/Z and Y/Z (N, 2) of pixels (N, 2), by Newton's method; NaN where no ray leads there."""
+    wanted = (pixels - lens.values[2:4]) / lens.values[:2]
+    if lens.model == "fisheye":
+        long = np.linalg.norm(wanted, axis=1)
+        start = np.tan(np.clip(long, 0.0, 1.5)) / np.maximum(long, 1e-12)
+        plane = wanted * start[:, None]
+    else:
+        plane = wanted.copy()
+    bend = _fisheye if lens.model == "fisheye" else _brown_conrady
+    for _ in range(ITERATIONS):
+        bent, across, _ = bend(plane, lens.values[4:], True)
+        error = bent - wanted
+        determinant = across[:, 0, 0] * across[:, 1, 1] - across[:, 0, 1] * across[:, 1, 0]
+        determinant = np.where(np.abs(determinant) < 1e-9, np.nan, determinant)
+        step = np.stack(
+            [
+                across[:, 1, 1] * error[:, 0] - across[:, 0, 1] * error[:, 1],
+                across[:, 0, 0] * error[:, 1] - across[:, 1, 0] * error[:, 0],
+            ],
+            axis=1,
+        )
+        plane = plane - step / determinant[:, None]
+        if np.nanmax(np.abs(error), initial=0.0) < 1e-12:
+            break
+    return plane
+
+
+def in_sight(lens: Lens, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
+    """Say which points (N, 3) [m] fall into the image, `margin` [px] inside its edge: (N,) bool.
+
+    A point beyond the angle at which the distortion's polynomial turns back is out of sight, wherever it would fall.
+    """
+    ahead = points[:, 2] > 1e-6
+    safe = np.where(ahead[:, None], points, [0.0, 0.0, 1.0])
+    pixel, size = project(lens, safe), np.array(lens.size)
+    inside = np.all((pixel >= margin) & (pixel <= size - 1 - margin), axis=1)
+    plane = safe[:, :2] / safe[:, 2:]
+    back = rays(lens, np.where(inside[:, None], pixel, lens.values[2:4]))
+    return ahead & inside & (np.abs(back - plane).max(axis=1) < 1e-6 * (1.0 + np.abs(plane).max(axis=1)))

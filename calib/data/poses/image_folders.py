@@ -1,0 +1,242 @@
+"""A folder of images of a board beside the joint values: what a camera brings.
+
+==================  ===================================================================================================
+``*.png`` …         the images (png, jpg, tif, bmp, pgm, webp), as the sensor gave them
+``joints.csv``      ``image`` (the file's name), then the joints as in every measurement file: ``q1 [deg]`` …
+``board.toml``      the board (`calib board` writes it)
+``camera.yaml``     the lens as ROS ``camera_info``; without it, it is found from the images
+``corners.csv``     the corners found; written at the first reading, read instead of the images afterwards; remove it
+                    to have the images looked at again
+==================  ===================================================================================================
+
+One folder is one camera that sees one board. Whether the arm carries the camera or the board is found from the
+measurements, unless the options say so ([camera] mounting). A board of another size than ``board.toml`` says changes
+every length of the robot with it: measure the print.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from calib.data.camera import board as boards
+from calib.data.camera import camera_info, corner_file
+from calib.data.camera.board import Board
+from calib.data.camera.corner_file import Found
+from calib.data.camera.lens import Lens
+from calib.data.csv_table import Table, read_table
+from calib.data.poses import plausible
+from calib.data.poses.columns import find_joints
+from calib.data.poses.fit_options import FileOptions
+from calib.data.poses.pixels import Pixels
+from calib.data.poses.plausible import Limits
+from calib.errors import CalibError, MeasurementError
+
+JOINTS = "joints.csv"
+LOOKED_INTO = 3  # useless images that are looked into for the reason
+LEAST = 3  # usable images below which a folder is refused
+
+Progress = Callable[[int, int, str], None]
+
+
+def is_image_folder(path: Path) -> bool:
+    """Say whether a path is a folder of images (or of the corners found in them) beside joint values."""
+    return path.is_dir() and ((path / JOINTS).exists() or (path / boards.FILE).exists())
+
+
+def read_images(
+    path: str | Path,
+    joints: Sequence[str],
+    options: FileOptions | None = None,
+    *,
+    kinds: Sequence[str] | None = None,
+    limits: Limits | None = None,
+    progress: Progress | None = None,
+) -> Pixels:
+    """Read a folder of images for a robot with these joints.
+
+    Args:
+        path: of the folder.
+        joints, kinds, limits: as `calib.data.poses.pose_files.read_measurements`.
+        options: see there; [camera] is about images.
+        progress: called with (done, total, image).
+
+    Raises:
+        MeasurementError: where a file is missing or cannot be, or no three images are of use.
+    """
+    path, options = Path(path), options or FileOptions()
+    board = read_own_board(path)
+    table = _joint_table(path)
+    columns = find_joints(table, options, joints)
+    q = np.stack([table.numbers(name, "joint", options.units.get("joints", "")) for name in columns], axis=1)
+    notes = list(plausible.check_joints(q, table, columns, joints, options, kinds, limits))
+    found = find_corners(path, board, table.texts("image"), progress)
+    names = table.texts("image")
+    rows, said = _usable(names, found, path)
+    notes += said
+    lens, known = _own_lens(path, found.size, options)
+    detected = [found.images[names[row]] for row in rows]
+    return Pixels(
+        q[rows], columns, np.array([one.pixel for one in detected]), board, lens,
+        mounting=options.camera.mounting.replace("auto", ""), sigma=np.array([one.sigma for one in detected]),
+        names=tuple(names),
+        size=found.size if found.size[0] else (lens.size if lens else (0, 0)), known=known, free=_free(options, known),
+        model=options.camera.model, tool_names=(options.tool,), station=options.station or path.name, file=str(path),
+        rows=table.rows[rows], notes=tuple(notes),
+    )  # fmt: skip
+
+
+def read_own_board(path: Path) -> Board:
+    """Read the folder's ``board.toml``.
+
+    Raises:
+        MeasurementError: where there is none.
+    """
+    if not (path / boards.FILE).is_file():
+        raise MeasurementError(
+            f"has no {boards.FILE}, which says what board is seen: copy the one that calib board wrote into it", path
+        )
+    return boards.read_board(path)
+
+
+def _joint_table(path: Path) -> Table:
+    place = path / JOINTS
+    if not place.is_file():
+        raise MeasurementError(
+            f"has no {JOINTS}: a table of image, q1 [deg] ... is needed, one row per image with its joint values", path
+        )
+    table = read_table(place)
+    names = table.texts("image")
+    if twice := [name for name, count in Counter(names).items() if count > 1]:
+        raise MeasurementError(f"'{twice[0]}' stands there {names.count(twice[0])} times", place, column="image")
+    return table
+
+
+def find_corners(path: Path, board: Board, names: Sequence[str], progress: Progress | None = None) -> Found:
+    """Return the corners of a folder's images: from ``corners.csv`` where that is newer, else by looking at them.
+
+    Args:
+        path: of the folder.
+        board: to look for.
+        names: of the images.
+        progress: called with (done, total, image).
+    """
+    stored = path / corner_file.FILE
+    images = [path / name for name in names if (path / name).is_file()]
+    if stored.is_file():
+        newest = max((each.stat().st_mtime for each in (*images, path / boards.FILE)), default=0.0)
+        kept = corner_file.read_corners(stored, board)
+        if stored.stat().st_mtime >= newest and {each.name for each in images} <= set(kept.images):
+            return kept
+    if not images:
+        missing = f"'{names[0]}' and the others" if len(names) > 1 else f"'{names[0]}'" if names else "images"
+        raise MeasurementError(f"none of the images that {JOINTS} names is there ({missing})", path)
+    found = detected(((each.name, each) for each in images), board, len(images), progress)
+    with suppress(CalibError):  # a folder that cannot be written into is read all the same
+        corner_file.write_corners(stored, found)
+    return found
+
+
+def detected(
+    images: Iterable[tuple[str, Path | np.ndarray]], board: Board, count: int = 0, progress: Progress | None = None
+) -> Found:
+    """Look for a board in images, files or arrays, by name.
+
+    Images of another size than most are of no use: a camera's lens is that of one size.
+    """
+    from calib.data.camera.detection import Detection, detect
+    from calib.data.camera.images import read_image
+
+    result, sizes, useless = dict[str, Detection](), dict[str, tuple[int, int]](), 0
+    blank = np.full((len(boards.corners(board)), 2), np.nan)
+    for number, (name, each) in enumerate(images):
+        if progress:
+            progress(number, count, name)
+        try:
+            image = read_image(each) if isinstance(each, Path) else each
+        except MeasurementError as error:
+            result[name] = Detection(blank, blank[:, 0], str(error).removeprefix(f"{each}: "))
+            continue
+        sizes[name] = image.shape[1], image.shape[0]
+        result[name] = detect(image, board, thorough=useless < LOOKED_INTO)
+        useless += bool(result[name].problem)
+    if not sizes:
+        return Found(result)
+    usual = Counter(sizes.values()).most_common(1)[0][0]
+    for name, size in sizes.items():
+        if size != usual:
+            turned = "; was it turned by a program?" if size == usual[::-1] else ""
+            words = f"{size[0]} x {size[1]} pixels, where most are {usual[0]} x {usual[1]}{turned}"
+            result[name] = Detection(blank, blank[:, 0], words)
+    return Found(result, usual)
+
+
+def _usable(names: Sequence[str], found: Found, path: Path) -> tuple[np.ndarray, list[str]]:
+    """Return the rows (of the table) whose images are of use, and what is to be said of the others."""
+    missing = [name for name in names if name not in found.images]
+    problems = {name: found.images[name].problem for name in names if name in found.images}
+    rows = np.array([k for k, name in enumerate(names) if problems.get(name) == ""], dtype=int)
+    notes = []
+    if missing:
+        notes.append(f"{len(missing)} of {len(names)} rows have no image: {listed(missing)}")
+    if extra := sorted(set(found.images) - set(names)):
+        notes.append(f"{len(extra)} images have no row in {JOINTS}: {listed(extra)}")
+    notes += problem_words(problems)
+    if len(rows) < LEAST:
+        why = "; ".join(notes) or "there are no more rows"
+        raise MeasurementError(
+            f"{len(rows)} usable image{'s' if len(rows) != 1 else ''}: a calibration takes some 20 to 40 from all "
+            f"around, {LEAST} at the very least ({why})",
+            path,
+        )
+    return rows, notes
+
+
+def problem_words(problems: Mapping[str, str]) -> list[str]:
+    """Return why images are of no use, one sentence per reason, with their names."""
+    reasons: dict[str, list[str]] = {}
+    for name, problem in problems.items():
+        if problem:
+            reasons.setdefault(problem, []).append(name)
+    return [
+        f"{len(own)} image{'s are' if len(own) > 1 else ' is'} of no use ({reason}): {listed(own)}"
+        for reason, own in reasons.items()
+    ]
+
+
+def listed(names: Sequence[str], most: int = 5) -> str:
+    """Return names with commas between them, the first few."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def _own_lens(path: Path, size: tuple[int, int], options: FileOptions) -> tuple[Lens | None, bool]:
+    """Return the folder's lens and whether it was given; None where it is to be found from the images."""
+    place = path / camera_info.FILE
+    if not place.is_file():
+        if options.camera.intrinsics == "given":
+            raise MeasurementError(f"has no {camera_info.FILE}, which intrinsics = 'given' asks for", path)
+        return None, False
+    lens = camera_info.read_lens(place)
+    if size[0] and lens.size != size:
+        raise MeasurementError(
+            f"is about images of {lens.size[0]} x {lens.size[1]} pixels, those beside it have {size[0]} x {size[1]}",
+            place,
+        )
+    return lens, True
+
+
+def _free(options: FileOptions, known: bool) -> tuple[str, ...]:
+    """Return the names of what is fitted of lens and board, as the options say."""
+    camera, result = options.camera, list[str]()
+    if camera.intrinsics == "fit" or (camera.intrinsics == "auto" and not known):
+        own = {"pinhole": ("k1", "k2", "p1", "p2"), "fisheye": ("k1", "k2", "k3", "k4")}[camera.model]
+        result += ["fx", "fy", "cx", "cy", *own]
+    if "scale" in camera.board:
+        result.append("scale")
+    if "bend" in camera.board:
+        result += ["bend_xx", "bend_xy", "bend_yy"]
+    return tuple(result)

@@ -1,0 +1,74 @@
+"""Corners of a board in images: what a camera measures; one image is one row."""
+
+from __future__ import annotations
+
+from dataclasses import KW_ONLY, dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from calib.data.camera.board import Board
+from calib.data.camera.lens import Lens
+from calib.data.poses.measurements import PoseMeasurements
+
+IN_HAND, TO_HAND = "in hand", "to hand"
+
+
+@dataclass(frozen=True, eq=False)
+class Pixels(PoseMeasurements):
+    """Where the corners of one rigid board lie in the image.
+
+    The camera in the hand: the arm carries the camera (``tool``), ``station`` is the board's place. The camera to the
+    hand: the arm carries the board (``tool``), ``station`` is the camera's place.
+
+    Attributes:
+        pixel: (m, K, 2) corners of the board's table [px]; NaN where not seen.
+        board: the board.
+        lens: of the camera, where known beforehand or estimated from images.
+        mounting: ``in hand`` or ``to hand``; empty where it is yet to be found.
+        sigma: (m, K) standard deviation of a coordinate [px].
+        names: of all images of the file; ``rows`` count them from 1.
+        size: width and height of the images [px]; 0, 0 where unknown.
+        model: of a lens that is yet to be found.
+        known: whether the lens was given, and not found from these images.
+        free: what is fitted of the lens (``fx`` …) and of the board (``scale``, ``bend_xx`` …).
+    """
+
+    pixel: np.ndarray
+    board: Board
+    lens: Lens | None
+    _: KW_ONLY
+    mounting: str = ""
+    sigma: np.ndarray | None = None
+    names: tuple[str, ...] = ()
+    size: tuple[int, int] = (0, 0)
+    model: str = "pinhole"
+    known: bool = False
+    free: tuple[str, ...] = ()
+
+    kind: ClassVar[str] = "pixels"
+    has_instrument: ClassVar[bool] = True
+    per_row: ClassVar[tuple[str, ...]] = (*PoseMeasurements.per_row, "pixel", "sigma")
+
+    @property
+    def seen(self) -> np.ndarray:
+        """(m, K) which corners were seen."""
+        return ~np.isnan(self.pixel[:, :, 0])
+
+    @property
+    def measured(self) -> np.ndarray:
+        return np.nan_to_num(self.pixel.reshape(len(self), -1), nan=-1.0)
+
+    @property
+    def camera(self) -> str:
+        """The name of the camera among an installation's lenses: what carries it."""
+        return self.tool_names[0] if self.mounting == IN_HAND else self.station
+
+    @property
+    def target(self) -> str:
+        """The name of the board among an installation's boards."""
+        return self.station if self.mounting == IN_HAND else self.tool_names[0]
+
+    def name(self, row: int) -> str:
+        """Return the name of the image whose number in the file is `row`."""
+        return self.names[row - 1] if 0 < row <= len(self.names) else f"image {row}"

@@ -1,0 +1,173 @@
+"""What images do not say of themselves: the lens, whether the arm carries camera or board, and their first placement.
+
+Every image gives the board's pose by its corners alone (`calib.data.camera.board_pose`); the arm's poses beside them
+place camera and board in closed form (`calib.geometry.hand_eye`). Both ways of mounting are tried.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from calib.data.camera.board_pose import board_poses
+from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.pixels import IN_HAND, TO_HAND, Pixels
+from calib.errors import MeasurementError
+from calib.geometry.hand_eye import Placement, place_robustly
+from calib.robot.chain import Chain
+from calib.robot.kinematics import forward
+from calib.transforms import invert
+
+FEWEST = 3  # images that place a camera at all
+ENOUGH = 100  # images that it is placed by (our choice, as the next ones)
+UNLIKE = 3.0  # a mounting is found where the other one's misfit is so many times as large
+PAIRED = 0.25  # of the misfit is left with the rows shifted: they were
+SQUARE = 0.04  # relative error of the board's scale that is refused
+LOST = 0.2  # median misfit over the distance to the board beyond which nothing is placed
+
+
+@dataclass(frozen=True, eq=False)
+class CameraPlacement:
+    """What a block of images tells of camera and board by itself.
+
+    Attributes:
+        rows: (k,) the rows that were looked at.
+        poses: (k, 4, 4) of the board in the camera's frame, by PnP.
+        mounting: ``in hand`` or ``to hand``.
+        placed: station and tool.
+    """
+
+    rows: np.ndarray
+    poses: np.ndarray
+    mounting: str
+    placed: Placement
+
+
+def complete_camera(chain: Chain, block: Pixels, others: Sequence[PoseMeasurements] = ()) -> Pixels:
+    """Return a block of images with lens and mounting, and refuse one that cannot be this arm's.
+
+    Args:
+        chain: the nominal arm.
+        block: of images.
+        others: blocks fitted already; the lens of one with images of this size is taken over.
+
+    Raises:
+        MeasurementError: where images and joints do not belong together, or the board is not of the stated size.
+    """
+    for other in others:
+        if block.lens is None and isinstance(other, Pixels) and other.size == block.size and other.lens is not None:
+            block = replace(block, lens=other.lens, mounting=block.mounting or other.mounting, free=())
+    if block.lens is None:
+        from calib.data.camera.intrinsics import estimate_lens
+
+        if not block.size[0]:
+            raise MeasurementError("neither the images' size nor a lens (camera.yaml) is known", block.file)
+        guess = estimate_lens(block.board, block.pixel, block.size, block.model, block.file)
+        block = replace(block, lens=guess.lens)
+    arm = forward(chain, block.q)
+    found = place_camera(block, arm)
+    _check_square(block, arm[found.rows], found)
+    return replace(block, mounting=found.mounting)
+
+
+def seen_target(mounting: str, poses: np.ndarray) -> np.ndarray:
+    """Return poses of what the arm carries, in the frame of what stands: of board poses (m, 4, 4) in the camera."""
+    return invert(poses) if mounting == IN_HAND else poses
+
+
+def place_camera(block: Pixels, arm: np.ndarray) -> CameraPlacement:
+    """Place the camera and the board of a block of images, in whichever mounting explains them.
+
+    Args:
+        block: with its lens.
+        arm: (m, 4, 4) poses of the tip in the base.
+
+    Raises:
+        MeasurementError: where images and joints do not belong together.
+    """
+    assert block.lens is not None
+    rows = np.unique(np.linspace(0, len(block) - 1, ENOUGH).astype(int))
+    found = board_poses(block.lens, block.board, block.pixel[rows])
+    good = np.flatnonzero(np.isfinite(found.rms))
+    if len(good) < FEWEST:
+        raise MeasurementError(
+            f"{len(good)} images with a board place no camera: {FEWEST} at least, from different sides; a calibration "
+            "takes some 20 to 40",
+            block.file,
+        )
+    rows, poses = rows[good], found.poses[good]
+    lever = float(np.median(np.linalg.norm(poses[:, :3, 3], axis=1)))
+    choices = [block.mounting] if block.mounting else [IN_HAND, TO_HAND]
+    tried = {each: place_robustly(arm[rows], seen_target(each, poses), lever) for each in choices}
+    mounting = min(tried, key=lambda each: tried[each].error)
+    _check_pairing(block, arm[rows], poses, choices, tried[mounting], lever)
+    if len(tried) == 2:
+        one, other = sorted(each.error for each in tried.values())
+        if other < UNLIKE * one:
+            raise MeasurementError(
+                f"whether the arm carries the camera or the board cannot be told ({1e3 * one:.1f} against "
+                f"{1e3 * other:.1f} mm): say so in the options, [camera] mounting = 'in hand' or 'to hand'",
+                block.file,
+            )
+    return CameraPlacement(rows, poses, mounting, tried[mounting])
+
+
+def _check_pairing(
+    block: Pixels, arm: np.ndarray, poses: np.ndarray, mountings: Sequence[str], placed: Placement, lever: float
+) -> None:
+    """Refuse images that belong to other rows of joints, or to none."""
+    if placed.error <= 0.01 * lever or len(arm) < 6:
+        return
+    for shift, mounting in product((-1, 1, -2, 2), mountings):
+        seen = seen_target(mounting, poses)
+        own = slice(max(shift, 0), len(arm) + min(shift, 0)), slice(max(-shift, 0), len(arm) + min(-shift, 0))
+        again = place_robustly(arm[own[0]], seen[own[1]], lever)
+        if again.error < PAIRED * placed.error:
+            rows = f"{abs(shift)} row{'s' if abs(shift) > 1 else ''}"
+            raise MeasurementError(
+                f"images and joint values are shifted by {rows}: as they stand the board is off by "
+                f"{1e3 * placed.error:.0f} mm in the median, with each image beside the joints {rows} "
+                f"{'further down' if shift > 0 else 'further up'} by {1e3 * again.error:.1f} mm; correct the column "
+                "'image'",
+                block.file,
+            )
+    if placed.error > LOST * lever:
+        raise MeasurementError(
+            f"images and joint values do not belong together: wherever camera and board are placed, the board is off "
+            f"by {1e3 * placed.error:.0f} mm in the median. Were the joints logged at these images, in this order and "
+            "unit, on this robot? Did the board (or the camera) stay where it was?",
+            block.file,
+        )
+
+
+def _check_square(block: Pixels, arm: np.ndarray, found: CameraPlacement) -> None:
+    """Refuse a board of another size than stated: the arm's motion tells the size of a square to a few per cent.
+
+    Of B_i = S A_i X with the board's lengths times λ, for fixed rotations, the translations are linear in λ.
+    """
+    placed, count = found.placed, len(arm)
+    turn, seen = placed.station[:3, :3], seen_target(found.mounting, found.poses)
+    if count < 6:
+        return
+    rows = np.zeros((count, 3, 7))
+    rows[:, :, 0] = -seen[:, :3, 3]
+    rows[:, :, 1:4] = turn @ arm[:, :3, :3]
+    rows[:, :, 4:] = np.eye(3)
+    target = -(arm[:, :3, 3] @ turn.T)
+    keep = placed.misfit <= np.quantile(placed.misfit, 0.8)
+    matrix, wanted = rows[keep].reshape(-1, 7), target[keep].ravel()
+    solution, _, rank, _ = np.linalg.lstsq(matrix, wanted, rcond=1e-6)
+    spare = max(len(wanted) - 7, 1)
+    noise = float(np.linalg.norm(matrix @ solution - wanted)) / np.sqrt(spare)
+    sigma = noise * float(np.sqrt(np.linalg.pinv(matrix.T @ matrix)[0, 0]))
+    factor = float(solution[0])
+    if rank == 7 and abs(factor - 1.0) > max(SQUARE, 6.0 * sigma) and sigma < 0.1:
+        stated = 1e3 * block.board.square
+        raise MeasurementError(
+            f"the robot's motion says that a square of the board is {stated * factor:.2f} mm (±{stated * sigma:.2f}), "
+            f"board.toml says {stated:.2f}: measure the print and put its size in (was it printed at 100 %?)",
+            block.file,
+        )

@@ -1,0 +1,214 @@
+"""What an image says of the geometry: the corners of one rigid board, as one pose and a table.
+
+    r = y - π(P c + p),   ∂π/∂x = ∂π/∂point · (ω × R c + v) + ∂π/∂lens + ∂π/∂point · R ∂c/∂shape
+
+with (R, p) the board in the camera's frame. All corners of an image share the six numbers [v; ω]: a QR of its own
+2K x (6 + k + 1) matrix leaves 6 + k + 1 rows of the least-squares problem, the same problem (Golub & Van Loan 2013,
+sec. 5.3), so that thousands of images take the memory of thousands of poses.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.data.camera.board import corners
+from calib.data.camera.lens import project_with_slopes
+from calib.data.poses.pixels import IN_HAND, Pixels
+from calib.errors import MeasurementError, UsageError
+from calib.geometry.image_noise import ImageNoise, OwnPoses
+from calib.geometry.installation import Installation, Seen
+from calib.geometry.optics import View, shape_slopes
+from calib.geometry.parameters import layout_counts
+from calib.geometry.residuals import Part, parts
+
+CHUNK = 500  # images reduced at once
+STEEPEST = {"pinhole": 2.0, "fisheye": 10.0}  # tangent of the angle off the axis beyond which a corner is taken at it
+
+
+@dataclass(frozen=True, eq=False)
+class PixelPart(Part):
+    """Residuals of corners, ordered by image; ``jacobian`` is that of what the corners of an image share.
+
+    Attributes:
+        value, sigma: (2, N) [px].
+        jacobian: (f, 6 + k, m) of the board's twist [v; ω] in the camera's axes, and of lens and board.
+        index: (N,) image of each corner.
+        local: (N, 2, 6 + k) derivative of the corner by those.
+        corner: (N,) its number in the board's table.
+        depth: (N,) pixels per metre there, across the line of sight.
+        carried: (m, 6, 6) the board's twist per twist [v; ω] of what the arm carries, both in the camera's axes.
+        noise: of corners and images, as `fill` whitens by; None for that of the scale alone.
+    """
+
+    local: np.ndarray
+    corner: np.ndarray
+    depth: np.ndarray
+    carried: np.ndarray
+    noise: ImageNoise | None = None
+
+    @property
+    def height(self) -> int:
+        return len(np.unique(self.index)) * (self.local.shape[2] + 1)
+
+    @property
+    def per_length(self) -> np.ndarray | float:
+        return self.depth
+
+    def sizes(self) -> np.ndarray:
+        square = np.sum((self.value / self.depth) ** 2, axis=0)
+        count = np.bincount(self.index)
+        return np.sqrt(np.bincount(self.index, square)[count > 0] / count[count > 0])
+
+    def per_row(self) -> Part:
+        images, place, count = np.unique(self.index, return_inverse=True, return_counts=True)
+        mean = np.array([np.bincount(place, axis / self.depth) / count for axis in self.value])
+        return Part("position", mean, self.jacobian[:, :0], None, 0, images)
+
+    def row_weights(self, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        images, place, count = np.unique(self.index, return_inverse=True, return_counts=True)
+        mean = np.bincount(place, weight) / count
+        return images, mean if self.noise is None else mean * self.noise.weight[images]
+
+    def dense(self) -> np.ndarray:
+        """Return the derivative of every corner (f, 2, N)."""
+        return np.einsum("ncl,fln->fcn", self.local, self.jacobian[:, :, self.index])
+
+    def fill(self, residual: np.ndarray, matrix: np.ndarray, scale: np.ndarray) -> None:
+        scale = np.broadcast_to(scale, self.value.shape)
+        images, first = np.unique(self.index, return_index=True)
+        edges = np.append(first, len(self.index))
+        width = self.local.shape[2] + 1
+        for start in range(0, len(images), CHUNK):
+            own = slice(start, min(start + CHUNK, len(images)))
+            rows = slice(edges[own.start], edges[own.stop])
+            small = _triangles(
+                np.concatenate([self.local[rows], self.value.T[rows, :, None]], axis=2) / scale.T[rows, :, None],
+                np.diff(edges[own.start : own.stop + 1]),
+            )
+            place = slice(own.start * width, own.stop * width)
+            if self.noise is not None:
+                small = self._whitened_images(small, images[own])
+            residual[place] = small[:, :, -1].ravel()
+            shared = self.jacobian[:, :, images[own]].transpose(2, 1, 0)
+            matrix[:, place] = (small[:, :, :-1] @ shared).reshape(-1, len(self.jacobian)).T
+
+    def _whitened_images(self, small: np.ndarray, images: np.ndarray) -> np.ndarray:
+        """Return the images' triangles whitened by what is common to an image's corners, and weighed."""
+        assert self.noise is not None
+        common = small[:, :, :6] @ self.carried[images] * self.noise.deviations
+        factor = np.linalg.cholesky(np.eye(small.shape[1]) + common @ common.transpose(0, 2, 1))
+        return np.linalg.solve(factor, small) * np.sqrt(self.noise.weight[images])[:, None, None]
+
+    def own_poses(self, scale: np.ndarray) -> OwnPoses:
+        """Return what the images say with a pose of their own each, at sigmas `scale` (2, N)."""
+        images, first = np.unique(self.index, return_index=True)
+        counts = np.diff(np.append(first, len(self.index)))
+        table = np.concatenate([self.local[:, :, :6], self.value.T[:, :, None]], axis=2) / scale.T[:, :, None]
+        small = _triangles(table, counts)
+        system = small[:, :6, :6] @ self.carried[images]
+        information = system.transpose(0, 2, 1) @ system
+        gradient = np.einsum("kji,kj->ki", system, small[:, :6, 6])
+        residual = np.einsum("kij,kj->ki", np.linalg.pinv(information, hermitian=True), gradient)
+        return OwnPoses(residual, information, small[:, 6, 6] ** 2, np.maximum(2 * counts - 6, 0))
+
+    def spread_over(self, noise: ImageNoise) -> ImageNoise:
+        """Return the noise with one weight per measured row, of weights per image with corners."""
+        weight = np.ones(self.jacobian.shape[2])
+        weight[np.unique(self.index)] = noise.weight
+        return replace(noise, weight=weight)
+
+    def within(self, scale: np.ndarray) -> np.ndarray:
+        """Return the corners' residuals (2, N) [px] that their image's own best pose leaves."""
+        images, place = np.unique(self.index, return_inverse=True)
+        found = self.own_poses(scale)
+        moved = np.einsum("kij,kj->ki", self.carried[images], found.residual)
+        return self.value - np.einsum("ncl,nl->cn", self.local[:, :, :6], moved[place])
+
+
+def _triangles(table: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Return R (images, w, w) of the QR of each image's rows; table (N, 2, w) holds those of `counts` corners each."""
+    width = table.shape[2]
+    most = max(int(counts.max(initial=0)), (width + 1) // 2)
+    padded = np.zeros((len(counts), most, 2, width))
+    image = np.repeat(np.arange(len(counts)), counts)
+    padded[image, np.arange(len(table)) - np.repeat(np.cumsum(counts) - counts, counts)] = table
+    return np.asarray(np.linalg.qr(padded.reshape(len(counts), 2 * most, width), mode="r"))
+
+
+def view_of(cell: Installation, measured: Pixels, free: np.ndarray) -> View:
+    """Return the lens and the board that images are predicted with, and which of their values are free."""
+    if measured.camera not in cell.optics.lens_names or measured.target not in cell.optics.board_names:
+        raise UsageError(
+            f"{measured.file}: camera '{measured.camera}' with board '{measured.target}' is not part of the "
+            f"installation, which has {', '.join(cell.optics.lens_names) or 'no camera'}"
+        )
+    start = sum(layout_counts(cell)[:-1])
+    wanted = start + cell.optics.place(measured.camera, measured.target)
+    where = {int(k): place for place, k in enumerate(free)}
+    own = np.array([place for place, k in enumerate(wanted) if int(k) in where], dtype=int)
+    return View(
+        cell.optics.lenses[cell.optics.lens_names.index(measured.camera)],
+        cell.optics.boards[cell.optics.board_names.index(measured.target)],
+        own,
+        np.array([where[int(wanted[k])] for k in own], dtype=int),
+    )
+
+
+@parts.register
+def _pixels(measured: Pixels, seen: Seen, jacobian: np.ndarray) -> list[Part]:
+    """r = y - π(point), see the module."""
+    if seen.view is None:
+        raise MeasurementError("no camera is known for these images", measured.file)
+    view, in_hand = seen.view, measured.mounting == IN_HAND
+    image, corner = np.nonzero(measured.seen)
+    place, bend = shape_slopes(measured.board, view.shape, corners(measured.board))
+    turn = np.moveaxis(seen.rotation, 0, -1).transpose(1, 0, 2)  # (m, 3, 3), columns are the target's axes
+    origin = seen.point.T
+    if in_hand:  # the target is the camera, in the board's frame
+        turn = turn.transpose(0, 2, 1)
+        origin = -np.einsum("mij,mj->mi", turn, origin)
+    turned = np.einsum("nij,nj->ni", turn[image], place[corner])
+    point = turned + origin[image]
+    aside = np.maximum(np.linalg.norm(point[:, :2], axis=1), 1e-3)
+    point[:, 2] = np.maximum(point[:, 2], aside / STEEPEST[view.lens.model])  # of a wild guess, behind the camera
+    pixel, by_point, by_lens = project_with_slopes(view.lens, point)
+    local = np.empty((len(image), 2, 6 + len(view.own)))
+    local[:, :, :3] = by_point
+    local[:, :, 3:6] = np.cross(turned[:, None, :], by_point)  # g · (ω × c) = (c × g) · ω
+    if len(view.own):
+        by_shape = by_point @ np.einsum("nij,njs->nis", turn[image], bend[corner])
+        local[:, :, 6:] = np.concatenate([by_lens, by_shape], axis=2)[:, :, view.own]
+    shared = np.zeros((len(jacobian), 6 + len(view.own), len(measured)))
+    shared[:, :6] = _twist_of_board(jacobian, turn, origin) if in_hand else jacobian
+    shared[view.place, 6 + np.arange(len(view.own))] = 1.0
+    value = (measured.pixel[image, corner] - pixel).T
+    sigma = None if measured.sigma is None else np.broadcast_to(measured.sigma[image, corner], value.shape)
+    depth = np.sqrt(np.abs(np.prod(view.lens.values[:2]))) / point[:, 2]
+    carried = np.tile(np.eye(6), (len(measured), 1, 1))
+    if in_hand:  # ω × (o - c): the camera turns about itself, and the board's origin swings
+        carried[:, :3, 3:] = -_cross_matrix(origin)
+    return [PixelPart("pixel", value, shared, sigma, 0, image, local, corner, depth, carried)]
+
+
+def _cross_matrix(vectors: np.ndarray) -> np.ndarray:
+    """Return [v]× (m, 3, 3) of vectors (m, 3)."""
+    x, y, z = vectors.T
+    zero = np.zeros(len(vectors))
+    return np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
+
+
+def _twist_of_board(jacobian: np.ndarray, turn: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """Return [v; ω] of the board in the camera's axes (f, 6, m) from those of the camera in the board's.
+
+    With the board at (R, o) in the camera's frame, ω' = -R ω and o' = -R v + ω' × o.
+
+    Args:
+        jacobian: (f, 6, m) of the camera, in the board's axes.
+        turn: (m, 3, 3) R.
+        origin: (m, 3) o [m].
+    """
+    omega = -np.einsum("mij,fjm->fim", turn, jacobian[:, 3:])
+    velocity = -np.einsum("mij,fjm->fim", turn, jacobian[:, :3])
+    return np.concatenate([velocity + np.cross(omega, origin.T[None], axis=1), omega], axis=1)

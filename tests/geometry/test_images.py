@@ -1,0 +1,268 @@
+"""Claims of corners in images: exact derivatives, an exact reduction, recovery of what was planted, honest sigmas."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from differences import check
+from planted import perturb
+from scipy.spatial.transform import Rotation
+
+from calib.data.camera.board_pose import board_poses
+from calib.data.camera.lens import Lens
+from calib.data.poses.measurements import Positions, take
+from calib.data.poses.pixels import IN_HAND, TO_HAND, Pixels
+from calib.errors import MeasurementError
+from calib.geometry.camera_guess import complete_camera
+from calib.geometry.first_guess import install
+from calib.geometry.fit import fit, placed_on
+from calib.geometry.hand_eye import place_robustly
+from calib.geometry.installation import see
+from calib.geometry.observation import observe, prepare
+from calib.geometry.optics import BoardShape
+from calib.geometry.parameters import layout, step
+from calib.geometry.result import outliers
+from calib.geometry.weighing import Settings
+from calib.robot.deflection import Deflection
+from calib.robot.load import load
+from calib.simulation.cells import camera_cell as camera
+from calib.simulation.cells.cell import Cell, SimulatedInstrument, measure
+from calib.simulation.cells.truth import position_errors
+from calib.simulation.cells.virtual_cells import rigid, virtual_cell
+from calib.transforms import pose
+
+FISHEYE = Lens("fisheye", np.array([900.0, 905.0, 1220.0, 1010.0, 0.05, -0.02, 0.01, 0.003]), (2448, 2048))
+NONE = np.array([], dtype=int)
+
+
+@cache
+def study(mounting: str = IN_HAND, count: int = 40, seed: int = 0, encoder: float = 1e-5) -> tuple:
+    """Return a rigid LWR4+ with a camera, and the corners of `count` images, lens and mounting not told."""
+    instrument = SimulatedInstrument(encoder_sigma=encoder)
+    cell = camera.camera_cell(rigid(virtual_cell("lwr4plus", instrument=instrument)), mounting, reach_of_arm=0.75)
+    return cell, camera.photograph(cell, camera.views(cell, count, seed), 0.05, seed)
+
+
+def started(cell, block):
+    block = complete_camera(cell.cell.nominal, block)
+    start = install(cell.cell.nominal, [block])
+    table = layout(start)
+    return block, start, np.concatenate([table.arm_index, table.frame_index])
+
+
+@pytest.mark.parametrize("mounting", [IN_HAND, TO_HAND])
+@pytest.mark.parametrize("lens", [camera.FIVE_MEGAPIXEL, FISHEYE], ids=["pinhole", "fisheye"])
+def test_the_residuals_slope_is_minus_the_jacobian(mounting, lens):
+    """Arm, both placements, every value of the lens, scale and bending; some corners unseen; away from the truth."""
+    cell = camera.camera_cell(
+        Cell(load("ur5"), replace(virtual_cell("ur5").truth, deflection=Deflection())),
+        mounting,
+        lens=lens,
+        shape=BoardShape(1.01, 0.1, -0.2, 0.3),
+    )
+    block = camera.photograph(cell, camera.views(cell, 4, 1), 0.5, 0)
+    pixel = block.pixel.copy()
+    pixel[1, 5:20] = np.nan
+    block = replace(block, pixel=pixel, mounting=mounting, lens=lens)
+    away = replace(cell.cell.truth, chain=perturb(cell.cell.truth.chain, 3))
+    ready = prepare(away, [block])[0]
+    free = np.random.default_rng(0).permutation(len(layout(away).names))
+    part = observe(away, ready, free)[0]
+    dense = part.dense()
+    check(
+        lambda x: observe(step(away, free, x), ready, NONE)[0].value / 1e3,
+        -dense.transpose(1, 2, 0) / 1e3, np.zeros(len(free)), step=1e-6, tolerance=1e-6,
+    )  # fmt: skip
+    residual, matrix = part.whitened(part.sigma)
+    whole = (dense / part.sigma).reshape(len(free), -1).T
+    values = (part.value / part.sigma).ravel()
+    assert len(residual) < len(values)  # the same least-squares problem in fewer rows
+    assert np.abs(matrix.T @ matrix - whole.T @ whole).max() < 1e-12 * np.abs(whole.T @ whole).max()
+    assert np.abs(matrix.T @ residual - whole.T @ values).max() < 1e-9 * np.abs(whole.T @ values).max()
+    assert residual @ residual == pytest.approx(values @ values, rel=1e-12)
+
+
+def test_whitening_by_what_an_image_shares_is_that_of_the_full_covariance():
+    """Rᵀ R of the reduced rows equals Jᵀ (f² σ² I + G S Gᵀ)⁻¹ J over all corners of an image."""
+    cell, block = study(count=6)
+    block, start, candidates = started(cell, block)
+    found = fit(start, [block], candidates[-20:])  # frames and lens
+    piece = found.pieces[0]
+    part, noise = piece.part, piece.part.noise
+    matrix = part.whitened(piece.sigma)[1]
+    total = np.zeros((len(found.free),) * 2)
+    for image in range(6):
+        own = part.index == image
+        local = part.local[own].reshape(-1, part.local.shape[2])
+        slope = local @ part.jacobian[:, :, image].T
+        shared = local[:, :6] @ part.carried[image] * noise.deviations
+        sigma = piece.sigma.T[own].reshape(-1)
+        total += slope.T @ np.linalg.solve(np.diag(sigma**2) + shared @ shared.T, slope)
+    assert np.abs(matrix.T @ matrix - total).max() < 1e-8 * np.abs(total).max()
+
+
+@pytest.mark.parametrize("mounting", [IN_HAND, TO_HAND])
+def test_the_arm_is_recovered_with_lens_and_mounting_found(mounting):
+    cell, block = study(mounting)
+    block, start, candidates = started(cell, block)
+    assert block.mounting == mounting
+    assert block.lens.values[:2] == pytest.approx(cell.lens.values[:2], rel=2e-3)
+    found = fit(start, [block], candidates)
+    before, after, _ = position_errors(cell.cell, found.cell, found.cell.chain)
+    assert before > 3.0 and after < 0.05
+    assert found.estimate.residual_std == pytest.approx(1.0, abs=0.05)
+    lens = found.cell.optics.lenses[0]
+    names = [f"{block.camera}.{name}" for name in ("fx", "fy", "cx", "cy")]
+    sigma = dict(zip(found.estimate.names, found.estimate.sigma))
+    off = (lens.values - cell.lens.values)[:4] / [sigma[name] for name in names]
+    assert np.abs(off).max() < 4.0
+
+
+def test_a_lens_that_was_given_stays():
+    cell, block = study()
+    block, start, candidates = started(cell, replace(block, lens=cell.lens, known=True, free=()))
+    found = fit(start, [block], candidates)
+    assert np.array_equal(found.cell.optics.lenses[0].values, cell.lens.values)
+    assert found.estimate.names[-1].endswith(".rz")
+
+
+def test_a_print_of_another_size_is_measured_beside_another_instrument():
+    """Board scale and bending are fitted where tracker points tell the scale; pixels and points in one fit."""
+    plain, _ = study()
+    shape = BoardShape(1.002, 0.05, 0.0, -0.04)
+    cell = camera.camera_cell(plain.cell, IN_HAND, shape=shape, reach_of_arm=0.75)
+    q = camera.views(cell, 40, 3)
+    free = ("scale", "bend_xx", "bend_xy", "bend_yy")
+    block = replace(camera.photograph(cell, q, 0.05, 3), lens=cell.lens, known=True, free=free)
+    points = measure(virtual_cell_points(cell), camera.views(cell, 40, 4), 5)
+    block = complete_camera(cell.cell.nominal, block)
+    start = install(cell.cell.nominal, [block, points])
+    table = layout(start)
+    found = fit(start, [block, points], np.concatenate([table.arm_index, table.frame_index]))
+    values = dict(zip(found.estimate.names, zip(found.estimate.values, found.estimate.sigma)))
+    for name, true in zip(("scale", "bend_xx", "bend_xy", "bend_yy"), shape.values):
+        value, sigma = values[f"{block.target}.{name}"]
+        assert abs(value - true) < 4.0 * sigma
+        assert sigma < (2e-4 if name == "scale" else 5e-3)
+
+
+def virtual_cell_points(cell) -> Cell:
+    """Return the same arm with a tracker that sees a reflector."""
+    truth = replace(
+        cell.cell.truth, stations=pose(Rotation.from_euler("z", 1.0), [2.0, 1.0, 0.5])[None],
+        station_names=("tracker",),
+        tools=pose(None, [0.05, 0.0, 0.1])[None], tool_names=("reflector",),
+    )  # fmt: skip
+    return Cell(cell.cell.nominal, truth, SimulatedInstrument("tracker", 20e-6, None))
+
+
+def test_two_cameras_see_one_board():
+    cell, one = study()
+    two_cell = camera.camera_cell(cell.cell, TO_HAND, lens=FISHEYE, reach_of_arm=0.75)
+    two = replace(
+        camera.photograph(two_cell, camera.views(two_cell, 25, 7), 0.05, 7), station="other camera", model="fisheye"
+    )
+    blocks = [complete_camera(cell.cell.nominal, each) for each in (one, replace(two, tool_names=("other board",)))]
+    start = install(cell.cell.nominal, blocks)
+    assert start.optics.lens_names == ("camera", "other camera")
+    table = layout(start)
+    found = fit(start, blocks, np.concatenate([table.arm_index, table.frame_index]))
+    assert position_errors(cell.cell, placed_like(found.cell), found.cell.chain)[2] < 0.03
+
+
+def placed_like(cell):
+    return replace(cell, stations=cell.stations[:1], tools=cell.tools[:1])
+
+
+def test_what_an_arm_does_not_repeat_is_told_from_what_a_corner_does_not():
+    """Encoders of 0.1 mrad before corners of 0.05 px: the fit finds both, and its sigmas are those of the arm."""
+    cell, block = study(count=60, encoder=1e-4)
+    block, start, candidates = started(cell, block)
+    found = fit(start, [block], candidates)
+    noise = found.pieces[0].part.noise
+    assert noise.factor == pytest.approx(1.0, abs=0.1)
+    assert noise.turn == pytest.approx(1e-4 * np.sqrt(7 / 3), rel=0.5)
+    assert found.estimate.residual_std == pytest.approx(1.0, abs=0.1)
+
+
+def test_bad_corners_and_images_are_named_and_do_little_harm():
+    cell, block = study()
+    pixel = block.pixel.copy()
+    pixel[3, 10] += [6.0, -4.0]
+    pixel[17] += 40.0
+    block, start, candidates = started(cell, replace(block, pixel=pixel, lens=cell.lens))
+    found = fit(start, [block], candidates, settings=Settings(loss="cauchy"))
+    named = [row for _, row, label, _ in outliers(found, 8.0) if label == "position"]
+    assert named[0] == 18
+    weight = found.pieces[0].weight
+    part = found.pieces[0].part
+    assert weight[(part.index == 3) & (part.corner == 10)] < 0.05
+    assert np.median(weight[part.index == 3]) > 0.5
+    assert position_errors(cell.cell, found.cell, found.cell.chain)[1] < 0.08
+
+
+def test_rows_shifted_by_one_are_said_to_be():
+    cell, block = study()
+    shifted = replace(take(block, np.arange(1, 40)), q=block.q[:-1])
+    with pytest.raises(MeasurementError, match=r"shifted by 1 row: .* further down"):
+        complete_camera(cell.cell.nominal, shifted)
+    mixed = replace(block, q=block.q[np.random.default_rng(0).permutation(40)])
+    with pytest.raises(MeasurementError, match="do not belong together"):
+        complete_camera(cell.cell.nominal, mixed)
+
+
+def test_a_board_of_another_square_is_refused_with_its_size():
+    cell, block = study()
+    wrong = replace(block, board=replace(block.board, square=0.025, marker=0.0175))
+    with pytest.raises(MeasurementError, match=r"square of the board is (29\.\d|30\.\d).* board.toml says 25.00"):
+        complete_camera(cell.cell.nominal, wrong)
+
+
+def test_images_from_one_direction_do_not_tell_the_focal_length():
+    cell, _ = study()
+    q = camera.views(cell, 12, 0, camera.Views((0.35, 0.4), 0.01))
+    with pytest.raises(MeasurementError, match=r"focal length is told to .* tilt it"):
+        complete_camera(cell.cell.nominal, camera.photograph(cell, q, 0.05, 0))
+    with pytest.raises(MeasurementError, match="1 images with a board: a lens takes 4"):
+        complete_camera(cell.cell.nominal, take(study()[1], [0]))
+
+
+def test_a_flat_board_has_one_pose_even_from_afar():
+    """Both poses that a distant plane may have are tried."""
+    cell, _ = study(TO_HAND)
+    q = camera.views(cell, 60, 5, camera.Views((0.6, 0.6), 0.5))
+    block = camera.photograph(cell, q, 0.1, 5)
+    found = board_poses(cell.lens, cell.board, block.pixel)
+    true = camera.board_poses(cell, q)
+    angle = Rotation.from_matrix(found.poses[:, :3, :3] @ true[:, :3, :3].transpose(0, 2, 1)).magnitude()
+    assert angle.max() < 0.02 and np.nanmax(found.rms) < 0.13
+    assert np.abs(found.poses[:, :2, 3] - true[:, :2, 3]).max() < 1e-3
+
+
+@pytest.mark.parametrize("method", ["Shah", "Li", "Park-Martin"])
+def test_every_closed_form_places_exact_poses(method, monkeypatch):
+    from calib.geometry import hand_eye
+
+    rng = np.random.default_rng(1)
+    arm, station, tool = (pose(Rotation.random(n, rng=rng), rng.normal(size=(n, 3))) for n in (12, 1, 1))
+    seen = station[0] @ arm @ tool[0]
+    only = {"Shah": hand_eye.place_pose, "Li": hand_eye._li, "Park-Martin": hand_eye._park_martin}[method]
+    one, two = only(arm, seen)
+    assert one == pytest.approx(station[0], abs=1e-9) and two == pytest.approx(tool[0], abs=1e-9)
+    assert place_robustly(arm, seen, 1.0).error < 1e-9
+
+
+def test_frames_of_unseen_images_are_placed_with_the_lens_of_the_fit():
+    cell, block = study()
+    block, start, candidates = started(cell, block)
+    found = fit(start, [block], candidates)
+    later = camera.photograph(cell, camera.views(cell, 15, 8), 0.05, 8)
+    later = complete_camera(cell.cell.nominal, later, [block])
+    assert later.lens is block.lens and not later.free
+    again = placed_on(found.cell, replace(later, station="moved"), None, Settings())
+    assert np.array_equal(again.optics.lenses[0].values, found.cell.optics.lenses[0].values)
+    assert see(again, later.q).point == pytest.approx(see(found.cell, later.q).point, abs=1e-4)
+    assert isinstance(later, Pixels) and not isinstance(later, Positions)
