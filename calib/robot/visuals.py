@@ -1,4 +1,8 @@
-"""The meshes a URDF draws its links with, where their files can be found."""
+"""The meshes a URDF draws its links with, where their files can be found.
+
+Read from our own parsed XML, not by yourdfpy: one capsule, or one ``<visual>`` without geometry, makes that refuse the
+whole file (ValueError, TypeError), and ``package://`` is resolved as for collision shapes, see `find_mesh`.
+"""
 
 from __future__ import annotations
 

@@ -9,8 +9,8 @@ import pytest
 from planted import cell, load, measure, perturb, random_joints
 
 from calib.data.poses.measurements import PoseMeasurements, Positions, take
-from calib.geometry.checks.diagnosis import diagnose, neighbour_floor
-from calib.geometry.checks.explanation import explain
+from calib.geometry.checks.diagnosis import BeyondStated, SetUpChange, SystematicResidual, diagnose, neighbour_floor
+from calib.geometry.checks.unidentified import LoosePlacement, Merged, Rank, unidentified
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit, polish_frames
 from calib.geometry.installation import Installation, see
@@ -56,18 +56,22 @@ def with_bad_rows(seed: int) -> PoseMeasurements:
     return replace(measured, position=position)
 
 
+def changes(found) -> list[SetUpChange]:
+    return [one for one in diagnose(found) if isinstance(one, SetUpChange)]
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_rows_of_another_set_up_are_named(seed):
-    lines = [line for line in diagnose(calibrate(with_bad_rows(seed))) if "set-up" in line]
-    assert len(lines) == 1 and lines[0].startswith("day.csv: rows 1–")
-    assert abs(int(lines[0].split("–")[1].split(" ")[0]) - 40) <= 16  # a tenth of the rows
+    (found,) = changes(calibrate(with_bad_rows(seed)))
+    assert (found.file, found.first) == ("day.csv", 1) and found.worse > found.rest
+    assert abs(found.last - 40) <= 16  # a tenth of the rows
 
 
 def test_bad_rows_scattered_over_the_day_are_no_set_up():
     alarms = 0
     for seed in range(12):
         shuffled = replace(take(with_bad_rows(seed), np.random.default_rng(seed).permutation(160)), rows=None)
-        alarms += any("set-up" in line for line in diagnose(calibrate(shuffled)))
+        alarms += bool(changes(calibrate(shuffled)))
     assert alarms == 0
 
 
@@ -75,7 +79,7 @@ def test_noise_of_one_component_is_no_set_up():
     alarms = 0
     for seed in range(20):
         found = calibrate(measure(truth_of(0), "distance", 160, seed, sigma=SIGMA))
-        alarms += any("set-up" in line for line in diagnose(found))
+        alarms += bool(changes(found))
     assert alarms == 0
 
 
@@ -83,15 +87,14 @@ def test_errors_that_neighbours_share_are_called_systematic():
     truth = truth_of(1)
     terms = (Term("theta2", "sin", 1, 3), Term("theta3", "cos", 2, 4))
     wavy = replace(truth, deflection=Deflection(terms, np.array([4e-4, 4e-4]), truth.chain))
-    lines = diagnose(calibrate(nearby(wavy, 40, 6, 1)))
-    assert any("mostly systematic" in line for line in lines)
+    assert any(isinstance(one, SystematicResidual) for one in diagnose(calibrate(nearby(wavy, 40, 6, 1))))
 
 
 def test_an_instrument_worse_than_it_states_is_named():
     measured = measure(truth_of(2), "position", 120, 2, sigma=10 * SIGMA)
     optimistic = replace(measured, sigma=np.full((120, 3), SIGMA))
-    lines = diagnose(calibrate(optimistic))
-    assert len(lines) == 1 and "10 times the stated uncertainty" in lines[0]
+    (found,) = diagnose(calibrate(optimistic))
+    assert isinstance(found, BeyondStated) and found.rms / found.stated == pytest.approx(10, rel=0.1)
     assert diagnose(calibrate(measured)) == []
 
 
@@ -102,13 +105,12 @@ def test_neighbours_differ_by_the_noise():
 
 
 def test_the_rank_is_told_with_its_gap():
-    lines = explain(calibrate(measure(truth_of(0), "pose", 60, 0, sigma=SIGMA)))
-    assert lines[0].startswith("30 of 38 parameters can be told apart")
-    assert "singular values fall from" in lines[0]
-    merged = " ".join(lines)
-    for name in ("alpha1", "d1", "r1", "theta1", "theta6"):
-        assert name in merged
-    assert "the placement of the instrument" in merged and "the mounting of the tool" in merged
+    rank, *others = unidentified(calibrate(measure(truth_of(0), "pose", 60, 0, sigma=SIGMA)))
+    assert isinstance(rank, Rank) and (rank.rank, rank.parameters) == (30, 38)
+    assert rank.next is not None and rank.next < rank.tolerance < rank.last
+    merged = [one for one in others if isinstance(one, Merged)]
+    assert {"alpha1", "d1", "r1", "theta1", "theta6"} <= {name for one in merged for name in one.names}
+    assert any(one.station for one in merged) and any(one.tool for one in merged)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -121,6 +123,7 @@ def test_tool_and_base_are_said_to_be_confused_only_where_they_are(seed):
     q[:, 3] -= (q[:, 1:3] - centre[1:3]).sum(axis=1)
     point = see(truth, q).point.T
     still = Positions(q, truth.chain.joint_names, position=point + SIGMA * rng.normal(size=point.shape))
-    assert any("cannot be told from the base" in line for line in explain(calibrate(still)))
+    loose = [one for one in unidentified(calibrate(still)) if isinstance(one, LoosePlacement)]
+    assert loose and loose[0].station
     free = measure(truth, "position", 150, seed, sigma=SIGMA)
-    assert not any("cannot be told" in line for line in explain(calibrate(free)))
+    assert not any(isinstance(one, LoosePlacement) for one in unidentified(calibrate(free)))

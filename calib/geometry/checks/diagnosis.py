@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -16,13 +16,45 @@ WORSE = 1.6  # a set-up's errors over the rest's from which on it is worth a wor
 CHANCE = 1e-3  # probability that the same rows in another order show such a change (our choice)
 
 
-def diagnose(found: GeometricFit) -> list[str]:
-    """Return warnings on each block: rows that look like another set-up, and residuals that are not noise."""
-    lines = []
+@dataclass(frozen=True)
+class SetUpChange:
+    """Rows `first` to `last` of a file that fit worse than the rest, as if of another set-up; rms of both [m]."""
+
+    file: str
+    first: int
+    last: int
+    worse: float
+    rest: float
+
+
+@dataclass(frozen=True)
+class SystematicResidual:
+    """A file's residual rms [m], of which neighbouring poses differ by `neighbours` [m] only."""
+
+    file: str
+    rms: float
+    neighbours: float
+
+
+@dataclass(frozen=True)
+class BeyondStated:
+    """A file's residual rms [m] far above the uncertainty that was stated [m]."""
+
+    file: str
+    rms: float
+    stated: float
+
+
+Diagnosis = SetUpChange | SystematicResidual | BeyondStated
+
+
+def diagnose(found: GeometricFit) -> list[Diagnosis]:
+    """Return findings on each block: rows that look like another set-up, and residuals that are not noise."""
+    result = []
     for block, part in lengths(found):
         if len(block.measured) >= FEWEST:
-            lines += [*_setup_change(block, part), *_systematic(block, part)]
-    return lines
+            result += [*_setup_change(block, part), *_systematic(block, part)]
+    return result
 
 
 def lengths(found: GeometricFit) -> list[tuple[Block, Part]]:
@@ -31,11 +63,7 @@ def lengths(found: GeometricFit) -> list[tuple[Block, Part]]:
     return [(block, first[number]) for number, block in enumerate(found.blocks)]
 
 
-def _name(block: Block) -> str:
-    return Path(block.measured.file).name or "measurements"
-
-
-def _setup_change(block: Block, part: Part) -> list[str]:
+def _setup_change(block: Block, part: Part) -> list[SetUpChange]:
     """Compare the rows before and after every cut, by size and by ranks (Mann–Whitney): a worse run is a set-up."""
     size = np.linalg.norm(part.value, axis=0)
     size = np.minimum(size, 4.0 * np.median(size))  # a few gross rows are not a set-up
@@ -57,30 +85,19 @@ def _setup_change(block: Block, part: Part) -> list[str]:
     rows = block.measured.rows[part.index]
     bad = (rows[0], rows[cut - 1]) if first_worse else (rows[cut], rows[-1])
     worse, rest = (before[best], after[best]) if first_worse else (after[best], before[best])
-    return [
-        f"{_name(block)}: rows {bad[0]}–{bad[1]} fit worse than the rest ({1e3 * worse:.2f} "
-        f"against {1e3 * rest:.2f} mm rms) and behave like another set-up: was the instrument, the tool or the robot's "
-        "mastering touched, or was it cold? Fit them apart (two files, stations 'each') or leave them out."
-    ]
+    return [SetUpChange(str(block.measured.file), int(bad[0]), int(bad[1]), float(worse), float(rest))]
 
 
-def _systematic(block: Block, part: Part) -> list[str]:
+def _systematic(block: Block, part: Part) -> list[Diagnosis]:
     """Compare residuals of neighbouring poses: noise differs between neighbours, a missing effect does not."""
     floor, rms = neighbour_floor(block.measured.q, part), float(np.sqrt(np.mean(np.sum(part.value**2, axis=0))))
     stated = None if part.sigma is None else float(np.sqrt(np.mean(np.sum(part.sigma**2, axis=0))))
-    lines = []
+    result: list[Diagnosis] = []
     if floor is not None and floor < 0.6 * rms:
-        lines.append(
-            f"{_name(block)}: the remaining {1e3 * rms:.3f} mm rms are mostly systematic "
-            f"(neighbouring poses differ by only {1e3 * floor:.3f} mm): this model does not explain them all."
-        )
+        result.append(SystematicResidual(str(block.measured.file), rms, floor))
     if stated is not None and rms > 5.0 * stated:
-        lines.append(
-            f"{_name(block)}: the residual ({1e3 * rms:.3f} mm rms) is {rms / stated:.0f} times "
-            f"the stated uncertainty ({1e3 * stated:.3f} mm): no geometry of this form explains the measurements to "
-            "the instrument's accuracy. The parameters' σ are scaled up accordingly, yet such errors are not random."
-        )
-    return lines
+        result.append(BeyondStated(str(block.measured.file), rms, stated))
+    return result
 
 
 def neighbour_floor(q: np.ndarray, part: Part) -> float | None:

@@ -12,7 +12,7 @@ from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import NotConverged
 from calib.geometry.accuracy import errors
 from calib.geometry.checks.diagnosis import diagnose
-from calib.geometry.checks.explanation import explain
+from calib.geometry.checks.unidentified import unidentified
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation
@@ -27,7 +27,7 @@ from calib.procedure.kinematic_stage.comparison import (
 )
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import Findings
-from calib.procedure.kinematic_stage.outliers import Outlier, named_outliers, plateau, remains
+from calib.procedure.kinematic_stage.remarks import Outlier, named_outliers, plateau, remains, remark
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import Arms, Assessment, assess
 from calib.procedure.kinematic_stage.verdict import Verdict
@@ -132,11 +132,21 @@ def run(
     say("comparing on unseen poses")
     rigid = rigid_fit(found, inputs.fit, settings)
     named = named_outliers(found.fit)
-    notes = *_moved_between(found.nominal.cell, inputs.fit, settings), *diagnose(found.fit)
+    notes = *_moved_between(found.nominal.cell, inputs.fit, settings), *map(remark, diagnose(found.fit))
     findings = _found_of(inputs, found, named, notes)
     arms = Arms(found.nominal.cell, found.fit.cell, rigid.cell.chain)
     result = assess(arms, inputs, findings, settings, asked=asked, tolerance=wanted.tolerance, seed=seed)
-    return Outcome(inputs, found, rigid, named, tuple(explain(found.fit)), findings, result, seed, wanted.tolerance)
+    return Outcome(
+        inputs,
+        found,
+        rigid,
+        named,
+        tuple(map(remark, unidentified(found.fit))),
+        findings,
+        result,
+        seed,
+        wanted.tolerance,
+    )
 
 
 def assessed(outcome: Outcome, inputs: Inputs, options: FitOptions, wanted: FitSettings) -> Outcome:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.procedure.kinematic_stage.comparison import Comparison
-from calib.procedure.kinematic_stage.outliers import FLOOR
+from calib.procedure.kinematic_stage.remarks import FLOOR
 
 WORSE = 1.01  # calibrated over nominal rms on the unseen from which on it is worse, not only no better
 GAIN = 0.10  # a smaller gain in rms on the unseen is no gain worth a new robot file

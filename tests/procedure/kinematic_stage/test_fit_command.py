@@ -175,7 +175,7 @@ def test_validation_files_may_follow_one_option_or_each_its_own(cell, calib):
 def test_the_same_seed_gives_the_same_numbers(cell, calib):
     file = cell.write("a.csv", cell.measure(40))
     for name in ("one", "two"):
-        assert calib("fit", "ur5", file, "--holdout", "0.3", "--seed", "4", "--out", name)[0] in (0, 1)
+        assert calib("fit", "ur5", file, "--holdout", "0.3", "--seed", "4", "--out", name)[0] == 0
     assert Path("one/metrics.json").read_bytes() == Path("two/metrics.json").read_bytes()
     assert Path("one/estimate.csv").read_bytes() == Path("two/estimate.csv").read_bytes()
 
@@ -199,7 +199,7 @@ def test_a_calibrated_folder_is_a_robot_and_a_worse_arm_fails(cell, calib):
 
 def test_deflections_go_out_as_a_table_with_its_formula_and_come_back(cell, calib):
     file = cell.write("a.csv", cell.measure(90))
-    assert calib("fit", "ur5", file, "--model", "coupling", "--out", "done")[0] in (0, 1)
+    assert calib("fit", "ur5", file, "--model", "coupling", "--out", "done")[0] == 0
     installation = installation_file.read("done")
     rows = read_rows(Path("done/joint_corrections.csv"))
     assert len(rows) == len(installation.deflection.terms) > 0

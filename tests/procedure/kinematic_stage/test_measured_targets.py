@@ -37,7 +37,7 @@ def test_commands_for_measured_poses_are_the_joints_they_were_measured_at(
 ):
     robot, file = data / folder / robot, data / folder / file
     arguments = ["fit", robot, file, "--holdout", share, "--out", tmp_path / "done", "--no-plots"]
-    assert cli.run([str(each) for each in arguments]) in (0, 1)
+    assert cli.run([str(each) for each in arguments]) == 0
     unseen = inputs.gather(robot, [file], settings=FitSettings(holdout=share)).unseen[file.name].block
     fitted = compensation.read(tmp_path / "done")
     turns = from_quaternion(unseen.position, unseen.quaternion)[:, :3, :3] if isinstance(unseen, Poses) else None

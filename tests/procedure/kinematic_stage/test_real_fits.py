@@ -13,8 +13,9 @@ pytestmark = pytest.mark.slow
 
 def metrics_of(calib, *arguments) -> tuple[dict, str]:
     code, out, err = calib("fit", *arguments, "--out", "done")
-    assert code in (0, 1), err
-    return json.loads(Path("done/metrics.json").read_text()), out
+    found = json.loads(Path("done/metrics.json").read_text())
+    assert code == (found["verdict"] == "fail"), err
+    return found, out
 
 
 @pytest.fixture
@@ -78,7 +79,7 @@ def test_motoman_wide(data, calib, here):
     assert "another set-up" in out
 
 
-@pytest.mark.parametrize(("robot", "position", "distance"), [("panda_2", 0.80, 0.23), ("panda_3", 0.23, 0.06)])
+@pytest.mark.parametrize(("robot", "position", "distance"), [("panda_2", 0.79, 0.21), ("panda_3", 0.23, 0.05)])
 def test_mukca_sockets(data, calib, here, robot, position, distance):
     with (data / "mukca_sockets" / f"{robot}.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))

@@ -10,8 +10,8 @@ import pytest
 
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions, Sockets, take
 from calib.geometry.accuracy import errors, summary
-from calib.geometry.checks.diagnosis import diagnose
-from calib.geometry.checks.explanation import explain
+from calib.geometry.checks.diagnosis import SetUpChange, SystematicResidual, diagnose
+from calib.geometry.checks.unidentified import LoosePlacement, unidentified
 from calib.geometry.first_guess import install
 from calib.geometry.model_choice.ladder import ModelSelection, climb
 from calib.geometry.result import outliers
@@ -127,7 +127,7 @@ def test_motoman_in_the_whole_workspace(data, capsys):
     assert calibrated["position_mm"]["rms"] <= 1.3
 
 
-@pytest.mark.parametrize("name, consistency, distance", [("panda_2.csv", 0.80, 0.22), ("panda_3.csv", 0.23, 0.05)])
+@pytest.mark.parametrize("name, consistency, distance", [("panda_2.csv", 0.79, 0.21), ("panda_3.csv", 0.23, 0.05)])
 def test_mukca_sockets_at_other_places(data, capsys, name, consistency, distance):
     chain, fitted, unseen = mukca(data, name)
     found, nominal, calibrated = judged(chain, fitted, unseen)
@@ -179,12 +179,11 @@ def test_tiago_outliers_are_named(data, capsys):
 def test_motoman_in_a_small_volume_cannot_tell_base_from_tool(data):
     chain, measured = motoman(data, "right_6x6x6_150.csv")
     found = climb(install(chain, [measured]), [measured], "geometry")
-    assert any("the tool cannot be told from the base" in line for line in explain(found.fit))
+    assert any(isinstance(one, LoosePlacement) and one.station for one in unidentified(found.fit))
 
 
 @pytest.mark.slow
 def test_motoman_in_the_whole_workspace_is_said_not_to_be_rigid(data):
     chain, measured = motoman(data, "right_wide_386.csv")
     found = climb(install(chain, [measured]), [measured], "geometry")
-    lines = diagnose(found.fit)
-    assert any("another set-up" in line or "systematic" in line for line in lines), lines
+    assert any(isinstance(one, SetUpChange | SystematicResidual) for one in diagnose(found.fit))
