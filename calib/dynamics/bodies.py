@@ -208,8 +208,13 @@ _PERMUTED = tuple(
 )
 
 
+def upright_turn(axis: int) -> np.ndarray:
+    """Return the turn (4, 4) from a body's frame to the kernels', whose z is the moving axis (0, 1, 2 for x, y, z)."""
+    return pose(np.eye(3)[:, _TURNS[axis]])
+
+
 def _upright(parents, axes, placements) -> list[np.ndarray]:
     """Return the placements between frames whose axes are relabelled so that the moving one is z."""
-    turns = [pose(np.eye(3)[:, _TURNS[axis]]) for axis in axes]
+    turns = [upright_turn(axis) for axis in axes]
     before = [np.eye(4) if parent < 0 else turns[parent].T for parent in parents]
     return [first @ placement @ turn for first, placement, turn in zip(before, placements, turns)]

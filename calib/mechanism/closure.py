@@ -13,7 +13,7 @@ as many actuators as freedoms that of the platform, must keep its sign along it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -23,8 +23,8 @@ from scipy.spatial.transform import Rotation
 
 from calib.arrays import frozen, shaped
 from calib.errors import CalibError, RobotError
-from calib.mechanism.parallel_robot import COORDINATES, Leg, ParallelRobot
-from calib.robot import kinematics
+from calib.mechanism.leg_links import LegLinks, Posture, leg_links, pseudo_inverse, times
+from calib.mechanism.parallel_robot import COORDINATES, ParallelRobot
 
 CLOSED = 1e-10  # gap and step [m or rad] below which a loop is closed
 STRIDE = 0.25  # of a reading or coordinate between two solutions on the way from home [rad or m] (our choice)
@@ -41,20 +41,6 @@ class NoPosture(CalibError):
     def __init__(self, message: str, samples: Sequence[int] = ()):
         self.samples = tuple(samples)
         super().__init__(message)
-
-
-@dataclass(frozen=True, eq=False)
-class Posture:
-    """N solutions: joints of the whole tree q (N, n_t) [rad or m], and poses of the platform (N, 4, 4)."""
-
-    q: np.ndarray
-    pose: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.q)
-
-    def __getitem__(self, index) -> Posture:  # type: ignore[no-untyped-def]
-        return Posture(self.q[index], self.pose[index])
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,24 +62,7 @@ class ClosedRobot:
     fixed: bool
 
 
-@dataclass(frozen=True, eq=False)
-class LegLinks:
-    """One leg at N postures.
-
-    Attributes:
-        full: (N, 6, n) Jacobian of its end: velocity, angular velocity; jacobian: (N, c, n) the held part of it.
-        inverse: (N, n, c) J⁺.
-        carried: (N, c, 6) G, velocity of its attachment by the platform's twist.
-        gap: (N, c) by which its end misses the attachment [m, rad].
-        lever: (N, 3) from the platform's origin to the attachment, in the base's axes.
-    """
-
-    full: np.ndarray
-    jacobian: np.ndarray
-    inverse: np.ndarray
-    carried: np.ndarray
-    gap: np.ndarray
-    lever: np.ndarray
+_Aim = Callable[[ClosedRobot, Sequence[LegLinks], np.ndarray, np.ndarray, Posture, np.ndarray], np.ndarray]
 
 
 def closed(robot: ParallelRobot) -> ClosedRobot:
@@ -104,7 +73,7 @@ def closed(robot: ParallelRobot) -> ClosedRobot:
     """
     start = Posture(np.concatenate([leg.home for leg in robot.legs])[None], robot.home[None])
     for _ in range(10):  # each leg by itself, the platform at rest
-        steps = [-_times(one.inverse, one.gap) for one in leg_links(robot, start)]
+        steps = [-times(one.inverse, one.gap) for one in leg_links(robot, start)]
         start = Posture(start.q + np.clip(np.concatenate(steps, axis=1), -BOUND, BOUND), start.pose)
     gap = max(float(np.abs(one.gap).max()) for one in leg_links(robot, start))
     with suppress(NoPosture, np.linalg.LinAlgError):  # what the loops make of the platform's other coordinates
@@ -133,24 +102,24 @@ def closed(robot: ParallelRobot) -> ClosedRobot:
     return ClosedRobot(robot, start, minors, frozen(_determinants(opened, links)[0]), fixed)
 
 
-def locate(known: ClosedRobot, readings: np.ndarray) -> Posture:
+def locate(known: ClosedRobot, readings: np.ndarray, near: Posture | None = None) -> Posture:
     """Return the postures at which the encoders of the actuated joints read so.
 
     Args:
         readings: (N, n) [rad or m]; a record, whose samples follow one another, is solved faster.
+        near: postures that are near, to start from; None: home.
 
     Raises:
         NoPosture: for samples out of reach, beyond a singularity, or in one.
     """
     readings = shaped(readings, (None, known.robot.n), f"readings of '{known.robot.name}'")
-    own = known.home.q[0, known.robot.actuated]
-    return _reached(known, readings, own, _from_readings)
+    return _reached(known, readings, known.home.q[0, known.robot.actuated], _from_readings, near)
 
 
-def place(known: ClosedRobot, coordinates: np.ndarray) -> Posture:
+def place(known: ClosedRobot, coordinates: np.ndarray, near: Posture | None = None) -> Posture:
     """Return the postures at platform coordinates (N, r) [m, rad], counted from home; arguments as of `locate`."""
     coordinates = shaped(coordinates, (None, known.robot.r), f"platform coordinates of '{known.robot.name}'")
-    return _reached(known, coordinates, np.zeros(known.robot.r), _from_coordinates)
+    return _reached(known, coordinates, np.zeros(known.robot.r), _from_coordinates, near)
 
 
 def coordinates_of(known: ClosedRobot, posture: Posture) -> np.ndarray:
@@ -171,12 +140,6 @@ def pose_of(known: ClosedRobot, coordinates: np.ndarray) -> np.ndarray:
     return pose
 
 
-def leg_links(robot: ParallelRobot, posture: Posture) -> list[LegLinks]:
-    """Return every leg's Jacobian, attachment and gap at postures, by rigid-body relations alone."""
-    starts = robot.starts
-    return [_links(leg, posture.q[:, a:b], posture.pose) for leg, a, b in zip(robot.legs, starts, starts[1:])]
-
-
 def twists(
     known: ClosedRobot, links: Sequence[LegLinks], shifts: Sequence[np.ndarray] | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -192,14 +155,14 @@ def twists(
     for k, one in enumerate(links):
         across = np.eye(one.gap.shape[1]) - one.jacobian @ one.inverse
         rows.append(across @ one.carried)
-        right.append(np.zeros_like(one.gap) if shifts is None else _times(across, shifts[k]))
+        right.append(np.zeros_like(one.gap) if shifts is None else times(across, shifts[k]))
     U, s, Vt = np.linalg.svd(np.concatenate(rows, axis=1), full_matrices=False)
     rank = 6 - robot.r
     free = Vt[:, rank:].transpose(0, 2, 1)
     D = free @ np.linalg.inv(free[:, robot.selected])
     along = np.einsum("nkr,nk->nr", U[:, :, :rank], np.concatenate(right, axis=1)) / s[:, :rank]
     least = np.einsum("nrk,nr->nk", Vt[:, :rank], along)
-    return D, least - _times(D, least[:, robot.selected])
+    return D, least - times(D, least[:, robot.selected])
 
 
 def reading_rows(known: ClosedRobot, links: Sequence[LegLinks]) -> np.ndarray:
@@ -241,14 +204,16 @@ def _where(known: ClosedRobot, posture: Posture) -> str:
     return ", ".join(f"{name} = {value:.4g}" for name, value in zip(known.robot.freedom, values))
 
 
-def _reached(known: ClosedRobot, wanted: np.ndarray, own: np.ndarray, aim) -> Posture:  # type: ignore[no-untyped-def]
+def _reached(known: ClosedRobot, wanted: np.ndarray, own: np.ndarray, aim: _Aim, near: Posture | None) -> Posture:
     """Return solutions for targets (N, k), home having `own`; by Newton along the straight line from home."""
     if not len(wanted):
         return known.home[:0]
-    if len(wanted) > 2 * STEP and np.abs(np.diff(wanted, axis=0)).max() < STRIDE / STEP:
-        first = _reached(known, wanted[::STEP], own, aim)
-        start = first[np.minimum((np.arange(len(wanted)) + STEP // 2) // STEP, len(first) - 1)]
-        found = _newton(known, start, wanted, aim)
+    if near is not None:
+        found = _newton(known, near, wanted, aim)
+    elif len(wanted) > 2 * STEP and np.abs(np.diff(wanted, axis=0)).max() < STRIDE / STEP:
+        first = _reached(known, wanted[::STEP], own, aim, None)
+        nearest = np.minimum((np.arange(len(wanted)) + STEP // 2) // STEP, len(first) - 1)
+        found = _newton(known, first[nearest], wanted, aim)
     else:
         count = max(1, int(np.ceil(np.abs(wanted - own).max() / STRIDE)))
         found = known.home[np.zeros(len(wanted), dtype=int)]
@@ -259,16 +224,16 @@ def _reached(known: ClosedRobot, wanted: np.ndarray, own: np.ndarray, aim) -> Po
     return found
 
 
-def _newton(known: ClosedRobot, start: Posture, wanted: np.ndarray, aim, rough: bool = False) -> Posture:  # type: ignore[no-untyped-def]
-    """Return solutions near `start`; of a rough one three steps are enough."""
+def _newton(known: ClosedRobot, start: Posture, wanted: np.ndarray, aim: _Aim, rough: bool = False) -> Posture:
+    """Return solutions near `start`; of a rough one two steps are enough."""
     q, pose = np.array(start.q), np.array(start.pose)
     left = np.arange(len(q))
-    for _ in range(3 if rough else LIMIT):
+    for _ in range(2 if rough else LIMIT):
         own = Posture(q[left], pose[left])
         links = leg_links(known.robot, own)
         D, t = twists(known, links, [one.gap for one in links])
-        twist = t + _times(D, aim(known, links, D, t, own, wanted[left]))
-        steps = np.concatenate([_times(one.inverse, _times(one.carried, twist) - one.gap) for one in links], axis=1)
+        twist = t + times(D, aim(known, links, D, t, own, wanted[left]))
+        steps = np.concatenate([times(one.inverse, times(one.carried, twist) - one.gap) for one in links], axis=1)
         size = np.maximum(np.abs(steps).max(axis=1), np.abs(twist).max(axis=1))
         share = np.minimum(1.0, BOUND / np.maximum(size, 1e-300))[:, None]
         q[left] += share * steps
@@ -299,62 +264,31 @@ def _tell_unreached(known: ClosedRobot, found: Posture, left: np.ndarray) -> Non
     )  # fmt: skip
 
 
-def _from_readings(known, links, D, t, posture, wanted):  # type: ignore[no-untyped-def]
+def _from_readings(
+    known: ClosedRobot, links: Sequence[LegLinks], D: np.ndarray, t: np.ndarray, posture: Posture, wanted: np.ndarray
+) -> np.ndarray:
     """Return the twist's independent parts (N, r) that bring the readings nearest to those wanted."""
     rows, right = [], wanted - posture.q[:, known.robot.actuated]
     for leg, one in zip(known.robot.legs, links):
         rows.append(
-            (one.inverse[:, list(leg.actuated)] @ one.carried, _times(one.inverse, one.gap)[:, list(leg.actuated)])
+            (one.inverse[:, list(leg.actuated)] @ one.carried, times(one.inverse, one.gap)[:, list(leg.actuated)])
         )
     A = np.concatenate([row for row, _ in rows], axis=1)
-    right = right + np.concatenate([own for _, own in rows], axis=1) - _times(A, t)
+    right = right + np.concatenate([own for _, own in rows], axis=1) - times(A, t)
     return _least_squares(A @ D, right)
 
 
-def _from_coordinates(known, links, D, t, posture, wanted):  # type: ignore[no-untyped-def]
+def _from_coordinates(
+    known: ClosedRobot, links: Sequence[LegLinks], D: np.ndarray, t: np.ndarray, posture: Posture, wanted: np.ndarray
+) -> np.ndarray:
+    """Return the twist's independent parts (N, r) that bring the platform to coordinates (N, r)."""
     target = pose_of(known, wanted)
     turn = Rotation.from_matrix(target[:, :3, :3] @ posture.pose[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
-    return (
-        np.hstack([target[:, :3, 3] - posture.pose[:, :3, 3], turn])[:, known.robot.selected]
-        - t[:, known.robot.selected]
-    )
-
-
-def _links(leg: Leg, q: np.ndarray, pose: np.ndarray) -> LegLinks:
-    walked = kinematics.sweep(leg.chain, q)
-    full = kinematics.joint_jacobian(leg.chain, walked, walked.position)
-    jacobian = full[:, : leg.held]
-    lever = pose[:, :3, :3] @ leg.attachment[:3, 3]
-    carried = np.zeros((len(q), leg.held, 6))
-    carried[:, range(3), range(3)] = 1.0
-    carried[:, [0, 1, 2], [4, 5, 3]] = lever[:, [2, 0, 1]]
-    carried[:, [0, 1, 2], [5, 3, 4]] = -lever[:, [1, 2, 0]]
-    gap = walked.position.T - pose[:, :3, 3] - lever
-    if leg.end == "rigid":
-        carried[:, range(3, 6), range(3, 6)] = 1.0
-        turned = walked.rotation.transpose(2, 1, 0) @ (pose[:, :3, :3] @ leg.attachment[:3, :3]).transpose(0, 2, 1)
-        wrong = 0.5 * (turned[:, [2, 0, 1], [1, 2, 0]] - turned[:, [1, 2, 0], [2, 0, 1]])
-        gap = np.hstack([gap, wrong])
-    return LegLinks(full, jacobian, _pseudo_inverse(jacobian), carried, gap, lever)
-
-
-def _pseudo_inverse(J: np.ndarray) -> np.ndarray:
-    try:
-        if J.shape[1] == J.shape[2]:
-            return np.linalg.inv(J)
-        across = J.transpose(0, 2, 1)
-        return np.linalg.solve(across @ J, across)
-    except np.linalg.LinAlgError:
-        return np.linalg.pinv(J)
+    return np.hstack([target[:, :3, 3] - posture.pose[:, :3, 3], turn])[:, known.robot.selected]
 
 
 def _least_squares(A: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return _times(_pseudo_inverse(A), b)
-
-
-def _times(A: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return A x sample by sample; A (N, k, l), x (N, l)."""
-    return (A @ x[:, :, None])[:, :, 0]
+    return times(pseudo_inverse(A), b)
 
 
 def _moved(pose: np.ndarray, twist: np.ndarray) -> np.ndarray:

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.mechanism.closure import ClosedRobot, LegLinks, Posture, leg_links, twists
+from calib.mechanism.closure import ClosedRobot, twists
+from calib.mechanism.leg_links import LegLinks, Posture, leg_links
 
 
 @dataclass(frozen=True, eq=False)

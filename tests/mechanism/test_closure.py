@@ -7,7 +7,8 @@ import pytest
 
 from calib.errors import RobotError
 from calib.mechanism import library, parallel_files
-from calib.mechanism.closure import NoPosture, closed, coordinates_of, leg_links, locate, place
+from calib.mechanism.closure import NoPosture, closed, coordinates_of, locate, place
+from calib.mechanism.leg_links import leg_links
 from calib.mechanism.velocities import of_platform, of_readings
 
 ROBOTS = ("dualv", "fivebar", "stewart")

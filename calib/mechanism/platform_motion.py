@@ -1,0 +1,113 @@
+"""Motions given by the platform's coordinates x(t): what they need of the robot, with slopes to design them by."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.mechanism.closure import ClosedRobot, place
+from calib.mechanism.distribution import distributed
+from calib.mechanism.leg_links import Posture
+from calib.mechanism.parallel_model import ParallelModel
+from calib.mechanism.velocities import LoopMotion, of_platform
+
+STEP = 1e-6  # of the differences by x
+
+
+def along(known: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray, near: Posture | None = None) -> LoopMotion:
+    """Return the robot's motion along platform coordinates x (N, r) with derivatives v, a.
+
+    Args:
+        near: (N,) postures to start Newton from; None: from home.
+    """
+    posture = place(known, x, near)
+    return of_platform(known, posture, *twist_of(known, x, v, a))
+
+
+def twist_of(known: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the independent parts of the platform's twist and their derivatives, each (N, r).
+
+    Position's are v and a themselves; ω = ψ̇ z + φ̇ Rz y + ρ̇ Rz Ry x of roll ρ, pitch φ, yaw ψ about the base's axes.
+    """
+    selected = known.robot.selected
+    if not (selected > 2).any() or ((selected > 2).sum() == 1 and 5 in selected):
+        return v, a
+    full = np.zeros((3, len(x), 6))
+    full[:, :, selected] = x, v, a
+    angles, rates, changes = full[:, :, 3:]
+    Rz = Rotation.from_euler("z", angles[:, 2]).as_matrix()
+    Rzy = Rz @ Rotation.from_euler("y", angles[:, 1]).as_matrix()
+    axes = np.stack([Rzy[:, :, 0], Rz[:, :, 1], np.broadcast_to([0.0, 0.0, 1.0], (len(x), 3))], axis=2)
+    yaw = rates[:, 2:] * axes[:, :, 2]
+    pitch = rates[:, 1:2] * axes[:, :, 1]
+    roll = rates[:, :1] * axes[:, :, 0]
+    full[1, :, 3:] = yaw + pitch + roll
+    full[2, :, 3:] = np.einsum("nij,nj->ni", axes, changes) + np.cross(yaw, pitch) + np.cross(yaw + pitch, roll)
+    return full[1][:, selected], full[2][:, selected]
+
+
+@dataclass(frozen=True, eq=False)
+class PlatformRegressor:
+    """Rows on the platform's coordinates, and actuator torques, as functions of x, v, a with slopes by differences.
+
+    Attributes:
+        model: of the robot.
+        columns: (b,) of the model's that count.
+        values: (p,) parameters that predict torques; None where unknown.
+        preload: overconstraint of redundant actuators [N m or N].
+    """
+
+    model: ParallelModel
+    columns: np.ndarray
+    values: np.ndarray | None = None
+    preload: float = 0.0
+    carried: Collection[str] | None = None
+
+    def regressor(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        """Return W (N, r, b) in the columns that count."""
+        return self._columns(along(self.model.known, x, v, a))
+
+    def regressor_gradient(
+        self, x: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the slopes of Σ weights · W (N, r, b) by x, v, a, each (N, r)."""
+        return self._slopes(x, v, a, lambda motion: np.einsum("nrb,nrb->n", self._columns(motion), weights))
+
+    def torques(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        """Return the actuators' torques (N, n) by the model."""
+        return self._torques(along(self.model.known, x, v, a))
+
+    def torques_gradient(
+        self, x: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the slopes of Σ weights · torques (N, n) by x, v, a, each (N, r)."""
+        return self._slopes(x, v, a, lambda motion: np.einsum("na,na->n", self._torques(motion), weights))
+
+    def _columns(self, motion: LoopMotion) -> np.ndarray:
+        return self.model.platform_regressor(motion, self.carried).transpose(2, 1, 0)[self.columns].transpose(2, 1, 0)
+
+    def _torques(self, motion: LoopMotion) -> np.ndarray:
+        if self.values is None:
+            raise ValueError("no parameters to predict torques with")
+        forces = self.model.platform_force(self.values, motion, self.carried)
+        return distributed(self.model.known, motion.jacobians, forces, self.preload)
+
+    def _slopes(
+        self, x: np.ndarray, v: np.ndarray, a: np.ndarray, of: Callable[[LoopMotion], np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the slopes of a value per sample; central differences, exact but for rounding by v and a."""
+        known, (count, r) = self.model.known, x.shape
+        near = place(known, x)
+        result = np.empty((3, count, r))
+        for order, step in enumerate((STEP, 1e-3, 1.0)):
+            for j in range(r):
+                ends = []
+                for sign in (1.0, -1.0):
+                    moved = [x, v, a]
+                    moved[order] = moved[order] + sign * step * np.eye(r)[j]
+                    ends.append(of(along(known, *moved, near=near)))
+                result[order, :, j] = (ends[0] - ends[1]) / (2.0 * step)
+        return result[0], result[1], result[2]
