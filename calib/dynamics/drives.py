@@ -157,6 +157,14 @@ def fill(terms: Sequence[DriveTerm], out: np.ndarray, motions: Sequence[np.ndarr
         state += own
 
 
+def fill_energies(terms: Sequence[DriveTerm], out: np.ndarray, v: np.ndarray) -> None:
+    """Write the kinetic energies ½ Σ weight v_row v_joint of acceleration terms into out (k, N); v (n, N)."""
+    for column, one in zip(out, terms, strict=True):
+        for row, motion in one.acts if one.shape == "acceleration" else ():
+            for joint, weight in motion:
+                column += 0.5 * weight * v[row] * v[joint]
+
+
 def acting(
     one: DriveTerm, motions: Sequence[np.ndarray | None], states: np.ndarray
 ) -> Iterator[tuple[int, np.ndarray]]:

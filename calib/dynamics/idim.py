@@ -194,6 +194,18 @@ class IdentificationModel:
         bodies = np.array(values[: self.inertial]) * present
         return rigid_body.inverse_dynamics(self.bodies, bodies, q, v, a)
 
+    def energy_columns(self, q: np.ndarray, v: np.ndarray, carried: Collection[str] | None = None) -> np.ndarray:
+        """Return the energies h (N, p) per unit of each parameter, whose derivative is the power; zero for friction.
+
+        Bodies' are those of `rigid_body.energies`, a motor's inertia has ½ v², coupled ones v_i v_j.
+        """
+        out = np.zeros((len(q), self.p))
+        if self.inertial:
+            out[:, : self.inertial] = rigid_body.energies(self.bodies, q, v)
+            self._drop_absent(out.T, carried)
+        drives.fill_energies(self.columns, out.T[self.inertial :], v.T)
+        return out
+
     def carried_columns(self, carried: Collection[str]) -> np.ndarray:
         """Return (10 B,) one for parameters of bodies that are there, zero for those of payloads that are not."""
         kinds = zip(self.bodies.labels, self.bodies.kinds)

@@ -225,8 +225,8 @@ BOTH = TorqueRows(
     "Ia Fvl Fcl offl Fvm Fcm offm",
 )
 DRIVE = TorqueRows("drive", (JointBlock("", _MOTOR, motor=1.0, sensor=-1.0),), "Ia Fvm Fcm offm")
-ROWS = {one.name: one for one in (MOTOR, LINK, BOTH, DRIVE)}
 MODELS = {1: LINK, 2: BOTH, 3: DRIVE}  # as the 2019 paper numbers them
 
 POWER = projected("power", Projection(("power",), ("W",), lambda q, v: v[:, None, :]))
-"""One row: the power of all torques, vᵀ tau."""
+"""One row: the power of all torques, vᵀ tau (the power identification model, Gautier 1997)."""
+ROWS = {one.name: one for one in (MOTOR, LINK, BOTH, DRIVE, POWER)}

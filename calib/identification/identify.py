@@ -16,6 +16,7 @@ from calib.dynamics.bodies import standard_parameters
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel, with_terms
 from calib.dynamics.regressor_model import RegressorModel, States
+from calib.dynamics.torque_rows import POWER
 from calib.errors import MeasurementError, UsageError
 from calib.estimation.essential import Elimination, Rule, eliminate
 from calib.estimation.triangles import condition_numbers
@@ -29,7 +30,16 @@ from calib.identification.methods.method import IdentificationProblem, Method, M
 from calib.identification.methods.registry import method_named
 from calib.identification.prediction import Dynamics, Model, predict, transmitted
 from calib.identification.prior import Prior, find_prior
-from calib.identification.rows import ObservationRows, extend, observe, observe_terms, pool, triangulate, with_blocks
+from calib.identification.rows import (
+    ObservationRows,
+    by_recording,
+    extend,
+    observe,
+    observe_terms,
+    pool,
+    triangulate,
+    with_blocks,
+)
 from calib.identification.settings import IdentificationSettings, make_model, per_joint
 from calib.robot.calibrated import CalibratedChain, as_calibrated
 from calib.robot.chain import Chain, sampling_limits
@@ -148,6 +158,8 @@ def identify_model(
     decimator = common_decimator(cases, settings)
     say("observation matrix")
     rows = with_blocks([observe(model, base.kept, case, decimator) for case in cases], settings.folds)
+    if model.torque_rows is POWER and len(cases) > 1:
+        rows = [by_recording(part, k, len(cases)) for k, part in enumerate(rows)]
     _require_enough(rows, base)
     say("first fit")
     first = first_fit(rows, noise)

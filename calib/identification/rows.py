@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from calib.data.signals.decimation import Decimator, decimate, decimate_blocks, kept
+from calib.data.signals.filtering import slope
 from calib.dynamics import drives
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.regressor_model import RegressorModel
+from calib.dynamics.torque_rows import POWER
+from calib.errors import UsageError
 from calib.estimation.triangles import Triangles, absorb, empty, retriangulate
 from calib.identification.cases import Case
 
 BLOCK = 4096  # samples of the full rate at a time
+EDGE = 4  # samples beside a block that differences of its energies reach
 MARGIN = 2  # thinned samples beside a cut between blocks that share a filter window: not judged
 
 
@@ -58,7 +63,12 @@ def observe(
     step, place = max(1, BLOCK // decimator.factor) * decimator.factor, 0
     for start, stop in segments(motion.segment):
         spans = [slice(i, min(i + step, stop)) for i in range(start, stop, step)]
-        blocks = (_block(model, columns[column[own]], row[own], case, part, load, states) for part in spans)
+        if model.torque_rows is POWER:
+            blocks = (
+                _power_block(model, columns[column[own]], case, part, states, slice(start, stop)) for part in spans
+            )
+        else:
+            blocks = (_block(model, columns[column[own]], row[own], case, part, load, states) for part in spans)
         for part in decimate_blocks(blocks, decimator):
             matrix[place : place + part.shape[1], row[own], column[own]] = part.T
             place += part.shape[1]
@@ -180,6 +190,45 @@ def _block(
     own = None if load is None else load[part]
     full = model.regressor(motion.q[part], motion.v[part], motion.a[part], own, case.carried, states[:, part])
     return full.transpose(2, 1, 0)[columns, rows]
+
+
+def _power_block(
+    model: RegressorModel, columns: np.ndarray, case: Case, part: slice, states: np.ndarray, segment: slice
+) -> np.ndarray:
+    """Return entries (k, N_i) of the power's regressor, d/dt h of energies and vᵀ W of the other columns.
+
+    No acceleration takes part. Differences and the filter of the decimation are linear and do not mind which comes
+    first: this is the derivative of the filtered energies (Gautier 1997; Gautier & Briot 2013).
+    """
+    if not isinstance(model, _HasEnergy):
+        raise UsageError("rows = 'power' need a model that knows its energies")
+    motion = case.motion
+    near = slice(max(segment.start, part.start - EDGE), min(segment.stop, part.stop + EDGE))
+    h = model.energy_columns(motion.q[near], motion.v[near], case.carried)[:, columns]
+    rising = slope(h, motion.rate)
+    plain = np.gradient(h, 1.0 / motion.rate, axis=0) if len(h) > 1 else np.zeros_like(h)
+    rising = np.where(np.isfinite(rising), rising, plain)[part.start - near.start :][: part.stop - part.start].T
+    q, v = motion.q[part], motion.v[part]
+    losses = model.regressor(q, v, np.zeros_like(v), None, case.carried, states[:, part]).transpose(2, 1, 0)[columns, 0]
+    stored = [k < model.inertial or model.columns[k - model.inertial].shape == "acceleration" for k in columns]
+    return np.where(np.array(stored)[:, None], rising, losses)
+
+
+def by_recording(rows: ObservationRows, own: int, count: int) -> ObservationRows:
+    """Return rows with one place per recording in place of their single row: recording `own` of `count` fills its own.
+
+    So that recordings are weighed apart, as joints are where a sample has a row for each.
+    """
+    place = np.arange(count) == own
+    return replace(
+        rows, matrix=np.where(place[:, None], rows.matrix, 0.0), target=np.where(place, rows.target, 0.0),
+        present=rows.present & place,
+    )  # fmt: skip
+
+
+@runtime_checkable
+class _HasEnergy(Protocol):
+    def energy_columns(self, q: np.ndarray, v: np.ndarray, carried: Collection[str] | None = None) -> np.ndarray: ...
 
 
 def _rows(

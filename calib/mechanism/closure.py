@@ -107,7 +107,7 @@ def locate(known: ClosedRobot, readings: np.ndarray, near: Posture | None = None
 
     Args:
         readings: (N, n) [rad or m]; a record, whose samples follow one another, is solved faster.
-        near: postures that are near, to start from; None: home.
+        near: checked postures that are near, to start from: the new ones are not checked again; None: home.
 
     Raises:
         NoPosture: for samples out of reach, beyond a singularity, or in one.
@@ -209,8 +209,8 @@ def _reached(known: ClosedRobot, wanted: np.ndarray, own: np.ndarray, aim: _Aim,
     if not len(wanted):
         return known.home[:0]
     if near is not None:
-        found = _newton(known, near, wanted, aim)
-    elif len(wanted) > 2 * STEP and np.abs(np.diff(wanted, axis=0)).max() < STRIDE / STEP:
+        return _newton(known, near, wanted, aim)
+    if len(wanted) > 2 * STEP and np.abs(np.diff(wanted, axis=0)).max() < STRIDE / STEP:
         first = _reached(known, wanted[::STEP], own, aim, None)
         nearest = np.minimum((np.arange(len(wanted)) + STEP // 2) // STEP, len(first) - 1)
         found = _newton(known, first[nearest], wanted, aim)
@@ -304,23 +304,22 @@ def _leg_rcond(one: LegLinks, home: LegLinks) -> np.ndarray:
     moved = np.linalg.norm(home.full[0, :3], axis=0)
     turns = np.linalg.norm(home.full[0, 3:], axis=0) > 0.5
     length = max(float(moved[turns].max(initial=0.0)), 1e-6)
-    scaled = np.array(one.jacobian)
-    scaled[:, :3] /= length
-    scaled[:, :, ~turns] *= length
-    return _rcond(scaled)
+    by_row = np.where(np.arange(one.jacobian.shape[1]) < 3, length, 1.0)[:, None] / np.where(turns, 1.0, length)
+    return _rcond(one.jacobian / by_row, one.inverse * by_row.T)
 
 
 def _platform_rcond(known: ClosedRobot, rows: np.ndarray, home: np.ndarray) -> np.ndarray:
     """Return reciprocal conditions (N,) of J_p^inv, translations and rotations in units of their largest at home."""
     turns, size = known.robot.selected > 2, np.linalg.norm(home[0], axis=0)
     scale = np.where(turns, size[turns].max(initial=0.0), size[~turns].max(initial=0.0))
-    by_row = np.linalg.norm(home[0] / scale, axis=1)
-    return _rcond(rows / scale / by_row[:, None])
+    scaled = rows / scale / np.linalg.norm(home[0] / scale, axis=1)[:, None]
+    return _rcond(scaled, pseudo_inverse(scaled))
 
 
-def _rcond(J: np.ndarray) -> np.ndarray:
-    s = np.linalg.svd(J, compute_uv=False)
-    return np.asarray(s[:, -1] / np.maximum(s[:, 0], 1e-300))
+def _rcond(J: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+    """Return 1 / (|J| |J⁻|) (N,) in Frobenius norms: between the reciprocal condition and a part of it."""
+    size = np.linalg.norm(J, axis=(1, 2)) * np.linalg.norm(inverse, axis=(1, 2))
+    return np.where(np.isfinite(size), 1.0 / np.maximum(size, 1e-300), 0.0)
 
 
 def _determinants(known: ClosedRobot, links: Sequence[LegLinks]) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Compiled kernels (numba) of closed loops: the legs at given postures, and a simulated run.
 
-A leg is read from the arrays of its `Bodies`: ``links`` and ``constants``, every frame turned so that its joint's axis
-is z; ``tail`` (4, 4) takes its last frame to its end. R, p place the platform; c of the six equations of a leg are held.
+A leg is read from the arrays of its `Bodies`, ``links`` and ``constants``, every frame turned so that its joint's axis
+is z; ``tail`` (4, 4) takes its last frame to its end. R, p place the platform; c of a leg's six equations are held.
 """
 
 from __future__ import annotations

@@ -70,8 +70,12 @@ class ParallelModel:
     def inertial(self) -> int:
         return 10 * len(self.labels)
 
-    @cached_property
+    @property
     def names(self) -> tuple[str, ...]:
+        return self._names
+
+    @cached_property
+    def _names(self) -> tuple[str, ...]:
         bodies = (name + label for label in self.labels for name in STANDARD)
         return (*bodies, *(one.name for one in self.terms))
 
@@ -127,11 +131,7 @@ class ParallelModel:
             out[first : first + count] = np.einsum("njr,njc->crn", J.joints[:, a:b], W[:, :, :count], optimize=True)
             first += count
         own = wrench_regressor(motion.posture.pose, motion.twist, motion.change, robot.gravity)
-        own = (J.platform.transpose(0, 2, 1) @ own).transpose(2, 1, 0)
-        out[first : first + 10] = own
-        for k, label in enumerate(self.payloads, 1):
-            if self._carries(label, carried):
-                out[first + 10 * k : first + 10 * k + 10] = own
+        self._fill_platform(out, first, (J.platform.transpose(0, 2, 1) @ own).transpose(2, 1, 0), carried)
         motions = [motion.posture.q.T, motion.v.T, motion.a.T, None]
         for k, one in enumerate(self.terms):
             for joint, column in drives.acting(one, motions, np.zeros((0, len(motion.v)))):
@@ -180,6 +180,10 @@ class ParallelModel:
         present = [True, *(self._carries(label, carried) for label in self.payloads)]
         return own[present].sum(axis=0)
 
+    def energy_columns(self, q: np.ndarray, v: np.ndarray, carried: Collection[str] | None = None) -> np.ndarray:
+        """Return the energies h (N, p) at the encoders' q, v (N, n), as `IdentificationModel.energy_columns`."""
+        return self.energies(self.moved(q, v, np.zeros_like(v)), carried)
+
     def energies(self, motion: LoopMotion, carried: Collection[str] | None = None) -> np.ndarray:
         """Return the columns h (N, p) of kinetic and potential energy; zero for friction (eq. 3 of the power paper)."""
         robot = self.known.robot
@@ -188,15 +192,15 @@ class ParallelModel:
             own = rigid_body.energies(bodies, motion.posture.q[:, a:b], motion.v[:, a:b])
             out[first : first + 10 * leg.bodies] = own[:, : 10 * leg.bodies].T
             first += 10 * leg.bodies
-        own = energy_columns(motion.posture.pose, motion.twist, robot.gravity).T
-        out[first : first + 10] = own
-        for k, label in enumerate(self.payloads, 1):
-            if self._carries(label, carried):
-                out[first + 10 * k : first + 10 * k + 10] = own
-        for k, one in enumerate(self.terms):
-            if one.shape == "acceleration":
-                out[self.inertial + k] = 0.5 * sum(motion.v[:, joint] ** 2 for joint, _ in one.acts)
+        self._fill_platform(out, first, energy_columns(motion.posture.pose, motion.twist, robot.gravity).T, carried)
+        drives.fill_energies(self.terms, out[self.inertial :], motion.v.T)
         return out.T
+
+    def _fill_platform(self, out: np.ndarray, first: int, own: np.ndarray, carried: Collection[str] | None) -> None:
+        """Write the platform's ten columns, and the same for each payload on board."""
+        for k, label in enumerate(("", *self.payloads)):
+            if not label or self._carries(label, carried):
+                out[first + 10 * k : first + 10 * k + 10] = own
 
     def acting(self) -> np.ndarray:
         states = self.sample(4, np.random.default_rng(0))

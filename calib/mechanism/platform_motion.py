@@ -12,9 +12,10 @@ from calib.mechanism.closure import ClosedRobot, place
 from calib.mechanism.distribution import distributed
 from calib.mechanism.leg_links import Posture
 from calib.mechanism.parallel_model import ParallelModel
-from calib.mechanism.velocities import LoopMotion, of_platform
+from calib.mechanism.velocities import LoopMotion, loop_jacobians, of_platform
 
 STEP = 1e-6  # of the differences by x
+SPARE = 0.01  # of the box's width, beyond it (our choice)
 
 
 def along(known: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray, near: Posture | None = None) -> LoopMotion:
@@ -68,7 +69,7 @@ class PlatformRegressor:
 
     def regressor(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return W (N, r, b) in the columns that count."""
-        return self._columns(along(self.model.known, x, v, a))
+        return self._columns(along(self.model.known, self._reachable(x), v, a))
 
     def regressor_gradient(
         self, x: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
@@ -78,13 +79,19 @@ class PlatformRegressor:
 
     def torques(self, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the actuators' torques (N, n) by the model."""
-        return self._torques(along(self.model.known, x, v, a))
+        return self._torques(along(self.model.known, self._reachable(x), v, a))
 
     def torques_gradient(
         self, x: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the slopes of Σ weights · torques (N, n) by x, v, a, each (N, r)."""
         return self._slopes(x, v, a, lambda motion: np.einsum("na,na->n", self._torques(motion), weights))
+
+    def _reachable(self, x: np.ndarray) -> np.ndarray:
+        """Return coordinates brought back to the robot's box: a search may leave it."""
+        robot = self.model.known.robot
+        spare = SPARE * (robot.upper - robot.lower)
+        return np.clip(x, robot.lower - spare, robot.upper + spare)
 
     def _columns(self, motion: LoopMotion) -> np.ndarray:
         return self.model.platform_regressor(motion, self.carried).transpose(2, 1, 0)[self.columns].transpose(2, 1, 0)
@@ -100,14 +107,18 @@ class PlatformRegressor:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the slopes of a value per sample; central differences, exact but for rounding by v and a."""
         known, (count, r) = self.model.known, x.shape
-        near = place(known, x)
+        within = self._reachable(x)
+        near, inside = place(known, within), within == x
+        still = loop_jacobians(known, near)
         result = np.empty((3, count, r))
         for order, step in enumerate((STEP, 1e-3, 1.0)):
             for j in range(r):
                 ends = []
-                for sign in (1.0, -1.0):
-                    moved = [x, v, a]
-                    moved[order] = moved[order] + sign * step * np.eye(r)[j]
-                    ends.append(of(along(known, *moved, near=near)))
+                for shift in (step * np.eye(r)[j], -step * np.eye(r)[j]):
+                    moved = [within, v, a]
+                    moved[order] = moved[order] + shift
+                    posture = place(known, moved[0], near) if order == 0 else near
+                    twist = twist_of(known, *moved)
+                    ends.append(of(of_platform(known, posture, *twist, None if order == 0 else still)))
                 result[order, :, j] = (ends[0] - ends[1]) / (2.0 * step)
-        return result[0], result[1], result[2]
+        return result[0] * inside, result[1], result[2]

@@ -35,7 +35,7 @@ def test_a_model_that_is_right_explains_the_target_of_its_rows(rows):
     assert np.allclose(explained, rows.target(motor, sensor, q, v), rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize("rows", ROWS.values(), ids=lambda rows: rows.name)
+@pytest.mark.parametrize("rows", [one for one in ROWS.values() if one.projection is None], ids=lambda rows: rows.name)
 def test_fold_is_the_adjoint_of_observe(rows):
     rng, sides = np.random.default_rng(1), model(BOTH).sides
     torques, (q, v, _) = rng.normal(size=(7, N, len(sides))), states()

@@ -79,12 +79,13 @@ def scaled(noise: np.ndarray | None, std: np.ndarray, counts: np.ndarray) -> np.
 def residual_inflation(all_rows: Sequence[ObservationRows], values: np.ndarray) -> np.ndarray:
     """Return the integrated autocorrelation of each row's residuals (rows,), averaged over cases by length."""
     rows = all_rows[0].target.shape[1]
-    total, weight = np.zeros(rows), 0.0
+    total, weight = np.zeros(rows), np.zeros(rows)
     for part in all_rows:
-        residual = part.target - part.matrix @ values
-        total += len(residual) * np.array([inflation(residual[:, row]) for row in range(rows)])
-        weight += len(residual)
-    return np.maximum(total / max(weight, 1.0), 1.0)
+        residual, seen = part.target - part.matrix @ values, np.asarray(part.present.any(axis=0))
+        own = [inflation(residual[:, row]) if seen[row] else 0.0 for row in range(rows)]
+        total += len(residual) * np.array(own)
+        weight += len(residual) * seen
+    return np.maximum(total / np.maximum(weight, 1.0), 1.0)
 
 
 def scaled_tls(pooled: Triangles, std: np.ndarray, exact: np.ndarray) -> LinearFit:
