@@ -23,6 +23,7 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     drop = ["offl3"]                 # parameters left out first
     prior = "auto"                   # auto, none, cad: draw what the motion does not tell to the robot's own inertias
     folds = 6                        # time blocks of the cross-validation
+    accept = []                      # findings that are meant so: masses, speed, clock, lag
 
     [filter]                         # default: from the data
     cutoff = 20.0                    # f_q of the positions' filter [Hz], or one per joint
@@ -38,6 +39,7 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     rate = 1000.0                    # of files without stamps [Hz]
     topic = "/joint_states"
     use_range = true                 # follow the file's own use_range
+    lag = 0.0                        # by which torques and currents come later than the positions of their row [s]
     names = { torque = "tau_m" }     # our name = the file's
     units = { q = "deg" }            # of columns that state none
     [[coupling]]                     # a motor that turns with the sum of two joints: Iam Fvm Fcm
@@ -107,6 +109,7 @@ def _no_zero(value: Any) -> Any:
     return value
 
 
+FINDINGS = ("masses", "speed", "clock", "lag")  # `calib.identification.checks.plausible`
 Texts = Annotated[tuple[Name, ...], Spread(words="a text, or a list of them")]
 Gains = Annotated[tuple[float, ...], Expect("a list of numbers, finite and none of them zero"), Checked(_no_zero)]
 
@@ -170,6 +173,7 @@ class OptionsFile:
     loop: Annotated[LoopSettings, Checked(check_loop)] | None = None
     slow: Annotated[float | tuple[float, ...], OneOrMany(Real(above=0))] | None = None
     cut_slow: Flag = False
+    accept: tuple[Annotated[str, OneOf(FINDINGS)], ...] = ()
     gain_identification: GainPair | None = None
     recording: RecordingOptions = field(default_factory=RecordingOptions)
     filter: FilterOptions = field(default_factory=FilterOptions)
@@ -192,6 +196,7 @@ class IdentifyOptions:
         slow: see the module; None: the default share.
         cut_slow: learn nothing from rows of standing joints.
         gain_pair: recordings that tell the drive gains.
+        accept: findings that do not count against the model, see `FINDINGS`.
         source: the file, for messages.
     """
 
@@ -201,6 +206,7 @@ class IdentifyOptions:
     slow: float | tuple[float, ...] | None = None
     cut_slow: bool = False
     gain_pair: GainPair | None = None
+    accept: tuple[str, ...] = ()
     source: str = ""
 
     def for_file(self, path: str | Path) -> FileSettings:
@@ -236,7 +242,9 @@ def parse_options(table: Mapping[str, Any], source: str = "options") -> Identify
     for name, file in read.files.items():
         check_keys(dict.fromkeys(file.payload), read.payload, f'{source}: files."{name}".payload')
     every = FileSettings(read.recording, read.filter, gains=read.gains)
-    return IdentifyOptions(settings, every, read.files, read.slow, read.cut_slow, read.gain_identification, source)
+    return IdentifyOptions(
+        settings, every, read.files, read.slow, read.cut_slow, read.gain_identification, read.accept, source
+    )
 
 
 def _terms(tables: tuple[TermTable, ...], source: str) -> tuple[DriveTerm, ...]:

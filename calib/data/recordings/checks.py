@@ -18,6 +18,7 @@ SLOWEST, FASTEST = 5.0, 50e3  # sampling rates that occur [Hz]
 MOVES = 1e-3  # a joint that goes less far has not moved [rad or m]: above encoder noise
 POSES = 300  # of a recording, among which two alike are looked for
 BACK = 0.05  # of each joint's travel by which two poses may differ to be one
+BEYOND = 3.0  # times its limit: no joint's torque reaches that
 NEEDED = ("t", "q", "effort", "v", "tau_link", "tau_motor")
 
 
@@ -158,11 +159,24 @@ def _still(recording: Recording) -> list[str]:
 
 
 def _effort_notes(recording: Recording, joints: Joints | None) -> list[str]:
-    """Note efforts that do not suit the limits: currents given as torques differ from them by the gear."""
+    """Note efforts that do not suit the limits: currents given as torques differ from them by the gear.
+
+    Raises:
+        MeasurementError: where every joint is far beyond its limit: another unit.
+    """
     if joints is None or recording.kind != "torque":
         return []
     most, limit = np.abs(recording.effort).max(axis=0), joints.effort
     known = np.isfinite(limit) & (limit > 0)
+    usual = np.quantile(np.abs(recording.effort), 0.99, axis=0)  # a spike is no unit
+    if known.any() and (usual[known] > BEYOND * limit[known]).all():
+        j = int(np.argmax(np.where(known, usual / np.where(known, limit, 1.0), 0.0)))
+        message = (
+            f"|torque| reaches {usual[j]:.4g} where the joint's limit is {limit[j]:g}, and every joint is beyond "
+            f"{BEYOND:g} times its limit: are these N mm, or another robot's? If N mm, say so (a header 'tau_1 [mNm]', "
+            "or units: torque = 'mNm'); if N m, correct the limits in the robot's file"
+        )
+        raise MeasurementError(message, recording.file, column=column(recording, "effort", j))
     high = known & (most > 1.2 * np.where(known, limit, np.inf))
     notes = [
         f"{recording.joint_names[j]}: |torque| reaches {most[j]:.3g}, its limit is {limit[j]:g}: another unit?"

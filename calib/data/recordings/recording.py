@@ -13,6 +13,7 @@ from calib.errors import MeasurementError, UsageError
 
 KINDS = ("torque", "current")
 SERIES = ("q", "v", "effort", "tau_link", "tau_motor", "q_link", "q_ref", "tau_ff")
+LATE = ("effort", "tau_link", "tau_motor")  # what may come late: they have a path of their own to the log
 _CUT = re.compile(r"^(?P<file>.+)@(?P<start>[^@:/\\]*):(?P<stop>[^@:/\\]*)$")
 
 
@@ -151,6 +152,30 @@ def cut(recording: Recording, start: float | None = None, stop: float | None = N
         last = f"{recording.t[-1]:.4g} s" if len(recording) else "nothing"
         raise MeasurementError(f"the cut @{low}:{high} leaves no sample; the recording ends at {last}", recording.file)
     return take(recording, slice(first, end))
+
+
+def earlier(recording: Recording, lag: float) -> Recording:
+    """Return the recording with torques and currents `lag` [s] earlier: they had come that much later than positions.
+
+    Samples whose torque was not recorded go.
+
+    Raises:
+        MeasurementError: where nothing is left.
+    """
+    if not lag:
+        return recording
+    t = recording.t + lag
+    inside = (t >= recording.t[0]) & (t <= recording.t[-1]) if len(t) else np.zeros(0, bool)
+    if not inside.any():
+        message = f"torques {lag:g} s late leave no sample of {recording.duration:.3g} s"
+        raise MeasurementError(message, recording.file)
+    moved = {
+        name: np.column_stack([np.interp(t, recording.t, own) for own in value.T])
+        for name in LATE
+        if (value := getattr(recording, name)) is not None
+    }
+    notes = (*recording.notes, f"torques are taken {1e3 * lag:g} ms earlier, as asked for")
+    return take(replace(recording, notes=notes, **moved), inside)
 
 
 def span(t: np.ndarray, start: float | None, stop: float | None) -> tuple[int, int]:

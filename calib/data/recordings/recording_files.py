@@ -9,7 +9,7 @@ from calib.data.recordings.archives import Ends, read_archive
 from calib.data.recordings.bags import read_bag
 from calib.data.recordings.checks import check_recording
 from calib.data.recordings.csv_logs import read_log
-from calib.data.recordings.recording import Joints, Recording, parse_cut
+from calib.data.recordings.recording import Joints, Recording, earlier, parse_cut
 from calib.data.recordings.recording_options import RecordingOptions
 from calib.errors import MeasurementError
 
@@ -34,7 +34,7 @@ def read_recording(
     recording = reader(Path(file), joints, options, (start, stop))
     if joints is not None:
         _check_names(recording, joints)
-    return check_recording(recording, joints)
+    return check_recording(earlier(recording, options.lag), joints)
 
 
 def _check_names(recording: Recording, joints: Joints) -> None:

@@ -28,7 +28,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from calib.config import Checked, Flag, Hidden, Name, OneOf, Positive, Text, shown, strict
+from calib.config import Checked, Flag, Hidden, Name, OneOf, Positive, Real, Text, shown, strict
 from calib.data.recordings.recording import Joints, named
 from calib.errors import MeasurementError, UsageError, suggestion
 from calib.units import CURRENTS, EFFORTS, POSITIONS, TIMES, VELOCITIES
@@ -48,6 +48,7 @@ SYNONYMS: Mapping[str, tuple[str, ...]] = {
     ),
     "tau_ff": ("tau_ff", "tau_feedforward", "torque_feedforward"),
 }  # fmt: skip
+LATEST = 1.0  # largest lag that is believed [s] (our choice)
 RATES = ("frequency", "rate", "sample_rate", "fs")
 OWN = ("joint_names", "drive_gain", "use_range")
 SCALES = {
@@ -86,6 +87,7 @@ class RecordingOptions:
         rate: sampling rate of a file without stamps [Hz].
         topic: of a ROS bag with several topics of joint states.
         use_range: follow the file's own `use_range` where the path has no cut.
+        lag: by which torques and currents come later than the positions of their row [s].
         rows: what the torques to be explained are called, for messages.
         motors, sensors: whether they need the motors' torques, those of sensors behind the gears: where they need
             these and no column is called a torque or current, tau_motor is the effort.
@@ -97,6 +99,7 @@ class RecordingOptions:
     rate: Positive | None = None
     topic: Name = ""
     use_range: Flag = True
+    lag: Annotated[float, Real(least=-LATEST, most=LATEST, unit="s")] = 0.0
     rows: Annotated[str, Hidden()] = "motor"
     motors: Annotated[bool, Hidden()] = True
     sensors: Annotated[bool, Hidden()] = False

@@ -5,7 +5,7 @@ Everything is looked at on a coarse common grid; `trajectories.recall` finds the
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from calib.data.recordings.recording import Recording
-from calib.dynamics.bodies import bodies_of, standard_parameters
+from calib.dynamics.bodies import bodies_of, standard_parameters, with_gravity
 from calib.dynamics.rigid_body import inverse_dynamics
 from calib.robot.chain import Chain
 from trajectories.errors import BadInput
@@ -27,6 +27,7 @@ EDGE = 0.25  # kept before and after the motion [s], for the filters' borders
 SMOOTH = 10  # half width of the window for derivatives, in steps of the coarse grid
 SURE = 0.8  # partial correlation with the torque of the nominal masses from which on its sign counts
 HEAVY = 0.03  # of the torque limit: rigid-body torques smaller than this say nothing
+INERTIAL = 0.01  # the same for torques of acceleration alone, which are smaller
 UNLIMITED = 100.0  # torque limit of a joint that states none [N m or N]
 CREEP = 0.05  # speed over which the sign of Coulomb friction is smoothed [rad/s or m/s]
 
@@ -176,16 +177,40 @@ def nominal_share(recording: Recording, chain: Chain) -> np.ndarray:
     Returns:
         (n,) factors on τ_nominal: 1 for right masses, below 0 for a reversed sign; NaN for joints that do not count.
     """
-    grid, place = _on_grid(recording)
+    return share_of_nominal(recording.t, recording.q, recording.effort, chain)
+
+
+def share_of_nominal(
+    t: np.ndarray, q: np.ndarray, effort: np.ndarray, chain: Chain, gravity: Sequence[float] | None = None,
+    part: str = "",
+) -> np.ndarray:  # fmt: skip
+    """Return what `nominal_share` does, of samples.
+
+    Args:
+        t: (N,) [s]; q, effort: (N, n).
+        chain: the arm with its nominal masses.
+        gravity: [m/s²], where it is not the robot's own.
+        part: ``gravity`` or ``inertia`` compares these torques alone, the others left free like friction.
+    """
+    grid = np.arange(t[0], t[-1], STEP)
+    torque, place = _smooth(_sampled(t, effort, grid)), _sampled(t, q, grid)
     q, v, a = (_smooth(place, order) for order in range(3))
-    torque = _smooth(_sampled(recording.t, recording.effort, grid))
-    rigid = inverse_dynamics(bodies_of(chain), standard_parameters(chain), q, v, a)
+    bodies, parameters = bodies_of(chain), standard_parameters(chain)
+    bodies = bodies if gravity is None else with_gravity(bodies, np.asarray(gravity, dtype=float))
+    rigid = inverse_dynamics(bodies, parameters, q, v, a)
+    other = None
+    if part:
+        static = inverse_dynamics(bodies, parameters, q, np.zeros_like(v), np.zeros_like(a))
+        rigid, other = (static, rigid - static) if part == "gravity" else (rigid - static, static)
     limit = np.array([joint.effort for joint in chain.joints])
-    heavy = rigid.std(axis=0) > HEAVY * np.where(np.isfinite(limit), limit, UNLIMITED)
+    heavy = rigid.std(axis=0) > (INERTIAL if part == "inertia" else HEAVY) * np.where(
+        np.isfinite(limit), limit, UNLIMITED
+    )
     share = np.full(chain.n, np.nan)
     for j in np.flatnonzero(heavy):
         friction = np.column_stack([v[:, j], np.tanh(v[:, j] / CREEP), np.ones(len(q))])
-        own, seen = (x - friction @ np.linalg.lstsq(friction, x, rcond=None)[0] for x in (rigid[:, j], torque[:, j]))
+        free = friction if other is None else np.column_stack([friction, other[:, j]])
+        own, seen = (x - free @ np.linalg.lstsq(free, x, rcond=None)[0] for x in (rigid[:, j], torque[:, j]))
         common, power = own @ seen, own @ own
         if abs(common) / max(np.sqrt(power * (seen @ seen)), 1e-12) > SURE:
             share[j] = common / max(power, 1e-12)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.data.recordings.checks import check_recording
-from calib.data.recordings.recording import Joints, Recording
+from calib.data.recordings.recording import Joints, Recording, earlier
 from calib.data.recordings.recording_files import read_recording
 from calib.data.signals.decimation import SHARE
 from calib.data.signals.motion import FilterOptions, Motion, make_motion, sample
@@ -179,7 +179,7 @@ def read_motion(given: str | Path | Recording, chain: Chain, own: FileSettings, 
             positions need filtering, it says itself.
     """
     if isinstance(given, Recording):
-        recording = check_recording(given, joints_of(chain))
+        recording = check_recording(earlier(given, own.recording.lag), joints_of(chain))
     else:
         recording = read_recording(given, joints_of(chain), own.recording)
     sampled = sample(recording, own.filter)

@@ -11,9 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.data.signals.persistency import ExcitationReport, repeats, report_excitation
+from calib.identification.checks.plausible import compare_sizes
 from calib.identification.friction.passivity import driven
 from calib.identification.prediction import Dynamics, predict
 from calib.identification.scores import Score, score
+from calib.procedure.dynamic_stage import plausibility
 from calib.procedure.dynamic_stage.gains import relative_warnings
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, Progress
 from calib.procedure.dynamic_stage.tracking import Tracking, track
@@ -25,6 +27,7 @@ from calib.procedure.dynamic_stage.verdict import (
 )
 from calib.procedure.kinematic_stage.verdict import Verdict
 from calib.simulation.loop.controllers import Controller
+from calib.units import TORQUE
 
 REPEAT = 0.5  # share of states met in training from which on a validation file proves nothing (our choice)
 
@@ -99,8 +102,12 @@ def assess(
     fit = {case.name: scores[case.name] for case in inputs.cases}
     validation = {case.name: scores[case.name] for case in inputs.unseen}
     proofs = {name: one for name, one in validation.items() if name not in repeated}
-    labels = inputs.options.settings.torque_rows.numbered(inputs.chain.n)
+    settings = inputs.options.settings
+    labels = settings.torque_rows.numbered(inputs.chain.n)
+    sizes = [compare_sizes(case, inputs.chain, settings.gravity, inputs.unit == TORQUE) for case in inputs.cases]
+    odd, accepted = plausibility.findings(sizes, inputs.chain.joint_names), inputs.options.accept
     verdict = with_prior(judge(fit, proofs, repeated, excitation, wrong, labels), findings.rests)
+    verdict = plausibility.held_by(verdict, odd, accepted)
     say("tracking with the model fed forward")
     amperes = relative_warnings(inputs.unit)
     tracking = (
@@ -108,7 +115,8 @@ def assess(
         else track(inputs, dynamics, predictions, findings.controller)
     )  # fmt: skip
     told = (
-        *amperes, *warnings(inputs.cases, inputs.unseen, validation, repeated, excitation, inputs.chain),
+        *amperes, *plausibility.told(odd, accepted),
+        *warnings(inputs.cases, inputs.unseen, validation, repeated, excitation, inputs.chain),
         *findings.notes,
     )  # fmt: skip
     return Assessment(

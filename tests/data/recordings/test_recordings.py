@@ -214,7 +214,7 @@ def test_what_is_odd_is_noted(archive, series):
     assert any("is their sign reversed?" in note for note in notes)
     notes = read_recording(archive(tau=series["tau"] / 80), ROBOT).notes
     assert any("are these currents" in note for note in notes)
-    notes = read_recording(archive(tau=series["tau"] * 10), ROBOT).notes
+    notes = read_recording(archive(tau=series["tau"] * [10, 1, 1]), ROBOT).notes
     assert any("its limit is 100" in note for note in notes)
     narrow = Joints(("a", "b", "c"), lower=np.full(3, -0.1), upper=np.full(3, 0.1))
     assert len([note for note in read_recording(archive(), narrow).notes if "beyond its limits" in note]) == 3

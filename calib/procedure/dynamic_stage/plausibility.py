@@ -1,0 +1,135 @@
+"""What sizes, signs and clocks of the recordings mean for a verdict; all thresholds are our choice.
+
+A finding that makes the numbers of a model wrong by far is no note under a pass: it fails, or holds the verdict at
+marginal, until the options' ``accept`` says that it is meant. Findings and their names:
+
+masses   torques that pull against the robot's own masses, or `FAR` times as much as these ask for, or a share of it:
+         fail; beyond `OFF`, or `FAR` at single joints: marginal
+speed    measured velocities that are not the slope of the positions, by `SLIGHT`: marginal; by `WRONG` times: fail
+clock    torques of acceleration beyond `LIGHT` to `HEAVY` times those of the robot's own inertias: marginal
+lag      torques that come later than the positions of their row, at most joints alike (``[recording] lag = …`` takes
+         them earlier): a note; where that explains `HELPS` of what is left: marginal
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.identification.checks.plausible import Lag, RecordingSizes
+from calib.procedure.kinematic_stage.verdict import Verdict
+
+FAR, OFF = 3.0, 2.2
+SLIGHT, WRONG = 0.05, 1.5
+LIGHT, HEAVY = 0.5, 5.0
+HELPS = 0.3
+LEVELS = ("pass", "marginal", "fail")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What is odd with a recording: its name in ``accept``, the best level it allows, and a sentence."""
+
+    name: str
+    level: str
+    words: str
+
+
+def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Finding]:
+    """Return what is odd with recordings, worst first."""
+    found = [
+        one for each in sizes for one in (*_masses(each, joints), *_speed(each, joints), *_lag(each.name, each.lag))
+    ]
+    return sorted(found, key=lambda one: -LEVELS.index(one.level))
+
+
+def held_by(verdict: Verdict, found: Sequence[Finding], accepted: Collection[str]) -> Verdict:
+    """Return the verdict, no better than the findings allow that were not accepted."""
+    for one in found:  # worst first
+        if one.name not in accepted and LEVELS.index(one.level) > LEVELS.index(verdict.level):
+            return Verdict(one.level, f"{one.words}; {verdict.reason}")
+    return verdict
+
+
+def told(found: Sequence[Finding], accepted: Collection[str]) -> list[str]:
+    """Return what a user should know."""
+    return [
+        f"{one.words} (accepted by the options)" if one.name in accepted else f"{one.words}{_yes(one)}" for one in found
+    ]
+
+
+def _yes(one: Finding) -> str:
+    return "" if one.level == "pass" else f'; if that is meant, accept = ["{one.name}"] in the options'
+
+
+def _masses(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
+    """Compare with the robot's own masses: signs, then sizes."""
+    share = each.masses
+    sure = np.flatnonzero(np.isfinite(share))
+    if not len(sure):
+        return
+    against = [joints[j] for j in sure if share[j] < 0.0]
+    if against:
+        yield Finding(
+            "masses", "fail",
+            f"{each.name}: the torques of {', '.join(against)} push the wrong way for the robot's own masses: is a "
+            "sign reversed, the torques' or the gravity's, or are columns exchanged?",
+        )  # fmt: skip
+        return
+    usual, told = float(np.median(share[sure])), ", ".join(f"{joints[j]} {share[j]:.2g}" for j in sure)
+    words = f"{each.name}: the torques are not those of the robot's own masses, but times {told}"
+    advice = "is this the robot, are the columns in its order, the torques in N m behind the gears?"
+    if not 1.0 / FAR < usual < FAR:
+        yield Finding("masses", "fail", f"{words}: {advice}")
+    elif not 1.0 / OFF < usual < OFF or (share[sure] > FAR).any() or (share[sure] < 1.0 / FAR).any():
+        yield Finding("masses", "marginal", f"{words}: {advice}")
+
+
+def _clock(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
+    """Compare inertia with the robot's own where gravity agrees: stamps off by a factor leave its square there."""
+    both = np.isfinite(each.inertia)
+    usual = float(np.median(each.inertia[both])) if both.sum() >= 2 else 1.0
+    if LIGHT < usual < HEAVY or not np.isfinite(each.masses).any() or np.nanmin(each.masses) < 0.0:
+        return
+    shown = ", ".join(f"{joints[j]} {each.inertia[j]:.2g}" for j in np.flatnonzero(both))
+    yield Finding(
+        "clock", "marginal",
+        f"{each.name}: the torques of acceleration are not those of the robot's own inertias, but times {shown}: are "
+        f"the stamps some {max(usual, 1 / usual) ** 0.5:.2g} times too {'large' if usual > 1 else 'small'}? What "
+        "measured velocities would show, masses that are not the robot's show as well",
+    )  # fmt: skip
+
+
+def _speed(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
+    """Compare measured velocities with the slopes of the positions."""
+    ratio = each.speed
+    off = np.flatnonzero(np.abs(np.nan_to_num(ratio, nan=1.0) - 1.0) > SLIGHT)
+    if not len(off):
+        return
+    known = np.flatnonzero(np.isfinite(ratio))
+    usual = float(np.median(ratio[off]))
+    if len(off) == len(known) and np.ptp(ratio[off]) < 0.02 * usual:
+        what, why = (
+            "every joint",
+            f"are the stamps {max(usual, 1 / usual):.3g} times too {'large' if usual > 1 else 'small'}",
+        )
+    else:
+        what = ", ".join(f"{joints[j]} ({ratio[j]:.3g})" for j in off)
+        why = "are columns exchanged, or units"
+    far = ((ratio[off] > WRONG) | (ratio[off] < 1.0 / WRONG)).any()
+    words = f"{each.name}: the measured velocities are {usual:.3g} times the slopes of the positions at {what}: {why}?"
+    yield Finding("speed", "fail" if far else "marginal", f"{words} Accelerations and inertias rest on the stamps")
+
+
+def _lag(name: str, lag: Lag | None) -> Iterator[Finding]:
+    if lag is None:
+        return
+    way = "later" if lag.seconds > 0 else "earlier"
+    yield Finding(
+        "lag", "marginal" if lag.after < (1.0 - HELPS) * lag.before else "pass",
+        f"{name}: the torques come some {1e3 * abs(lag.seconds):.0f} ms {way} than the positions: [recording] lag = "
+        f"{lag.seconds:.3f} in the options takes them back; with standard friction {100 * lag.after:.1f} % of the "
+        f"joints' torques then stay unexplained, {100 * lag.before:.1f} % as recorded",
+    )  # fmt: skip

@@ -1,0 +1,101 @@
+"""Recordings that are not what they claim: signs, sizes and clocks, against the robot's own masses and stamps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import planted_motion as planted
+import pytest
+
+from calib.data.recordings.checks import check_recording
+from calib.data.recordings.recording import Joints, Recording, earlier
+from calib.data.signals.motion import FilterOptions, make_motion
+from calib.errors import MeasurementError
+from calib.identification.cases import Case, make_case
+from calib.identification.checks.plausible import compare_sizes
+from calib.procedure.dynamic_stage.plausibility import Finding, findings, held_by, told
+from calib.procedure.kinematic_stage.verdict import Verdict
+
+NAMES = ("joint1", "joint2", "joint3")
+ARM = replace(planted.arm(), joints=tuple(replace(joint, effort=60.0) for joint in planted.arm().joints))
+
+
+def recorded(late: float = 0.0, clock: float = 1.0, seed: int = 0, **series: np.ndarray) -> Recording:
+    """Return the planted arm's recording, with measured velocities, torques late [s], stamps times `clock`."""
+    t, q, v, a = planted.motion(seed)
+    tau = planted.torques(q, v, a) + 0.2 * np.random.default_rng(seed).normal(size=q.shape)
+    tau = np.column_stack([np.interp(t - late, t, own) for own in tau.T])
+    return Recording(clock * t, q, series.get("tau", tau), "torque", NAMES, v=series.get("v", v), file="log")
+
+
+def case_of(recording: Recording) -> Case:
+    return make_case("log", make_motion(recording, FilterOptions(cutoff=30.0, band=10.0)))
+
+
+def found(recording: Recording, gravity: tuple[float, ...] | None = None) -> list[Finding]:
+    return findings([compare_sizes(case_of(recording), ARM, gravity)], NAMES)
+
+
+def test_a_sound_recording_is_not_remarked_upon() -> None:
+    assert found(recorded()) == []
+    sizes = compare_sizes(case_of(recorded()), ARM)
+    assert sizes.masses[1] == pytest.approx(1.0, abs=0.15) and sizes.speed == pytest.approx(1.0, abs=1e-3)
+
+
+def test_torques_against_the_robots_own_masses_fail() -> None:
+    (one,) = found(recorded(), gravity=(0.0, 0.0, 9.81))
+    assert (one.name, one.level) == ("masses", "fail") and "joint2" in one.words and "wrong way" in one.words
+
+
+@pytest.mark.parametrize("factor, level", [(1.5, None), (2.6, "marginal"), (4.0, "fail"), (0.2, "fail")])
+def test_torques_of_another_robot_are_told_by_their_size(factor: float, level: str | None) -> None:
+    one = next((one for one in found(recorded(tau=factor * recorded().effort)) if one.name == "masses"), None)
+    assert (one.level if one else None) == level
+
+
+@pytest.mark.parametrize("clock, level", [(1.03, None), (1.1, "marginal"), (2.0, "fail"), (0.5, "fail")])
+def test_velocities_that_are_no_slopes_are_told(clock: float, level: str | None) -> None:
+    one = next((one for one in found(recorded(clock=clock)) if one.name == "speed"), None)
+    assert (one.level if one else None) == level
+    assert one is None or f"are the stamps {max(clock, 1 / clock):.3g} times too" in one.words
+
+
+@pytest.mark.parametrize("late", [0.0, 0.005, 0.03, 0.05, -0.05, 0.1, 0.2])
+def test_a_lag_of_all_torques_is_found_and_taken_back(late: float) -> None:
+    lag = compare_sizes(case_of(recorded(late)), ARM).lag
+    if abs(late) < 0.015:
+        assert lag is None
+        return
+    assert lag is not None and lag.seconds == pytest.approx(late, abs=0.006) and lag.after < 0.6 * lag.before
+    assert compare_sizes(case_of(earlier(recorded(late), lag.seconds)), ARM).lag is None
+
+
+def test_one_joint_that_prefers_a_lag_is_no_clock() -> None:
+    tau = recorded().effort.copy()
+    tau[:, 2] = recorded(0.05).effort[:, 2]
+    assert compare_sizes(case_of(recorded(tau=tau)), ARM).lag is None
+
+
+def test_a_finding_holds_the_verdict_until_it_is_accepted() -> None:
+    odd = [Finding("masses", "fail", "wrong way"), Finding("lag", "pass", "late")]
+    held = held_by(Verdict("pass", "5 %"), odd, ())
+    assert held == Verdict("fail", "wrong way; 5 %") and held_by(held, odd, ()) == held
+    assert held_by(Verdict("pass", "5 %"), odd, ("masses",)) == Verdict("pass", "5 %")
+    assert told(odd, ()) == ['wrong way; if that is meant, accept = ["masses"] in the options', "late"]
+    assert told(odd, ("masses",))[0] == "wrong way (accepted by the options)"
+
+
+def test_torques_beyond_all_limits_are_another_unit() -> None:
+    joints = Joints(NAMES, effort=np.full(3, 60.0))
+    check_recording(recorded(), joints)
+    with pytest.raises(MeasurementError, match="N mm"):
+        check_recording(recorded(tau=1e3 * recorded().effort), joints)
+    spiked = recorded().effort.copy()
+    spiked[7] = 1e4
+    assert "another unit?" in " ".join(check_recording(recorded(tau=spiked), joints).notes)
+
+
+def test_currents_without_gains_compare_with_no_masses() -> None:
+    one = replace(case_of(recorded()), target=5.0 * case_of(recorded()).target)
+    assert np.isnan(compare_sizes(one, ARM, newtons=False).masses).all()
