@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from calib import files
 from calib.data.csv_table import read_header, read_table
 from calib.errors import MeasurementError
 
@@ -166,3 +167,11 @@ def test_a_ragged_row_far_down_keeps_its_number(write):
     with pytest.raises(MeasurementError, match="1 cells where the header has 2") as error:
         read_table(write("a,b", "1,2\n" * 40_002 + "3\n"))
     assert error.value.row == 40_003
+
+
+def test_numbers_are_written_as_rows_are(tmp_path):
+    values = np.random.default_rng(0).normal(size=(40, 3)) * 10.0 ** np.arange(-60, 60).reshape(40, 3)
+    values[0] = [0.0, -0.0, 5.0]
+    header = ["# t", 'a, "b"', "c;d"]
+    plain = files.write_table(tmp_path / "rows.csv", header, values.tolist()).read_bytes()
+    assert files.write_numbers(tmp_path / "numbers.csv", header, values).read_bytes() == plain

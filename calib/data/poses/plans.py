@@ -39,7 +39,7 @@ def write_poses(
         if unit == "deg" and kind != "prismatic":
             values[:, j] = np.rad2deg(values[:, j])
             header[j] = f"{header[j]} [deg]"
-    return files.write_table(path, header, values.tolist())
+    return files.write_numbers(path, header, values)
 
 
 def read_poses(

@@ -8,7 +8,7 @@ placement of a held-out station (projected out).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -73,6 +73,7 @@ class FoldStatistics:
     held_out: list[Gram]
     rows: np.ndarray
     total: Gram
+    _chosen: dict[bytes, np.ndarray] = field(default_factory=dict, init=False)
 
     def problem(self, terms: np.ndarray, fold: int | None = None) -> tuple[Gram, np.ndarray, np.ndarray]:
         """Return statistics, ridge groups and first sizes for geometry and terms: of all rows, or without a fold."""
@@ -99,10 +100,16 @@ class FoldStatistics:
         """Return the rms error on held-out rows of the geometry alone [m]."""
         return self.error(np.array([], dtype=int)).rms
 
+    def ridges(self, terms: np.ndarray) -> np.ndarray:
+        """Return the prior standard deviation of each term that all rows choose; 0 where they switch it off."""
+        key = terms.tobytes()
+        if key not in self._chosen:
+            self._chosen[key] = relevance(*self.problem(terms)).ridge[self.rigid :]
+        return self._chosen[key]
+
     def alive(self, terms: np.ndarray) -> int:
         """Return how many of the terms the data keep."""
-        ridge = relevance(*self.problem(terms)).ridge[self.rigid :]
-        return int(np.sum(ridge > 0.0))
+        return int(np.sum(self.ridges(terms) > 0.0))
 
 
 def fold_statistics(

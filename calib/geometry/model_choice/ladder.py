@@ -18,7 +18,6 @@ import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import UsageError
-from calib.estimation.relevance import relevance
 from calib.geometry.fit import fit, fit_with_prior, polish_frames
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.cross_validation import FoldStatistics, fold_statistics
@@ -241,8 +240,7 @@ class _Climber:
 
     def _final(self, statistics: FoldStatistics, terms: list[Term], places: list[np.ndarray]) -> GeometricFit:
         """Fit geometry and effects to all rows, each term with the ridge the data chose; terms without effect go."""
-        chosen = relevance(*statistics.problem(np.concatenate(places)))
-        ridge = chosen.ridge[statistics.rigid :]
+        ridge = statistics.ridges(np.concatenate(places))
         alive = np.flatnonzero(ridge > 0.0)
         picked = tuple(terms[k] for k in alive)
         cell = replace(

@@ -147,7 +147,7 @@ def _transform(names: tuple[str, ...], groups: dict[str, dict[str, float]], stan
 
 def write(found: Identification, folder: Path) -> None:
     """Write the triangle of an identification's data (`_information`)."""
-    files.write_table(folder / INFORMATION, (*found.names, "target"), _information(found).tolist())
+    files.write_numbers(folder / INFORMATION, (*found.names, "target"), _information(found))
 
 
 def _numbers(path: Path) -> np.ndarray:

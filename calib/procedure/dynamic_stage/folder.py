@@ -231,7 +231,7 @@ def _write_torques(case: Case, predicted: np.ndarray, path: Path) -> Path:
     names = [f"{what}_{j + 1}" for what in ("measured", "predicted") for j in range(rows)]
     joints = [f"q{j + 1}" for j in range(motion.q.shape[1])]
     table = np.column_stack([motion.t, case.target, predicted, motion.q])[::step]
-    return files.write_table(path, ["t [s]", *names, *joints], table.tolist())
+    return files.write_numbers(path, ["t [s]", *names, *joints], table)
 
 
 def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:

@@ -95,7 +95,7 @@ def _write_setpoints(track: Setpoints, path: Path) -> Path:
     """Write t, q, v, a and, where known, tau; SI, a row per sample of the controller."""
     parts = {"q": track.q, "v": track.v, "a": track.a} | ({} if track.tau is None else {"tau": track.tau})
     header = ["t", *(f"{letter}{j + 1}" for letter in parts for j in range(track.n))]
-    return files.write_table(path, header, np.column_stack([track.times, *parts.values()]).tolist())
+    return files.write_numbers(path, header, np.column_stack([track.times, *parts.values()]))
 
 
 def _write_optional(track: Setpoints | None, path: Path) -> None:

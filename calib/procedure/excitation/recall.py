@@ -91,7 +91,7 @@ def write(averaged: AveragedMotion, out: Path) -> Path:
     if out.suffix == ".csv":
         header = ["t", *(f"{called[name]}{j + 1}" for name in averages for j in range(len(names)))]
         table = np.column_stack([t, *(one.mean for one in averages.values())])
-        return files.write_table(out, header, table.tolist())
+        return files.write_numbers(out, header, table)
     arrays = {called[name]: one.mean for name, one in averages.items()}
     arrays |= {f"variance_{called[name]}": one.variance for name, one in averages.items()}
     buffer = io.BytesIO()

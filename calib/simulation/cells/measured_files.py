@@ -32,7 +32,7 @@ def write(measured: Positions, path: str | Path, degrees: bool = True) -> Path:
     if isinstance(measured, Poses) and measured.sigma_rotation is not None:
         columns.append(measured.sigma_rotation)
         header += [f"sigma_r{axis}" for axis in "xyz"]
-    return files.write_table(path, header, np.hstack(columns).tolist())
+    return files.write_numbers(path, header, np.hstack(columns))
 
 
 def write_log(recording: Recording, path: str | Path, degrees: bool = True) -> Path:
