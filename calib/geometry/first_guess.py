@@ -7,7 +7,7 @@ With the arm's poses A_i = (R_i, a_i) from the nominal chain:
 * position   S⁻¹ y_i = R_i t + a_i: linear in S's rotation (9 numbers), its offset and t; the 9 are projected on SO(3);
 * sockets    R_i t + a_i constant within each group: linear in t;
 * images     the board's pose in each (PnP), and of three closed forms for B_i = S A_i X the best
-             (`calib.geometry.hand_eye`).
+             (`calib.geometry.images.hand_eye`).
 
 Each guess then gets a few robust Gauss–Newton steps on the frames alone (`calib.geometry.fit`).
 """
@@ -23,10 +23,10 @@ from scipy.spatial.transform import Rotation
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions, Sockets, take
 from calib.data.poses.pixels import Pixels
 from calib.errors import MeasurementError
-from calib.geometry.camera_guess import place_camera, seen_target
-from calib.geometry.hand_eye import average_pose, place_pose
+from calib.geometry.images.camera_guess import place_camera, seen_target
+from calib.geometry.images.hand_eye import average_pose, place_pose
+from calib.geometry.images.optics import BoardShape, Optics
 from calib.geometry.installation import Installation
-from calib.geometry.optics import BoardShape, Optics
 from calib.robot.chain import Chain
 from calib.robot.deflection import Deflection
 from calib.robot.kinematics import forward

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from calib.arrays import frozen
-from calib.geometry.optics import Optics, View
+from calib.geometry.images.optics import Optics, View
 from calib.robot.chain import Chain
 from calib.robot.deflection import Deflection, extra_displacements
 from calib.robot.kinematics import Sweep, sweep

@@ -30,8 +30,8 @@ import numpy as np
 
 from calib.data.camera.lens import Lens
 from calib.errors import CalibError, RobotError
+from calib.geometry.images.optics import BoardShape, Optics
 from calib.geometry.installation import Installation
-from calib.geometry.optics import BoardShape, Optics
 from calib.records import read_record
 from calib.robot import calibrated, description
 from calib.robot.calibrated import nominal_of

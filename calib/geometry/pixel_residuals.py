@@ -17,9 +17,9 @@ from calib.data.camera.board import corners
 from calib.data.camera.lens import project_with_slopes
 from calib.data.poses.pixels import IN_HAND, Pixels
 from calib.errors import MeasurementError, UsageError
-from calib.geometry.image_noise import ImageNoise, OwnPoses
+from calib.geometry.images.image_noise import ImageNoise, OwnPoses
+from calib.geometry.images.optics import View, shape_slopes
 from calib.geometry.installation import Installation, Seen
-from calib.geometry.optics import View, shape_slopes
 from calib.geometry.parameters import layout_counts
 from calib.geometry.residuals import Part, parts
 

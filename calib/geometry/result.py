@@ -11,7 +11,7 @@ from calib.estimation import robust
 from calib.estimation.base_columns import ColumnSplit
 from calib.estimation.estimate import Estimate
 from calib.estimation.nonlinear import Solution
-from calib.geometry.image_noise import ImageNoise
+from calib.geometry.images.image_noise import ImageNoise
 from calib.geometry.installation import Installation, merged
 from calib.geometry.observation import Block
 from calib.geometry.pixel_residuals import PixelPart

@@ -10,7 +10,7 @@ from calib.errors import MeasurementError, UsageError
 from calib.estimation import robust
 from calib.estimation.estimate import Estimate
 from calib.estimation.nonlinear import Solution, covariance
-from calib.geometry.image_noise import ImageNoise, estimate_noise
+from calib.geometry.images.image_noise import ImageNoise, estimate_noise
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, observe, stack
 from calib.geometry.parameters import layout, parameter_values

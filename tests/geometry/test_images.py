@@ -16,13 +16,13 @@ from calib.data.camera.lens import Lens
 from calib.data.poses.measurements import Positions, take
 from calib.data.poses.pixels import IN_HAND, TO_HAND, Pixels
 from calib.errors import MeasurementError
-from calib.geometry.camera_guess import complete_camera
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit, placed_on
-from calib.geometry.hand_eye import place_robustly
+from calib.geometry.images.camera_guess import complete_camera
+from calib.geometry.images.hand_eye import place_robustly
+from calib.geometry.images.optics import BoardShape
 from calib.geometry.installation import see
 from calib.geometry.observation import observe, prepare
-from calib.geometry.optics import BoardShape
 from calib.geometry.parameters import layout, step
 from calib.geometry.result import outliers
 from calib.geometry.weighing import Settings
@@ -244,7 +244,7 @@ def test_a_flat_board_has_one_pose_even_from_afar():
 
 @pytest.mark.parametrize("method", ["Shah", "Li", "Park-Martin"])
 def test_every_closed_form_places_exact_poses(method, monkeypatch):
-    from calib.geometry import hand_eye
+    from calib.geometry.images import hand_eye
 
     rng = np.random.default_rng(1)
     arm, station, tool = (pose(Rotation.random(n, rng=rng), rng.normal(size=(n, 3))) for n in (12, 1, 1))

@@ -15,7 +15,7 @@ import numpy as np
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.estimation.relevance import Gram, gram, relevance
 from calib.geometry.fit import plausible_deviation
-from calib.geometry.image_noise import ImageNoise
+from calib.geometry.images.image_noise import ImageNoise
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.folds import Folds
 from calib.geometry.observation import observe, prepare

@@ -14,11 +14,11 @@ from calib.data.poses.measurements import PoseMeasurements, take
 from calib.data.poses.pixels import Pixels
 from calib.data.poses.pose_files import joint_columns, read_measurements
 from calib.errors import MeasurementError, UsageError
-from calib.geometry.camera_guess import complete_camera
 from calib.geometry.checks.copied_rows import repeated
 from calib.geometry.checks.orientations import check_orientations
 from calib.geometry.checks.repeatability import repeated_rows
 from calib.geometry.first_guess import check_scale
+from calib.geometry.images.camera_guess import complete_camera
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.robot import calibrated, description
 from calib.robot.calibrated import CalibratedChain

@@ -21,9 +21,9 @@ from calib.data.camera.lens import Lens, in_sight, project
 from calib.data.poses.image_folders import JOINTS
 from calib.data.poses.pixels import IN_HAND, Pixels
 from calib.errors import CannotSimulate
+from calib.geometry.images.optics import BoardShape, Optics, shaped_points
 from calib.geometry.installation import Installation
 from calib.geometry.inverse import Goal, reach, seen_at
-from calib.geometry.optics import BoardShape, Optics, shaped_points
 from calib.robot.chain import Chain, random_joints, sampling_limits
 from calib.robot.deflection import Deflection
 from calib.robot.kinematics import forward

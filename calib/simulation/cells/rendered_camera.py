@@ -17,7 +17,7 @@ import numpy as np
 from calib.data.camera.board import Board
 from calib.data.camera.board_print import raster
 from calib.data.camera.lens import Lens, project, rays
-from calib.geometry.optics import BoardShape, shaped_points
+from calib.geometry.images.optics import BoardShape, shaped_points
 
 SUB = 3  # sub-pixels each way
 NODES = 8  # pixels between the nodes at which rays are computed; cubic in between

@@ -1,7 +1,7 @@
 """What images do not say of themselves: the lens, whether the arm carries camera or board, and their first placement.
 
 Every image gives the board's pose by its corners alone (`calib.data.camera.board_pose`); the arm's poses beside them
-place camera and board in closed form (`calib.geometry.hand_eye`). Both ways of mounting are tried.
+place camera and board in closed form (`calib.geometry.images.hand_eye`). Both ways of mounting are tried.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from calib.data.camera.board_pose import board_poses
 from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.pixels import IN_HAND, TO_HAND, Pixels
 from calib.errors import MeasurementError
-from calib.geometry.hand_eye import Placement, place_robustly
+from calib.geometry.images.hand_eye import Placement, place_robustly
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from calib.transforms import invert
