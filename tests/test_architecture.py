@@ -103,7 +103,7 @@ def test_every_folder_with_modules_is_a_package():
 
 def test_a_fit_loads_no_dynamics():
     """Loading these modules took longer than the mathematics of a fit."""
-    heavy = ["scipy.signal", "scipy.stats", "scipy.interpolate", "numba", "calib.procedure.dynamic_stage.inputs"]
+    heavy = ["scipy.signal", "scipy.stats", "scipy.interpolate", "numba", "calib.procedure.dynamic_stage.inputs", "cv2"]
     code = f"import sys, calib.api.kinematic; print([name for name in {heavy} if name in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"

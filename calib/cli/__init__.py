@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from calib.cli import dynamics, geometry, motion, session
+from calib.cli import camera, dynamics, geometry, motion, session
 
 # many small matrices: BLAS threads only get in each other's way (a fit on two busy cores: 9 s against 19 s)
 for _pool in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -35,7 +35,7 @@ app = typer.Typer(
 _FLAGS = ("--debug", "--help", "--line", "--plots", "--no-plots", "--refit-frames", "--no-refit-frames")
 _USAGE: Any = typer.BadParameter.__mro__[2]  # ClickException, of the click that this typer uses (or brings)
 
-for _group in (geometry, dynamics, motion, session):
+for _group in (geometry, camera, dynamics, motion, session):
     app.add_typer(_group.app)
 
 

@@ -15,7 +15,12 @@ app = typer.Typer()
 @app.command()
 def fit(
     robot: Robot,
-    measured: Annotated[list[Path], typer.Argument(help="CSV files of measured poses: calib formats measurements")],
+    measured: Annotated[
+        list[Path],
+        typer.Argument(
+            help="CSV files of measured poses (calib formats measurements), or folders of images (calib formats images)"
+        ),
+    ],
     out: Annotated[Path, typer.Option(help="folder for the calibrated robot and its report")],
     validate: Annotated[list[Path] | None, typer.Option(help="CSV file of unseen poses; may be repeated")] = None,
     holdout: Annotated[float, typer.Option(help="share of each file's poses kept from the fit")] = 0.0,

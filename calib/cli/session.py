@@ -88,8 +88,8 @@ def formats(
     topic: Annotated[
         str | None,
         typer.Argument(
-            help="measurements, targets, options, identify-options, identified, exports, constraints, mdh, robot, "
-            "session, limits, waypoints, excitation or recordings"
+            help="measurements, images, targets, options, identify-options, identified, exports, constraints, mdh, "
+            "robot, session, limits, waypoints, excitation or recordings"
         ),
     ] = None,
     schema: Annotated[

@@ -14,6 +14,16 @@ TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
         "CSV files of measured poses, positions, distances",
         ("calib.data.poses.pose_files", "calib.data.poses.robodk"),
     ),
+    "images": (
+        "a folder of images of a board, its board.toml, camera.yaml, corners.csv",
+        (
+            "calib.data.poses.image_folders",
+            "calib.data.camera.board",
+            "calib.data.camera.camera_info",
+            "calib.data.camera.corner_file",
+            "calib.data.poses.image_bags",
+        ),
+    ),
     "targets": (
         "targets of calib compensate, and the commands it writes",
         ("calib.data.poses.target_files", "calib.procedure.kinematic_stage.compensation"),

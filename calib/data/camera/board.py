@@ -15,7 +15,7 @@ Squares are counted, not inner corners::
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -23,6 +23,7 @@ import numpy as np
 
 from calib import files
 from calib.config import OneOf, Real, Whole, parse, read_toml, strict
+from calib.errors import UsageError
 
 KINDS = ("charuco", "chessboard", "apriltag")
 DICTIONARIES = (
@@ -85,6 +86,19 @@ class Board:
         """The board in a few words."""
         what = {"charuco": "ChArUco", "chessboard": "chessboard", "apriltag": "AprilTag grid"}[self.kind]
         return f"{what} {self.columns} x {self.rows}, {1e3 * self.square:g} mm"
+
+
+def checked(board: Board) -> Board:
+    """Return a board made by hand, checked as one from a file.
+
+    Raises:
+        ValueError: where a value cannot be.
+    """
+    return parse(Board, asdict(board), "board", _Refused)
+
+
+class _Refused(UsageError, ValueError):
+    """A board that cannot be."""
 
 
 def corners(board: Board) -> np.ndarray:

@@ -14,12 +14,33 @@ import numpy as np
 
 from calib import files
 from calib.data.camera.board import Board, corners
-from calib.data.camera.detection import Detection
 from calib.errors import MeasurementError
 
 FILE = "corners.csv"
 HEADER = ("image", "corner", "u [px]", "v [px]", "sigma [px]", "edge [px]", "problem")
 USUAL = 0.1  # sigma where a file states none [px]; our choice
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """What was found in one image.
+
+    Attributes:
+        pixel: (K, 2) of each corner of the board; NaN where it was not seen.
+        sigma: (K,) standard deviation of each coordinate [px].
+        problem: why the image is of no use; empty where it is of use.
+        edge: median width of the edges [px]; NaN without a board.
+    """
+
+    pixel: np.ndarray
+    sigma: np.ndarray
+    problem: str = ""
+    edge: float = float("nan")
+
+    @property
+    def seen(self) -> np.ndarray:
+        """(K,) which corners were seen."""
+        return ~np.isnan(self.pixel[:, 0])
 
 
 @dataclass(frozen=True, eq=False)

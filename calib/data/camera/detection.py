@@ -7,13 +7,14 @@ patch, n² (Σ g gᵀ)⁻¹ with grey-level noise n and gradients g, and a floor
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
 
 from calib.data.camera.board import DICTIONARIES, Board, corners
 from calib.data.camera.board_print import charuco, dictionary
+from calib.data.camera.corner_file import Detection
 
 COARSE = 1.5e6  # pixels of the image that markers are sought in (our choice, as the next ones)
 FEWEST = 8  # corners that make an image useful
@@ -21,28 +22,6 @@ FLOOR = {"charuco": 0.02, "chessboard": 0.02, "apriltag": 0.2}  # of a corner's 
 BLURRED = 7.0  # width of an edge from which on an image is refused [px]
 MOVED = 1.8  # ratio of the widths of edges across and along from which on blur is motion
 HALF = 9  # half width of the patches that quality is measured in [px]
-
-
-@dataclass(frozen=True, eq=False)
-class Detection:
-    """What was found in one image.
-
-    Attributes:
-        pixel: (K, 2) of each corner of the board; NaN where it was not seen.
-        sigma: (K,) standard deviation of each coordinate [px].
-        problem: why the image is of no use; empty where it is of use.
-        edge: median width of the edges [px]; NaN without a board.
-    """
-
-    pixel: np.ndarray
-    sigma: np.ndarray
-    problem: str = ""
-    edge: float = float("nan")
-
-    @property
-    def seen(self) -> np.ndarray:
-        """(K,) which corners were seen."""
-        return ~np.isnan(self.pixel[:, 0])
 
 
 def detect(image: np.ndarray, board: Board, thorough: bool = True) -> Detection:

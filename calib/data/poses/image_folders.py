@@ -26,7 +26,7 @@ import numpy as np
 from calib.data.camera import board as boards
 from calib.data.camera import camera_info, corner_file
 from calib.data.camera.board import Board
-from calib.data.camera.corner_file import Found
+from calib.data.camera.corner_file import Detection, Found
 from calib.data.camera.lens import Lens
 from calib.data.csv_table import Table, read_table
 from calib.data.poses import plausible
@@ -70,7 +70,7 @@ def read_images(
     """
     path, options = Path(path), options or FileOptions()
     board = read_own_board(path)
-    table = _joint_table(path)
+    table = joint_table(path)
     columns = find_joints(table, options, joints)
     q = np.stack([table.numbers(name, "joint", options.units.get("joints", "")) for name in columns], axis=1)
     notes = list(plausible.check_joints(q, table, columns, joints, options, kinds, limits))
@@ -103,7 +103,8 @@ def read_own_board(path: Path) -> Board:
     return boards.read_board(path)
 
 
-def _joint_table(path: Path) -> Table:
+def joint_table(path: Path) -> Table:
+    """Read the folder's ``joints.csv``."""
     place = path / JOINTS
     if not place.is_file():
         raise MeasurementError(
@@ -148,7 +149,7 @@ def detected(
 
     Images of another size than most are of no use: a camera's lens is that of one size.
     """
-    from calib.data.camera.detection import Detection, detect
+    from calib.data.camera.detection import detect
     from calib.data.camera.images import read_image
 
     result, sizes, useless = dict[str, Detection](), dict[str, tuple[int, int]](), 0

@@ -16,6 +16,7 @@ from calib.geometry.installation import Installation
 from calib.geometry.weighing import Settings
 from calib.procedure.kinematic_stage.inputs import Unseen, pose_count
 from calib.procedure.kinematic_stage.metrics import RepeatedPoses
+from calib.procedure.measuring.image_findings import reprojection
 from calib.robot.chain import Chain
 
 
@@ -37,6 +38,7 @@ class Comparison:
         shares_frames: True where another file's base and tool placement was used.
         repeated: what poses that were measured several times say (`calib.procedure.kinematic_stage.comparison`); None
             without any.
+        reprojection: rms distance of seen from predicted corners, of each arm [px]; None without images.
     """
 
     blocks: tuple[PoseMeasurements, ...]
@@ -50,6 +52,7 @@ class Comparison:
     alone: Errors | None = None
     shares_frames: bool = False
     repeated: Mapping[str, Any] | None = None
+    reprojection: tuple[float, float] | None = None
 
     def table(self) -> dict[str, object]:
         """Return the comparison as ``metrics.json`` holds it."""
@@ -60,6 +63,8 @@ class Comparison:
             result["urdf_alone"] = summary(self.alone)
         if len(self.pairs[0]):
             result["pair_distance_mm"] = {arm: statistics(sizes, 1e3) for arm, sizes in zip(arms, self.pairs)}
+        if self.reprojection is not None:
+            result["reprojection_px"] = dict(zip(arms, self.reprojection))
         if self.repeated is not None:
             result["iso9283"] = self.repeated
         return result
@@ -82,9 +87,10 @@ def compare(
     one, two = (errors(cell, blocks, torques) for cell in cells)
     first, second = (pair_errors(cell, blocks, torques, seed=seed) for cell in cells)
     rigid = None if alone is None else errors(alone, blocks)
+    corners: Any = tuple(reprojection(cell, blocks, torques) for cell in cells)
     return Comparison(
         tuple(blocks), torques, cells, (one, two), (first, second), pose_count(blocks), frames, proves, rigid,
-        shares_frames, _repeated_table(cells, blocks, torques),
+        shares_frames, _repeated_table(cells, blocks, torques), None if None in corners else corners,
     )  # fmt: skip
 
 

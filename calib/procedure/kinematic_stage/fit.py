@@ -31,6 +31,7 @@ from calib.procedure.kinematic_stage.remarks import Outlier, named_outliers, pla
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import Arms, Assessment, assess
 from calib.procedure.kinematic_stage.verdict import Verdict
+from calib.procedure.measuring.image_findings import image_notes
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import stretched_length
 
@@ -132,7 +133,8 @@ def run(
     say("comparing on unseen poses")
     rigid = rigid_fit(found, inputs.fit, settings)
     named = named_outliers(found.fit)
-    notes = *_moved_between(found.nominal.cell, inputs.fit, settings), *map(remark, diagnose(found.fit))
+    told = *map(remark, diagnose(found.fit)), *image_notes(found.fit)
+    notes = *_moved_between(found.nominal.cell, inputs.fit, settings), *told
     findings = _found_of(inputs, found, named, notes)
     arms = Arms(found.nominal.cell, found.fit.cell, rigid.cell.chain)
     result = assess(arms, inputs, findings, settings, asked=asked, tolerance=wanted.tolerance, seed=seed)

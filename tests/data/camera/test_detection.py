@@ -12,7 +12,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calib.data.camera.board import Board, corners
-from calib.data.camera.detection import Detection, detect
+from calib.data.camera.corner_file import Detection
+from calib.data.camera.detection import detect
 from calib.data.camera.images import decode, read_image
 from calib.data.camera.lens import Lens, project
 from calib.errors import MeasurementError

@@ -1,0 +1,122 @@
+"""Boards to print, and a first look at images of them, for people: what `calib board` and `calib images` say."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import numpy as np
+
+from calib import files
+from calib.data.camera import board as boards
+from calib.data.camera.board import KINDS, Board
+from calib.data.camera.corner_file import Found
+from calib.data.poses.image_folders import JOINTS, find_corners, joint_table, problem_words, read_own_board
+from calib.errors import UsageError
+
+Show = Callable[[str], None]
+USUAL = {"charuco": ("5x5_100", 0.7), "chessboard": ("5x5_100", 0.7), "apriltag": ("apriltag_36h11", 0.3)}
+GRID = (12, 9)  # cells of the image that coverage counts (our choice)
+
+
+def make(
+    out: Path, kind: str, columns: int, rows: int, square: float, marker: float | None, words: str | None,
+    paper: str | None,
+) -> list[str]:  # fmt: skip
+    """Write ``board.toml``, ``board.pdf`` and ``board.svg``; return what to do with them.
+
+    Args:
+        out: folder.
+        kind, columns, rows, words, paper: see `calib.data.camera.board`; a dictionary, and the paper's name.
+        square, marker: [mm].
+
+    Raises:
+        UsageError: for a board that cannot be, or does not fit onto its paper.
+    """
+    from calib.data.camera import board_print
+
+    if kind not in KINDS:
+        raise UsageError(f"--kind {kind}: expected one of {', '.join(KINDS)}")
+    if paper is not None and paper.lower() not in board_print.PAPERS:
+        raise UsageError(f"--paper {paper}: expected one of {', '.join(board_print.PAPERS)}")
+    usual, share = USUAL[kind]
+    try:
+        made = boards.checked(
+            Board(
+                kind, columns, rows, square / 1e3, (share * square if marker is None else marker) / 1e3, words or usual
+            )
+        )
+        size = board_print.page_size(made, (paper or "").lower())
+    except ValueError as error:
+        raise UsageError(f"this board cannot be: {error}") from None
+    files.write(out / "board.pdf", board_print.pdf(made, size))
+    files.write(out / "board.svg", board_print.svg(made, size))
+    boards.write_board(made, out / boards.FILE)
+    wide, high = (round(1e3 * length) for length in size)
+    return [
+        f"{made.words}, {len(boards.corners(made))} corners, on a page of {wide} x {high} mm: {out / 'board.pdf'}",
+        "print it at 100 % (not fitted to the page), check the ruler, glue it onto glass or aluminium; then measure "
+        f"several squares together and put the size of one into {out / boards.FILE}: the robot's lengths get their "
+        "scale from it",
+    ]
+
+
+def look(folder: Path, show: Show) -> list[str]:
+    """Look at the images of a folder; return what was found, in sentences."""
+    board = read_own_board(folder)
+    names = joint_table(folder).texts("image") if (folder / JOINTS).exists() else _images(folder)
+    found = find_corners(folder, board, names, lambda done, total, name: show(f"{done} of {total}: {name}"))
+    return summary(found, board, names)
+
+
+def _images(folder: Path) -> list[str]:
+    from calib.data.camera.images import SUFFIXES
+
+    names = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+    if not names:
+        raise UsageError(f"{folder}: there is neither a {JOINTS} nor an image ({', '.join(SUFFIXES)})")
+    return names
+
+
+def summary(found: Found, board: Board, names: Iterable[str]) -> list[str]:
+    """Return what was found in images, in sentences: how many are of use, why others are not, what they cover."""
+    kept = [one for one in found.images.values() if not one.problem]
+    total = len(boards.corners(board))
+    lines = [f"{len(kept)} of {len(list(names))} images are of use ({board.words})"]
+    if kept:
+        seen = np.array([one.seen.sum() for one in kept])
+        sigma = float(np.nanmedian(np.concatenate([one.sigma[one.seen] for one in kept])))
+        edge = float(np.nanmedian([one.edge for one in kept]))
+        lines.append(
+            f"{seen.mean():.1f} of {total} corners per image, each to about {sigma:.2f} px; edges {edge:.1f} px wide"
+        )
+        if found.size[0]:
+            lines.append(coverage_words(np.concatenate([one.pixel[one.seen] for one in kept]), found.size))
+    return [*lines, *problem_words({name: one.problem for name, one in found.images.items()})]
+
+
+def coverage(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Return how many corners (N, 2) [px] lie in each cell of an image, (rows, columns) of `GRID`."""
+    bins = [np.linspace(0, length, count + 1) for length, count in zip(size, GRID)]
+    return np.histogram2d(pixels[:, 0], pixels[:, 1], bins)[0].T
+
+
+def coverage_words(pixels: np.ndarray, size: tuple[int, int]) -> str:
+    """Return how much of the image the corners cover, with a word where that is little."""
+    share = float(np.mean(coverage(pixels, size) > 0))
+    words = f"corners lie in {share:.0%} of the image"
+    few = ": bring the board (or the camera) nearer, and into the image's corners, or the lens is not told there"
+    return words + (few if share < 0.6 else "")
+
+
+def from_bag(
+    bag: Path, board: Path, out: Path, image_topic: str | None, joint_topic: str | None, show: Show
+) -> list[str]:
+    """Make a folder of images' corners and joint values from a bag; return what was found, in sentences."""
+    from calib.data.poses.image_bags import read_image_bag, write_image_folder
+
+    made = boards.read_board(board)
+    found = read_image_bag(bag, made, image_topic or "", joint_topic or "", lambda k, name: show(f"image {k}: {name}"))
+    write_image_folder(found, made, out)
+    lines = summary(found.corners, made, found.names)
+    return [*lines, *found.notes, f"written to {out}; calib fit ROBOT {out} --out FOLDER fits it"]

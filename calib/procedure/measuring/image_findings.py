@@ -1,0 +1,76 @@
+"""What a fit says of its images: how well corners are predicted, what the arm adds, where the scale is from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.pixels import Pixels
+from calib.geometry.accuracy import Torques
+from calib.geometry.installation import Installation
+from calib.geometry.observation import observe, prepare
+from calib.geometry.pixel_residuals import PixelPart
+from calib.geometry.result import GeometricFit
+from calib.procedure.measuring.boards import coverage_words
+
+ODD = 8.0  # sigmas from which on a corner is named (our choice)
+NAMED = 3
+
+
+def reprojection(cell: Installation, blocks: Sequence[PoseMeasurements], torques: Torques = None) -> float | None:
+    """Return the rms distance of corners seen from corners predicted [px]; None without images."""
+    squares = [
+        np.sum(part.value**2, axis=0)
+        for block in prepare(cell, blocks, torques)
+        for part in observe(cell, block, np.array([], dtype=int))
+        if isinstance(part, PixelPart)
+    ]
+    return float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else None
+
+
+def image_notes(found: GeometricFit) -> list[str]:
+    """Return what is to be said of a fit's images; nothing where there are none."""
+    lines, others = [], [block.measured for block in found.blocks if not isinstance(block.measured, Pixels)]
+    for piece in found.pieces:
+        block, part = found.blocks[piece.block].measured, piece.part
+        if not isinstance(block, Pixels) or not isinstance(part, PixelPart) or part.noise is None:
+            continue
+        name, noise = Path(block.file).name, part.noise
+        rms = float(np.sqrt(np.mean(np.sum(part.value**2, axis=0))))
+        own = float(np.sqrt(np.mean(np.sum(part.within(piece.sigma) ** 2, axis=0))))
+        lines.append(
+            f"{name}: reprojection error {rms:.3f} px rms, {own:.3f} px where each image has a pose of its own; the "
+            f"rest, {1e3 * noise.displacement:.3f} mm and {1e3 * noise.turn:.3f} mrad per axis and image, is what "
+            "the arm does not repeat or the model does not explain"
+        )
+        pixels = block.pixel[block.seen]
+        lines.append(f"{name}: {coverage_words(pixels, block.size)}")
+        lines += _odd_corners(name, block, part, piece.sigma)
+        if "scale" not in block.free:
+            lines.append(
+                f"{name}: the board gives the scale ({1e3 * block.board.square:g} mm a square): an error of 0.1 % "
+                "there is one of 0.1 % in every length of the robot"
+                + (", against which the other instruments' measurements stand" if others else "")
+            )
+    return lines
+
+
+def _odd_corners(name: str, block: Pixels, part: PixelPart, sigma: np.ndarray) -> list[str]:
+    """Name corners that do not fit into their own image."""
+    off = part.within(sigma)
+    size = np.sqrt(np.mean((off / sigma) ** 2, axis=0))
+    odd = np.flatnonzero(size > ODD)
+    if not len(odd):
+        return []
+    worst = odd[np.argsort(-size[odd])[:NAMED]]
+    told = ", ".join(
+        f"corner {part.corner[k]} of {block.name(int(block.rows[part.index[k]]))} "
+        f"({float(np.linalg.norm(off[:, k])):.1f} px)"
+        for k in worst
+    )
+    return [
+        f"{name}: {len(odd)} of {len(size)} corners do not fit into their image: {told}; loss = 'cauchy' bears them"
+    ]
