@@ -10,9 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import scipy.linalg
+from scipy.linalg.lapack import dgeqrf  # type: ignore[attr-defined]
 
 from calib.arrays import frozen, shaped
 from calib.errors import CalibError, Unidentifiable
@@ -128,9 +130,21 @@ def residual_squares(data: Triangles, values: np.ndarray) -> np.ndarray:
 
 def retriangulate(stacked: np.ndarray) -> np.ndarray:
     """Return the R factor of any matrix as a square upper triangle, padded with zero rows."""
+    return _factor(stacked, overwrite=False)
+
+
+def _factor(stacked: np.ndarray, overwrite: bool) -> np.ndarray:
     size = stacked.shape[1]
-    factor = np.asarray(scipy.linalg.qr(stacked, mode="r", check_finite=False)[0])[:size]
-    return np.vstack([factor, np.zeros((size - len(factor), size))])
+    result = np.zeros((size, size))
+    if stacked.size:
+        packed = dgeqrf(stacked, lwork=32 * size, overwrite_a=overwrite)[0][:size]
+        np.copyto(result[: len(packed)], packed, where=_upper(size)[: len(packed)])
+    return result
+
+
+@lru_cache(maxsize=256)
+def _upper(size: int) -> np.ndarray:
+    return np.triu(np.ones((size, size), dtype=bool))
 
 
 def condition_numbers(factor: np.ndarray) -> tuple[float, float]:
@@ -163,11 +177,11 @@ def require_rank(scaled: np.ndarray, names: Sequence[str], advice: str = ADVICE)
     Raises:
         Unidentifiable: naming every column with a part in a null direction.
     """
-    _, values, vt = np.linalg.svd(scaled)
+    values = np.linalg.svd(scaled, compute_uv=False)
     weak = values <= RESOLUTION * values[0] if values[0] > 0.0 else np.ones(len(values), dtype=bool)
     if not weak.any():
         return values
-    part = np.linalg.norm(vt[weak], axis=0)
+    part = np.linalg.norm(np.linalg.svd(scaled)[2][weak], axis=0)
     concerned = [name for name, size in zip(names, part) if size > 0.01]
     shown = ", ".join(concerned[:12]) + (f" and {len(concerned) - 12} more" if len(concerned) > 12 else "")
     message = (
@@ -184,9 +198,8 @@ def _update(factor: np.ndarray, matrix: np.ndarray, target: np.ndarray) -> np.nd
     stacked[: len(old)] = old[:, live]
     stacked[len(old) :, :-1] = matrix[:, live[:-1]]
     stacked[len(old) :, -1] = target
-    upper = np.asarray(scipy.linalg.qr(stacked, mode="r", overwrite_a=True, check_finite=False)[0])[: len(live)]
     result = np.zeros_like(factor)
-    result[: len(upper), live] = upper  # live[i] >= i: still upper triangular
+    result[: len(live), live] = _factor(stacked, overwrite=True)  # live[i] >= i: still upper triangular
     return result
 
 
