@@ -6,9 +6,11 @@ from __future__ import annotations
 
 import os
 import sys
+from functools import lru_cache
 from typing import Annotated, Any
 
 import typer
+from typer.main import get_command
 
 from calib.cli import camera, dynamics, geometry, motion, session
 
@@ -52,11 +54,17 @@ def main(arguments: list[str] | None = None) -> None:
     sys.exit(run(arguments))
 
 
+@lru_cache(maxsize=1)
+def _command() -> Any:
+    """Return the commands as Typer makes them of the functions' signatures, once for a process that runs many."""
+    return get_command(app)
+
+
 def run(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code; errors become one message on stderr."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        code = int(app(args=_spread(given), standalone_mode=False) or 0)
+        code = int(_command()(args=_spread(given), standalone_mode=False) or 0)
         return _interrupted(given) if code == 130 else code  # Typer turns Ctrl-C into this code
     except typer.Exit as stop:
         return stop.exit_code
