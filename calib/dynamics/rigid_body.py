@@ -89,7 +89,7 @@ def regressor_gradient(
     from calib.dynamics import kernels
 
     q, v, a = _states(bodies, q=q, v=v, a=a)
-    weights = np.ascontiguousarray(shaped(weights, (len(q), bodies.n, 10 * bodies.count), "weights of the regressor"))
+    weights = _plain(shaped(weights, (len(q), bodies.n, 10 * bodies.count), "weights of the regressor"))
     slopes = np.zeros((3, *q.shape))
     kernels.regressor_gradient(
         bodies.links, bodies.constants, bodies.order, *_placed(bodies, q), v, a, weights, *slopes
@@ -167,13 +167,18 @@ _NAMES = {"q": "joint positions q", "v": "joint velocities v", "a": "joint accel
 
 
 def _states(bodies: Bodies, **arrays: np.ndarray) -> list[np.ndarray]:
-    """Return q, v, a as finite C-contiguous (N, n) arrays of one length."""
+    """Return q, v, a as finite (N, n) arrays of one length and one kind: numba compiles a kernel per kind of array."""
     rows: int | None = None
     checked = []
     for key, array in arrays.items():
-        checked.append(np.ascontiguousarray(shaped(array, (rows, bodies.n), _NAMES[key])))
+        checked.append(_plain(shaped(array, (rows, bodies.n), _NAMES[key])))
         rows = len(checked[0])
     return checked
+
+
+def _plain(array: np.ndarray) -> np.ndarray:
+    """Return an array as C-contiguous and writable memory, itself where it is."""
+    return np.require(array, requirements=["C", "W"])
 
 
 def _placed(bodies: Bodies, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
