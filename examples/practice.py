@@ -62,4 +62,4 @@ def record(path: str, motion: int) -> None:
 
 def bring(session: str) -> None:
     """Bring what a session waits for: measured poses, or logs of its motions."""
-    demo.bring_what_waits(Path(session), print)
+    demo.simulate_next(Path(session), print)

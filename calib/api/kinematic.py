@@ -92,7 +92,7 @@ class GeometryFit:
     @property
     def estimate(self) -> Estimate:
         """The fitted parameters [m, rad] with their covariance."""
-        return self.outcome.climb.fit.estimate
+        return self.outcome.selection.fit.estimate
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write the folder that `calib fit --out` writes: robot.toml, URDF, estimate, residuals, certificate."""
@@ -115,7 +115,9 @@ class GeometryFit:
         """Return the fitted parameters as a pandas DataFrame: name, unit, nominal, value, sigma, RSD [%]."""
         from calib.procedure.kinematic_stage.tables import HEADER, estimate_table
 
-        return data_frame(estimate_table(self.outcome.climb.fit, self.outcome.climb.nominal.cell).rows(), list(HEADER))
+        return data_frame(
+            estimate_table(self.outcome.selection.fit, self.outcome.selection.nominal.cell).rows(), list(HEADER)
+        )
 
     def renderables(self) -> Iterator[Any]:
         """Yield what ``print`` shows, for a rich console."""
@@ -124,7 +126,7 @@ class GeometryFit:
         yield from console.section(geometry_section.outcome_section(fit_metrics(self.outcome)))
 
     def __repr__(self) -> str:
-        return f"<GeometryFit of {self.robot.chain.name}: model {self.outcome.climb.chosen}, {self.verdict.level}>"
+        return f"<GeometryFit of {self.robot.chain.name}: model {self.outcome.selection.chosen}, {self.verdict.level}>"
 
     def __str__(self) -> str:
         return as_text(self.renderables())

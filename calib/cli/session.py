@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calib.cli.shared import Base, Plots, Seed, Tip, exit_failed, make_console, say, told
+from calib.cli.shared import Base, Plots, Seed, Tip, exit_failed, make_console, reporting, say
 
 if TYPE_CHECKING:
     from calib.procedure.session.questions import Answers
@@ -145,9 +145,9 @@ def demo(
     from calib.errors import command_line
     from calib.procedure.session import demo as demonstration
 
-    with told() as (say, progress):
+    with reporting() as (say, progress):
         if bring is not None:
-            demonstration.bring_what_waits(bring, say)
+            demonstration.simulate_next(bring, say)
             return
         found = demonstration.run(
             out, robot, seed, say, progress, dynamics=not geometry_only, guided=guided, plots=plots,
@@ -178,7 +178,7 @@ def run(
     from calib.procedure.session import fleet
 
     folders, started, outcomes = fleet.folders_of(sessions), time.perf_counter(), []
-    with told() as (say, progress):
+    with reporting() as (say, progress):
         progress(f"running {len(folders)} sessions")
         for outcome in run_sessions(folders, workers=workers, plots=plots, command=f"calib run --workers {workers}"):
             outcomes.append(outcome)
@@ -198,7 +198,7 @@ def _go_on(folder: Path, command: str, again: str = "", plots: bool = True) -> N
     from calib.procedure.session import commands
 
     typed = command_line(command, folder, *([again] if again else []))
-    with told() as (say, progress):
+    with reporting() as (say, progress):
         stop = commands.go_on(folder, say, progress, typed, again, plots)
     say(*stop.lines)
     exit_failed(stop.verdict)

@@ -63,7 +63,7 @@ def progress() -> Iterator[Any]:
 
 
 @contextmanager
-def told() -> Iterator[tuple[Any, Any]]:
+def reporting() -> Iterator[tuple[Any, Any]]:
     """Yield two functions: for lines that stay, and for words that show while work goes on."""
     from rich.markup import escape
 

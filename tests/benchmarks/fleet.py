@@ -29,7 +29,7 @@ def prepare(folder: Path, number: int) -> None:
     session = begin(folder, NewSession(robot, "cmm", seed=number, dynamics=False))
     with locked(session, quiet):
         steps.run_next(session, quiet, quiet, "benchmark")
-    demo.bring(session, virtual_cell(robot, number), number)
+    demo.simulate_measurements(session, virtual_cell(robot, number), number)
     session.path("state.json").unlink()
 
 

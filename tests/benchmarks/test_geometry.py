@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit, fit_with_prior, polish_frames
-from calib.geometry.model_choice.ladder import climb
+from calib.geometry.model_choice.ladder import select_model
 from calib.geometry.observation import observe, predict, prepare
 from calib.geometry.parameters import step
 from calib.robot.chain import AXES, Chain
@@ -119,7 +119,7 @@ def by_scipy(start, block, free):
     return least_squares(residual, np.zeros(len(free)), method="lm")
 
 
-@pytest.mark.parametrize("way", ["whole", "fit alone", "fit of given columns", "scipy of given columns", "climb"])
+@pytest.mark.parametrize("way", ["whole", "fit alone", "fit of given columns", "scipy of given columns", "selection"])
 @pytest.mark.parametrize("description", ["MDH", "URDF"])
 def test_fit_of_800_poses(benchmark, description, way):
     nominal, measured = problem(description)
@@ -132,8 +132,8 @@ def test_fit_of_800_poses(benchmark, description, way):
         benchmark(whole, nominal, measured)
     elif way == "fit alone":
         benchmark(fit, start, [measured])
-    elif way == "climb":
-        found = benchmark.pedantic(climb, (install(nominal, [measured]), [measured]), rounds=3)
+    elif way == "selection":
+        found = benchmark.pedantic(select_model, (install(nominal, [measured]), [measured]), rounds=3)
         assert found.chosen == "geometry"
     elif way == "fit of given columns":
         found = benchmark(fit_with_prior, start, [block], free)

@@ -13,7 +13,7 @@ from calib.dynamics.gravity import gravity_torques
 from calib.errors import UsageError
 from calib.geometry.first_guess import install
 from calib.geometry.installation import Installation, see
-from calib.geometry.model_choice.ladder import climb
+from calib.geometry.model_choice.ladder import select_model
 from calib.robot.deflection import Deflection, Term, evaluate, names
 
 SIGMA = 4e-5
@@ -54,7 +54,7 @@ def unseen(found, truth: Installation, known: bool) -> float:
 def test_a_rigid_truth_gives_the_geometry_and_no_effect(robot, kind, count, seed):
     truth = rigid(robot, seed)
     measured = measure(truth, kind, count, seed, sigma=SIGMA, sigma_rotation=1e-4)
-    found = climb(install(load(robot), [measured]), [measured])
+    found = select_model(install(load(robot), [measured]), [measured])
     assert found.chosen == "geometry"
     assert not found.fit.cell.deflection.terms
     kept = [rung.model for rung in found.rungs if rung.kept]
@@ -67,7 +67,7 @@ def test_a_rigid_truth_gives_the_geometry_and_no_effect(robot, kind, count, seed
 def test_an_arm_that_is_its_nominal_needs_only_frames():
     truth = cell(load("ur5"), 1)
     measured = measure(truth, "position", 150, 1, sigma=SIGMA)
-    found = climb(install(load("ur5"), [measured]), [measured])
+    found = select_model(install(load("ur5"), [measured]), [measured])
     assert found.chosen == "frames"
 
 
@@ -77,7 +77,7 @@ def test_joint_offsets_are_found_to_be_joint_offsets():
     offsets = dict(zip(moving, 2e-3 * np.random.default_rng(0).normal(size=6)))
     truth = cell(nominal.with_values(offsets), 1)
     measured = measure(truth, "position", 150, 1, sigma=SIGMA)
-    found = climb(install(nominal, [measured]), [measured])
+    found = select_model(install(nominal, [measured]), [measured])
     assert found.chosen == "offsets"
 
 
@@ -89,8 +89,8 @@ def test_planted_compliance_is_found(seed, known):
     torque = lambda q: gravity_torques(nominal, q)  # noqa: E731
     measured = measure(truth, "position", 200, seed, sigma=SIGMA, torque=torque)
     torques = [torque(measured.q)] if known else None
-    found = climb(install(nominal, [measured]), [measured], torques=torques)
-    plain = climb(install(nominal, [measured]), [measured], "geometry")
+    found = select_model(install(nominal, [measured]), [measured], torques=torques)
+    plain = select_model(install(nominal, [measured]), [measured], "geometry")
     assert "stiffness" in found.chosen
     errors = [unseen(f.fit, truth, True) if known or f is plain else _unseen_sag(f.fit, truth) for f in (found, plain)]
     assert errors[0] < 2.5 * SIGMA < 5 * SIGMA < errors[1]
@@ -114,7 +114,7 @@ def test_planted_harmonics_are_found(seed):
     truth, nominal = wavy(seed), load("ur5")
     measured = measure(truth, "position", 400, seed, sigma=SIGMA)
     start = install(nominal, [measured])
-    found, plain = climb(start, [measured]), climb(start, [measured], "geometry")
+    found, plain = select_model(start, [measured]), select_model(start, [measured], "geometry")
     assert "harmonics" in found.chosen
     assert unseen(found.fit, truth, False) < 0.5 * unseen(plain.fit, truth, False)
     fitted = dict(zip(names(found.fit.cell.deflection, nominal), np.asarray(found.fit.cell.deflection.coefficients)))
@@ -127,7 +127,7 @@ def test_planted_harmonics_are_found(seed):
 def test_the_last_rung_kept_is_the_one_chosen_and_each_kept_rung_is_better():
     truth = wavy(1)
     measured = measure(truth, "position", 300, 1, sigma=SIGMA)
-    found = climb(install(load("ur5"), [measured]), [measured])
+    found = select_model(install(load("ur5"), [measured]), [measured])
     kept = [rung for rung in found.rungs if rung.kept]
     assert np.all(np.diff([rung.cross_validated for rung in kept]) < 0)
     assert found.chosen.split(" + ")[-1] == kept[-1].model.removeprefix("+ ")
@@ -140,7 +140,7 @@ def test_the_last_rung_kept_is_the_one_chosen_and_each_kept_rung_is_better():
 def test_any_rung_can_be_asked_for(model):
     truth = rigid("ur5", 2)
     measured = measure(truth, "position", 120, 1, sigma=SIGMA)
-    found = climb(install(load("ur5"), [measured]), [measured], model)
+    found = select_model(install(load("ur5"), [measured]), [measured], model)
     assert found.chosen.split(" + ")[-1] == model
     assert found.rungs[-1].kept
 
@@ -152,7 +152,7 @@ def test_what_is_fixed_stays_at_its_nominal():
     measured = measure(truth, "position", 120, 1, sigma=SIGMA)
     start = install(nominal, [measured])
     fixed = layout(start).find(["theta3", "d3"])
-    found = climb(start, [measured], "geometry", fixed=fixed)
+    found = select_model(start, [measured], "geometry", fixed=fixed)
     assert np.array_equal(found.fit.cell.chain.values[fixed], nominal.values[fixed])
     assert not np.isin(fixed, found.fit.free).any()
 
@@ -161,13 +161,13 @@ def test_an_unknown_model_is_refused_with_the_list():
     truth = rigid("ur5", 3)
     measured = measure(truth, "position", 40, 1, sigma=SIGMA)
     with pytest.raises(UsageError, match="harmonics"):
-        climb(truth, [measured], "neural")
+        select_model(truth, [measured], "neural")
 
 
 def test_progress_is_told():
     truth = rigid("ur5", 3)
     measured = measure(truth, "position", 60, 1, sigma=SIGMA)
     told = []
-    climb(truth, [measured], "geometry", progress=lambda done, total, what: told.append((done, total, what)))
+    select_model(truth, [measured], "geometry", progress=lambda done, total, what: told.append((done, total, what)))
     assert list(dict.fromkeys(what for _, _, what in told)) == ["frames", "offsets", "geometry"]
     assert all(a[0] <= b[0] for a, b in pairwise(told)) and told[-1][0] <= told[-1][1]

@@ -90,7 +90,7 @@ def test_planted_robots_come_back_within_their_covariance():
     inside = 0
     for seed in range(6):
         truth, _, base, data = planted(seed)
-        found = solve.find_consistent(data)
+        found = solve.find_possible(data)
         assert (found.margins > 1e-3).all() and found.possible and not found.blamed
         assert found.distance < found.allowed
         off = base.transform @ (found.dynamics.values - truth)
@@ -103,7 +103,7 @@ def test_planted_robots_come_back_within_their_covariance():
 
 def test_with_exact_data_the_torques_are_those_of_the_base_parameters():
     _, model, _, data = planted(3, noise=1e-5)
-    found = solve.find_consistent(data)
+    found = solve.find_possible(data)
     samples = bases.random_samples(model, 50, 9)
     matrix = model.regressor(samples.q, samples.v, samples.a)
     wanted = matrix @ data.dynamics.values
@@ -116,7 +116,7 @@ def test_an_impossible_base_is_told_with_the_body_and_a_possible_one_is_not():
     values = np.array(data.values)
     place = base.names.index(next(name for name in base.names if name.startswith("ZZ2")))
     values[place] = -0.5
-    found = solve.find_consistent(told(data.chain, model, base, values, data.covariance))
+    found = solve.find_possible(told(data.chain, model, base, values, data.covariance))
     assert not found.possible and found.nearest > found.allowed
     assert any("body 2" in name or "body 3" in name for name, _ in found.blamed)
     assert found.blamed[0][1] < found.nearest
@@ -126,7 +126,7 @@ def test_an_impossible_base_is_told_with_the_body_and_a_possible_one_is_not():
 def test_without_a_cad_rods_of_a_mass_the_data_choose_stand_in():
     _, model, base, data = planted(5)
     bare = told(arm(None), model, base, data.values, data.covariance)
-    found = solve.find_consistent(bare)
+    found = solve.find_possible(bare)
     assert "no masses" in found.source and found.possible and found.distance < found.allowed
     assert 1.0 < found.dynamics.values[[9, 19, 29]].sum() < 100.0
 

@@ -80,7 +80,7 @@ class ModelSelection:
     loss: str = "none"
 
 
-def climb(
+def select_model(
     cell: Installation,
     measured: Sequence[PoseMeasurements],
     model: str = "auto",

@@ -65,16 +65,16 @@ def nearest(problem: BodyCost, spared: int | None = None) -> np.ndarray:
     return result
 
 
-def blame(problem: BodyCost, told: Information, most: int = 3) -> tuple[tuple[str, float], ...]:
+def blame(problem: BodyCost, information: Information, most: int = 3) -> tuple[tuple[str, float], ...]:
     """Return whose possibility costs most: label or name, and the distance left without the demand on it."""
-    model = told.dynamics.model
+    model = information.dynamics.model
     found = [(f"body {label}", i) for i, label in enumerate(model.bodies.labels)]
     found += [
         (one.name, problem.bodies + k)
         for k, one in enumerate(model.columns)
         if problem.positive[k] and problem.sizes[k] > 0.0
     ]
-    left = sorted((told.distance(nearest(problem, place)), name) for name, place in found)
+    left = sorted((information.distance(nearest(problem, place)), name) for name, place in found)
     return tuple((name, distance) for distance, name in left[:most])
 
 

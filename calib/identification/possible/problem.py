@@ -48,12 +48,12 @@ class BodyCost:
         return self.lift * np.where(self.drawn, gamma, WEAK)
 
 
-def make_problem(told: Information, references: PriorBodies) -> BodyCost:
+def make_problem(information: Information, references: PriorBodies) -> BodyCost:
     """Return the cost of an identified model; sizes of drive terms come from the torque they could explain."""
-    model = told.dynamics.model
+    model = information.dynamics.model
     bodies = model.bodies.count
-    columns = told.factor[:, :-1] @ told.transform
-    norms, target = np.linalg.norm(columns, axis=0)[10 * bodies :], np.linalg.norm(told.factor[:, -1])
+    columns = information.factor[:, :-1] @ information.transform
+    norms, target = np.linalg.norm(columns, axis=0)[10 * bodies :], np.linalg.norm(information.factor[:, -1])
     seen = norms > 1e-9 * np.linalg.norm(columns, axis=0).max()
     whole = target / np.where(seen, norms, 1.0)  # would explain all of the torque
     positive = np.array([one.nonnegative for one in model.columns], dtype=bool)
@@ -63,6 +63,7 @@ def make_problem(told: Information, references: PriorBodies) -> BodyCost:
         if one.shape == "acceleration" and positive[k]:
             sizes[k] = min(sizes[k], mass * ROTOR**2)
     return BodyCost(
-        np.column_stack([columns, told.factor[:, -1]]), bodies, pseudo_inertia.from_standard(references.parameters),
-        references.drawn, np.where(seen, sizes, 0.0), positive, told.dynamics.values[10 * bodies :],
+        np.column_stack([columns, information.factor[:, -1]]), bodies,
+        pseudo_inertia.from_standard(references.parameters),
+        references.drawn, np.where(seen, sizes, 0.0), positive, information.dynamics.values[10 * bodies :],
     )  # fmt: skip

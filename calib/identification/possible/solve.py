@@ -58,7 +58,7 @@ SETTLED = 1e-8  # Newton decrement²: the cost is within half of it of its least
 
 
 @dataclass(frozen=True, eq=False)
-class Consistent:
+class PossibleBodies:
     """Standard parameters of a robot that can exist.
 
     Attributes:
@@ -98,11 +98,11 @@ class Consistent:
         return self.nearest <= self.allowed
 
 
-def find_consistent(told: Information, weight: float | None = None) -> Consistent:
+def find_possible(information: Information, weight: float | None = None) -> PossibleBodies:
     """Return the full standard parameters of an identified model.
 
     Args:
-        told: what was identified.
+        information: what was identified.
         weight: γ; None: where the evidence is largest.
 
     Raises:
@@ -110,28 +110,34 @@ def find_consistent(told: Information, weight: float | None = None) -> Consisten
     """
     from scipy.special import chdtri
 
-    model = told.dynamics.model
+    model = information.dynamics.model
     if not model.torque_rows.has_bodies:
         raise UsageError("the model holds drives alone (kind 'drive'): there are no bodies to make consistent")
-    allowed = float(np.sqrt(chdtri(told.b, 0.05)))
-    choices = [(references, make_problem(told, references)) for references in find_prior_bodies(told.chain, model)]
+    allowed = float(np.sqrt(chdtri(information.b, 0.05)))
+    choices = [
+        (references, make_problem(information, references))
+        for references in find_prior_bodies(information.chain, model)
+    ]
     away, problem = min(
-        ((told.distance(border.nearest(problem)), problem) for _, problem in choices[:: max(len(choices) - 1, 1)]),
+        (
+            (information.distance(border.nearest(problem)), problem)
+            for _, problem in choices[:: max(len(choices) - 1, 1)]
+        ),
         key=lambda pair: pair[0],
     )
-    blamed = border.blame(problem, told) if away > allowed else ()
-    doubt = max(1.0, away / np.sqrt(told.b))
+    blamed = border.blame(problem, information) if away > allowed else ()
+    doubt = max(1.0, away / np.sqrt(information.b))
     _, gamma, problem, values, references = max(
         (candidate for choice in choices for candidate in _candidates(*choice, weight, doubt)), key=lambda one: one[0]
     )
-    while weight is None and away <= allowed < told.distance(values) and gamma > SMALLEST:
+    while weight is None and away <= allowed < information.distance(values) and gamma > SMALLEST:
         gamma /= 2.0
         values = solve(problem, gamma)
-    return Consistent(
+    return PossibleBodies(
         Dynamics(model, values), covariance(problem, gamma, values), gamma, doubt,
         np.array([pseudo_inertia.margin(body) for body in _bodies(problem, values)]),
-        told.distance(values), away, allowed, blamed, references.source,
-        (*references.notes, *_notes(model, told, problem, values, allowed)),
+        information.distance(values), away, allowed, blamed, references.source,
+        (*references.notes, *_notes(model, information, problem, values, allowed)),
     )  # fmt: skip
 
 
@@ -259,14 +265,14 @@ def _scaled(problem: BodyCost, pseudo: np.ndarray) -> np.ndarray:
 
 
 def _notes(
-    model: IdentificationModel, told: Information, problem: BodyCost, values: np.ndarray, allowed: float
+    model: IdentificationModel, information: Information, problem: BodyCost, values: np.ndarray, allowed: float
 ) -> Sequence[str]:
     """Return what stands out: a distance beyond the covariance, bodies thinner than a millimetre."""
     found = []
-    if (away := told.distance(values)) > allowed:
+    if (away := information.distance(values)) > allowed:
         found.append(
             f"the consistent parameters are {away:.3g} standard deviations from the estimate, beyond {allowed:.3g} (95 "
-            f"% for {told.b} parameters): the torques no longer are quite those identified"
+            f"% for {information.b} parameters): the torques no longer are quite those identified"
         )
     for label, body in zip(model.bodies.labels, _bodies(problem, values)):
         if pseudo_inertia.margin(body) < 1e-3:

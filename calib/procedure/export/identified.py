@@ -12,7 +12,7 @@ from calib.identification.friction.drive_table import Drives, drive_table
 from calib.identification.model_file import MODEL, refuse_currents
 from calib.identification.possible.information import Information
 from calib.identification.possible.information import read as read_information
-from calib.identification.possible.solve import Consistent, find_consistent
+from calib.identification.possible.solve import PossibleBodies, find_possible
 from calib.procedure.export import geometry
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
@@ -32,7 +32,7 @@ class IdentifiedRobot:
 
     robot: CalibratedChain
     information: Information
-    found: Consistent
+    found: PossibleBodies
     bodies: np.ndarray
     drives: Drives
 
@@ -55,13 +55,13 @@ def read(folder: Path) -> IdentifiedRobot:
     """Return what an identification left, with all parameters made those of possible bodies."""
     refuse_currents(folder, "an export of masses")
     information = read_information(folder)
-    found = find_consistent(information)
+    found = find_possible(information)
     own = bodies_of(information.chain).count
     bodies = found.dynamics.values[: 10 * own].reshape(own, 10)
     return IdentifiedRobot(geometry.read(folder), information, found, bodies, drive_table(found.dynamics))
 
 
-def consistency_lines(found: Consistent, b: int) -> list[str]:
+def consistency_lines(found: PossibleBodies, b: int) -> list[str]:
     """Return what consistency cost, in words."""
     lines = [
         f"masses of possible bodies: thinnest {1e3 * float(found.margins.min()):.3g} mm (as a standard deviation), "

@@ -1,4 +1,4 @@
-"""The fit as the guided procedure runs it: climb the models, judge on unseen rows, say what came of it."""
+"""The fit as the guided procedure runs it: select the model, judge on unseen rows, say what came of it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.folds import folds_by_name
-from calib.geometry.model_choice.ladder import ModelSelection, climb, rigid_fit
+from calib.geometry.model_choice.ladder import ModelSelection, rigid_fit, select_model
 from calib.geometry.parameters import fixed_parameters, stated_prior
 from calib.geometry.result import GeometricFit, calibrated_chain
 from calib.geometry.weighing import Settings, combine
@@ -45,7 +45,7 @@ class Outcome:
 
     Attributes:
         inputs: what it worked on.
-        climb: the rungs, the chosen model, and the fits of the nominal and the calibrated arm.
+        selection: the rungs, the chosen model, and the fits of the nominal and the calibrated arm.
         rigid: the best fit without joint corrections: the geometry that a URDF holds and dynamics is identified on.
         outliers: rows of the fit that do not fit, worst first.
         unclear: what the data cannot tell, in words.
@@ -56,7 +56,7 @@ class Outcome:
     """
 
     inputs: Inputs
-    climb: ModelSelection
+    selection: ModelSelection
     rigid: GeometricFit
     outliers: Sequence[Outlier]
     unclear: tuple[str, ...]
@@ -68,7 +68,7 @@ class Outcome:
     @property
     def calibrated(self) -> CalibratedChain:
         """The calibrated robot, for all that goes on from here."""
-        found = calibrated_chain(self.climb.fit, self.rigid, self.inputs.nominal)
+        found = calibrated_chain(self.selection.fit, self.rigid, self.inputs.nominal)
         return replace(found, source=str(self.inputs.source))
 
     @property
@@ -115,7 +115,7 @@ def run(
     say("placing the instrument and the tool")
     start = install(inputs.chain, inputs.fit, inputs.known)
     torques = [gravity_of(inputs.chain, block) for block in inputs.fit]
-    found = climb(
+    found = select_model(
         start,
         inputs.fit,
         asked,
@@ -154,7 +154,7 @@ def run(
 def assessed(outcome: Outcome, inputs: Inputs, options: FitOptions, wanted: FitSettings) -> Outcome:
     """Return an outcome judged anew on the unseen rows of `inputs`; nothing is fitted."""
     settings = combine(Settings(), loss=wanted.loss or options.loss, loss_scale=options.loss_scale)
-    arms = Arms(outcome.climb.nominal.cell, outcome.climb.fit.cell, outcome.rigid.cell.chain)
+    arms = Arms(outcome.selection.nominal.cell, outcome.selection.fit.cell, outcome.rigid.cell.chain)
     asked = wanted.model or options.model
     result = assess(
         arms, inputs, outcome.findings, settings, asked=asked, tolerance=outcome.tolerance, seed=outcome.seed

@@ -195,7 +195,7 @@ def write_folder(outcome: Outcome, out: Path, plots: Callable[[Outcome, Path], N
 
 
 def _write_all(outcome: Outcome, folder: Path) -> None:
-    fit, chain = outcome.climb.fit, outcome.inputs.chain
+    fit, chain = outcome.selection.fit, outcome.inputs.chain
     robot, origin = outcome.calibrated, f"calibrated from {outcome.inputs.source}"
     calibrated.write(folder, robot, installation_file.frame_tables(fit.cell), _record(outcome), origin)
     urdfs = {URDF: robot.chain}
@@ -207,7 +207,7 @@ def _write_all(outcome: Outcome, folder: Path) -> None:
             urdf_write.edit_file(outcome.inputs.source, folder / name, chain, geometry)
         else:
             files.write(folder / name, urdf_write.write_new(geometry))
-    table = estimate_table(fit, outcome.climb.nominal.cell)
+    table = estimate_table(fit, outcome.selection.nominal.cell)
     write_estimate(folder, HEADER, table.rows())
     write_covariance(folder / COVARIANCE, table.names, table.covariance)
     write_residuals(outcome, folder / RESIDUALS)
@@ -218,9 +218,9 @@ def metrics(outcome: Outcome) -> dict[str, object]:
     """Return the content of ``metrics.json``."""
     return {
         "schema": SCHEMA,
-        "fit": {"parameters": len(outcome.climb.fit.free), **outcome.fit.table()},
+        "fit": {"parameters": len(outcome.selection.fit.free), **outcome.fit.table()},
         "validation": outcome.assessment.table()["validation"],
-        "model": outcome.climb.chosen,
+        "model": outcome.selection.chosen,
         "ladder": [
             {
                 "model": rung.model,
@@ -229,10 +229,10 @@ def metrics(outcome: Outcome) -> dict[str, object]:
                 "kept": rung.kept,
                 "note": rung.note,
             }
-            for rung in outcome.climb.rungs
+            for rung in outcome.selection.rungs
         ],
         "seed": outcome.seed,
-        "status": outcome.climb.fit.solution.status.name.lower(),
+        "status": outcome.selection.fit.solution.status.name.lower(),
         "verdict": outcome.verdict.level,
         "reason": outcome.verdict.reason,
         "tolerance_mm": None if outcome.tolerance is None else 1e3 * outcome.tolerance,
@@ -257,11 +257,11 @@ def _record(outcome: Outcome) -> dict[str, object]:
     """Return what the provenance says of how the robot was calibrated, besides from what."""
     inputs = outcome.inputs
     again = inputs.earlier is not None and inputs.earlier.nominal is not None
-    frames = {} if again else installation_file.frame_tables(outcome.climb.nominal.cell)
+    frames = {} if again else installation_file.frame_tables(outcome.selection.nominal.cell)
     return {
         **{f"nominal_{kind}": table for kind, table in frames.items()},
         "files": [block.file for block in inputs.fit],
-        "model": outcome.climb.chosen,
+        "model": outcome.selection.chosen,
         "seed": outcome.seed,
         "verdict": f"{outcome.verdict.level}: {outcome.verdict.reason}",
         "covariance": COVARIANCE,

@@ -145,7 +145,7 @@ def write_residuals(outcome: Outcome, path: Path) -> Path:
 
 def _weights(outcome: Outcome) -> dict[tuple[str, int, str], float]:
     """Return the robust weight of each fitted residual by file, row and tool; the least of its natures."""
-    fit, result = outcome.climb.fit, {}
+    fit, result = outcome.selection.fit, {}
     for piece in fit.pieces:
         for i, w in zip(piece.part.index, piece.weight):
             key = _key(fit.blocks[piece.block].measured, int(i))

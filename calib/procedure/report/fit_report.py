@@ -120,8 +120,8 @@ def fit_metrics(outcome: Outcome) -> FitMetrics:
 
 def collect(outcome: Outcome) -> Report:
     """Return what a certificate needs of a fit."""
-    chain, fit = outcome.inputs.chain, outcome.climb.fit
-    table, names = estimate_table(fit, outcome.climb.nominal.cell), layout(fit.cell)
+    chain, fit = outcome.inputs.chain, outcome.selection.fit
+    table, names = estimate_table(fit, outcome.selection.nominal.cell), layout(fit.cell)
     groups = {name: names.group(k) for k, name in enumerate(names.names)}
     fitted = set(table.names)
     sets = [rows_of("fit", outcome.fit, False)]

@@ -243,13 +243,13 @@ def ladder(
     kept: Sequence[bool],
     noise: float | None = None,
 ) -> Figure:
-    """Draw the error on rows left out, rung by rung: the climb ends where the gain ends.
+    """Draw the error on rows left out, rung by rung: the search ends where the gain ends.
 
     Args:
         models: names of the rungs.
         parameters: fitted by each.
         unseen: cross-validated rms [m].
-        kept: whether the climb went on from there; the last one kept is the model chosen.
+        kept: whether the search went on from there; the last one kept is the model chosen.
         noise: rms of the instrument's own error [m].
     """
     errors, x, taken = 1e3 * np.asarray(unseen, dtype=float), np.arange(len(models)), np.flatnonzero(kept)

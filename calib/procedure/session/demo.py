@@ -71,7 +71,7 @@ def run(
         seed: of the robot's errors, the noise, the pose selection and the motions.
         say, progress: lines that stay, and words that pass.
         dynamics: identify them, too, where the library knows the robot's masses.
-        guided: stop where an engineer would; `bring_what_waits` then plays his part.
+        guided: stop where an engineer would; `simulate_next` then plays his part.
         plots: whether figures are drawn.
     """
     started = time.perf_counter()
@@ -161,7 +161,7 @@ def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, 
     return before, after
 
 
-def bring_what_waits(folder: Path, say: Say) -> None:
+def simulate_next(folder: Path, say: Say) -> None:
     """Let the simulated cell bring what the session in `folder` waits for; compare a finished one with the truth.
 
     Raises:
@@ -188,10 +188,10 @@ def _bring_for(session: Session, step: str, say: Say) -> None:
     seed = session.settings.seed
     cell = virtual_cell(session.settings.robot.given, seed)
     if step in ("measure", "validate"):
-        bring(session, cell, seed)
+        simulate_measurements(session, cell, seed)
         say("    (the simulated cell measures both lists of poses)")
     elif step in ("record", "predict"):
-        bring_logs(session, arm_of(session, cell), seed)
+        simulate_recordings(session, arm_of(session, cell), seed)
         say("    (the simulated arm plays both motions)")
     else:
         raise SessionError(f"the demonstration cannot bring what {step} needs")
@@ -202,7 +202,7 @@ def arm_of(session: Session, cell: Cell) -> MovingArm:
     return moving_arm(cell, session.settings.robot.given, session.settings.seed)
 
 
-def bring(session: Session, cell: Cell, seed: int) -> None:
+def simulate_measurements(session: Session, cell: Cell, seed: int) -> None:
     """Let the simulated cell measure the planned poses, and three of them once more at the end; the CMM wanders."""
     _mark(session, cell.note)
     kinds = [joint.kind for joint in cell.nominal.joints]
@@ -222,7 +222,7 @@ def _mark(session: Session, note: str) -> None:
     files.write(path, "\n".join([*known, *([line] if line not in known else [])]) + "\n")
 
 
-def bring_logs(session: Session, arm: MovingArm, seed: int) -> None:
+def simulate_recordings(session: Session, arm: MovingArm, seed: int) -> None:
     """Let the simulated arm play the designed motions, and log them."""
     _mark(session, arm.note)
     motions = dynamics_steps.designed_motions(session)

@@ -182,8 +182,8 @@ def fit(session: Session, say: Say) -> list[str]:
     settings = session.settings
     outcome = fitting.run(_gathered(session), _options_of(session), _fit_settings(session), say)
     outputs.write_folder(outcome, session.fit.path, partial(certificate.write_fit, plots=session.plots))
-    count = len(outcome.climb.fit.free)
-    notes = [f"model {outcome.climb.chosen}, {count} parameters on {outcome.fit.poses} poses", *outcome.warnings]
+    count = len(outcome.selection.fit.free)
+    notes = [f"model {outcome.selection.chosen}, {count} parameters on {outcome.fit.poses} poses", *outcome.warnings]
     if outcome.outliers:
         named = ", ".join(each.words for each in outcome.outliers[:3])
         advice = "" if settings.fit.loss != "none" else '; look at these rows, or set loss = "huber" in session.toml'

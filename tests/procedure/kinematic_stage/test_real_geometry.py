@@ -13,7 +13,7 @@ from calib.geometry.accuracy import errors, summary
 from calib.geometry.checks.diagnosis import SetUpChange, SystematicResidual, diagnose
 from calib.geometry.checks.unidentified import LoosePlacement, unidentified
 from calib.geometry.first_guess import install
-from calib.geometry.model_choice.ladder import ModelSelection, climb
+from calib.geometry.model_choice.ladder import ModelSelection, select_model
 from calib.geometry.result import outliers
 from calib.geometry.weighing import Settings
 from calib.robot.formats import urdf
@@ -79,7 +79,7 @@ def mukca(data: Path, name: str):
 
 def judged(chain, fitted: PoseMeasurements, unseen: PoseMeasurements) -> tuple[ModelSelection, dict, dict]:
     """Return the climb, and the errors on unseen rows of the nominal and the calibrated arm."""
-    found = climb(install(chain, [fitted]), [fitted])
+    found = select_model(install(chain, [fitted]), [fitted])
     assert found.fit.solution.status.good
     return found, *(summary(errors(cell, [unseen])) for cell in (found.nominal.cell, found.fit.cell))
 
@@ -163,7 +163,7 @@ def test_tiago_outliers_are_named(data, capsys):
     chain, measured = tiago(data)
     assert chain.joints[0].kind == "prismatic"
     settings = Settings(loss="cauchy", passes=10)
-    found = climb(install(chain, [measured]), [measured], "offsets", settings=settings)
+    found = select_model(install(chain, [measured]), [measured], "offsets", settings=settings)
     named = outliers(found.fit)
     sizes = 1e3 * errors(found.fit.cell, [measured]).position
     with capsys.disabled():
@@ -178,12 +178,12 @@ def test_tiago_outliers_are_named(data, capsys):
 
 def test_motoman_in_a_small_volume_cannot_tell_base_from_tool(data):
     chain, measured = motoman(data, "right_6x6x6_150.csv")
-    found = climb(install(chain, [measured]), [measured], "geometry")
+    found = select_model(install(chain, [measured]), [measured], "geometry")
     assert any(isinstance(one, LoosePlacement) and one.station for one in unidentified(found.fit))
 
 
 @pytest.mark.slow
 def test_motoman_in_the_whole_workspace_is_said_not_to_be_rigid(data):
     chain, measured = motoman(data, "right_wide_386.csv")
-    found = climb(install(chain, [measured]), [measured], "geometry")
+    found = select_model(install(chain, [measured]), [measured], "geometry")
     assert any(isinstance(one, SetUpChange | SystematicResidual) for one in diagnose(found.fit))

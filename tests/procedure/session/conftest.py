@@ -29,7 +29,7 @@ def finished_folder(planned_folder: Path, tmp_path_factory: pytest.TempPathFacto
     folder = tmp_path_factory.mktemp("finished") / "cell"
     shutil.copytree(planned_folder, folder)
     session = open_session(folder)
-    demo.bring(session, virtual_cell("lwr4plus"), 1)
+    demo.simulate_measurements(session, virtual_cell("lwr4plus"), 1)
     assert go_on(session, plots=True) is None
     return folder
 
@@ -42,7 +42,7 @@ def planned(planned_folder: Path, tmp_path: Path) -> Session:
 
 @pytest.fixture
 def measured(planned: Session) -> Session:
-    demo.bring(planned, virtual_cell("lwr4plus"), 1)
+    demo.simulate_measurements(planned, virtual_cell("lwr4plus"), 1)
     return planned
 
 

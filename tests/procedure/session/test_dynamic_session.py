@@ -48,7 +48,7 @@ def recorded_folder(waiting_folder: Path, tmp_path_factory: pytest.TempPathFacto
     folder = tmp_path_factory.mktemp("recorded") / "cell"
     shutil.copytree(waiting_folder, folder)
     session = open_session(folder)
-    demo.bring_logs(session, demo.arm_of(session, virtual_cell("lwr4plus", 1)), 1)
+    demo.simulate_recordings(session, demo.arm_of(session, virtual_cell("lwr4plus", 1)), 1)
     return folder
 
 
