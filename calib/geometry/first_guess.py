@@ -3,7 +3,8 @@
 With the arm's poses A_i = (R_i, a_i) from the nominal chain:
 
 * full pose  B_i = S A_i X: rotations by Shah (2013, "Solving the robot-world/hand-eye calibration problem using the
-  Kronecker product"), then the two translations linearly;
+  Kronecker product"), then the two translations linearly; or, where poses hold nearly one orientation, which leaves
+  these open, by turns and ways together (`calib.geometry.images.hand_eye`);
 * position   S⁻¹ y_i = R_i t + a_i: linear in S's rotation (9 numbers), its offset and t; the 9 are projected on SO(3);
 * sockets    R_i t + a_i constant within each group: linear in t;
 * images     the board's pose in each (PnP), and of three closed forms for B_i = S A_i X the best
@@ -24,7 +25,7 @@ from calib.data.poses.measurements import PoseMeasurements, Poses, Positions, So
 from calib.data.poses.pixels import Pixels
 from calib.errors import MeasurementError
 from calib.geometry.images.camera_guess import place_camera, seen_target
-from calib.geometry.images.hand_eye import average_pose, place_pose
+from calib.geometry.images.hand_eye import average_pose, chordal_turns, place_pose
 from calib.geometry.images.optics import BoardShape, Optics
 from calib.geometry.installation import Installation
 from calib.robot.chain import Chain
@@ -42,6 +43,7 @@ UNITS = {
     25.4: "are they mm under a header that says in",
     0.03937: "are they in under a header that says mm",
 }
+TURN, TURNED = 0.05, 6.0  # poses that turn by more tell a tool well whatever they turn by [rad] (our choice)
 ENOUGH = 300  # rows of a block that a guess is made from (our choice)
 
 
@@ -49,14 +51,15 @@ def install(chain: Chain, measured: Sequence[PoseMeasurements], known: Deflectio
     """Return the nominal arm, with deflections known from an earlier fit, stations and tools placed by measurements.
 
     A tool seen in several blocks takes its guess from the block that tells most (poses before positions before the
-    rest, then the most rows); a station likewise. Tools that no block can place start at the tip.
+    rest, then the one whose poses turn most, then the most rows); a station likewise. Tools that no block can place
+    start at the tip.
 
     Raises:
         MeasurementError: too few rows to place an instrument.
     """
     stations: dict[str, np.ndarray] = {}
     tools: dict[str, np.ndarray] = {}
-    for block in sorted(measured, key=lambda b: (_rank(b), -len(b))):
+    for block in sorted(measured, key=lambda b: (_rank(b), -_turning(chain, b), -len(b))):
         block = take(block, np.unique(np.linspace(0, len(block) - 1, ENOUGH).astype(int)))
         arm = forward(chain, block.q)
         check_scale(block, arm)
@@ -111,6 +114,15 @@ def _rank(block: PoseMeasurements) -> int:
     """Return how far behind others a block's kind is in telling where instrument and target stand."""
     telling = (Poses, Pixels, Positions, Sockets)
     return next((rank for rank, kind in enumerate(telling) if isinstance(block, kind)), len(telling))
+
+
+def _turning(chain: Chain, block: PoseMeasurements) -> float:
+    """Return how far a block's poses turn about their second axis, rms in steps of `TURN`, up to `TURNED` of them."""
+    rows = np.unique(np.linspace(0, len(block) - 1, ENOUGH).astype(int))
+    if len(rows) < 3:
+        return 0.0
+    _, turns = chordal_turns(forward(chain, block.q[rows])[:, :3, :3])
+    return min(float(np.sqrt(np.clip(np.linalg.eigvalsh(np.cov(turns.T))[1], 0.0, None)) // TURN), TURNED)
 
 
 Guess = tuple[np.ndarray | None, np.ndarray]

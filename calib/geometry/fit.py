@@ -27,6 +27,8 @@ RETRIES = 4
 SPARE = 1.5  # measured numbers per unknown at least (our choice)
 WIDTHS = 3  # updates of a drawn fit's widths
 NARROWEST = 1e-6  # [m, rad]
+CRAWLS = 60  # linearisations after which a placement that has not settled does not tell itself (our choice)
+HARDLY = 1e-3  # relative size of a column of a placement that a block hardly tells (our choice)
 
 
 def fit(
@@ -241,11 +243,18 @@ def polish_frames(
 
 def placed_on(
     cell: Installation, block: PoseMeasurements, torques: Sequence[np.ndarray | None] | None, settings: Settings
-) -> Installation:
-    """Return an arm, deflections included, with base and tool placement fitted on a block and nothing else."""
+) -> GeometricFit:
+    """Fit base and tool placement of an arm, deflections included, on a block and nothing else.
+
+    Where that does not settle, since the block hardly tells some of it (the turn about a line that is driven), what it
+    tells by less than `HARDLY` stays where it is. Whether that settled is the solution's status.
+    """
     start = install(cell.chain, [block], cell.known)
     start = replace(start, deflection=cell.deflection, optics=start.optics.like(cell.optics))
-    return polish_frames(start, [block], settings, torques).cell
+    found = polish_frames(start, [block], replace(settings, limit=CRAWLS), torques)
+    if found.solution.status.good:
+        return found
+    return polish_frames(found.cell, [block], replace(settings, tolerance=HARDLY), torques)
 
 
 def without_corrections(

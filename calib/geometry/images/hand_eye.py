@@ -1,10 +1,12 @@
 """Where a camera and a board stand, from poses alone: three closed forms of B_i = S A_i X, and which of them is best.
 
-* Shah (2013): rotations by the Kronecker product's first singular pair, then translations (`place_pose`);
+* Shah (2013): rotations by the Kronecker product's first singular pair, then translations;
 * Li, Wang & Wu (2010): rotations and translations at once, S⁻¹ B_i = A_i X as one homogeneous linear system;
 * Park & Martin (1994): AX = XB of the motions between images for X, then S as the mean of what each image says.
 
-The best is the one with the smallest median misfit. Images that contradict the rest are left out, a few times.
+For poses that hold nearly one orientation, which leaves rotations alone open, `place_pose` has a fourth: turns and
+ways together. The best is the one with the smallest median misfit. Images that contradict the rest are left out, a few
+times.
 """
 
 from __future__ import annotations
@@ -19,6 +21,9 @@ from calib.transforms import invert, orthonormal, pose
 
 ROUNDS = 3  # of leaving the worst images out (our choice, as the next one)
 KEPT = 0.7
+LEVER = 0.3  # what a turn counts as [m/rad] (our choice, as the next two)
+UNTURNED = 0.01  # rms turn [rad] below which it tells no offset of the target
+WAYS = 5  # rounds of rotation and offset
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +56,7 @@ def place_robustly(arm: np.ndarray, seen: np.ndarray, lever: float) -> Placement
         lever: what a radian counts in the misfit [m].
     """
     methods: dict[str, Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]] = {
-        "Shah": place_pose, "Li": _li, "Park-Martin": _park_martin,
+        "Shah": _by_orientations, "Li": _li, "Park-Martin": _park_martin,
     }  # fmt: skip
     best: Placement | None = None
     for name, method in methods.items():
@@ -120,7 +125,7 @@ def average_pose(poses: np.ndarray) -> np.ndarray:
 
 
 def place_pose(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Solve B_i = S A_i X for S and X (Shah 2013).
+    """Solve B_i = S A_i X for S and X: by orientations (Shah 2013), or by turns and ways together; the better one.
 
     Args:
         arm: (m, 4, 4) poses A_i of the tip in the base.
@@ -129,6 +134,12 @@ def place_pose(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarra
     Returns:
         station (4, 4) and tool (4, 4).
     """
+    placed = [_by_orientations(arm, seen), _by_ways(arm, seen)]
+    return min(placed, key=lambda each: float(np.median(_misfit(arm, seen, *each, LEVER))))
+
+
+def _by_orientations(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return S and X by Shah: good where the poses turn about two axes by much more than they are off."""
     a, b = arm[:, :3, :3], seen[:, :3, :3]
     # vec(R_S R_A R_X) = vec(R_B): the sum of R_B ⊗ R_A has vec(R_S) and vec(R_X) as its first singular pair
     kernel = np.einsum("mij,mkl->ikjl", b, a).reshape(9, 9)
@@ -136,9 +147,39 @@ def place_pose(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarra
     station_rotation, tool_transposed = u[:, 0].reshape(3, 3), vt[0].reshape(3, 3)
     station_rotation = orthonormal(station_rotation * np.sign(np.linalg.det(station_rotation)))
     tool_rotation = orthonormal(tool_transposed * np.sign(np.linalg.det(tool_transposed))).T
-    # y_i - R_S a_i = R_S R_i t + p_S
-    turned = station_rotation @ a
-    matrix = np.concatenate([turned, np.broadcast_to(np.eye(3), turned.shape)], axis=2).reshape(-1, 6)
-    target = (seen[:, :3, 3] - arm[:, :3, 3] @ station_rotation.T).reshape(-1)
-    solution = np.linalg.lstsq(matrix, target, rcond=1e-9)[0]
-    return pose(station_rotation, solution[3:]), pose(tool_rotation, solution[:3])
+    station, offset = _translations(arm, seen[:, :3, 3], station_rotation)
+    return pose(station_rotation, station), pose(tool_rotation, offset)
+
+
+def _by_ways(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return S and X from what turns and ways from the mean have in common: good for a line driven in one orientation.
+
+    log(R_B,i R̄_Bᵀ) = R_S log(R_A,i R̄_Aᵀ), the chordal means being turned alike, and
+    y_i - ȳ = R_S (a_i - ā + (R_i - R̄) t): R_S by Kabsch on both, turns at a lever of `LEVER`, and t by its linear
+    solution, in turns.
+    """
+    (a, turns), (b, seen_turns) = (chordal_turns(poses[:, :3, :3]) for poses in (arm, seen))
+    station, offset, rotation = np.zeros(3), np.zeros(3), np.eye(3)
+    for _ in range(WAYS):
+        ways = arm[:, :3, 3] + arm[:, :3, :3] @ offset
+        one = np.concatenate([ways - ways.mean(axis=0), LEVER * turns])
+        two = np.concatenate([seen[:, :3, 3] - seen[:, :3, 3].mean(axis=0), LEVER * seen_turns])
+        rotation = Rotation.align_vectors(two, one)[0].as_matrix()
+        station, offset = _translations(arm, seen[:, :3, 3], rotation)
+    return pose(rotation, station), pose((rotation @ a).T @ b, offset)
+
+
+def chordal_turns(rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the chordal mean (3, 3) of rotations (m, 3, 3), and the rotation vectors (m, 3) that lead away from it."""
+    mean = orthonormal(rotations.mean(axis=0))
+    return mean, Rotation.from_matrix(rotations @ mean.T).as_rotvec()
+
+
+def _translations(arm: np.ndarray, position: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return p_S (3,) and t (3,) of  y_i - R_S a_i = R_S R_i t + p_S; 0 for what of t hardly any turn tells."""
+    turned, target = rotation @ arm[:, :3, :3], position - arm[:, :3, 3] @ rotation.T
+    away = turned - turned.mean(axis=0)
+    u, size, vt = np.linalg.svd(away.reshape(-1, 3), full_matrices=False)
+    told = size > UNTURNED * np.sqrt(len(arm))
+    offset = vt[told].T @ ((u[:, told].T @ (target - target.mean(axis=0)).reshape(-1)) / size[told])
+    return (target - turned @ offset).mean(axis=0), offset

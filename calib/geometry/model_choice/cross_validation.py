@@ -26,6 +26,8 @@ from calib.robot.chain import Chain
 from calib.robot.deflection import Deflection, Term
 
 CHUNK = 1000  # poses observed at once
+BLIND = 3.0  # error by covariance alone, over the nominal residuals, from which on a fold says nothing (our choice)
+LOOSE = 1.0  # how far a frame may be from where it is [m, rad] (our choice)
 METRES = ("position", "consistency", "distance", "plane", "pixel")
 
 
@@ -143,25 +145,65 @@ def fold_statistics(
     pooled = all(block.has_instrument for block in measured)
     for fold in range(folds.count):
         inside = [np.flatnonzero(members == fold) for members in folds.members]
-        metric, whitened, count = _statistics(
-            cell, measured, inside, free, scales, weights, noises, torques, folds.kind == "stations"
-        )
+        seen = {block.station for block, rows in zip(measured, inside) if len(rows) < len(block)}
+        moved = [block.has_instrument and block.station not in seen for block in measured]
+        metric, whitened, count = _statistics(cell, measured, inside, free, scales, weights, noises, torques, moved)
         held_out.append(metric)
         rows.append(count)
         if not pooled:
             outside = [np.flatnonzero(members != fold) for members in folds.members]
-            whitened = _statistics(cell, measured, outside, free, scales, weights, noises, torques, False)[1]
+            whitened = _statistics(cell, measured, outside, free, scales, weights, noises, torques)[1]
         each.append(whitened)
     if pooled:
         total = sum(each[1:], each[0])
         training = [_without(total, part) for part in each]
     else:
         every = [np.arange(len(b)) for b in measured]
-        total = _statistics(cell, measured, every, free, scales, weights, noises, torques, False)[1]
+        total = _statistics(cell, measured, every, free, scales, weights, noises, torques)[1]
         training = each
     wide = plausible_deviation(found.cell, found.free) if found.prior is None else found.prior
     plausible = np.where(np.isfinite(wide), wide, 10.0)
     return FoldStatistics(rigid, groups, sizes, plausible, training, held_out, np.array(rows), total)
+
+
+def blind_folds(
+    nominal: GeometricFit,
+    measured: Sequence[PoseMeasurements],
+    folds: Folds,
+    torques: Sequence[np.ndarray | None] | None = None,
+) -> np.ndarray:
+    """Return which folds cannot be judged (folds,): the other rows do not tell where the tool would be in them.
+
+    There the error that geometry and frames would have by their covariance alone, with the nominal arm's residuals
+    taken for noise and `plausible_deviation` known beforehand, is above `BLIND` times those residuals.
+
+    Args:
+        nominal: the nominal arm with its frames fitted to all rows.
+        measured: the blocks it was fitted to, positions or poses all.
+        folds: partition of the rows.
+        torques: gravity torques per block.
+    """
+    table = layout(nominal.cell)
+    free = np.concatenate([table.arm_index, table.frame_index])
+    sigmas: list[dict[str, float]] = [{} for _ in measured]
+    for piece in nominal.pieces:
+        sigmas[piece.block][piece.part.label] = max(float(np.sqrt(np.mean(piece.part.value**2))), 1e-9)
+    known = np.array([LOOSE if k >= table.arm else w for k, w in zip(free, plausible_deviation(nominal.cell, free))])
+    weights = row_weights(nominal)
+    each, squares, none, moved = [], [], [None] * len(measured), [True] * len(measured)
+    for fold in range(folds.count):
+        inside = [np.flatnonzero(members == fold) for members in folds.members]
+        held, own, count = _statistics(nominal.cell, measured, inside, free, sigmas, weights, none, torques, moved)
+        each.append(own)
+        squares.append((held.square / max(count, 1.0), held.total / max(count, 1.0)))
+    total = sum(each[1:], each[0])
+    result = np.zeros(folds.count, dtype=bool)
+    noise = sum(square for _, square in squares) / folds.count
+    for fold, own in enumerate(each):
+        spread = np.linalg.inv((_without(total, own).square + np.diag(known**-2)) * np.outer(known, known))
+        predicted = float(np.sum(squares[fold][0] * (spread * np.outer(known, known))))
+        result[fold] = predicted > BLIND**2 * noise
+    return result
 
 
 def _without(total: Gram, part: Gram) -> Gram:
@@ -177,9 +219,12 @@ def _statistics(
     weights: Sequence[np.ndarray],
     noises: Sequence[ImageNoise | None],
     torques: Sequence[np.ndarray | None] | None,
-    replace_station: bool,
+    moved: Sequence[bool] | None = None,
 ) -> tuple[Gram, Gram, float]:
-    """Return the statistics of chosen rows in metres (of what is in metres), whitened, and the count of metric rows."""
+    """Return the statistics of chosen rows in metres (of what is in metres), whitened, and the count of metric rows.
+
+    Of the blocks that are `moved` the station's placement is projected out of the statistics in metres.
+    """
     p = len(free)
     metric = whitened = Gram(np.zeros((p, p)), np.zeros(p), 0.0, 0)
     count = 0.0
@@ -203,7 +248,7 @@ def _statistics(
                     bare = replace(part, noise=None) if isinstance(part, PixelPart) else part
                     residual, matrix = bare.whitened(root * part.per_length)
                     count += float(weight.sum())
-                    if replace_station:
+                    if moved is not None and moved[number]:
                         frames.append((residual, matrix))
                     else:
                         metric = metric + gram(residual, matrix)

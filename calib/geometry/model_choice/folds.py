@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.data.poses.measurements import Distances, PoseMeasurements, Sockets
+from calib.data.poses.measurements import Distances, PoseMeasurements, Sockets, take
 from calib.errors import UsageError
 
 REGIONS = 20
@@ -27,11 +27,13 @@ class Folds:
         kind: ``stations``, ``files``, ``fixtures`` or ``regions``; ``random`` or ``poses`` (one left out) on request.
         count: number of folds.
         members: per block, (m,) fold of each row.
+        blind: names of what is not left out as a whole, since the rest cannot tell where its tool would be.
     """
 
     kind: str
     count: int
     members: tuple[np.ndarray, ...]
+    blind: tuple[str, ...] = ()
 
 
 def transfer_folds(measured: Sequence[PoseMeasurements], seed: int = 0) -> Folds:
@@ -53,6 +55,34 @@ def transfer_folds(measured: Sequence[PoseMeasurements], seed: int = 0) -> Folds
     if len(measured) == 1 and isinstance(measured[0], Sockets) and (fixtures := _fixtures(measured[0])) is not None:
         return fixtures
     return region_folds(measured, seed=seed)
+
+
+def divide(folds: Folds, blind: np.ndarray, measured: Sequence[PoseMeasurements], seed: int = 0) -> Folds:
+    """Return folds in which those that `blind` (count,) marks are divided: each of their regions is left out by itself.
+
+    What is left out as a whole has to be predicted by the rest. Where the rest cannot tell the tool (it holds one
+    orientation, say), errors there say nothing of any model; those on a part, the other part being fitted, do.
+    """
+    members, count = [np.array(fold) for fold in folds.members], 0
+    for fold in range(folds.count):
+        inside = [np.flatnonzero(each == fold) for each in folds.members]
+        if not blind[fold]:
+            new = [np.full(len(rows), 0) for rows in inside]
+        else:
+            chosen = [(take(block, rows), k) for k, (block, rows) in enumerate(zip(measured, inside)) if len(rows)]
+            new = [np.zeros(0, dtype=int) for _ in measured]
+            for (_, k), fresh in zip(chosen, region_folds([block for block, _ in chosen], seed=seed).members):
+                new[k] = fresh
+        for each, rows, fresh in zip(members, inside, new):
+            each[rows] = count + fresh
+        count += 1 + max(int(fresh.max(initial=0)) for fresh in new)
+    names = [
+        block.station if block.has_instrument else block.file
+        for block, fold in zip(measured, folds.members)
+        if len(fold) and blind[fold[0]]
+    ]
+    kind = folds.kind if not blind.all() else "regions"
+    return Folds(kind, count, tuple(members), tuple(dict.fromkeys(names)))
 
 
 def region_folds(

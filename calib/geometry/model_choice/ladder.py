@@ -16,13 +16,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import PoseMeasurements, Positions
 from calib.errors import UsageError
 from calib.geometry.fit import fit, fit_with_prior, polish_frames
 from calib.geometry.installation import Installation
-from calib.geometry.model_choice.cross_validation import FoldStatistics, fold_statistics
+from calib.geometry.model_choice.cross_validation import FoldStatistics, blind_folds, fold_statistics
 from calib.geometry.model_choice.effects import EFFECTS, MODELS, Effect, term_groups, term_sizes
-from calib.geometry.model_choice.folds import Folds, transfer_folds
+from calib.geometry.model_choice.folds import Folds, divide, transfer_folds
 from calib.geometry.observation import prepare
 from calib.geometry.parameters import layout
 from calib.geometry.result import GeometricFit, outliers
@@ -115,10 +115,10 @@ def select_model(
         raise UsageError(f"model '{model}' is none of auto, {', '.join(MODELS)}")
     tell = progress or (lambda done, total, what: None)
     folds, settings = folds or transfer_folds(measured, seed), settings or Settings()
-    climber = _Climber(cell, measured, settings, torques, fixed, prior, folds, tell)
+    climber = _Climber(cell, measured, settings, torques, fixed, prior, folds, tell, seed)
     climber.rigid(model)
     if settings.loss == "auto" and outliers(climber.best, GROSS):
-        climber = _Climber(cell, measured, replace(settings, loss="cauchy"), torques, fixed, prior, folds, tell)
+        climber = _Climber(cell, measured, replace(settings, loss="cauchy"), torques, fixed, prior, folds, tell, seed)
         climber.rigid(model)
     if model == "auto" or model in [effect.name for effect in EFFECTS]:
         climber.effects(model)
@@ -138,6 +138,7 @@ class _Climber:
         prior: np.ndarray | None,
         folds: Folds,
         tell: Progress,
+        seed: int = 0,
     ):
         self.measured, self.settings, self.torques, self.folds, self.tell = measured, settings, torques, folds, tell
         self.fixed, self.prior = np.array([], dtype=int) if fixed is None else fixed, prior
@@ -145,6 +146,9 @@ class _Climber:
         self.nominal = polish_frames(cell, measured, settings, torques)
         self.best, self.rungs, self.chosen = self.nominal, [], "frames"
         self.stiff = self.nominal
+        if folds.kind == "stations" and not folds.blind and all(isinstance(block, Positions) for block in measured):
+            blind = blind_folds(self.nominal, measured, folds, torques)
+            self.folds = divide(folds, blind, measured, seed) if blind.any() else folds
         self.steps = 0
         self.drawn = not all(block.has_instrument for block in measured)
 
@@ -173,26 +177,33 @@ class _Climber:
             self.rungs.append(
                 ModelStep(name, len(found.free), unseen, wanted, "" if better else "no better on unseen rows")
             )
+            self.full = found if name == "geometry" else None
             if wanted:
                 self.best, self.chosen, error = found, name, unseen
             elif model != "auto" and name != last:
                 error = min(error, unseen)
             if name == last:
                 break
-        self.stiff = self.best
+        self.stiff, self.error = self.best, error
 
     def effects(self, model: str) -> None:
-        """Try the effects one by one on top of the geometry; by name, take all up to it."""
-        if self.chosen != "geometry":
+        """Try the effects one by one on top of the geometry; by name, take all up to it.
+
+        The geometry need not pay alone: gear errors may hide what it brings. Then both together have to.
+        """
+        if self.full is None or (model != "auto" and self.chosen != "geometry"):
             return
         offered = {effect.name: self._terms(effect) for effect in EFFECTS}
         everything = tuple(term for terms in offered.values() for term in terms)
         self._tick("observation matrix")
-        statistics = self._statistics(self.best, everything)
+        statistics = self._statistics(self.full, everything)
         place = _places(offered)
         names = [effect.name for effect in EFFECTS]
         if model == "auto":
+            climbed = len(self.rungs)
             kept = self._greedy(statistics, offered, place)
+            if kept and self.chosen != "geometry":
+                kept = self._both(kept, climbed)
         else:
             kept = names[: names.index(model) + 1]
             where = np.concatenate([place[name] for name in kept])
@@ -200,6 +211,7 @@ class _Climber:
             self.rungs.append(self._rung(statistics, f"+ {model}", where, True, ""))
         if kept:
             self._tick("final fit")
+            self.best = self.full
             self.best = self._final(
                 statistics, [term for name in kept for term in offered[name]], [place[n] for n in kept]
             )
@@ -231,6 +243,20 @@ class _Climber:
             waiting.remove(best)
             error = tried[best]
         return kept
+
+    def _both(self, kept: list[str], climbed: int) -> list[str]:
+        """Return `kept` where geometry and effects together pay more than what is chosen; else nothing is kept.
+
+        Args:
+            kept: effects that pay on the geometry.
+            climbed: rungs tried before them, the geometry last.
+        """
+        pays = min(rung.cross_validated for rung in self.rungs[climbed:] if rung.kept) < self.error * (1.0 - GAIN)
+        note = "pays together with what follows" if pays else "no better on unseen rows than without the geometry"
+        for k in range(climbed - 1, len(self.rungs)):
+            if k < climbed or not pays:
+                self.rungs[k] = replace(self.rungs[k], kept=pays, note=note)
+        return kept if pays else []
 
     def _rung(
         self, statistics: FoldStatistics, name: str, where: np.ndarray, kept: bool, note: str, rms: float | None = None

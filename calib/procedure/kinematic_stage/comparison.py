@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -32,13 +32,14 @@ class Comparison:
         pairs: errors of the distances between pairs of positions, of each [m].
         poses: how many robot poses.
         frames: whose base and tool placement was used, in words.
-        proves: False where the rows were fitted on.
+        proves: False where the rows were fitted on, or where the placement did not settle.
         alone: errors of the calibrated robot as a URDF holds it, without corrections and with frames fitted for it
             on the same rows as theirs; None where that is all there is.
         shares_frames: True where another file's base and tool placement was used.
         repeated: what poses that were measured several times say (`calib.procedure.kinematic_stage.comparison`); None
             without any.
         reprojection: rms distance of seen from predicted corners, of each arm [px]; None without images.
+        settled: False where the placement of base and tool on these rows did not settle: their errors mean nothing.
     """
 
     blocks: tuple[PoseMeasurements, ...]
@@ -53,6 +54,7 @@ class Comparison:
     shares_frames: bool = False
     repeated: Mapping[str, Any] | None = None
     reprojection: tuple[float, float] | None = None
+    settled: bool = True
 
     def table(self) -> dict[str, object]:
         """Return the comparison as ``metrics.json`` holds it."""
@@ -105,19 +107,24 @@ def compare_unseen(
 ) -> Comparison:
     """Return both arms' errors on unseen rows, their frames refitted where the rows have frames of their own."""
     block = unseen.block
-    torques = [torque_of(block)]
+    torques, settled = [torque_of(block)], True
     if unseen.own_frames:
-        nominal, calibrated = (placed_on(cell, block, torques, settings) for cell in (nominal, calibrated))
-        alone = None if alone is None else placed_on(alone, block, torques, settings)
+        placed = [placed_on(cell, block, torques, settings) for cell in (nominal, calibrated)]
+        nominal, calibrated = (each.cell for each in placed)
+        alone = None if alone is None else placed_on(alone, block, torques, settings).cell
+        settled = all(each.solution.status.good for each in placed)
         words = "base and tool placement refitted on these rows"
     elif unseen.held_out:
         words = "those of the fit"
     else:
         words = f"those of the fit, station '{block.station}'" if block.has_instrument else "tool of the fit"
     shares = not (unseen.own_frames or unseen.held_out)
-    return compare(
+    found = compare(
         nominal, calibrated, [block], torques, words, not unseen.seen, seed, alone=alone, shares_frames=shares
     )
+    if settled:
+        return found
+    return replace(found, settled=False, proves=False, frames="base and tool placement did not settle on these rows")
 
 
 def gravity_of(chain: Chain, block: PoseMeasurements) -> np.ndarray | None:

@@ -174,8 +174,18 @@ def _found_of(inputs: Inputs, found: ModelSelection, named: Sequence[Outlier], n
         outlier_share=len({(each.file, each.row) for each in named}) / sum(len(block) for block in inputs.fit),
         unexplained=said if remains(found, long) else "",
         reach=long,
-        notes=(*((said,) if said else ()), *notes),
+        notes=(*((said,) if said else ()), *notes, *_blind_note(found.folds.blind)),
+        blind=found.folds.blind,
     )
+
+
+def _blind_note(blind: Sequence[str]) -> list[str]:
+    if not blind:
+        return []
+    return [
+        f"{', '.join(blind)}: left out by regions, not as a whole, since the rows of the other stations do not tell "
+        "where the tool would be there; what transfers from station to station is not judged by these"
+    ]
 
 
 def cross_validated(found: ModelSelection) -> float:

@@ -131,6 +131,7 @@ class Findings:
         reach: of the arm [m].
         loss: that was used; empty where it is not known.
         notes: what a user should know of the fit, whatever the unseen rows are.
+        blind: stations whose rows were left out by regions only, since the others do not tell where their tool is.
     """
 
     model: str
@@ -141,6 +142,7 @@ class Findings:
     reach: float
     loss: str = ""
     notes: tuple[str, ...] = ()
+    blind: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

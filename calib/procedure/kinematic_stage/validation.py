@@ -108,14 +108,14 @@ def assess(
     verdict = judge(
         fitted, validation, model=findings.model, asked=asked, cross_validated=findings.cross_validated,
         outlier_share=findings.outlier_share, unexplained=findings.unexplained, tolerance=tolerance,
-        nominal_cross_validated=findings.nominal_cross_validated, reach=findings.reach,
+        nominal_cross_validated=findings.nominal_cross_validated, reach=findings.reach, blind=findings.blind,
     )  # fmt: skip
     clause, loud = urdf_alone(fitted, validation)
     verdict = verdict if not clause else replace(verdict, reason=f"{verdict.reason}; {clause}")
     blocks = (*inputs.fit, *(unseen.block for unseen in inputs.unseen.values()))
     warnings = (
         *loud, *inputs.notes, *(note for block in blocks for note in block.notes), *elsewhere(fitted, validation),
-        *findings.notes, *_doubtful(validation),
+        *findings.notes, *_doubtful(validation), *_unsettled(validation),
     )  # fmt: skip
     return Assessment(fitted, validation, verdict, tuple(dict.fromkeys(warnings)))
 
@@ -175,6 +175,16 @@ def _doubtful(validation: Mapping[str, Comparison]) -> list[str]:
                 f"for the verdict too; without them the rms is {without:.3f} mm"
             )
     return result
+
+
+def _unsettled(validation: Mapping[str, Comparison]) -> list[str]:
+    """Name unseen files on which the placement of base and tool did not settle."""
+    return [
+        f"{name} is not scored: base and tool placement did not settle on its rows, which hardly tell both; measure it "
+        "from a station of the fit, or let it hold poses that turn about more than one axis"
+        for name, each in validation.items()
+        if not each.settled
+    ]
 
 
 def write_errors(path: Path, chain: Chain, validation: Mapping[str, Comparison]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,6 +52,7 @@ def judge(
     nominal_cross_validated: float | None = None,
     reach: float = np.inf,
     tolerance: float | None = None,
+    blind: Sequence[str] = (),
 ) -> Verdict:
     """Judge a calibration by the rows it has not seen.
 
@@ -63,7 +64,8 @@ def judge(
     3. only frames were asked for: pass, with nothing claimed of the arm;
     4. the tolerance, where one was given, is exceeded on some unseen file: fail;
     5. frames were chosen, so that no model of the arm is better than the nominal one: pass where what remains is below
-       `calib.procedure.kinematic_stage.outliers.FLOOR` of the reach (there is nothing to gain), else fail;
+       `calib.procedure.kinematic_stage.outliers.FLOOR` of the reach (there is nothing to gain), else fail; where not
+       every station could be left out as a whole, the choice itself is in doubt: marginal in place of pass;
     6. on some unseen file the calibrated arm is worse than the nominal one: fail. By cross-validation alone, where both
        leave less than `FLOOR` of the reach: marginal, since the nominal arm may have been fitted to these very rows;
     7. no unseen rows and no cross-validation: marginal;
@@ -86,6 +88,7 @@ def judge(
         nominal_cross_validated: error of the nominal arm on rows left out [m]; by default its error on the fit's rows.
         reach: of the arm [m].
         tolerance: largest rms on unseen poses that is good enough [m]; None where none was given.
+        blind: stations that could not be left out as a whole.
     """
     proofs = {name: comparison for name, comparison in validation.items() if comparison.proves}
     own = _rms(fit.errors[1].main)
@@ -98,7 +101,7 @@ def judge(
         _turned({"the fitted poses": fit, **proofs}),
         _frames_asked(model, asked),
         _too_coarse(found, tolerance),
-        _nothing_gained(found, model, reach),
+        _nothing_gained(found, model, reach, blind),
         _worse(found, bool(proofs), reach),
     ):
         if verdict is not None:
@@ -174,10 +177,17 @@ def _too_coarse(found: list[_Proof], tolerance: float | None) -> Verdict | None:
     return None
 
 
-def _nothing_gained(found: list[_Proof], model: str, reach: float) -> Verdict | None:
+def _nothing_gained(found: list[_Proof], model: str, reach: float, blind: Sequence[str]) -> Verdict | None:
     if model != "frames":
         return None
     worst = max((proof.before for proof in found), default=np.inf)
+    if blind and worst <= FLOOR * reach < np.inf:
+        return Verdict(
+            "marginal",
+            f"no model of the arm was found better than the nominal one ({1e3 * worst:.3f} mm rms), but "
+            f"{', '.join(blind)} could be left out by regions only: the other rows do not tell where the tool would be "
+            "there, so that nothing says what transfers; measure poses that turn about several axes from one station",
+        )
     if worst <= FLOOR * reach < np.inf:
         return Verdict(
             "pass",
