@@ -19,7 +19,7 @@ from calib.geometry.weighing import Settings
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from calib.robot.load import load
-from calib.simulation.cells.cell import Cell, SimulatedInstrument, simulate_measurements
+from calib.simulation.cells.cell import Cell, SimulatedInstrument, measure
 from calib.simulation.cells.virtual_cells import perturbed_cell, rigid
 
 START = np.array([0.3, -1.4, 1.6, -1.7, -1.5, 0.4])
@@ -53,7 +53,7 @@ def test_full_poses_of_one_orientation_are_placed_as_well_as_their_positions(kin
     """They were placed 300 mm wrong: rotations alone tell nothing of where the instrument stands there."""
     for seed in (1,):
         cell = rigid(probe(seed))
-        block = simulate_measurements(cell, driven(cell.nominal, kind, 80, tilt, seed), seed)
+        block = measure(cell, driven(cell.nominal, kind, 80, tilt, seed), seed)
         assert isinstance(block, Poses)
         points = Positions(block.q, block.joint_names, block.position, sigma=block.sigma)
         for arm, most in ((Installation(cell.nominal), 1.1), (Installation(cell.truth.chain), 1.5)):
@@ -69,11 +69,11 @@ def test_task_files_beside_spread_poses_do_not_hide_the_model(hidden):
     rng = np.random.default_rng(5)
     spread = rng.uniform(-2.0, 2.0, (40, 6))
     surfaces = [driven(cell.nominal, kind, 80, 0.0, 3) for kind in ("surface", "curve")]
-    blocks = [replace(simulate_measurements(cell, q, k), station=f"{k}") for k, q in enumerate([spread, *surfaces])]
+    blocks = [replace(measure(cell, q, k), station=f"{k}") for k, q in enumerate([spread, *surfaces])]
     found = select_model(install(cell.nominal, blocks), blocks)
     assert found.folds.blind == ("0",)
     assert found.chosen.startswith("geometry")
-    unseen = simulate_measurements(cell, rng.uniform(-2.0, 2.0, (200, 6)), 9)
+    unseen = measure(cell, rng.uniform(-2.0, 2.0, (200, 6)), 9)
     after, before = (rms(replace(each.cell, station_names=("station", "1", "2")), unseen)
                      for each in (found.fit, found.nominal))  # fmt: skip
     assert after < 0.2 * before
