@@ -98,6 +98,20 @@ def curvature(values: np.ndarray, rate: float, width: int = 4) -> np.ndarray:
     return _differences(values, CURVATURE[width], rate**2, 1.0)
 
 
+def moving_cubics(values: np.ndarray, width: int, order: int = 0) -> np.ndarray:
+    """Return `values` (N, n), or a derivative per sample, by the cubic that fits the `width` samples on either side.
+
+    Savitzky and Golay (1964); the first and last `width` rows are on the cubics of the outermost windows.
+    """
+    reach = np.arange(-width, width + 1.0)
+    fit = np.linalg.pinv(np.vander(reach, 4, increasing=True))  # coefficients of 1, k, k², k³
+    factorial, powers = np.array([[1, 1, 1, 1], [0, 1, 2, 3], [0, 0, 2, 6]])[order], np.arange(4) - order
+    at = np.where(powers >= 0, factorial * reach[:, None] ** np.maximum(powers, 0), 0.0) @ fit  # of every place in it
+    inner = sum(at[width, k] * values[k : len(values) - 2 * width + k] for k in range(2 * width + 1))
+    size = 2 * width + 1
+    return np.concatenate([at[:width] @ values[:size], inner, at[width + 1 :] @ values[len(values) - size :]])
+
+
 def _differences(values: np.ndarray, coefficients: tuple[float, ...], scale: float, sign: float) -> np.ndarray:
     width, n = len(coefficients), len(values)
     out = np.full(values.shape, np.nan)

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from calib.data.recordings.recording import Recording
+from calib.data.signals.filtering import moving_cubics
 from calib.dynamics.bodies import bodies_of, standard_parameters, with_gravity
 from calib.dynamics.rigid_body import inverse_dynamics
 from calib.robot.chain import Chain
@@ -219,6 +220,4 @@ def share_of_nominal(
 
 def _smooth(values: np.ndarray, order: int = 0) -> np.ndarray:
     """Return values (N, n) on the coarse grid, or their derivatives, by cubics over a moving window."""
-    from scipy.signal import savgol_filter  # slow to load
-
-    return np.asarray(savgol_filter(values, 2 * SMOOTH + 1, 3, deriv=order, delta=STEP, axis=0))
+    return moving_cubics(values, min(SMOOTH, (len(values) - 1) // 2), order) / STEP**order

@@ -17,7 +17,7 @@ from calib.data.signals.decimation import (
     factor_for,
     kept,
 )
-from calib.data.signals.filtering import border, curvature, hann, low_pass, slope
+from calib.data.signals.filtering import border, curvature, hann, low_pass, moving_cubics, slope
 from calib.data.signals.persistency import count_peaks
 from calib.errors import CalibError, MeasurementError
 
@@ -180,3 +180,17 @@ def test_windows_and_peaks_are_scipys():
         least = 0.3 * rng.random() * power.max()
         peaks, _ = scipy.signal.find_peaks(power, height=least, distance=8, prominence=0.5 * least)
         assert count_peaks(power, least) == len(peaks)
+
+
+@pytest.mark.parametrize("order", [0, 1, 2])
+def test_moving_cubics_are_savitzkys_and_golays(order):
+    from scipy.signal import savgol_filter
+
+    x = np.random.default_rng(0).normal(size=(57, 3)).cumsum(axis=0)
+    expected = savgol_filter(x, 21, 3, deriv=order, axis=0)
+    np.testing.assert_allclose(moving_cubics(x, 10, order), expected, rtol=1e-11, atol=1e-12)
+
+
+def test_moving_cubics_of_very_few_samples_are_those_samples():
+    x = np.random.default_rng(1).normal(size=(3, 2))
+    np.testing.assert_allclose(moving_cubics(x, 1), x, atol=1e-12)
