@@ -213,7 +213,8 @@ def read_file(
 def _blocks(
     each: Path | PoseMeasurements, chain: Chain, options: FitOptions, like: Sequence[PoseMeasurements] = ()
 ) -> list[PoseMeasurements]:
-    return read_file(each, chain, options, like) if isinstance(each, (str, Path)) else _checked([each], chain, like)
+    named = isinstance(each, (str, Path))
+    return read_file(Path(each), chain, options, like) if named else _checked([each], chain, like)
 
 
 def _path(each: Path | PoseMeasurements) -> Path:
