@@ -17,6 +17,7 @@ TOML; every key is optional, and a key that is none of these is refused. Lengths
     beta = true                      # a sixth element for nearly parallel axes of an MDH table
     fix = ["theta1"]                 # parameters that stay at their nominal value
     free = ["d3"]                    # if given, only these move
+    accept = []                      # findings that are meant so: unexplained, reflection, scale
 
     [columns]                        # our name = the file's
     x = "X_leica"
@@ -76,6 +77,9 @@ LOSSES = ("auto", "none", "huber", "cauchy")
 Metres = Annotated[float, Real(above=0, most=0.1, unit="m")]
 Radians = Annotated[float, Real(above=0, most=1.0, unit="rad")]
 Each = Spread(3, "a number or three")
+
+
+FINDINGS = ("unexplained", "reflection", "scale")  # that the verdict may call a fit odd for
 
 
 @strict
@@ -142,7 +146,7 @@ class FitOptions(FileOptions):
 
     Attributes:
         files: file name → how that file is read.
-        model, loss, loss_scale, beta, fix, free, prior: as in the options file.
+        model, loss, loss_scale, beta, fix, free, accept, prior: as in the options file.
         source: the options file, for messages.
     """
 
@@ -153,6 +157,7 @@ class FitOptions(FileOptions):
     beta: Flag = True
     fix: Names = ()
     free: Names = ()
+    accept: tuple[Annotated[str, OneOf(FINDINGS)], ...] = ()
     prior: Mapping[str, Positive] = field(default_factory=dict)
     source: Annotated[str, Hidden()] = ""
 

@@ -13,28 +13,18 @@ lag      torques that come later than the positions of their row, at most joints
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from calib.identification.checks.plausible import Lag, RecordingSizes
-from calib.procedure.kinematic_stage.verdict import Verdict
+from calib.procedure.kinematic_stage.metrics import Finding
+from calib.procedure.kinematic_stage.plausibility import LEVELS
 
 FAR, OFF = 3.0, 2.2
 SLIGHT, WRONG = 0.05, 1.5
 LIGHT, HEAVY = 0.5, 5.0
 HELPS = 0.3
-LEVELS = ("pass", "marginal", "fail")
-
-
-@dataclass(frozen=True)
-class Finding:
-    """What is odd with a recording: its name in ``accept``, the best level it allows, and a sentence."""
-
-    name: str
-    level: str
-    words: str
 
 
 def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Finding]:
@@ -43,25 +33,6 @@ def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Fin
         one for each in sizes for one in (*_masses(each, joints), *_speed(each, joints), *_lag(each.name, each.lag))
     ]
     return sorted(found, key=lambda one: -LEVELS.index(one.level))
-
-
-def held_by(verdict: Verdict, found: Sequence[Finding], accepted: Collection[str]) -> Verdict:
-    """Return the verdict, no better than the findings allow that were not accepted."""
-    for one in found:  # worst first
-        if one.name not in accepted and LEVELS.index(one.level) > LEVELS.index(verdict.level):
-            return Verdict(one.level, f"{one.words}; {verdict.reason}")
-    return verdict
-
-
-def told(found: Sequence[Finding], accepted: Collection[str]) -> list[str]:
-    """Return what a user should know."""
-    return [
-        f"{one.words} (accepted by the options)" if one.name in accepted else f"{one.words}{_yes(one)}" for one in found
-    ]
-
-
-def _yes(one: Finding) -> str:
-    return "" if one.level == "pass" else f'; if that is meant, accept = ["{one.name}"] in the options'
 
 
 def _masses(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:

@@ -25,6 +25,7 @@ from calib.procedure.dynamic_stage.verdict import (
     warnings,
     with_prior,
 )
+from calib.procedure.kinematic_stage.plausibility import held_by, told
 from calib.procedure.kinematic_stage.verdict import Verdict
 from calib.simulation.loop.controllers import Controller
 from calib.units import TORQUE
@@ -107,21 +108,21 @@ def assess(
     sizes = [compare_sizes(case, inputs.chain, settings.gravity, inputs.unit == TORQUE) for case in inputs.cases]
     odd, accepted = plausibility.findings(sizes, inputs.chain.joint_names), inputs.options.accept
     verdict = with_prior(judge(fit, proofs, repeated, excitation, wrong, labels), findings.rests)
-    verdict = plausibility.held_by(verdict, odd, accepted)
+    verdict = held_by(verdict, odd, accepted)
     say("tracking with the model fed forward")
     amperes = relative_warnings(inputs.unit)
     tracking = (
         Tracking(unseen=bool(inputs.unseen), failure=amperes[0]) if amperes
         else track(inputs, dynamics, predictions, findings.controller)
     )  # fmt: skip
-    told = (
-        *amperes, *plausibility.told(odd, accepted),
+    said = (
+        *amperes, *told(odd, accepted),
         *warnings(inputs.cases, inputs.unseen, validation, repeated, excitation, inputs.chain),
         *findings.notes,
     )  # fmt: skip
     return Assessment(
         fit, validation, predictions, repeated, excitation, _tolerated(verdict, proofs, tolerance),
-        tuple(dict.fromkeys(told)), tracking,
+        tuple(dict.fromkeys(said)), tracking,
     )  # fmt: skip
 
 

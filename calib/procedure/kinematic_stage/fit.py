@@ -21,6 +21,7 @@ from calib.geometry.model_choice.ladder import ModelSelection, rigid_fit, select
 from calib.geometry.parameters import fixed_parameters, stated_prior
 from calib.geometry.result import GeometricFit, calibrated_chain
 from calib.geometry.weighing import Settings, combine
+from calib.procedure.kinematic_stage import plausibility
 from calib.procedure.kinematic_stage.comparison import (
     Comparison,
     gravity_of,
@@ -135,7 +136,7 @@ def run(
     named = named_outliers(found.fit)
     told = *map(remark, diagnose(found.fit)), *image_notes(found.fit)
     notes = *_moved_between(found.nominal.cell, inputs.fit, settings), *told
-    findings = _found_of(inputs, found, named, notes)
+    findings = _found_of(inputs, found, named, notes, torques, options.accept)
     arms = Arms(found.nominal.cell, found.fit.cell, rigid.cell.chain)
     result = assess(arms, inputs, findings, settings, asked=asked, tolerance=wanted.tolerance, seed=seed)
     return Outcome(
@@ -162,10 +163,15 @@ def assessed(outcome: Outcome, inputs: Inputs, options: FitOptions, wanted: FitS
     return replace(outcome, inputs=inputs, assessment=result)
 
 
-def _found_of(inputs: Inputs, found: ModelSelection, named: Sequence[Outlier], notes: Sequence[str]) -> Findings:
+def _found_of(
+    inputs: Inputs, found: ModelSelection, named: Sequence[Outlier], notes: Sequence[str],
+    torques: Sequence[np.ndarray | None], accepted: Sequence[str],
+) -> Findings:  # fmt: skip
     """Return what a fit says of itself, whatever rows it has not seen; `notes` are those of moved instruments etc."""
     long = stretched_length(inputs.chain)
     said = plateau(found, long)
+    left = cross_validated(found)
+    odd = plausibility.findings(found.nominal.cell, found.fit.cell, inputs.fit, torques, left, long)
     return Findings(
         model=found.chosen,
         loss=found.loss,
@@ -176,6 +182,7 @@ def _found_of(inputs: Inputs, found: ModelSelection, named: Sequence[Outlier], n
         reach=long,
         notes=(*((said,) if said else ()), *notes, *_blind_note(found.folds.blind)),
         blind=found.folds.blind,
+        odd=plausibility.settled(odd, accepted),
     )
 
 

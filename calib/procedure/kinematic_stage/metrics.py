@@ -119,6 +119,15 @@ class OutlierRow:
 
 
 @dataclass(frozen=True)
+class Finding:
+    """What is odd with measurements: its name in ``accept``, the best level it allows, and a sentence."""
+
+    name: str
+    level: str
+    words: str
+
+
+@dataclass(frozen=True)
 class Findings:
     """What a fit says of itself and a verdict needs beside the errors on rows; kept in the fit's folder.
 
@@ -132,6 +141,7 @@ class Findings:
         loss: that was used; empty where it is not known.
         notes: what a user should know of the fit, whatever the unseen rows are.
         blind: stations whose rows were left out by regions only, since the others do not tell where their tool is.
+        odd: what cannot be of this arm, see `calib.procedure.kinematic_stage.plausibility`.
     """
 
     model: str
@@ -143,6 +153,7 @@ class Findings:
     loss: str = ""
     notes: tuple[str, ...] = ()
     blind: tuple[str, ...] = ()
+    odd: tuple[Finding, ...] = ()
 
 
 @dataclass(frozen=True)

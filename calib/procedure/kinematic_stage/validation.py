@@ -28,6 +28,7 @@ from calib.procedure.kinematic_stage.comparison import (
 )
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import Findings
+from calib.procedure.kinematic_stage.plausibility import held_by
 from calib.procedure.kinematic_stage.verdict import OWN_FRAMES, Verdict, judge
 from calib.robot.chain import Chain
 from calib.transforms import invert
@@ -110,11 +111,13 @@ def assess(
         outlier_share=findings.outlier_share, unexplained=findings.unexplained, tolerance=tolerance,
         nominal_cross_validated=findings.nominal_cross_validated, reach=findings.reach, blind=findings.blind,
     )  # fmt: skip
+    verdict = held_by(verdict, findings.odd, ())
     clause, loud = urdf_alone(fitted, validation)
     verdict = verdict if not clause else replace(verdict, reason=f"{verdict.reason}; {clause}")
     blocks = (*inputs.fit, *(unseen.block for unseen in inputs.unseen.values()))
     warnings = (
-        *loud, *inputs.notes, *(note for block in blocks for note in block.notes), *elsewhere(fitted, validation),
+        *loud, *(one.words for one in findings.odd),
+        *inputs.notes, *(note for block in blocks for note in block.notes), *elsewhere(fitted, validation),
         *findings.notes, *_doubtful(validation), *_unsettled(validation),
     )  # fmt: skip
     return Assessment(fitted, validation, verdict, tuple(dict.fromkeys(warnings)))

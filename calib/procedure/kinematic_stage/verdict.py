@@ -61,8 +61,8 @@ def judge(
     1. on some unseen file both arms are off by more than `ELSEWHERE` of the reach: not judged, which is a fail, since
        nothing is proved;
     2. the calibrated arm's orientations are off by more than `TURNED` on some unseen file, or on the fitted rows: fail;
-    3. only frames were asked for: pass, with nothing claimed of the arm;
-    4. the tolerance, where one was given, is exceeded on some unseen file: fail;
+    3. the tolerance, where one was given, is exceeded on some unseen file: fail;
+    4. only frames were asked for: pass, with nothing claimed of the arm;
     5. frames were chosen, so that no model of the arm is better than the nominal one: pass where what remains is below
        `calib.procedure.kinematic_stage.outliers.FLOOR` of the reach (there is nothing to gain), else fail; where not
        every station could be left out as a whole, the choice itself is in doubt: marginal in place of pass;
@@ -76,6 +76,7 @@ def judge(
     11. more than `OUTLIERS` of the rows do not fit: marginal;
     12. else pass.
 
+    What cannot be of this arm holds the verdict down afterwards (`calib.procedure.kinematic_stage.plausibility`).
     Without unseen files, both arms are judged by cross-validation.
 
     Args:
@@ -99,8 +100,8 @@ def judge(
     for verdict in (
         _elsewhere(proofs, reach),
         _turned({"the fitted poses": fit, **proofs}),
-        _frames_asked(model, asked),
         _too_coarse(found, tolerance),
+        _frames_asked(model, asked, own),
         _nothing_gained(found, model, reach, blind),
         _worse(found, bool(proofs), reach),
     ):
@@ -163,9 +164,10 @@ def _elsewhere(proofs: Mapping[str, Comparison], reach: float) -> Verdict | None
     return None
 
 
-def _frames_asked(model: str, asked: str) -> Verdict | None:
+def _frames_asked(model: str, asked: str, left: float) -> Verdict | None:
     if model == "frames" and asked == "frames":
-        return Verdict("pass", "only base and tool placement were asked for; the arm is as it was")
+        words = "only base and tool placement were asked for; the arm is as it was"
+        return Verdict("pass", f"{words}, {1e3 * left:.3f} mm rms remain")
     return None
 
 

@@ -1,0 +1,102 @@
+"""Can an instrument have seen this arm? One factor on all lengths, and axes that are left-handed.
+
+Both are looked at with the nominal arm: base and tool placement take up what they can, and what an arm's own errors
+leave is small against either. All thresholds are our choice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
+from calib.errors import CalibError
+from calib.geometry.accuracy import errors
+from calib.geometry.first_guess import install
+from calib.geometry.fit import polish_frames
+from calib.geometry.installation import Installation
+from calib.geometry.observation import observe, prepare
+from calib.geometry.parameters import layout
+
+FLIP = np.array([1.0, -1.0, 1.0])
+Torques = Sequence[np.ndarray | None] | None
+
+
+@dataclass(frozen=True)
+class Scale:
+    """One factor on all measured lengths, fitted beside base and tool placement of the nominal arm.
+
+    Attributes:
+        factor: measured over the arm's.
+        sigma: of the factor.
+        explained: share of the squares of the nominal arm's errors that it takes away.
+    """
+
+    factor: float
+    sigma: float
+    explained: float
+
+
+def scale_of(nominal: Installation, blocks: Sequence[PoseMeasurements], torques: Torques = None) -> Scale | None:
+    """Return the factor on the instrument's lengths; None without positions.
+
+    Args:
+        nominal: the arm with base and tool placement fitted for it.
+        blocks: of any kinds; those that measure positions count.
+    """
+    frames, rows, columns = layout(nominal).frame_index, [], []
+    for block in prepare(nominal, blocks, torques):
+        if not isinstance(block.measured, Positions):
+            continue
+        part = next(part for part in observe(nominal, block, frames) if part.label == "position")
+        seen = np.asarray(block.measured.position)[part.index]
+        rows.append(part.value.ravel())
+        columns.append(
+            np.column_stack([part.jacobian.reshape(len(frames), -1).T, (seen - seen.mean(axis=0)).T.ravel()])
+        )
+    if not rows:
+        return None
+    value, matrix = np.concatenate(rows), np.concatenate(columns)
+    size = np.maximum(np.linalg.norm(matrix, axis=0), 1e-12)
+    return _scale(value, matrix / size, float(size[-1]))
+
+
+def _scale(value: np.ndarray, matrix: np.ndarray, size: float) -> Scale | None:
+    """Return the last column's share in explaining `value`, the others being free: y - p = (1 - 1/s) y."""
+    others, last = matrix[:, :-1], matrix[:, -1]
+    left, own = (x - others @ np.linalg.lstsq(others, x, rcond=1e-9)[0] for x in (value, last))
+    power, count = float(own @ own), len(value) - matrix.shape[1]
+    if count < 1 or power < 1e-12:
+        return None
+    slope = float(own @ left) / power
+    squares = float(left @ left)
+    rest = max(squares - slope**2 * power, 0.0)
+    return Scale(
+        1.0 / (1.0 - slope / size), float(np.sqrt(rest / count / power)) / size, 1.0 - rest / max(squares, 1e-300)
+    )
+
+
+def mirrored_rms(nominal: Installation, blocks: Sequence[PoseMeasurements], torques: Torques = None) -> float:
+    """Return the rms [m] that base and tool placement of the nominal arm leave where the instrument's y is turned.
+
+    NaN where no positions were measured, or they place no instrument.
+    """
+    flipped = [_flipped(block) for block in blocks if isinstance(block, Positions)]
+    if not flipped:
+        return np.nan
+    own = None if torques is None else [t for t, block in zip(torques, blocks) if isinstance(block, Positions)]
+    try:
+        placed = polish_frames(install(nominal.chain, flipped, nominal.known), flipped, None, own).cell
+    except CalibError:
+        return np.nan
+    return float(np.sqrt(np.mean(errors(placed, flipped, own).main ** 2)))
+
+
+def _flipped(block: Positions) -> Positions:
+    """Return a block seen in a frame of the other hand: y turned; a rotation R becomes F R F."""
+    turned = {"position": np.asarray(block.position) * FLIP}
+    if isinstance(block, Poses):
+        turned["quaternion"] = np.asarray(block.quaternion) * [-1.0, 1.0, -1.0, 1.0]
+    return replace(block, **turned)

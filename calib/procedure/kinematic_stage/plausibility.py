@@ -1,0 +1,133 @@
+"""What cannot be of this arm, and what that means for a verdict; all thresholds are our choice.
+
+A finding that makes the numbers of a model wrong by far is no note under a pass: it fails, or holds the verdict at
+marginal, until the options' ``accept`` says that it is meant. Findings of poses and their names:
+
+unexplained   on rows left out even the chosen model leaves more than `NO_ARM` of the reach: fail
+reflection    with the instrument's y turned the nominal arm fits `BETTER` times as well: its axes are left-handed: fail
+scale         one factor on all measured lengths takes away `SHARE` of the squares of the nominal arm's errors; off one
+              by more than `GROWN`: marginal, else a note
+commanded     less than `TOO_GOOD` remains, which no instrument measures: a note
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from calib.data.poses.measurements import PoseMeasurements
+from calib.geometry.accuracy import errors
+from calib.geometry.checks.plausible import Scale, mirrored_rms, scale_of
+from calib.geometry.installation import Installation
+from calib.procedure.kinematic_stage.metrics import Finding
+from calib.procedure.kinematic_stage.verdict import Verdict
+
+NO_ARM = 0.015
+BETTER = 3.0
+SHARE, LEAST, GROWN = 0.3, 1e-3, 5e-3
+TOO_GOOD = 2e-6  # [m]
+LEVELS = ("pass", "marginal", "fail")
+
+
+def held_by(verdict: Verdict, found: Sequence[Finding], accepted: Collection[str]) -> Verdict:
+    """Return the verdict, no better than the findings allow that were not accepted; they come first in its reason."""
+    for one in sorted(found, key=lambda one: -LEVELS.index(one.level)):
+        if one.level != "pass" and one.name not in accepted and LEVELS.index(one.level) >= LEVELS.index(verdict.level):
+            words = one.words.partition("; if that is meant, accept")[0]
+            return Verdict(one.level, f"{words}; {verdict.reason}")
+    return verdict
+
+
+def told(found: Sequence[Finding], accepted: Collection[str]) -> list[str]:
+    """Return what a user should know."""
+    return [f"{one.words}{_advice(one, accepted)}" for one in found]
+
+
+def _advice(one: Finding, accepted: Collection[str]) -> str:
+    if one.name in accepted:
+        return " (accepted by the options)"
+    return "" if one.level == "pass" else f'; if that is meant, accept = ["{one.name}"] in the options'
+
+
+def settled(found: Sequence[Finding], accepted: Collection[str]) -> tuple[Finding, ...]:
+    """Return findings as a fit's folder keeps them: those that were accepted allow a pass."""
+    words = told(found, accepted)
+    return tuple(
+        replace(one, words=said, level="pass" if one.name in accepted else one.level) for one, said in zip(found, words)
+    )
+
+
+def findings(
+    nominal: Installation,
+    calibrated: Installation,
+    blocks: Sequence[PoseMeasurements],
+    torques: Sequence[np.ndarray | None],
+    left: float | None,
+    reach: float,
+) -> list[Finding]:
+    """Return what is odd with the rows of a fit, worst first.
+
+    Args:
+        nominal, calibrated: the arms, placed.
+        blocks: the rows; torques: gravity torques (m, n) per block [N m].
+        left: error of the chosen model on rows left out [m]; None where it was not computed.
+        reach: of the arm [m].
+    """
+    before, after = (_rms(cell, blocks, torques) for cell in (nominal, calibrated))
+    remains = after if left is None else left
+    found = []  # what explains most first
+    if before > NO_ARM * reach:
+        found += _reflection(before, mirrored_rms(nominal, blocks, torques))
+    found += [*_unexplained(remains, reach), *_commanded(before, after)]
+    scale = scale_of(nominal, blocks, torques)
+    if scale is not None and before * np.sqrt(1.0 - scale.explained) < NO_ARM * reach:
+        found += _scale(scale)
+    return sorted(found, key=lambda one: -LEVELS.index(one.level))
+
+
+def _unexplained(remains: float, reach: float) -> Iterator[Finding]:
+    if remains > NO_ARM * reach:
+        yield Finding(
+            "unexplained", "fail",
+            f"{1e3 * remains:.3g} mm rms remain on the measured rows, as of no arm of {reach:.1f} m reach: is it this "
+            "robot, are units, joint order, signs and rows right, and did instrument and tool stay where they were?",
+        )  # fmt: skip
+
+
+def _reflection(before: float, mirrored: float) -> Iterator[Finding]:
+    if before > BETTER * mirrored:
+        yield Finding(
+            "reflection", "fail",
+            f"the instrument's axes seem left-handed: with y turned the nominal arm is off by {1e3 * mirrored:.3g} mm "
+            f"rms, as measured by {1e3 * before:.3g} mm: is the sign of a column reversed, or are two exchanged?",
+        )  # fmt: skip
+
+
+def _scale(found: Scale) -> Iterator[Finding]:
+    if found.explained < SHARE or abs(found.factor - 1.0) < LEAST:
+        return
+    grown = 100.0 * (found.factor - 1.0)
+    yield Finding(
+        "scale", "marginal" if abs(found.factor - 1.0) > GROWN else "pass",
+        f"all measured lengths are {abs(grown):.2g} % {'larger' if grown > 0 else 'smaller'} than the arm's, by one "
+        f"factor, {found.factor:.4f} ± {found.sigma:.1g}, which explains {100 * found.explained:.0f} % of what the "
+        "nominal arm leaves: is the instrument's (or a camera's target's) scale right? The fit takes it for the arm's",
+    )  # fmt: skip
+
+
+def _commanded(before: float, after: float) -> Iterator[Finding]:
+    if 0.0 < after < TOO_GOOD:
+        whose = "the nominal arm" if before < TOO_GOOD else "the calibrated arm"
+        size = before if before < TOO_GOOD else after
+        yield Finding(
+            "commanded", "pass",
+            f"{whose} leaves {1e6 * size:.2g} µm rms, less than any instrument's noise: are these commanded or "
+            "computed positions, not measured ones?",
+        )  # fmt: skip
+
+
+def _rms(cell: Installation, blocks: Sequence[PoseMeasurements], torques: Sequence[np.ndarray | None]) -> float:
+    sizes = errors(cell, blocks, torques).main
+    return float(np.sqrt(np.mean(sizes**2))) if len(sizes) else 0.0

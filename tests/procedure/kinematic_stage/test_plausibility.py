@@ -1,0 +1,78 @@
+"""Measurements that are not what they claim: no verdict of pass stands on them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.robot.kinematics import forward
+
+COUNT = 40
+
+
+def changed(cell, name: str, change, quaternions: bool = False) -> Path:
+    rows = cell.measure(COUNT)
+    place = np.array([[row[axis] for axis in "xyz"] for row in rows])
+    for row, (x, y, z) in zip(rows, change(place)):
+        row |= {"x": x, "y": y, "z": z}
+    columns = None if quaternions else [*(f"q{j + 1}" for j in range(6)), *"xyz"]
+    return cell.write(name, rows, columns)
+
+
+def verdict() -> tuple[str, str, list[str]]:
+    found = json.loads(Path("o/metrics.json").read_text())
+    return found["verdict"], found["reason"], [one["name"] for one in found["findings"]["odd"]]
+
+
+def test_sound_poses_are_not_remarked_upon(cell, calib):
+    code, _, err = calib("fit", "ur5", cell.write("m.csv", cell.measure(COUNT)), "--out", "o", "--model", "frames")
+    level, reason, odd = verdict()
+    assert (code, level, odd) == (0, "pass", []), err
+    assert "the arm is as it was" in reason and "mm rms remain" in reason
+
+
+@pytest.mark.parametrize(
+    "change, name",
+    [
+        (lambda place: np.random.default_rng(0).permutation(place), "unexplained"),
+        (lambda place: np.random.default_rng(0).uniform(-0.8, 0.8, place.shape), "unexplained"),
+        (lambda place: place[:, [1, 1, 2]], "unexplained"),
+        (lambda place: place * [1, -1, 1], "reflection"),
+    ],
+)
+def test_frames_alone_are_judged_too(cell, calib, change, name):
+    code, out, _ = calib("fit", "ur5", changed(cell, "m.csv", change), "--out", "o", "--model", "frames")
+    level, reason, odd = verdict()
+    assert (code, level) == (1, "fail") and odd[0] == name
+    assert reason.startswith("the instrument's axes seem left-handed" if name == "reflection" else "")
+    assert f'accept = ["{name}"] in the options' in out
+    Path("a.toml").write_text('accept = ["unexplained", "reflection"]')
+    again = calib("fit", "ur5", "m.csv", "--out", "o", "--model", "frames", "--options", "a.toml")
+    assert (again[0], verdict()[0]) == (0, "pass") and "(accepted by the options)" in again[1]
+
+
+@pytest.mark.parametrize("factor, level", [(1.0, None), (1.05, "marginal"), (0.97, "marginal"), (1.003, "pass")])
+def test_one_factor_on_all_lengths_is_the_instruments(cell, calib, factor, level):
+    calib("fit", "ur5", changed(cell, "m.csv", lambda place: factor * place), "--out", "o", "--model", "frames")
+    found = json.loads(Path("o/metrics.json").read_text())["findings"]["odd"]
+    own = {one["name"]: one for one in found}
+    assert ("scale" in own) == (level is not None)
+    if level is not None:
+        assert own["scale"]["level"] == level
+        said = float(own["scale"]["words"].partition("by one factor, ")[2].split()[0])
+        assert said == pytest.approx(factor, abs=5e-4)
+
+
+def test_computed_positions_are_noted(cell, calib):
+    rows = cell.measure(COUNT)
+    q = np.array([[row[f"q{j + 1}"] for j in range(6)] for row in rows])
+    place = forward(cell.nominal, q)[:, :3, 3] + 3e-7 * np.random.default_rng(0).normal(size=(COUNT, 3))  # rounded
+    for row, (x, y, z) in zip(rows, place):
+        row |= {"x": x, "y": y, "z": z}
+    path = cell.write("m.csv", rows, [*(f"q{j + 1}" for j in range(6)), *"xyz"])
+    _, out, err = calib("fit", "ur5", path, "--out", "o", "--model", "frames")
+    assert not err
+    assert verdict()[2] == ["commanded"] and "not measured ones?" in out
