@@ -316,7 +316,7 @@ def _number(value: Any, quantity: str) -> float:
 
 
 def _expression(text: str, quantity: str) -> float:
-    if len(text) > LONGEST:
+    if len(text) > LONGEST or "_" in text:  # Python would read 0_5 as 5
         raise ValueError(text)
     text, factor = text.strip(), 1.0
     for unit, size in sorted(QUANTITIES.get(quantity, {}).items(), key=lambda item: -len(item[0])):

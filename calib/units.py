@@ -68,3 +68,14 @@ def per_ampere(own: str, unit: str) -> str:
     if unit == TORQUE:
         return own
     return own.replace(TORQUE, "A") if TORQUE in own else f"{own} A/({TORQUE})"
+
+
+def plain_number(text: str) -> float:
+    """Return the number that a text is, in ASCII digits; Python would read ``0_5`` as 5, and other scripts' digits.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    if "_" in text or not text.isascii():
+        raise ValueError(text)
+    return float(text)

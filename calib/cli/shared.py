@@ -74,9 +74,10 @@ def reporting() -> Iterator[tuple[Any, Any]]:
 
 def numbers(text: str, count: int, option: str, finite: bool = True) -> list[float]:
     from calib.errors import UsageError
+    from calib.units import plain_number
 
     try:
-        values = [float(part) for part in text.split(",")]
+        values = [plain_number(part) for part in text.split(",")]
     except ValueError:
         values = []
     if len(values) != count or (finite and not all(map(isfinite, values))):

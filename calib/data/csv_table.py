@@ -12,6 +12,7 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain, islice
 from pathlib import Path
 from typing import IO
@@ -20,11 +21,12 @@ import numpy as np
 
 from calib.arrays import frozen
 from calib.errors import MeasurementError, suggestion
-from calib.units import ANGLES, LENGTHS
+from calib.units import ANGLES, LENGTHS, plain_number
 
 _HEADING = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
 _DECIMAL_COMMA = re.compile(r"^[+-]?\d*,\d+([eE][+-]?\d+)?$")
 _CHUNK = 20_000
+LONGEST = 1 << 20  # letters of a line (our choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,16 +152,20 @@ def _open(path: str | Path, headed: bool) -> tuple[IO[str], str, list[str]]:
     """Open a file and return it behind its header line, with the separator and the header's cells."""
     try:
         file = open(path, encoding="utf-8-sig", newline="")  # noqa: SIM115 (the caller reads on, and closes it)
-    except OSError as error:
-        raise MeasurementError(f"cannot be read: {error.strerror}", path) from error
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        raise MeasurementError(f"cannot be read: {getattr(error, 'strerror', None) or error}", path) from error
     try:
         comment, place = "", 0
-        for line in iter(file.readline, ""):
+        for line in iter(partial(file.readline, LONGEST), ""):
+            if len(line) == LONGEST:
+                raise MeasurementError(f"has a line of more than {LONGEST} letters: this is no table", path)
             text = line.strip()
             if text.startswith("#"):
                 comment = text
             elif text:
-                while line.count('"') % 2 and (more := file.readline()):  # a quoted name that holds a line break
+                while (
+                    line.count('"') % 2 and len(line) < LONGEST and (more := file.readline(LONGEST))
+                ):  # a quoted name that holds a line break
                     line += more
                 separator = _separator(line.strip())
                 lines = line.strip("\r\n").splitlines(keepends=True)
@@ -172,6 +178,12 @@ def _open(path: str | Path, headed: bool) -> tuple[IO[str], str, list[str]]:
     except UnicodeDecodeError as error:
         file.close()
         raise _not_utf8(error, path) from error
+    except (csv.Error, StopIteration) as error:
+        file.close()
+        raise MeasurementError(f"is no CSV: {error}", path) from error
+    except MeasurementError:
+        file.close()
+        raise
     file.close()
     raise MeasurementError("is empty: no header and no rows", path)
 
@@ -277,7 +289,10 @@ def _read_cells(
 
 def _convert(column: Sequence[str]) -> np.ndarray:
     """Return the cells as floats where all of them are numbers or empty, else as texts."""
+    joined = "".join(column)
     try:
+        if "_" in joined or not joined.isascii():
+            raise ValueError("digits that Python alone takes for such")
         return np.array(column, dtype=float)
     except ValueError:
         if all(not cell.strip() or _is_number(cell) for cell in column):
@@ -304,7 +319,7 @@ def _filled(cells: np.ndarray) -> bool:
 
 def _is_number(cell: str) -> bool:
     try:
-        float(cell)
+        plain_number(cell)
     except ValueError:
         return False
     return True

@@ -10,11 +10,15 @@ and memory with the cut.
 
 from __future__ import annotations
 
+import lzma
+import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Mapping
+from math import prod
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 from numpy.lib import format as npy
@@ -31,6 +35,7 @@ from calib.data.recordings.recording_options import (
 )
 from calib.errors import MeasurementError
 
+MEMBERS, LARGEST = 1000, 8_000_000_000  # of an archive, and bytes of a member (our choices)
 Ends = tuple[float | None, float | None]
 
 
@@ -45,8 +50,10 @@ def read_archive(
     try:
         with zipfile.ZipFile(path) as archive:
             return _from_archive(archive, path, joints, options, ends)
-    except (zipfile.BadZipFile, EOFError, zlib.error) as error:
+    except (zipfile.BadZipFile, EOFError, zlib.error, lzma.LZMAError, struct.error, UnicodeError) as error:
         raise MeasurementError(f"is a damaged archive ({error}): was it copied whole?", path) from error
+    except (RuntimeError, NotImplementedError) as error:  # zipfile's words for a password, and for unknown compression
+        raise MeasurementError(f"cannot be unpacked ({error}): save it with np.savez", path) from error
     except OSError as error:
         raise MeasurementError(f"cannot be read: {error.strerror or error}", path) from error
 
@@ -58,6 +65,8 @@ def _from_archive(
     options: RecordingOptions,
     ends: Ends,
 ) -> Recording:
+    if len(archive.infolist()) > MEMBERS:
+        raise MeasurementError(f"has {len(archive.infolist())} members: is this a recording?", path)
     members = {name.removesuffix(".npy"): name for name in archive.namelist()}
     found = find_names(tuple(members), options, path)
     count = _shape(archive, members[found["q"]], path)[0]
@@ -67,7 +76,7 @@ def _from_archive(
     if q.ndim != 2:
         raise MeasurementError(f"has shape {q.shape}, expected (samples, joints)", path, column=found["q"])
     kind = "current" if "current" in found else "torque"
-    names = [str(name) for name in _optional(archive, members, "joint_names", path, [])]
+    names = _names(archive, members, path)
     order, names = joint_order(names, joints, q.shape[1], path)
     series = {}
     for ours, theirs in found.items():
@@ -78,7 +87,9 @@ def _from_archive(
             message = f"has shape {values.shape} where {found['q']} has {q.shape} (samples, joints)"
             raise MeasurementError(message, path, column=theirs)
         series["effort" if ours == kind else ours] = _arrange(values, order, scale(ours, options.units.get(ours, "")))
-    gain = _optional(archive, members, "drive_gain", path, None)
+    gain = _few(archive, members, "drive_gain", path, q.shape[1])
+    if gain is not None and (gain == 0.0).any():
+        raise MeasurementError("has a gain of zero: no current makes a torque there", path, column="drive_gain")
     factor = scale(kind, options.units.get(kind, ""))
     variance = f"variance_{found.get(kind, '')}"
     unused = [name for name in members if name not in (*found.values(), *OWN, *RATES, "periods", variance)]
@@ -87,7 +98,7 @@ def _from_archive(
         _arrange(q, order, scale("q", options.units.get("q", ""))),
         kind=kind,
         joint_names=names,
-        drive_gain=None if gain is None else np.asarray(gain, dtype=float)[order],
+        drive_gain=None if gain is None else gain[order],
         effort_variance=_variance(archive, members, variance, path, q.shape, rows, order, factor),
         file=str(path),
         rows=np.arange(rows.start, rows.stop) + 1,
@@ -106,7 +117,7 @@ def _variance(
     values = _member(archive, members[name], path, rows)
     if values.shape != shape:
         raise MeasurementError(f"has shape {values.shape}, expected {shape} (samples, joints)", path, column=name)
-    periods = float(np.ravel(_member(archive, members["periods"], path))[0])
+    (periods,) = _few(archive, members, "periods", path, 1)  # type: ignore[misc]  # it is there
     if not (periods >= 1 and np.isfinite(values).all() and (values >= 0).all()):
         message = f"expected variances, finite and not negative, over one period or more; periods is {periods:g}"
         raise MeasurementError(message, path, column=name)
@@ -124,12 +135,13 @@ def _stamps(
     """Return all stamps (N,) [s] from the first, or the counts of the samples over a stated rate."""
     if "t" not in found:
         stated = next((name for name in RATES if name in members), "")
-        rate = options.rate or (float(_member(archive, members[stated], path).ravel()[0]) if stated else 0.0)
+        own = _few(archive, members, stated, path, 1) if stated and not options.rate else None
+        rate = options.rate or (0.0 if own is None else float(own[0]))
         if not rate > 0:
             wanted = f"{', '.join(SYNONYMS['t'])}, or {', '.join(RATES)}"
             raise MeasurementError(f"has neither stamps nor a rate ({wanted}); found: {', '.join(members)}", path)
         return np.arange(count) / rate
-    t = _member(archive, members[found["t"]], path, exact=True).ravel()
+    t = _member(archive, members[found["t"]], path, exact=True, kinds="fiu").ravel()
     if len(t) != count:
         raise MeasurementError(f"has {len(t)} stamps where q has {count} samples", path, column=found["t"])
     return (t - t[0] if len(t) else t).astype(float) * scale("t", options.units.get("t", ""))
@@ -150,34 +162,55 @@ def _range(
         if first >= end:
             cut(Recording(t, np.zeros((len(t), 0)), np.zeros((len(t), 0)), "torque", (), file=str(path)), *ends)
         return slice(first, end), []
-    stated = _optional(archive, members, "use_range", path, None) if options.use_range else None
+    stated = _few(archive, members, "use_range", path, 2) if options.use_range else None
     if stated is None:
         return slice(0, len(t)), []
-    first, end = (int(value) for value in np.ravel(stated)[:2])
+    first, end = (int(value) for value in np.clip(stated, -1, len(t) + 1))
     if not 0 <= first < end <= len(t):
         raise MeasurementError(f"is {first} to {end}, but there are {len(t)} samples", path, column="use_range")
     whole = first == 0 and end == len(t)
     return slice(first, end), [] if whole else [f"rows {first + 1} to {end} of {len(t)} are used: its use_range"]
 
 
-def _optional(archive: zipfile.ZipFile, members: Mapping[str, str], name: str, path: Path, default: Any) -> Any:
-    return _member(archive, members[name], path, exact=True) if name in members else default
+def _few(archive: zipfile.ZipFile, members: Mapping[str, str], name: str, path: Path, count: int) -> np.ndarray | None:
+    """Return a member of `count` finite numbers; None where there is none of that name."""
+    if name not in members:
+        return None
+    values = _member(archive, members[name], path, kinds="fiu").ravel()
+    if len(values) != count or not np.isfinite(values).all():
+        shown = np.array2string(values, threshold=8, edgeitems=3)
+        raise MeasurementError(f"expected {count} finite number(s), found {shown[:100]}", path, column=name)
+    return values
+
+
+def _names(archive: zipfile.ZipFile, members: Mapping[str, str], path: Path) -> list[str]:
+    """Return the joints' names; none where the archive has none."""
+    if "joint_names" not in members:
+        return []
+    values = _member(archive, members["joint_names"], path, exact=True, kinds="US").ravel()
+    return [name.decode("utf-8", "replace") if isinstance(name, bytes) else str(name) for name in values.tolist()]
 
 
 def _header(archive: zipfile.ZipFile, member: str, path: Path) -> tuple[IO[bytes], tuple[int, ...], bool, np.dtype]:
     """Open a member behind its header; returns it with shape, order and type."""
-    stream = archive.open(member)
+    stream, column = archive.open(member), member.removesuffix(".npy")
     try:
         version = npy.read_magic(stream)
         read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
         shape, fortran, dtype = read(stream)
-    except ValueError as error:
+    except (ValueError, TypeError, KeyError, SyntaxError, tokenize.TokenError, RecursionError, OverflowError) as error:
         stream.close()
-        raise MeasurementError(f"is no NumPy array ({error})", path, column=member.removesuffix(".npy")) from error
+        raise MeasurementError(f"is no NumPy array ({error})", path, column=column) from error
+    message, size = "", prod(shape) * dtype.itemsize
     if dtype.hasobject:
-        stream.close()
         message = "holds Python objects, which are not read (they could run code): save plain arrays"
-        raise MeasurementError(message, path, column=member.removesuffix(".npy"))
+    elif any(length < 0 for length in shape) or size > archive.getinfo(member).file_size:
+        message = f"says that it is {shape}, which is more than there is: was it copied whole?"
+    elif size > LARGEST:
+        message = f"holds {size / 1e9:.3g} GB, more than {LARGEST / 1e9:g}: cut the recording"
+    if message:
+        stream.close()
+        raise MeasurementError(message, path, column=column)
     return stream, shape, fortran, dtype
 
 
@@ -188,10 +221,19 @@ def _shape(archive: zipfile.ZipFile, member: str, path: Path) -> tuple[int, ...]
 
 
 def _member(
-    archive: zipfile.ZipFile, member: str, path: Path, rows: slice | None = None, exact: bool = False
-) -> np.ndarray:
-    """Return the `rows` of a member as floats (with `exact` in its own type) without holding the others."""
+    archive: zipfile.ZipFile, member: str, path: Path, rows: slice | None = None, exact: bool = False,
+    kinds: str = "fiub",
+) -> np.ndarray:  # fmt: skip
+    """Return the `rows` of a member as floats (with `exact` in its own type) without holding the others.
+
+    Args:
+        kinds: of numpy's types that are what it should hold.
+    """
     stream, shape, fortran, dtype = _header(archive, member, path)
+    if dtype.kind not in kinds:
+        stream.close()
+        wanted = "texts" if "U" in kinds else "numbers"
+        raise MeasurementError(f"holds {dtype}, expected {wanted}", path, column=member.removesuffix(".npy"))
     with stream:
         if fortran or not shape or rows is None:
             rows = slice(0, shape[0] if shape else 1) if rows is None else rows
@@ -201,9 +243,6 @@ def _member(
             size = dtype.itemsize * int(np.prod(shape[1:]))
             _skip(stream, rows.start * size)
             values = np.frombuffer(stream.read((rows.stop - rows.start) * size), dtype).reshape(-1, *shape[1:])
-    if not exact and values.dtype.kind not in "fiub":
-        message = f"holds {values.dtype}, expected numbers"
-        raise MeasurementError(message, path, column=member.removesuffix(".npy"))
     return values if exact else values.astype(float)
 
 
