@@ -6,8 +6,10 @@ Loads nothing heavy: the command line builds default settings before it knows wh
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache, wraps
 from inspect import signature
+from math import inf
 from numbers import Integral, Real
 from pathlib import Path
 from types import NoneType, UnionType
@@ -21,6 +23,28 @@ _PLAIN = {
 _WORDS = {
     bool: "True or False", int: "a whole number", float: "a number", str: "a text", NoneType: "None", Path: "a path",
 }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Within:
+    """Where a number may lie, as an annotation: ``Annotated[float, Within(above=0.0, most=1e6)]``; never NaN.
+
+    Attributes:
+        least, above: from, or beyond, which it lies; most: up to which.
+    """
+
+    least: float = -inf
+    most: float = inf
+    above: float = -inf
+
+    def holds(self, value: Any) -> bool:
+        return bool(self.above < value <= self.most and value >= self.least)
+
+    @property
+    def words(self) -> str:
+        low = f"above {self.above:g}" if self.above > -inf else f"from {self.least:g}" if self.least > -inf else ""
+        high = f"up to {self.most:g}" if self.most < inf else ""
+        return " ".join(part for part in (low, high) if part)
 
 
 def checked(given: C) -> C:
@@ -68,7 +92,7 @@ def _fits(value: Any, hint: Any) -> bool:
     """Say whether a value is of an annotated type; what the annotation leaves open fits."""
     kind, inner = get_origin(hint), get_args(hint)
     if kind is Annotated:
-        return _fits(value, inner[0])
+        return _fits(value, inner[0]) and all(one.holds(value) for one in inner[1:] if isinstance(one, Within))
     if kind in (Union, UnionType):
         return any(_fits(value, one) for one in inner)
     if kind is Literal:
@@ -94,7 +118,7 @@ def _words(hint: Any) -> str:
     """Return an annotated type in words."""
     kind, inner = get_origin(hint), get_args(hint)
     if kind is Annotated:
-        return _words(inner[0])
+        return " ".join([_words(inner[0]), *(one.words for one in inner[1:] if isinstance(one, Within))])
     if kind in (Union, UnionType):
         *first, last = dict.fromkeys(map(_words, inner))
         return f"{', '.join(first)} or {last}" if first else last

@@ -163,9 +163,8 @@ def _open(path: str | Path, headed: bool) -> tuple[IO[str], str, list[str]]:
             if text.startswith("#"):
                 comment = text
             elif text:
-                while (
-                    line.count('"') % 2 and len(line) < LONGEST and (more := file.readline(LONGEST))
-                ):  # a quoted name that holds a line break
+                # a quoted name that holds a line break goes on in the next line
+                while line.count('"') % 2 and len(line) < LONGEST and (more := file.readline(LONGEST)):
                     line += more
                 separator = _separator(line.strip())
                 lines = line.strip("\r\n").splitlines(keepends=True)

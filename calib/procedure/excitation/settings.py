@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
-from calib.arguments import checked
+from calib.arguments import Within, checked
+
+Rate = Annotated[float, Within(above=0.0, most=1e5)]  # [Hz]
+Slower = Annotated[float, Within(1.0, 1000.0)]
 
 
 @checked
@@ -34,19 +38,19 @@ class ExcitationSettings:
 
     goals: tuple[str, ...] = ()
     hard: tuple[str, ...] = ()
-    period: float = 20.0
-    harmonics: int = 5
+    period: Annotated[float, Within(above=0.0, most=3600.0)] = 20.0
+    harmonics: Annotated[int, Within(1, 200)] = 5
     family: str = "fourier"
     drives: str = "Fv Fc off"
-    rate: float = 1000.0
-    samples: int = 200
-    starts: int = 6
-    evaluations: int = 600
-    seed: int = 0
-    front: int = 0
+    rate: Rate = 1000.0
+    samples: Annotated[int, Within(10, 100_000)] = 200
+    starts: Annotated[int, Within(1, 10_000)] = 6
+    evaluations: Annotated[int, Within(1, 10_000_000)] = 600
+    seed: Annotated[int, Within(0, 2**63)] = 0
+    front: Annotated[int, Within(0, 1000)] = 0
     start: tuple[float, ...] | None = None
-    repeat: int = 1
-    slower: float = 1.0
+    repeat: Annotated[int, Within(1, 10_000)] = 1
+    slower: Slower = 1.0
     existing: tuple[str, ...] = ()
     lock: tuple[str, ...] = ()
 
@@ -71,11 +75,11 @@ class PlanSettings:
 
     payloads: tuple[str, ...] = ()
     lines: bool = False
-    rate: float = 1000.0
-    shorten: int = 0
-    stray: float = 0.0
+    rate: Rate = 1000.0
+    shorten: Annotated[int, Within(0, 100_000)] = 0
+    stray: Annotated[float, Within(0.0, 10.0)] = 0.0
     start: tuple[float, ...] | None = None
-    slower: float = 1.0
+    slower: Slower = 1.0
 
 
 DEFAULT_PLAN = PlanSettings()

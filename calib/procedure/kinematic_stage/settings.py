@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
-from calib.arguments import checked
+from calib.arguments import Within, checked
 from calib.data.poses.fit_options import LOSSES, MODELS
 from calib.errors import UsageError
+
+Place = Annotated[float, Within(-100.0, 100.0)]  # of a target in the tip's frame [m]
+Sigma = Annotated[float, Within(above=0.0, most=10.0)]  # [m or rad]
 
 
 @checked
@@ -80,12 +84,12 @@ class SelectionSettings:
     """
 
     kind: str = "pose"
-    tools: tuple[tuple[float, ...], ...] = ()
+    tools: tuple[tuple[Place, ...], ...] = ()
     index: str = "O1"
     method: str = "detmax"
-    candidates: int = 2000
-    sigmas: tuple[float, float] | None = None
-    seed: int = 0
+    candidates: Annotated[int, Within(1, 1_000_000)] = 2000
+    sigmas: tuple[Sigma, Sigma] | None = None
+    seed: Annotated[int, Within(0, 2**63)] = 0
     starts: int = 8
     evaluations: int = 5000
     seconds: float | None = None
