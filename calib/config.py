@@ -562,7 +562,7 @@ class OneOrMany:
 def _label(value: Any) -> str:
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
         raise ValueError(f"expected a text or a number, found {shown(value)}")
-    return value if isinstance(value, str) else f"{value:.12g}"
+    return f"{value:.12g}" if isinstance(value, float) else str(value)  # an integer of any length
 
 
 def _numeric(value: Any) -> Any:
