@@ -24,7 +24,8 @@ def new(
         str | None, typer.Option(help="a .urdf, an MDH .toml, a library name, or the folder of an earlier fit")
     ] = None,
     instrument: Annotated[
-        str | None, typer.Option(help="cmm, tracker, tracker6d, mocap, camera, other-pose, other-position")
+        str | None,
+        typer.Option(help="cmm, tracker, tracker6d, mocap, camera, camera-poses, other-pose, other-position"),
     ] = None,
     tool: Annotated[
         str | None, typer.Option(help="x,y,z: where the target roughly sits in the tip's frame [m]")
@@ -136,6 +137,7 @@ def demo(
     out: Annotated[Path, typer.Option(help="the session's folder")] = Path("calib-demo"),
     robot: Annotated[str, typer.Option(help="a robot of the library")] = "lwr4plus",
     geometry_only: Annotated[bool, typer.Option("--geometry-only", help="leave the dynamics out")] = False,
+    instrument: Annotated[str, typer.Option(help="cmm, or camera: rendered images of a board")] = "cmm",
     guided: Annotated[bool, typer.Option("--guided", help="stop where an engineer would")] = False,
     bring: Annotated[Path | None, typer.Option(help="let the simulated cell bring what this session waits for")] = None,
     seed: Seed = 0,
@@ -151,6 +153,7 @@ def demo(
             return
         found = demonstration.run(
             out, robot, seed, say, progress, dynamics=not geometry_only, guided=guided, plots=plots,
+            instrument=instrument,
         )  # fmt: skip
     say("", *found.asks)
     if found.results:

@@ -82,10 +82,10 @@ def target_jacobian(
     cell: Installation, seen: Seen, free: np.ndarray, station: int, tool: np.ndarray, bases: np.ndarray | None = None
 ) -> np.ndarray:
     """Return [v; ω] of the targets per unit of each free parameter, (f, 6, m); see `Block` for the last three."""
-    arm, stations, tools, terms, _ = layout_counts(cell)
+    arm, stations, tools, optics, _ = layout_counts(cell)
     m = seen.point.shape[1]
     jacobian = np.zeros((len(free), 6, m))
-    section = np.searchsorted(np.cumsum([arm, stations, tools, terms]), free, side="right")
+    section = np.searchsorted(np.cumsum([arm, stations, tools, optics]), free, side="right")
     in_arm = np.flatnonzero(section == 0)
     if len(in_arm) == len(free):
         return element_jacobian(cell.chain, seen.walked, seen.point, free)
@@ -99,10 +99,10 @@ def target_jacobian(
         number, axis = divmod(int(free[place]) - arm - stations, 6)
         rows = tool == number
         jacobian[place][3 * (axis // 3) : 3 * (axis // 3) + 3] = np.where(rows, seen.rotation[axis % 3], 0.0)
-    in_terms = np.flatnonzero(section == 3)
+    in_terms = np.flatnonzero(section == 4)
     if len(in_terms):
         assert bases is not None
-        numbers = free[in_terms] - arm - stations - tools
+        numbers = free[in_terms] - arm - stations - tools - optics
         targets = deflection.target_elements(cell.chain, cell.deflection)[numbers]
         unique, inverse = np.unique(targets, return_inverse=True)
         moved = element_jacobian(cell.chain, seen.walked, seen.point, unique)

@@ -1,7 +1,7 @@
 """The vector of everything a geometric fit may move, its names, and how a step is taken.
 
 Order: arm elements (K), six per station (x y z rx ry rz, in the station-to-base placement's own axes), six per tool (in
-the target's own axes), deflection coefficients (E), and of images the lenses' values and the boards' shapes.
+the target's own axes), of images the lenses' values and the boards' shapes, deflection coefficients (E).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class ParameterLayout:
 
     Attributes:
         names, units: one per parameter.
-        arm, stations, tools, terms: how many of each; the rest is optics.
+        arm, stations, tools, optics, terms: how many of each.
         moving: positions of the optics that may be fitted.
     """
 
@@ -32,13 +32,14 @@ class ParameterLayout:
     arm: int
     stations: int
     tools: int
+    optics: int
     terms: int
     moving: tuple[int, ...] = ()
 
     def group(self, index: int) -> str:
-        """Return 'arm', 'station', 'tool', 'deflection' or 'optics' for a position in the vector."""
-        edges = np.cumsum([self.arm, self.stations, self.tools, self.terms])
-        return ("arm", "station", "tool", "deflection", "optics")[int(np.searchsorted(edges, index, side="right"))]
+        """Return 'arm', 'station', 'tool', 'optics' or 'deflection' for a position in the vector."""
+        edges = np.cumsum([self.arm, self.stations, self.tools, self.optics])
+        return ("arm", "station", "tool", "optics", "deflection")[int(np.searchsorted(edges, index, side="right"))]
 
     @property
     def arm_index(self) -> np.ndarray:
@@ -60,8 +61,7 @@ class ParameterLayout:
 
     @property
     def term_index(self) -> np.ndarray:
-        start = self.arm + self.stations + self.tools
-        return np.arange(start, start + self.terms)
+        return np.arange(len(self.names) - self.terms, len(self.names))
 
     def find(self, names: list[str] | tuple[str, ...]) -> np.ndarray:
         """Return positions by name.
@@ -83,16 +83,17 @@ def layout(cell: Installation) -> ParameterLayout:
     terms = cell.deflection.terms
     element_units = dict(zip(cell.chain.names, cell.chain.units))
     return ParameterLayout(
-        names=(*cell.chain.names, *frames, *deflection.names(cell.deflection, cell.chain), *cell.optics.names),
+        names=(*cell.chain.names, *frames, *cell.optics.names, *deflection.names(cell.deflection, cell.chain)),
         units=(
-            *cell.chain.units, *(units * (len(frames) // 6)), *(_unit(element_units, term) for term in terms),
-            *cell.optics.units,
+            *cell.chain.units, *(units * (len(frames) // 6)), *cell.optics.units,
+            *(_unit(element_units, term) for term in terms),
         ),
         arm=len(cell.chain.elements),
         stations=6 * len(cell.stations),
         tools=6 * len(cell.tools),
+        optics=len(cell.optics),
         terms=len(terms),
-        moving=tuple((len(cell.chain.elements) + len(frames) + len(terms) + cell.optics.moving).tolist()),
+        moving=tuple((len(cell.chain.elements) + len(frames) + cell.optics.moving).tolist()),
     )  # fmt: skip
 
 
@@ -105,7 +106,7 @@ def step(cell: Installation, free: np.ndarray, change: np.ndarray) -> Installati
     where = layout_counts(cell)
     full = np.zeros(sum(where))
     full[free] = change
-    arm, stations, tools, terms, optics = np.split(full, np.cumsum(where)[:-1])
+    arm, stations, tools, optics, terms = np.split(full, np.cumsum(where)[:-1])
     stations, tools = stations.reshape(-1, 6), tools.reshape(-1, 6)
     return replace(
         cell,
@@ -120,16 +121,16 @@ def step(cell: Installation, free: np.ndarray, change: np.ndarray) -> Installati
 
 
 def layout_counts(cell: Installation) -> tuple[int, int, int, int, int]:
-    """Return how many parameters the arm, stations, tools, deflection and optics have."""
+    """Return how many parameters the arm, stations, tools, optics and deflection have."""
     frames = 6 * len(cell.stations), 6 * len(cell.tools)
-    return len(cell.chain.elements), *frames, len(cell.deflection.terms), len(cell.optics)
+    return len(cell.chain.elements), *frames, len(cell.optics), len(cell.deflection.terms)
 
 
 def parameter_values(cell: Installation) -> np.ndarray:
     """Return the full parameter vector; frames count from their present placement, hence zeros."""
     _, stations, tools, _, _ = layout_counts(cell)
     terms = np.asarray(cell.deflection.coefficients)
-    return np.concatenate([cell.chain.values, np.zeros(stations + tools), terms, cell.optics.values])
+    return np.concatenate([cell.chain.values, np.zeros(stations + tools), cell.optics.values, terms])
 
 
 def fixed_parameters(start: Installation, options: FitOptions) -> np.ndarray:

@@ -38,15 +38,21 @@ class PixelPart(Part):
         local: (N, 2, 6 + k) derivative of the corner by those.
         corner: (N,) its number in the board's table.
         depth: (N,) pixels per metre there, across the line of sight.
+        axes: (m, 3, 3) a displacement of what the arm carries, in the station's axes, per one of the board in the
+            camera's.
         carried: (m, 6, 6) the board's twist per twist [v; ω] of what the arm carries, both in the camera's axes.
         noise: of corners and images, as `fill` whitens by; None for that of the scale alone.
+        shared: (N, 2, 6) `shared_errors` of a state that the fit began at, so that a fit has one metric; None: of this
+            one.
     """
 
     local: np.ndarray
     corner: np.ndarray
     depth: np.ndarray
+    axes: np.ndarray
     carried: np.ndarray
     noise: ImageNoise | None = None
+    shared: np.ndarray | None = None
 
     @property
     def height(self) -> int:
@@ -64,7 +70,8 @@ class PixelPart(Part):
     def per_row(self) -> Part:
         images, place, count = np.unique(self.index, return_inverse=True, return_counts=True)
         mean = np.array([np.bincount(place, axis / self.depth) / count for axis in self.value])
-        return Part("position", mean, self.jacobian[:, :0], None, 0, images)
+        flat = np.vstack([mean, np.zeros(len(images))])  # along the line of sight a mean offset says nothing
+        return Part("position", np.einsum("mij,jm->im", self.axes[images], flat), self.jacobian[:, :0], None, 0, images)
 
     def row_weights(self, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         images, place, count = np.unique(self.index, return_inverse=True, return_counts=True)
@@ -80,33 +87,33 @@ class PixelPart(Part):
         images, first = np.unique(self.index, return_index=True)
         edges = np.append(first, len(self.index))
         width = self.local.shape[2] + 1
+        shared = None if self.noise is None else self.shared_errors() if self.shared is None else self.shared
         for start in range(0, len(images), CHUNK):
             own = slice(start, min(start + CHUNK, len(images)))
-            rows = slice(edges[own.start], edges[own.stop])
-            small = _triangles(
-                np.concatenate([self.local[rows], self.value.T[rows, :, None]], axis=2) / scale.T[rows, :, None],
-                np.diff(edges[own.start : own.stop + 1]),
-            )
+            rows, counts = slice(edges[own.start], edges[own.stop]), np.diff(edges[own.start : own.stop + 1])
+            unit = scale.T[rows, :, None]
+            table = np.concatenate([self.local[rows], self.value.T[rows, :, None]], axis=2) / unit
+            padded = _padded(table, counts)
+            if shared is not None and self.noise is not None:
+                padded = _whitened(padded, _padded(shared[rows] / unit, counts, padded.shape[1]))
+                padded = padded * np.sqrt(self.noise.weight[images[own]])[:, None, None]
+            small = np.asarray(np.linalg.qr(padded, mode="r"))
             place = slice(own.start * width, own.stop * width)
-            if self.noise is not None:
-                small = self._whitened_images(small, images[own])
             residual[place] = small[:, :, -1].ravel()
-            shared = self.jacobian[:, :, images[own]].transpose(2, 1, 0)
-            matrix[:, place] = (small[:, :, :-1] @ shared).reshape(-1, len(self.jacobian)).T
+            by_image = self.jacobian[:, :, images[own]].transpose(2, 1, 0)
+            matrix[:, place] = (small[:, :, :-1] @ by_image).reshape(-1, len(self.jacobian)).T
 
-    def _whitened_images(self, small: np.ndarray, images: np.ndarray) -> np.ndarray:
-        """Return the images' triangles whitened by what is common to an image's corners, and weighed."""
+    def shared_errors(self) -> np.ndarray:
+        """Return what one standard deviation of each component of an image's error does to its corners, (N, 2, 6)."""
         assert self.noise is not None
-        common = small[:, :, :6] @ self.carried[images] * self.noise.deviations
-        factor = np.linalg.cholesky(np.eye(small.shape[1]) + common @ common.transpose(0, 2, 1))
-        return np.linalg.solve(factor, small) * np.sqrt(self.noise.weight[images])[:, None, None]
+        return np.einsum("ncl,nlk->nck", self.local[:, :, :6], self.carried[self.index]) * self.noise.deviations
 
     def own_poses(self, scale: np.ndarray) -> OwnPoses:
         """Return what the images say with a pose of their own each, at sigmas `scale` (2, N)."""
         images, first = np.unique(self.index, return_index=True)
         counts = np.diff(np.append(first, len(self.index)))
         table = np.concatenate([self.local[:, :, :6], self.value.T[:, :, None]], axis=2) / scale.T[:, :, None]
-        small = _triangles(table, counts)
+        small = np.asarray(np.linalg.qr(_padded(table, counts), mode="r"))
         system = small[:, :6, :6] @ self.carried[images]
         information = system.transpose(0, 2, 1) @ system
         gradient = np.einsum("kji,kj->ki", system, small[:, :6, 6])
@@ -127,14 +134,24 @@ class PixelPart(Part):
         return self.value - np.einsum("ncl,nl->cn", self.local[:, :, :6], moved[place])
 
 
-def _triangles(table: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return R (images, w, w) of the QR of each image's rows; table (N, 2, w) holds those of `counts` corners each."""
+def _padded(table: np.ndarray, counts: np.ndarray, height: int = 0) -> np.ndarray:
+    """Return rows (N, 2, w), `counts` corners per image, as (images, height, w) with zeros below."""
     width = table.shape[2]
-    most = max(int(counts.max(initial=0)), (width + 1) // 2)
+    most = height // 2 or max(int(counts.max(initial=0)), (width + 1) // 2)
     padded = np.zeros((len(counts), most, 2, width))
     image = np.repeat(np.arange(len(counts)), counts)
     padded[image, np.arange(len(table)) - np.repeat(np.cumsum(counts) - counts, counts)] = table
-    return np.asarray(np.linalg.qr(padded.reshape(len(counts), 2 * most, width), mode="r"))
+    return padded.reshape(len(counts), 2 * most, width)
+
+
+def _whitened(rows: np.ndarray, shared: np.ndarray) -> np.ndarray:
+    """Return (I + G Gᵀ)^(-1/2) A for A (images, h, w) and G (images, h, 6), by the eigenvectors of Gᵀ G."""
+    values, vectors = np.linalg.eigh(shared.transpose(0, 2, 1) @ shared)
+    values = np.maximum(values, 0.0)
+    axes = shared @ vectors
+    # U (1 - 1/sqrt(1 + s²)) Uᵀ with U = G V / s
+    factor = (1.0 - 1.0 / np.sqrt(1.0 + values)) / np.maximum(values, 1e-300)
+    return rows - axes @ (factor[:, :, None] * (axes.transpose(0, 2, 1) @ rows))
 
 
 def view_of(cell: Installation, measured: Pixels, free: np.ndarray) -> View:
@@ -144,7 +161,7 @@ def view_of(cell: Installation, measured: Pixels, free: np.ndarray) -> View:
             f"{measured.file}: camera '{measured.camera}' with board '{measured.target}' is not part of the "
             f"installation, which has {', '.join(cell.optics.lens_names) or 'no camera'}"
         )
-    start = sum(layout_counts(cell)[:-1])
+    start = sum(layout_counts(cell)[:3])
     wanted = start + cell.optics.place(measured.camera, measured.target)
     where = {int(k): place for place, k in enumerate(free)}
     own = np.array([place for place, k in enumerate(wanted) if int(k) in where], dtype=int)
@@ -189,7 +206,8 @@ def _pixels(measured: Pixels, seen: Seen, jacobian: np.ndarray) -> list[Part]:
     carried = np.tile(np.eye(6), (len(measured), 1, 1))
     if in_hand:  # ω × (o - c): the camera turns about itself, and the board's origin swings
         carried[:, :3, 3:] = -_cross_matrix(origin)
-    return [PixelPart("pixel", value, shared, sigma, 0, image, local, corner, depth, carried)]
+    axes = -turn.transpose(0, 2, 1) if in_hand else np.tile(np.eye(3), (len(measured), 1, 1))
+    return [PixelPart("pixel", value, shared, sigma, 0, image, local, corner, depth, axes, carried)]
 
 
 def _cross_matrix(vectors: np.ndarray) -> np.ndarray:

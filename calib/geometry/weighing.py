@@ -67,7 +67,8 @@ class Weigher:
         self.sigmas: list[np.ndarray] = []
         self.weights: list[np.ndarray] = []
         self.noises: list[ImageNoise | None] = []
-        self.used = self.sigmas, self.weights, self.noises
+        self.shared: list[np.ndarray | None] = []
+        self.used = self.sigmas, self.weights, self.noises, self.shared
 
     def parts(self, state: Installation, free: np.ndarray | None = None) -> list[Part]:
         """Return the residual parts of all blocks, with their Jacobian for `free`."""
@@ -79,8 +80,8 @@ class Weigher:
     def noisy(self, found: list[Part]) -> list[Part]:
         """Return parts of images with the noise that they are whitened by."""
         return [
-            replace(part, noise=noise) if isinstance(part, PixelPart) else part
-            for part, noise in zip(found, self.noises)
+            replace(part, noise=noise, shared=shared) if isinstance(part, PixelPart) else part
+            for part, noise, shared in zip(found, self.noises, self.shared)
         ]
 
     def update(self, state: Installation, first: bool) -> None:
@@ -98,12 +99,13 @@ class Weigher:
         loss = "none" if self.settings.loss == "auto" else self.settings.loss
         robustly = loss != "none"
         self.sigmas = [_sigma(part, share, first and not robustly, robustly) for part in found]
-        self.noises = [None] * len(found)
+        self.noises, self.shared = [None] * len(found), [None] * len(found)
         for k, part in enumerate(found):
             if isinstance(part, PixelPart):
                 unknowns = len(self.free) // len(found)
                 noise = estimate_noise(part.own_poses(self.sigmas[k]), unknowns, loss, self.settings.loss_scale)
                 self.noises[k] = part.spread_over(noise)
+                self.shared[k] = replace(part, noise=self.noises[k]).shared_errors()
                 self.sigmas[k] = noise.factor * self.sigmas[k]
         self.weights = [
             robust.weights(_size(part, sigma), loss, self.settings.loss_scale)
@@ -115,7 +117,7 @@ class Weigher:
 
         A common factor on all sigmas changes nothing but the scale, unless a prior stands against them.
         """
-        before, weights, noises = self.used = self.sigmas, self.weights, self.noises
+        before, weights, noises, shared = self.used = self.sigmas, self.weights, self.noises, self.shared
         self.update(solution.state, first=False)
         ratios = [float(np.mean(new / old)) for new, old in zip(self.sigmas, before)]
         steady = all(np.abs(new - old).max(initial=0.0) < 0.02 for new, old in zip(self.weights, weights))
@@ -124,7 +126,7 @@ class Weigher:
         if not steady or any(abs(ratio / common - 1.0) > 0.02 for ratio in ratios):
             return None
         if self.prior is not None or any(noises):
-            self.sigmas, self.weights, self.noises = before, weights, noises
+            self.sigmas, self.weights, self.noises, self.shared = before, weights, noises, shared
             return solution
         return replace(solution, factor=solution.factor / common, cost=solution.cost / common**2)
 

@@ -24,6 +24,7 @@ TOML; every table is optional, a key that is none of these is refused. Lengths i
     pitch = ["-20 deg", "20 deg"]
     sight = "40 deg"                 # half angle of the cone, around facing, in which the target sees the instrument
     range = [0.5, 20.0]              # least and largest distance of the target
+    [camera]                         # in place of an instrument, see `calib.procedure.measuring.camera_view`
     [collision]                      # by the URDF's collision shapes, or capsules where there are none
     margin = 0.01                    # least distance between parts
     radius = 0.06                    # of the capsules; by default 5 % of the stretched arm, 0.05 or more
@@ -39,7 +40,7 @@ TOML; every table is optional, a key that is none of these is refused. Lengths i
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -61,14 +62,17 @@ from calib.config import (
     shown,
     strict,
 )  # fmt: skip
+from calib.data.poses.pixels import IN_HAND
 from calib.errors import RobotError, UsageError
 from calib.geometry.installation import Installation
 from calib.geometry.observability import Observation, Target, TargetJacobian
+from calib.procedure.measuring.camera_view import CameraTable, CameraView, ImageObservation, camera_view
 from calib.procedure.measuring.sight import SeenOnly, Sight, sight_of
 from calib.robot.chain import sampling_limits
 from calib.robot.formats.markup import text
 from calib.robot.obstacles import Obstacle, Wall
 from calib.robot.tables import placement
+from calib.transforms import invert
 from poses import constraints
 from poses.space import PoseConstraint, SearchSpace
 
@@ -197,6 +201,7 @@ class ConstraintsFile:
     ] = field(default_factory=dict)
     target: TargetTable = field(default_factory=TargetTable)
     instrument: InstrumentTable | None = None
+    camera: CameraTable | None = None
     collision: CollisionTable | None = None
     obstacle: tuple[ObstacleTable, ...] = ()
     without: tuple[Annotated[str, OneOf((*CELL, *DEFAULTS))], ...] = ()
@@ -210,6 +215,7 @@ class Limits:
         collision: a `calib.robot.collision.Collision` or `calib.robot.capsules.Capsules`; None without one.
         clearance: the least distance it asks for [m].
         sight: lines of sight; None where nothing is asked.
+        camera: the view of a camera, where that is the instrument.
         checked: what is kept, in words.
         unchecked: what cannot be, since nobody has stated it, in words.
         notes: what else a user should know.
@@ -224,8 +230,9 @@ class Limits:
     sight: Sight | None = None
     checked: tuple[str, ...] = ()
     unchecked: tuple[str, ...] = ()
+    camera: CameraView | None = None
 
-    def space(self, seen: Observation, sight: bool = True) -> SearchSpace:
+    def space(self, seen: Observation | ImageObservation, sight: bool = True) -> SearchSpace:
         """Return the continuous problem of choosing poses by what an instrument would see.
 
         Args:
@@ -239,7 +246,7 @@ class Limits:
         if self.sight is None or not sight:
             return SearchSpace(seen, self.lower, self.upper, seen.product, kept)
         kept, rows = (*kept, *self.sight.constraints()), seen
-        if len(self.sight.targets) > 1:
+        if len(self.sight.targets) > 1 and isinstance(seen, Observation):
             rows = SeenOnly(seen, self.sight)
         return SearchSpace(rows, self.lower, self.upper, rows.product, kept)
 
@@ -271,7 +278,40 @@ def read_limits(
         raise UsageError(f"without {unknown[0]}: there are {', '.join((*DEFAULTS, *CELL))}")
     table = {} if path is None else {key: value for key, value in read_toml(path).items() if key not in MOTION}
     stated = parse(ConstraintsFile, table, str(path or "constraints"))
-    return limits_of(stated, cell, source, str(path or "constraints"), without)
+    limits = limits_of(stated, cell, source, str(path or "constraints"), without)
+    if stated.camera is None or path is None:
+        return limits
+    return _with_camera(limits, stated, cell, path, {*stated.without, *without})
+
+
+def beside(path: Path) -> dict[str, Path]:
+    """Return the files that a constraints file names, by name: a camera's lens and its board."""
+    table = {key: value for key, value in read_toml(path).items() if key not in MOTION}
+    camera = parse(ConstraintsFile, table, str(path)).camera
+    return {} if camera is None else {name: path.parent / name for name in (camera.lens, camera.board)}
+
+
+def _with_camera(limits: Limits, stated: ConstraintsFile, cell: Installation, path: Path, absent: set[str]) -> Limits:
+    """Return limits that keep the board in the camera's view, past the arm's own links."""
+    assert stated.camera is not None
+    try:
+        view = camera_view(stated.camera, cell.chain, str(path), path.parent)
+    except RobotError as error:
+        raise UsageError(str(error)) from error
+    stand = invert(view.cell.stations[0])[:3, 3]
+    if view.mounting == IN_HAND:
+        stand = (invert(view.cell.stations[0]) @ [*(0.5 * np.array(view.board.extent)), 0.0, 1.0])[:3]
+    arm = replace(view.cell, stations=np.eye(4)[None])
+    model = None if "view" in absent else limits.collision
+    sight = sight_of(arm, stand, [[0.0, 0.0, 1.0]], None, (0.0, np.inf), model)
+    found = (view.constraint(), *(sight.targets[0] if sight is not None else ()))
+    unchecked = tuple(each for each in limits.unchecked if not each.startswith("line of sight"))
+    words = "the whole board in the camera's view, its range and its tilt"
+    past = ("view past the arm",) if sight is not None else ()
+    return replace(
+        limits, constraints=(*limits.constraints, *found), camera=view, unchecked=unchecked,
+        checked=(*limits.checked, words, *past),
+    )  # fmt: skip
 
 
 def limits_of(

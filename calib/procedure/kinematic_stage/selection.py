@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,6 +17,7 @@ from calib.geometry.observability import observation, targets_of
 from calib.procedure.kinematic_stage.inputs import joint_kinds, load_robot
 from calib.procedure.kinematic_stage.pose_limits import read_limits
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
+from calib.procedure.measuring.camera_view import image_observation
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
 from poses.indices import observability
@@ -23,6 +25,7 @@ from poses.select import SearchSettings, Selection, select_poses
 from poses.space import is_feasible
 
 Progress = Callable[[int, int, str], None]
+VIEWS = 600  # postures that see a camera's board, to choose from (our choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,9 +78,23 @@ def choose(
         raise UsageError(f"-m {m}: at least one pose has to be chosen")
     chain, source = load_robot(robot, existing, FitOptions(), base, tip)
     cell = targets_of(chain, settings.tools)
-    jacobian = observation(cell, settings.kind, settings.sigmas, settings.seed)
     limits = read_limits(constraints, cell, source, settings.without)
+    view, joints = limits.camera, None
+    if view is None:
+        jacobian = observation(cell, settings.kind, settings.sigmas, settings.seed)
+    else:
+        jacobian = image_observation(view, limits.lower, limits.upper, settings.seed)
     space = limits.space(jacobian)
+    if view is not None:
+        if progress:
+            progress(0, 1, "views of the board")
+        wanted = min(settings.candidates, VIEWS)
+        joints = view.draw(wanted, partial(is_feasible, space), limits.lower, limits.upper, settings.seed)
+        if len(joints) < 2 * m:
+            raise UsageError(
+                f"the camera sees the board at {len(joints)} postures that keep everything else, {m} are to be chosen: "
+                "look at [camera], carried and stands, tilt and range"
+            )
     index, method = cast(Any, settings.index), cast(Any, settings.method)  # checked by `select_poses`
     before = value = None
     notes = list(limits.notes)
@@ -91,7 +108,7 @@ def choose(
         index, method, settings.candidates, settings.seed, starts=settings.starts, evaluations=settings.evaluations,
         seconds=np.inf if settings.seconds is None else settings.seconds, climbs=settings.climbs,
     )  # fmt: skip
-    found = select_poses(None, m, search, space=space, existing=before, map=map, progress=progress)
+    found = select_poses(None, m, search, q=joints, space=space, existing=before, map=map, progress=progress)
     assert found.q is not None
     found = replace(found, q=fewest_turns(chain, found.q, limits.lower, limits.upper))
     return Chosen(chain, found, len(jacobian.free), value, limits.checked, limits.unchecked, tuple(notes))

@@ -59,7 +59,8 @@ def estimate_table(found: GeometricFit, nominal: Installation) -> EstimateTable:
     full[found.free, np.arange(len(found.free))] = 1.0
     values, before = parameter_values(found.cell), np.zeros(len(table.names))
     before[: table.arm] = nominal.chain.values
-    before[len(before) - len(nominal.optics) :] = nominal.optics.values
+    optics = table.arm + table.stations + table.tools
+    before[optics : optics + table.optics] = nominal.optics.values
     start = table.arm
     for after, first in zip((*found.cell.stations, *found.cell.tools), (*nominal.stations, *nominal.tools)):
         block = slice(start, start + 6)

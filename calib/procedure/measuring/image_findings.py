@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements
-from calib.data.poses.pixels import Pixels
+from calib.data.poses.pixels import IN_HAND, Pixels
 from calib.geometry.accuracy import Torques
 from calib.geometry.installation import Installation
 from calib.geometry.observation import observe, prepare
@@ -29,6 +29,15 @@ def reprojection(cell: Installation, blocks: Sequence[PoseMeasurements], torques
         if isinstance(part, PixelPart)
     ]
     return float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else None
+
+
+def image_words(block: Pixels) -> str:
+    """Return what is said of images as they arrive: corners, mounting, lens, coverage."""
+    lens = block.lens
+    focal = "" if lens is None else f", focal length {lens.values[0]:.0f} px {'given' if block.known else 'found'}"
+    seen = f"{block.seen.sum(axis=1).mean():.1f} of {block.seen.shape[1]} corners each"
+    carried = "the arm carries the camera" if block.mounting == IN_HAND else "the arm carries the board"
+    return f"{seen}; {carried}{focal}; {coverage_words(block.pixel[block.seen], block.size)}"
 
 
 def image_notes(found: GeometricFit) -> list[str]:

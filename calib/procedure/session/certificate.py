@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from calib import files
+from calib.data.camera.corner_file import FILE as CORNERS
+from calib.data.poses.image_folders import JOINTS
 from calib.errors import command_line
 from calib.folders import CERTIFICATE
 from calib.procedure.excitation.coefficients import SAMPLES
@@ -152,11 +154,23 @@ def _session_plan(session: Session) -> str:
     return str(json.loads(path.read_text()).get("words", "chosen by hand"))
 
 
+def _filed(paths: list[Path]) -> list[Path]:
+    """Return what is to be filed of measured paths: of images the corners found in them stand for all."""
+    own = [
+        (path / CORNERS if (path / CORNERS).exists() else path / JOINTS) if path.is_dir() else path for path in paths
+    ]
+    return [*own, *(path / JOINTS for path in paths if path.is_dir() and (path / CORNERS).exists())]
+
+
 def listed(session: Session) -> list[tuple[str, str, str, str]]:
     """Return the files the certificate rests on, the ones to be filed first: name, what it is, bytes, SHA-256."""
     exported = sorted(path for path in session.path(session.export).glob("*") if path.is_file())
     exported.sort(key=lambda path: path.name != URDF)
-    wanted = [*exported[:1], robot_file(session), *measured_files(session)[0], *measured_files(session)[1]]
+    wanted = [
+        *exported[:1],
+        robot_file(session),
+        *(path for paths in measured_files(session) for path in _filed(paths)),
+    ]
     if session.dynamic:
         wanted += [path for paths in recordings(session) for path in paths if path.is_file()]
         wanted += sorted(session.path("6-excitation").glob(f"*/{SAMPLES}"))
@@ -167,7 +181,7 @@ def listed(session: Session) -> list[tuple[str, str, str, str]]:
     for path in wanted:
         name = path.relative_to(session.folder)
         role = ROLES[name.parts[0]]
-        if path.name.lower().startswith("validation"):
+        if name.parts[-1].lower().startswith("validation") or name.parts[1].lower().startswith("validation"):
             role += ", unseen by the fit" if name.parts[0] == "3-measured" else ", unseen by the identification"
         if name.parts[0] in ("4-fit", "8-dynamics", session.export) and made.get(str(name)) != fingerprint(path):
             role = certificate.EDITED

@@ -17,6 +17,7 @@ from calib.errors import UsageError, command_line
 from calib.folders import CERTIFICATE
 from calib.procedure.excitation.limits import read_motion_limits
 from calib.procedure.kinematic_stage.folder import URDF
+from calib.procedure.kinematic_stage.pose_limits import beside
 from calib.procedure.session import instructions, steps
 from calib.procedure.session.folder import Session, create, locked, open_session, verdict_of
 from calib.procedure.session.questions import instrument_named
@@ -84,6 +85,7 @@ def begin(folder: Path, wanted: NewSession) -> Session:
     copied, named = ({}, "") if wanted.limits is None else ({LIMITS: wanted.limits}, LIMITS)
     if wanted.limits is not None:
         read_motion_limits(wanted.limits, chain, source)
+        copied |= beside(wanted.limits)
     measured = InstrumentSection(device.label, device.measures, device.sigma_position, device.sigma_orientation)
     if wanted.tool is not None:
         x, y, z = (float(value) for value in wanted.tool)

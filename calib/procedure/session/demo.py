@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
+from calib.data.poses.pixels import Pixels
 from calib.data.poses.plans import read_poses
 from calib.errors import SessionError, UsageError, command_line
 from calib.estimate_files import read_estimate
@@ -25,7 +26,7 @@ from calib.procedure.session.commands import NewSession, begin
 from calib.procedure.session.folder import MARK, SETTINGS, Session, locked, open_session, verdict_of
 from calib.robot import calibrated, library
 from calib.robot.load import load
-from calib.simulation.cells import measured_files
+from calib.simulation.cells import camera_files, measured_files
 from calib.simulation.cells.cell import Cell, measure, wandering
 from calib.simulation.cells.truth import TRUTH, position_errors, share_within, torque_errors, true_base
 from calib.simulation.cells.virtual_arm import MovingArm, moving_arm, play, record
@@ -61,7 +62,7 @@ class DemoResult:
 
 def run(
     folder: Path, robot: str, seed: int, say: Say, progress: Say, *, dynamics: bool = True, guided: bool = False,
-    plots: bool = True,
+    plots: bool = True, instrument: str = "cmm",
 ) -> DemoResult:  # fmt: skip
     """Calibrate a simulated robot in a session, and compare with its hidden truth.
 
@@ -73,7 +74,10 @@ def run(
         dynamics: identify them, too, where the library knows the robot's masses.
         guided: stop where an engineer would; `simulate_next` then plays his part.
         plots: whether figures are drawn.
+        instrument: ``cmm``, or ``camera``, which takes rendered images.
     """
+    if instrument not in ("cmm", "camera"):
+        raise UsageError(f"--instrument {instrument}: the demonstration has cmm and camera")
     started = time.perf_counter()
     cell = virtual_cell(robot, seed)
     if dynamics and cell.nominal.inertias is None:
@@ -84,13 +88,20 @@ def run(
         )
         dynamics = False
     motion = MOTION if dynamics else {}
-    session = begin(folder, NewSession(robot, "cmm", FIT, VALIDATION, seed, dynamics=dynamics, motion=motion))
+    wanted = NewSession(robot, instrument, FIT, VALIDATION, seed, dynamics=dynamics, motion=motion)
+    if instrument == "camera":
+        seen = camera_files.seen_by_camera(cell)
+        cell = seen.cell
+        with camera_files.limits_of(seen) as limits:
+            session = begin(folder, replace(wanted, limits=limits))
+    else:
+        session = begin(folder, wanted)
     session = replace(session, plots=plots)
     say(f"the cell: {cell.note}")
     with locked(session):
         waiting = steps.run_next(session, say, progress, "calib demo")
         while waiting is not None and waiting.kind == steps.WAITING and not guided:
-            _bring_for(session, waiting.step.name, say)
+            _bring_for(session, waiting.step.name, say, progress)
             waiting = steps.run_next(session, say, progress, "calib demo")
     if waiting is not None:
         if not guided:
@@ -175,7 +186,7 @@ def simulate_next(folder: Path, say: Say) -> None:
     with locked(session, say):
         waiting = next((state for state in steps.states(session) if state.kind not in (steps.DONE, steps.KEPT)), None)
         if waiting is None:
-            _compare_with_truth(session, virtual_cell(session.settings.robot.given, session.settings.seed), say)
+            _compare_with_truth(session, _cell_of(session), say)
             return
         if waiting.kind != steps.WAITING:
             raise UsageError(f"{folder} waits for nothing; next: {command_line('next', folder)}")
@@ -183,11 +194,22 @@ def simulate_next(folder: Path, say: Say) -> None:
     say(f"next: {command_line('next', folder)}")
 
 
-def _bring_for(session: Session, step: str, say: Say) -> None:
+def _cell_of(session: Session) -> Cell:
+    """Return the virtual cell of a session of the demonstration."""
+    cell = virtual_cell(session.settings.robot.given, session.settings.seed)
+    return camera_files.seen_by_camera(cell).cell if session.settings.instrument.measures == Pixels.kind else cell
+
+
+def _bring_for(session: Session, step: str, say: Say, progress: Say = lambda words: None) -> None:
     """Let the simulated cell do what a step waits for."""
     seed = session.settings.seed
     cell = virtual_cell(session.settings.robot.given, seed)
-    if step in ("measure", "validate"):
+    if step in ("measure", "validate") and session.settings.instrument.measures == Pixels.kind:
+        found = camera_files.seen_by_camera(cell)
+        _mark(session, found.cell.note)
+        camera_files.bring_images(session.folder, found, seed, progress)
+        say("    (the simulated camera takes an image at every pose of both lists)")
+    elif step in ("measure", "validate"):
         simulate_measurements(session, cell, seed)
         say("    (the simulated cell measures both lists of poses)")
     elif step in ("record", "predict"):

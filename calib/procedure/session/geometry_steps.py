@@ -11,8 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
+from calib.data.camera.corner_file import FILE as CORNERS
 from calib.data.poses.fit_options import FileOptions, FitOptions, read_options
-from calib.data.poses.measurements import Poses, Positions
+from calib.data.poses.image_folders import is_image_folder
+from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
+from calib.data.poses.pixels import Pixels
 from calib.data.poses.plans import check_against, read_poses, write_poses
 from calib.errors import RobotError, UsageError
 from calib.geometry.weighing import Settings, combine
@@ -21,6 +24,7 @@ from calib.procedure.kinematic_stage import folder as outputs
 from calib.procedure.kinematic_stage import inputs
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import assess
+from calib.procedure.measuring.image_findings import image_words
 from calib.procedure.report import certificate, fit_report
 from calib.procedure.session import arrival
 from calib.procedure.session.folder import POSES, POSES_CHECKED, SELECTION, SUMMARY, UNSEEN, Session, verdicts
@@ -65,11 +69,23 @@ def _tolerance_of(session: Session) -> float | None:
 
 
 def measured_files(session: Session) -> tuple[list[Path], list[Path]]:
-    """Return the CSV files people have brought: for the fit, and for validation (names starting with it)."""
-    found = sorted(session.path("3-measured").glob("*.csv"))
+    """Return the files and folders of images people have brought: for the fit, and for validation (by their names)."""
+    place = session.path("3-measured")
+    folders = [path for path in sorted(place.iterdir()) if is_image_folder(path)] if place.is_dir() else []
+    found = [*sorted(place.glob("*.csv")), *folders]
     unseen = [path for path in found if path.name.lower().startswith("validation")]
     aside = [*unseen, *measured_again(session)]
     return [path for path in found if path not in aside], unseen
+
+
+def all_files(paths: Sequence[Path]) -> list[Path]:
+    """Return what people have brought at these paths, file by file; the corners found in images are ours."""
+    return [
+        each
+        for path in paths
+        for each in (sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path])
+        if not (path.is_dir() and each.name == CORNERS)
+    ]
 
 
 def measured_again(session: Session) -> list[Path]:
@@ -129,19 +145,25 @@ def arrive(session: Session, say: Say) -> list[str]:
     return notes
 
 
-def check_file(session: Session, chain: Chain, path: Path, plan: np.ndarray | None) -> list[str]:
+def check_file(
+    session: Session, chain: Chain, path: Path, plan: np.ndarray | None, like: Sequence[PoseMeasurements] = ()
+) -> list[str]:
     """Return what is to be said of a measured file: rows, kind, what was ignored, missing poses.
 
     Raises:
         MeasurementError: for whatever cannot be right, with row and column.
     """
     notes = []
-    for block in inputs.read_file(path, chain, _options_of(session)):
+    for block in inputs.read_file(path, chain, _options_of(session), like):
         wanted = session.settings.instrument.measures
         if wanted == Poses.kind and isinstance(block, Positions) and not isinstance(block, Poses):
             notes.append(f"{path.name}: positions only, where the instrument gives poses")
         ignored = f", ignored: {', '.join(block.ignored)}" if block.ignored else ""
         notes.insert(0, f"{path.name}: {len(block)} rows of kind {block.kind}{ignored}")
+        if isinstance(block, Pixels):
+            notes.append(f"{path.name}: {image_words(block)}")
+        elif wanted == Pixels.kind:
+            notes.append(f"{path.name}: no images, which the instrument takes; fitted all the same")
         notes += [f"{path.name}: {note}" for note in block.notes]
         if plan is not None:
             notes += [f"{path.name}: {note}" for note in (*check_against(plan, block), *arrival.readback(plan, block))]
@@ -201,8 +223,9 @@ def validate(session: Session, say: Say) -> list[str]:
         fit_report.write(fit_report.with_unseen(report, out.take_over(before), []), out.report)
         return ["no validation asked for: judged by cross-validation only"]
     plan = planned(session, chain, "validation")
+    like = _gathered(session).fit if any(path.is_dir() for path in unseen) else ()
     for path in unseen:
-        notes += check_file(session, chain, path, plan)
+        notes += check_file(session, chain, path, plan, like)
     say("comparing on unseen poses")
     given, options, wanted = _gathered(session, unseen), _options_of(session), _fit_settings(session)
     settings = combine(Settings(), loss=wanted.loss, loss_scale=options.loss_scale)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+from calib.data.poses.pixels import Pixels
 from calib.errors import SessionError, command_line
 from calib.procedure.excitation.coefficients import RUN, SAMPLES
 from calib.procedure.session import dynamics_steps, geometry_steps
@@ -25,6 +28,8 @@ def asks(session: Session, state: State) -> tuple[str, str]:
 
 def _at_the_robot(session: Session, name: str, both: bool) -> str:
     path = session.path(f"2-poses/{name}.csv")
+    if session.settings.instrument.measures == Pixels.kind:
+        return _take_images(session, path, both)
     what = "pose" if session.settings.instrument.measures == "pose" else "position"
     device = session.settings.instrument.name
     if not session.settings.poses.plan or not path.exists():
@@ -38,6 +43,17 @@ def _at_the_robot(session: Session, name: str, both: bool) -> str:
     )
 
 
+def _take_images(session: Session, path: Path, both: bool) -> str:
+    """Say how images are to be taken."""
+    where = "poses all over the workspace that see the board from near and far, and tilted"
+    if session.settings.poses.plan and path.exists():
+        where = f"the {sum(1 for _ in path.open()) - 1} poses of {path}{_and_validation(session) if both else ''}"
+    return (
+        f"Drive {where}; at each let the arm settle for a second, take an image of the board (focus, zoom and exposure "
+        "fixed, no automatic ones, no image turned or scaled), and log the joint angles read back."
+    )
+
+
 def _and_validation(session: Session) -> str:
     """Name the list of validation poses, so that the robot is visited once."""
     path = session.path(f"2-poses/{UNSEEN}")
@@ -48,6 +64,8 @@ def _and_validation(session: Session) -> str:
 
 def _form(session: Session, target: str, both: bool) -> str:
     joints = _chain(session).joint_names
+    if session.settings.instrument.measures == Pixels.kind:
+        return _form_of_images(session, joints, target, both)
     full = session.settings.instrument.measures == "pose"
     columns = ", ".join((*(f"{joint} [deg]" for joint in joints), *(f"{axis} [mm]" for axis in "xyz")))
     quaternion = ", qx, qy, qz, qw" if full else ""
@@ -56,6 +74,17 @@ def _form(session: Session, target: str, both: bool) -> str:
         files.append(str(session.path(f"3-measured/{UNSEEN}")))
     each = f"Bring {' and '.join(files)}, one row per pose: {columns}{quaternion} (calib formats measurements)"
     return f"{each}; then: {command_line('next', session.folder)}"
+
+
+def _form_of_images(session: Session, joints: tuple[str, ...], target: str, both: bool) -> str:
+    """Say where images, joint values and the board's description go."""
+    names = [target, *([UNSEEN] if both and session.settings.poses.validation else [])]
+    folders = " and ".join(str(session.path("3-measured") / Path(name).stem) for name in names)
+    return (
+        f"Bring {folders}: the images, joints.csv (image, {joints[0]} [deg] … {joints[-1]} [deg]; one row per image), "
+        "board.toml (calib board makes boards), and camera.yaml if the lens is known (calib formats images); then: "
+        f"{command_line('next', session.folder)}"
+    )
 
 
 def _play(session: Session, step: str) -> str:

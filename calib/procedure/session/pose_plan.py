@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from calib.data.poses.pixels import Pixels
 from calib.geometry.observability import observation, targets_of
 from calib.procedure.kinematic_stage import selection
 from calib.procedure.kinematic_stage.pose_limits import read_limits
@@ -37,7 +39,7 @@ def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], N
     links = (chain.base, chain.tip) if robot_file.suffix == ".urdf" else (None, None)
     stated = (instrument.sigma_position, instrument.sigma_orientation)
     choice = SelectionSettings(
-        kind=instrument.measures, tools=(tuple(instrument.tool),), index=wanted.index, method=wanted.method,
+        kind=seen_as(instrument.measures), tools=(tuple(instrument.tool),), index=wanted.index, method=wanted.method,
         sigmas=stated if all(stated) else None, seed=settings.seed,
     )  # fmt: skip
     chosen = selection.choose(
@@ -58,6 +60,11 @@ def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], N
     return Plan(found.q, unseen, words, tuple(selection.kept(chosen)), record)
 
 
+def seen_as(measures: str) -> str:
+    """Return the kind of measurement that poses are chosen for: an image tells a pose."""
+    return "pose" if measures == Pixels.kind else measures
+
+
 def _unseen(session: Session, robot_file: Any, chain: Chain, count: int) -> np.ndarray:
     """Return random poses within limits and constraints (count, n), from another stream than the candidates'."""
     if not count:
@@ -65,8 +72,10 @@ def _unseen(session: Session, robot_file: Any, chain: Chain, count: int) -> np.n
     name = session.settings.poses.constraints
     cell = targets_of(chain, [session.settings.instrument.tool])
     limits = read_limits(session.path(name) if name else None, cell, robot_file)
-    jacobian = observation(cell, session.settings.instrument.measures)
+    jacobian = observation(cell, seen_as(session.settings.instrument.measures))
     space = limits.space(jacobian)
     stream = np.random.default_rng([session.settings.seed, 1])
+    if limits.camera is not None:
+        return limits.camera.draw(count, partial(is_feasible, space), limits.lower, limits.upper, stream)
     q = draw_candidates(limits.lower, limits.upper, count, lambda q: is_feasible(space, q), seed=stream)
     return selection.fewest_turns(chain, q, limits.lower, limits.upper)

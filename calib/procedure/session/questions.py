@@ -21,7 +21,7 @@ class InstrumentPreset:
 
     Attributes:
         label: its name for people.
-        measures: ``pose`` or ``position``.
+        measures: ``pose``, ``position`` or ``pixels``.
         sigma_position, sigma_orientation: of one measurement, per axis [m], [rad]; 0: to be estimated.
         source: where the sigmas come from.
     """
@@ -42,7 +42,10 @@ INSTRUMENTS = {
     ),
     "tracker6d": InstrumentPreset("laser tracker, 6-D probe", "pose", 30e-6, 0.1e-3, "our guess"),
     "mocap": InstrumentPreset("motion capture", "pose", 0.0, 0.0, "estimated from the residuals"),
-    "camera": InstrumentPreset("camera and board", "pose", 0.0, 0.0, "estimated from the residuals"),
+    "camera": InstrumentPreset("camera and board", "pixels", 0.0, 0.0, "estimated from the residuals"),
+    "camera-poses": InstrumentPreset(
+        "camera and board", "pose", 0.0, 0.0, "poses by another program; estimated from the residuals"
+    ),
     "other-pose": InstrumentPreset("instrument", "pose", 0.0, 0.0, "estimated from the residuals"),
     "other-position": InstrumentPreset("instrument", "position", 0.0, 0.0, "estimated from the residuals"),
 }

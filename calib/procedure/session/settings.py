@@ -80,7 +80,9 @@ class InstrumentSection:
     """What measures, and how well."""
 
     name: Text
-    measures: Annotated[str, OneOf(("pose", "position")), About("pose (with orientation) or position")]
+    measures: Annotated[
+        str, OneOf(("pose", "position", "pixels")), About("pose (with orientation), position or pixels")
+    ]
     sigma_position: Annotated[NotNegative, About("of one measurement, per axis; 0: to be estimated")] = 0.0
     sigma_orientation: NotNegative = 0.0
     tool: Annotated[

@@ -57,7 +57,8 @@ def _plan(session: Session) -> list[Path]:
 
 
 def _arrived(session: Session) -> list[Path]:
-    measured = [*geometry_steps.measured_files(session)[0], *geometry_steps.measured_again(session)]
+    brought = [*geometry_steps.measured_files(session)[0], *geometry_steps.measured_again(session)]
+    measured = geometry_steps.all_files(brought)
     return [*_robot(session), session.path(f"2-poses/{POSES}"), *_options(session), *measured]
 
 
@@ -67,7 +68,8 @@ def _options(session: Session) -> list[Path]:
 
 
 def _fitted(session: Session) -> list[Path]:
-    return [*_robot(session), *_options(session), *geometry_steps.measured_files(session)[0]]
+    measured = geometry_steps.all_files(geometry_steps.measured_files(session)[0])
+    return [*_robot(session), *_options(session), *measured]
 
 
 def _validated(session: Session) -> list[Path]:
@@ -76,7 +78,7 @@ def _validated(session: Session) -> list[Path]:
         *fit,
         session.path(f"2-poses/{UNSEEN}"),
         *_options(session),
-        *geometry_steps.measured_files(session)[1],
+        *geometry_steps.all_files(geometry_steps.measured_files(session)[1]),
     ]
 
 

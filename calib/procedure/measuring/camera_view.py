@@ -1,0 +1,235 @@
+"""Whether a camera sees its board, where from, and what an image would tell: pose selection with a camera.
+
+``[camera]`` of the constraints file; places may be rough, a centimetre and a few degrees do::
+
+    [camera]
+    mounting = "in hand"             # the arm carries the camera; to hand: the board
+    lens = "camera.yaml"             # beside the file; ROS camera_info
+    board = "board.toml"
+    carried = {xyz = [0.04, 0.0, 0.06], rpy = [0, 0, 0]}             # what the arm carries, in the tip's frame
+    stands = {xyz = [0.5, 0.1, 0.0], rpy = ["180 deg", 0, 0]}        # the other, in the base; cameras look along z
+    tilt = "50 deg"                  # largest angle between the line of sight and the board's normal
+    range = [0.3, 1.2]               # least and largest distance of the board's middle [m]
+    margin = 10                      # pixels that the board keeps to the image's edge
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.config import Expect, Name, OneOf, Real, strict
+from calib.data.camera.board import Board, corners, read_board
+from calib.data.camera.camera_info import read_lens
+from calib.data.camera.lens import Lens, project
+from calib.data.poses.pixels import IN_HAND, TO_HAND, Pixels
+from calib.errors import UsageError
+from calib.geometry.identifiability import base_columns
+from calib.geometry.images.image_noise import ImageNoise
+from calib.geometry.images.optics import BoardShape, Optics
+from calib.geometry.installation import Installation, see
+from calib.geometry.inverse import Goal, reach, seen_at
+from calib.geometry.observation import observe, prepare
+from calib.geometry.parameters import layout
+from calib.geometry.pixel_residuals import PixelPart
+from calib.robot.chain import Chain
+from calib.robot.tables import placement
+from calib.transforms import invert, pose
+from poses.space import PoseConstraint
+
+CORNER, DISPLACEMENT, TURN = 0.05, 2e-5, 2e-5  # noise that a pose is judged by [px], [m], [rad]; our choice
+TRIES = 60
+Angle = Annotated[float, Real(above=0, quantity="angle")]
+Distance = Annotated[float, Real(least=0, quantity="length")]
+
+
+@strict
+@dataclass(frozen=True, kw_only=True)
+class CameraTable:
+    """[camera], see the module."""
+
+    mounting: Annotated[str, OneOf((IN_HAND, TO_HAND))]
+    lens: Name
+    board: Name
+    carried: Mapping[str, Any]
+    stands: Mapping[str, Any]
+    tilt: Angle = float(np.radians(50.0))
+    range: Annotated[tuple[Distance, Distance], Expect("two distances, least and largest")] = (0.2, 3.0)
+    margin: Annotated[float, Real(least=0)] = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class CameraView:
+    """What it takes to see the board, as a constraint: q (m, n) -> (m, 19), kept where <= 0.
+
+    Attributes:
+        cell: the arm with camera and board where they roughly are.
+        board: to be seen whole.
+        mounting: ``in hand`` or ``to hand``.
+        tilt: largest angle [rad].
+        span: least and largest distance [m].
+        margin: to the image's edge [px].
+    """
+
+    cell: Installation
+    board: Board
+    mounting: str
+    tilt: float
+    span: tuple[float, float]
+    margin: float
+
+    @property
+    def lens(self) -> Lens:
+        """Of the camera."""
+        return self.cell.optics.lenses[0]
+
+    def poses(self, q: np.ndarray) -> np.ndarray:
+        """Return the board's poses (m, 4, 4) in the camera's frame."""
+        found = see(self.cell, q).poses()
+        return invert(found) if self.mounting == IN_HAND else found
+
+    def __call__(self, q: np.ndarray) -> np.ndarray:
+        poses, size = self.poses(q), np.array(self.lens.size)
+        table = corners(self.board)
+        wide, high = table[:, :2].min(axis=0), table[:, :2].max(axis=0)
+        edge = np.array([[x, y, 0.0] for x in (wide[0], high[0]) for y in (wide[1], high[1])])
+        point = np.einsum("mij,kj->mki", poses[:, :3, :3], edge) + poses[:, None, :3, 3]
+        aside = np.maximum(np.linalg.norm(point[:, :, :2], axis=2), 1e-3)
+        ahead = np.concatenate([point[:, :, :2], np.maximum(point[:, :, 2:], aside[:, :, None] / 2.0)], axis=2)
+        pixel = project(self.lens, ahead.reshape(-1, 3)).reshape(len(q), -1, 2)
+        outside = np.concatenate([self.margin - pixel, pixel + self.margin + 1 - size], axis=2) / size[0]
+        middle = poses[:, :3, :3] @ (0.5 * np.array([*self.board.extent, 0.0])) + poses[:, :3, 3]
+        far = np.linalg.norm(middle, axis=1)
+        lean = np.cos(self.tilt) - np.einsum("mi,mi->m", poses[:, :3, 2], middle) / np.maximum(far, 1e-9)
+        rest = np.column_stack([self.span[0] - far, far - self.span[1], lean])
+        return np.concatenate([outside.reshape(len(q), -1), rest], axis=1)
+
+    def constraint(self) -> PoseConstraint:
+        """Return it as pose selection takes it."""
+        return PoseConstraint("board in view of the camera", self)
+
+    def draw(
+        self, count: int, feasible: Callable[[np.ndarray], np.ndarray], lower: np.ndarray, upper: np.ndarray,
+        seed: int | np.random.Generator,
+    ) -> np.ndarray:  # fmt: skip
+        """Return up to `count` postures (·, n) that see the board: views are drawn, and the arm put there.
+
+        Postures drawn at random see a board once in a thousand.
+        """
+        rng, goal = np.random.default_rng(seed), Goal(self.cell, 6, lower, upper)
+        result = np.zeros((0, self.cell.chain.n))
+        for _ in range(TRIES):
+            wanted = self._views(4 * count, rng)
+            targets = invert(wanted) if self.mounting == IN_HAND else wanted
+            q = reach(goal, targets, rng.uniform(lower, upper, (len(targets), len(lower))), 30)
+            q = q[np.linalg.norm(seen_at(goal, q).poses() - targets, axis=(1, 2)) < 1e-3]
+            result = np.concatenate([result, q[feasible(q)] if len(q) else q])
+            if len(result) >= count:
+                break
+        return result[:count]
+
+    def _views(self, count: int, rng: np.random.Generator) -> np.ndarray:
+        """Return random poses (count, 4, 4) of the board before the camera."""
+        about, lean = rng.uniform(-np.pi, np.pi, count), self.tilt * np.sqrt(rng.uniform(0.0, 1.0, count))
+        axis = np.column_stack([np.cos(about), np.sin(about), np.zeros(count)])
+        roll = Rotation.from_rotvec(np.outer(rng.uniform(-np.pi, np.pi, count), [0.0, 0.0, 1.0]))
+        turn = (Rotation.from_rotvec(lean[:, None] * axis) * roll).as_matrix()
+        depth = rng.uniform(*self.span, count)
+        share = rng.uniform(-0.8, 0.8, (count, 2)) * 0.5 * np.array(self.lens.size) / self.lens.values[:2]
+        place = np.column_stack([share * depth[:, None], depth])
+        return pose(turn, place - turn @ (0.5 * np.array([*self.board.extent, 0.0])))
+
+
+@dataclass(frozen=True, eq=False)
+class ImageObservation:
+    """Whitened observation Jacobian of images, in base columns: q (m, n) -> (m, rows, p).
+
+    An image's corners are reduced to what they tell of the board's pose and the lens; noise of corners and of the arm's
+    repeatability are our choice (`CORNER`, `DISPLACEMENT`, `TURN`).
+
+    Attributes:
+        view: camera and board.
+        free: (p,) the parameters that images can tell, in the full vector.
+    """
+
+    view: CameraView
+    free: np.ndarray
+    product = None
+
+    @property
+    def full(self) -> bool:
+        """Whether orientations are seen."""
+        return True
+
+    def __call__(self, q: np.ndarray) -> np.ndarray:
+        part = _part(self.view, q, self.free)
+        noise = ImageNoise(1.0, DISPLACEMENT, TURN, np.ones(len(q)))
+        matrix = replace(part, noise=noise).whitened(np.full(part.value.shape, CORNER))[1]
+        return matrix.reshape(len(q), -1, len(self.free))
+
+
+def _part(view: CameraView, q: np.ndarray, free: np.ndarray) -> PixelPart:
+    cell, table = view.cell, corners(view.board)
+    pixel = np.zeros((len(q), len(table), 2))
+    block = Pixels(
+        q, cell.chain.joint_names, pixel, view.board, view.lens, mounting=view.mounting,
+        station=cell.station_names[0], tool_names=cell.tool_names,
+    )  # fmt: skip
+    part = observe(cell, prepare(cell, [block])[0], free)[0]
+    assert isinstance(part, PixelPart)
+    return part
+
+
+def image_observation(view: CameraView, lower: np.ndarray, upper: np.ndarray, seed: int = 0) -> ImageObservation:
+    """Return the observation Jacobian of images in the columns that postures which see the board can tell."""
+    table = layout(view.cell)
+    columns = np.concatenate([table.arm_index, table.frame_index])
+    q = view.draw(100, lambda each: np.all(view(each) <= 1e-8, axis=1), lower, upper, seed)
+    if len(q) < 20:
+        raise UsageError(
+            f"the camera sees the board at hardly any posture ({len(q)} of 100 were found): look at [camera], carried "
+            "and stands, tilt and range"
+        )
+    block = Pixels(
+        q, view.cell.chain.joint_names, np.zeros((len(q), len(corners(view.board)), 2)), view.board, view.lens,
+        mounting=view.mounting, station=view.cell.station_names[0], tool_names=view.cell.tool_names,
+    )  # fmt: skip
+    split = base_columns(view.cell, prepare(view.cell, [block]), columns)
+    return ImageObservation(view, columns[split.kept])
+
+
+def camera_view(stated: CameraTable, chain: Chain, where: str, folder: Path) -> CameraView:
+    """Return the view that a constraints file states.
+
+    Args:
+        stated: its table.
+        chain: the nominal arm.
+        where: for messages.
+        folder: that the lens's and the board's files are beside.
+
+    Raises:
+        UsageError, MeasurementError, RobotError: for a file that is missing, or a place that cannot be.
+    """
+    for name in (stated.lens, stated.board):
+        if not (folder / name).is_file():
+            raise UsageError(f"{where}: camera: no file '{name}' beside it")
+    if not stated.range[0] < stated.range[1]:
+        raise UsageError(f"{where}: camera.range: {stated.range[0]:g} is not below {stated.range[1]:g}")
+    lens, board = read_lens(folder / stated.lens), read_board(folder / stated.board)
+    carried = placement(dict(stated.carried), f"{where}: camera.carried")
+    stands = placement(dict(stated.stands), f"{where}: camera.stands")
+    names = ("board", "camera") if stated.mounting == IN_HAND else ("camera", "board")
+    middle = pose(None, -0.5 * np.array([*board.extent, 0.0]))  # places are those of the board's middle
+    if stated.mounting == IN_HAND:
+        stands = stands @ middle
+    else:
+        carried = carried @ middle
+    free = frozenset(f"camera.{name}" for name in lens.names[:8])
+    optics = Optics((lens,), ("camera",), (BoardShape(),), ("board",), free)
+    cell = Installation(chain, invert(stands)[None], carried[None], names[:1], names[1:], optics=optics)
+    return CameraView(cell, board, stated.mounting, stated.tilt, stated.range, stated.margin)

@@ -1,0 +1,161 @@
+"""Claims: a folder of images is read like a measurement file; what is of no use in it is said, image by image."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+
+from calib.data.camera.board import read_board
+from calib.data.camera.camera_info import write_lens
+from calib.data.camera.lens import Lens
+from calib.data.poses.fit_options import parse_options
+from calib.data.poses.image_bags import read_image_bag, write_image_folder
+from calib.data.poses.image_folders import is_image_folder, read_images
+from calib.errors import MeasurementError
+from calib.simulation.cells import camera_cell as camera
+from calib.simulation.cells.cell import SimulatedInstrument
+from calib.simulation.cells.virtual_cells import rigid, virtual_cell
+
+LENS = Lens("pinhole", np.array([470.0, 471.0, 240.0, 178.0, -0.12, 0.05, 4e-4, -3e-4, 0.0]), (480, 360))
+
+
+@cache
+def cell() -> camera.CameraCell:
+    board = camera.Board("charuco", 6, 5, 0.04, 0.03, "4x4_50")
+    arm = rigid(virtual_cell("lwr4plus", instrument=SimulatedInstrument(encoder_sigma=0.0)))
+    return camera.camera_cell(arm, lens=LENS, board=board, reach_of_arm=0.75)
+
+
+@cache
+def joints() -> np.ndarray:
+    return camera.views(cell(), 7, 1, camera.Views((0.3, 0.45), 0.5))
+
+
+@pytest.fixture(scope="module")
+def taken(tmp_path_factory):
+    return camera.take_pictures(cell(), joints(), tmp_path_factory.mktemp("shots"), seed=1)
+
+
+@pytest.fixture
+def folder(taken, tmp_path):
+    for path in taken.iterdir():
+        if path.name != "corners.csv":
+            (tmp_path / path.name).write_bytes(path.read_bytes())
+    return tmp_path
+
+
+def read(path, **options):
+    return read_images(path, cell().cell.nominal.joint_names, parse_options(options))
+
+
+def test_corners_come_with_joints_and_are_looked_for_once(folder):
+    block = read(folder)
+    assert is_image_folder(folder) and block.kind == "pixels" and len(block) == 7
+    assert block.q == pytest.approx(joints(), abs=1e-9)
+    exact = camera.photograph(cell(), joints(), 0.0)
+    both = block.seen & exact.seen
+    assert both.sum() > 100 and np.sqrt(np.mean((block.pixel - exact.pixel)[both] ** 2)) < 0.08
+    before = (folder / "corners.csv").read_text()
+    for image in folder.glob("*.png"):
+        image.unlink()
+    again = read(folder)
+    assert np.array_equal(again.seen, block.seen) and again.size == LENS.size
+    assert np.nanmax(np.abs(again.pixel - block.pixel)) < 1e-8
+    assert (folder / "corners.csv").read_text() == before
+
+
+def test_useless_images_are_left_out_and_said_to_be(folder):
+    (folder / "0002.png").write_bytes(b"\x89PNG cut short")
+    image = cv2.imread(str(folder / "0004.png"), 0)
+    cv2.imwrite(str(folder / "0004.png"), np.ascontiguousarray(np.rot90(image)))
+    cv2.imwrite(str(folder / "0005.png"), np.full_like(image, 90))
+    (folder / "0006.png").rename(folder / "extra.png")
+    block = read(folder)
+    assert block.rows.tolist() == [1, 3, 7] and block.name(3) == "0003.png"
+    notes = " | ".join(block.notes)
+    assert "1 of 7 rows have no image: 0006.png" in notes and "no row in joints.csv: extra.png" not in notes
+    assert "(cannot be read as an image" in notes and "was it copied whole?): 0002.png" in notes
+    assert "360 x 480 pixels, where most are 480 x 360; was it turned by a program?): 0004.png" in notes
+    assert "(no board found: out of view, hidden, blurred or in glare): 0005.png" in notes
+
+
+def test_too_few_usable_images_are_refused_with_the_reasons(folder):
+    for name in ("0001", "0002", "0003", "0004", "0005"):
+        (folder / f"{name}.png").write_bytes(b"")
+    with pytest.raises(MeasurementError, match=r"2 usable images: .*5 images are of no use .*the file is empty"):
+        read(folder)
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (lambda f: (f / "board.toml").unlink(), "has no board.toml"),
+        (lambda f: (f / "joints.csv").unlink(), "has no joints.csv"),
+        (lambda f: (f / "joints.csv").write_text((f / "joints.csv").read_text().replace("0002", "0001")), "2 times"),
+        (lambda f: [p.unlink() for p in f.glob("*.png")], "none of the images that joints.csv names is there"),
+        (
+            lambda f: write_lens(Lens(LENS.model, LENS.values, (640, 480)), f / "camera.yaml"),
+            "is about images of 640 x 480 pixels, those beside it have 480 x 360",
+        ),
+    ],
+)
+def test_a_folder_that_lacks_something_is_refused(change, words, folder):
+    change(folder)
+    with pytest.raises(MeasurementError, match=words):
+        read(folder)
+
+
+def test_a_given_lens_is_kept_unless_it_is_to_be_fitted(folder):
+    write_lens(LENS, folder / "camera.yaml")
+    assert read(folder).known and not read(folder).free
+    fitted = read(folder, camera={"intrinsics": "fit", "board": ["bend"]})
+    assert {"fx", "k1", "bend_xx"} <= set(fitted.free) and "scale" not in fitted.free
+
+
+def write_bag(path, compressed: bool, moving: int) -> None:
+    """Write a ROS 2 bag: joint states at 100 Hz, an image at each stop, and one while the arm moves."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    types = store.types
+    header, time = types["std_msgs/msg/Header"], types["builtin_interfaces/msg/Time"]
+    kind = "sensor_msgs/msg/CompressedImage" if compressed else "sensor_msgs/msg/Image"
+    names = list(cell().cell.nominal.joint_names)
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        states = writer.add_connection("/joint_states", "sensor_msgs/msg/JointState", typestore=store)
+        images = writer.add_connection("/camera/image", kind, typestore=store)
+        stamp = 1_000_000_000
+        for number, q in enumerate(joints()):
+            for step in range(40):
+                own = q + (0.01 * step if number == moving else 0.0)
+                head = header(time(stamp // 10**9, stamp % 10**9), "")
+                message = types["sensor_msgs/msg/JointState"](head, names, own, np.zeros(7), np.zeros(7))
+                writer.write(states, stamp, store.serialize_cdr(message, "sensor_msgs/msg/JointState"))
+                if step == 20:
+                    pixels = cv2.imread(str(write_bag.folder / f"{number + 1:04}.png"), 0)
+                    if compressed:
+                        found = types[kind](head, "png", cv2.imencode(".png", pixels)[1].ravel())
+                    else:
+                        found = types[kind](head, *pixels.shape, "mono8", 0, pixels.shape[1], pixels.ravel())
+                    writer.write(images, stamp, store.serialize_cdr(found, kind))
+                stamp += 10_000_000
+
+
+@pytest.mark.parametrize("compressed", [True, False])
+def test_images_of_a_bag_take_the_joints_of_their_stamps(compressed, folder, tmp_path):
+    write_bag.folder = folder
+    write_bag(tmp_path / "bag", compressed, moving=2)
+    board = read_board(folder)
+    found = read_image_bag(tmp_path / "bag", board)
+    assert len(found.names) == 6 and "1 images were taken while the arm moved" in found.notes[0]
+    assert found.q == pytest.approx(np.delete(joints(), 2, axis=0), abs=1e-9)
+    block = read(write_image_folder(found, board, tmp_path / "out"))
+    assert len(block) == 6
+    direct = read(folder)
+    assert np.nanmax(np.abs(block.pixel - np.delete(direct.pixel, 2, axis=0))) < 1e-6
+    with pytest.raises(MeasurementError, match="has no images on '/camera'"):
+        read_image_bag(tmp_path / "bag", board, "/camera")
