@@ -55,6 +55,11 @@ def fit(
     Pass means that on poses it has not seen the calibrated arm is better than the nominal one, or that there is nothing
     to gain; that it is good enough is said only with --tolerance.
     """
+    from calib.procedure.parallel_stage import robots
+
+    if (parallel := robots.find(robot)) is not None:
+        _fit_parallel(parallel, measured, out, validate or [])
+        return
     from calib.api.kinematic import fit_geometry
     from calib.procedure.kinematic_stage import folder
     from calib.procedure.kinematic_stage.settings import FitSettings
@@ -245,3 +250,13 @@ def compensate(
     found.save(out, partial=partial)
     say(str(found))
     say(f"{int(found.commands.reached.sum())} of {len(found.q)} commands written to {out}")
+
+
+def _fit_parallel(robot: Any, measured: list[Path], out: Path, validate: list[Path]) -> None:
+    from calib.procedure.parallel_stage import folder
+    from calib.procedure.parallel_stage.fit import fit_parallel
+
+    with progress():
+        found = fit_parallel(robot, measured, validate)
+        folder.write_fitted(found, out)
+    say_written(found.lines(), out)

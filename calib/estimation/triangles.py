@@ -114,6 +114,28 @@ def select(data: Triangles, columns: np.ndarray) -> Triangles:
     return Triangles(names, tuple(data.units[k] for k in columns), frozen(np.stack(factors)), data.rows)
 
 
+def tie(data: Triangles, sets: Sequence[Sequence[str]]) -> Triangles:
+    """Return the triangles with the parameters of each set equal: one column, their sum, at the first one's place.
+
+    Raises:
+        CalibError: for a name that is no column, or in two sets.
+    """
+    named = [name for one in sets for name in one]
+    if wrong := [name for name in named if name not in data.names or named.count(name) > 1]:
+        raise CalibError(
+            f"equal parameters: '{wrong[0]}' is none of the columns, or named twice: {', '.join(data.names)}"
+        )
+    into = {name: one[0] for one in sets for name in one}
+    kept = [name for name in data.names if into.get(name, name) == name]
+    sums = np.zeros((data.parameters + 1, len(kept) + 1))
+    for k, name in enumerate(data.names):
+        sums[k, kept.index(into.get(name, name))] = 1.0
+    sums[-1, -1] = 1.0
+    factors = np.stack([retriangulate(factor @ sums) for factor in data.factors])
+    units = dict(zip(data.names, data.units))
+    return Triangles(tuple(kept), tuple(units[name] for name in kept), frozen(factors), data.rows)
+
+
 def combine(data: Triangles, std: np.ndarray | None = None) -> np.ndarray:
     """Return the R factor (p + 1, p + 1) of all rows, those of group g divided by std[g] (None: by one)."""
     scale = np.ones(data.groups) if std is None else shaped(std, (data.groups,), "standard deviation per group")

@@ -64,6 +64,11 @@ def read(path: str | Path, propose_beta: bool = True) -> Chain:
         RobotError: naming the table, the key and what is wrong with it.
     """
     table = load(path)
+    if "leg" in table or table.get("kind") == "parallel":
+        raise RobotError(
+            f"{path} is a parallel robot (legs and a platform), and this is for serial arms yet; calib "
+            "identify, excite and fit take it"
+        )
     robot = {key: value for key, value in table.items() if key not in EXTRA}
     if "element" not in robot:
         return mdh.from_table(robot, str(path), propose_beta)

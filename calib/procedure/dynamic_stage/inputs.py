@@ -170,18 +170,22 @@ def _read_case(path: str, name: str, motion: Motion, options: IdentifyOptions, f
     )  # fmt: skip
 
 
-def read_motion(given: str | Path | Recording, chain: Chain, own: FileSettings, like: Motion | None = None) -> Motion:
+def read_motion(
+    given: str | Path | Recording, chain: Chain | Joints, own: FileSettings, like: Motion | None = None
+) -> Motion:
     """Return the motion of a recording, held against the robot's joints and limits.
 
     Args:
         given: a path, with a cut if wanted, or the recording.
+        chain: the robot, or its joints.
         like: a motion whose identification band it is judged in, where the options state none; how far its own
             positions need filtering, it says itself.
     """
+    joints = chain if isinstance(chain, Joints) else joints_of(chain)
     if isinstance(given, Recording):
-        recording = check_recording(earlier(given, own.recording.lag), joints_of(chain))
+        recording = check_recording(earlier(given, own.recording.lag), joints)
     else:
-        recording = read_recording(given, joints_of(chain), own.recording)
+        recording = read_recording(given, joints, own.recording)
     sampled = sample(recording, own.filter)
     if like is not None and own.filter.band is None and like.band * np.median(np.diff(recording.t)) < 0.4:
         banded = replace(own.filter, band=like.band * (1.0 - 1e-9))

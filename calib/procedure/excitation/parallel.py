@@ -15,11 +15,12 @@ from calib.dynamics import base as bases
 from calib.dynamics.base import Base
 from calib.mechanism.parallel_model import ParallelModel, rows_named
 from calib.mechanism.platform_motion import PlatformRegressor, along
-from calib.mechanism.velocities import LoopMotion
+from calib.mechanism.velocities import LoopMotion, loop_jacobians
+from calib.procedure.excitation.goals import SCALINGS
 from calib.procedure.excitation.settings import ExcitationSettings
 from trajectories.basis import SampledMotion
 from trajectories.constraints import BoxLimit, MotionConstraint
-from trajectories.design.objectives import Excitation, condition_numbers
+from trajectories.design.objectives import Excitation, Index, condition_numbers
 from trajectories.design.optimise import design
 from trajectories.design.problem import ExcitationProblem
 from trajectories.design.search import SearchResult
@@ -108,6 +109,7 @@ def design_parallel(
     acceleration: np.ndarray | None = None,
     margin: float = 0.0,
     preload: float = 0.0,
+    index: Index = "cond",
     map: Callable = map,
     report: Callable[[int, int, str], None] | None = None,
 ) -> ParallelDesign:
@@ -120,6 +122,8 @@ def design_parallel(
         acceleration: (r,) limits of the coordinates' second derivatives; infinite where there is none.
         margin: share of the torque limits that stays free.
         preload: overconstraint of redundant actuators [N m or N].
+        index: what is optimised of the observation matrix, rows in units of what equal noise of all torques makes of
+            them at home: ``cond`` (both condition numbers), or ``logdet``, which makes the motion large besides.
 
     Raises:
         NothingFeasible: naming the limit that stands in the way.
@@ -137,7 +141,7 @@ def design_parallel(
     family = fourier_family(settings.harmonics, settings.period, robot.r, rate=settings.rate)
     problem = ExcitationProblem(
         family, plan.regressor,
-        plan.regressor_gradient, tuple((Excitation("cond", scaling=one), 0.5) for one in ("raw", "normalised")),
+        plan.regressor_gradient, _objectives(plan, index),
         tuple(constraints), samples=SAMPLES,
     )  # fmt: skip
     found = design(
@@ -146,9 +150,22 @@ def design_parallel(
     found, proof = ensured(problem, found, tuple(constraints), instants=INSTANTS)
     times = settings.period / INSTANTS * np.arange(INSTANTS)
     motion = dense_motion(family, found.x, times)
-    condition = condition_numbers(plan.regressor(motion.q, motion.v, motion.a))
+    condition = condition_numbers(plan.regressor(motion.q, motion.v, motion.a), _sigmas(plan))
     peak = None if values is None else np.abs(plan.torques(motion.q, motion.v, motion.a)).max(axis=0)
     return ParallelDesign(plan, base, family, found, proof, condition, peak, np.abs(motion.a).max(axis=0))
+
+
+def _sigmas(plan: PlatformRegressor) -> np.ndarray:
+    """Return what equal noise of all torques makes of the rows at home (r,)."""
+    known = plan.model.known
+    return np.linalg.norm(loop_jacobians(known, known.home).readings[0], axis=0)
+
+
+def _objectives(plan: PlatformRegressor, index: Index) -> tuple[tuple[Excitation, float], ...]:
+    sigmas = _sigmas(plan)
+    if index != "cond":
+        return ((Excitation(index, sigmas=sigmas), 1.0),)
+    return tuple((Excitation("cond", scaling=one, sigmas=sigmas), 0.5) for one in SCALINGS)
 
 
 def _columns(model: ParallelModel, base: Base) -> np.ndarray:
