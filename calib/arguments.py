@@ -65,7 +65,9 @@ def checked(given: C) -> C:
 def _checked(function: Callable[..., Any], name: str, annotated: Any, method: bool = False) -> Any:
     @cache
     def expected() -> tuple[Any, dict[str, Any]]:
-        return signature(function), get_type_hints(annotated)  # at the first call: modules load each other no more
+        return signature(function), get_type_hints(
+            annotated, include_extras=True
+        )  # at the first call: modules load each other no more
 
     @wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:

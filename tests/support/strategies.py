@@ -1,6 +1,8 @@
-"""Hypothesis strategies: names as people type them, and serial chains of any kind."""
+"""Hypothesis strategies: names as people type them, serial chains of any kind, files as they arrive."""
 
 from __future__ import annotations
+
+import re
 
 import numpy as np
 from hypothesis import strategies as st
@@ -59,3 +61,40 @@ def chains(draw: st.DrawFn, name: st.SearchStrategy[str] | None = None, inertias
     bodies = np.tile([0.1, 0, 0, 0.1, 0, 0.1, 0.2, 0.0, 0.1, 2.0], (n, 1)) if inertias else None
     tail = from_xyz_rpy([draw(finite(1.0)) for _ in range(3)], [draw(finite(1.5)) for _ in range(3)])
     return Chain(draw(name), tuple(joints), tuple(elements), tail=tail, inertias=bodies)
+
+
+ODD_CELLS = (
+    "nan", "inf", "-inf", "1e400", "1e-400", "0_5", "０.５", "", "-", "+", "1,5", '"', "1;2", "0x10", "true", "1e5",
+    "\t", "\0", "9" * 400, "é", "=1+1", "(", "{", "[", "<a", "]]>", "&amp;", "$q$", "-0", "1 2", "'", "null",
+)  # fmt: skip
+
+
+@st.composite
+def damaged(draw: st.DrawFn, content: bytes) -> bytes:
+    """Draw what may become of a file: cut off, bytes changed, parts doubled or lost, odd cells, other encodings."""
+    for _ in range(draw(st.integers(1, 3))):
+        size = len(content)
+        a, b = sorted((draw(st.integers(0, size)), draw(st.integers(0, size))))
+        match draw(st.sampled_from(["cell", "cut", "flip", "lose", "double", "junk", "encode", "line"])):
+            case "cell":
+                numbers = list(re.finditer(rb"-?\d+\.?\d*(e-?\d+)?|[A-Za-z_]\w*", content))
+                if numbers:
+                    found = draw(st.sampled_from(numbers))
+                    odd = draw(st.sampled_from(ODD_CELLS)).encode()
+                    content = content[: found.start()] + odd + content[found.end() :]
+            case "cut":
+                content = content[:a]
+            case "flip":
+                content = content[:a] + bytes([draw(st.integers(0, 255))]) + content[a + 1 :]
+            case "lose":
+                content = content[:a] + content[min(b, a + 200) :]
+            case "double":
+                content = content[:b] + content[a : min(b, a + 200)] + content[b:]
+            case "junk":
+                content = content[:a] + draw(st.binary(max_size=20)) + content[a:]
+            case "encode":
+                text = content.decode("utf-8", "replace")
+                content = text.encode(draw(st.sampled_from(["utf-16", "latin-1", "utf-8-sig"])), "replace")
+            case "line":
+                content = content.replace(b"\n", draw(st.sampled_from([b"\r\n", b"\r", b"\n\n", b",\n", b""])))
+    return content

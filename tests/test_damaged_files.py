@@ -1,0 +1,149 @@
+"""Files of every kind that is read, damaged in every way: they are read, or refused as such, and stay as they were."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import planted_motion as planted
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from strategies import damaged
+
+from calib.data.poses.fit_options import read_options
+from calib.data.poses.plans import read_poses
+from calib.data.poses.pose_files import read_measurements
+from calib.data.recordings.recording import Joints
+from calib.data.recordings.recording_files import read_recording
+from calib.errors import CalibError
+from calib.identification import identify_options
+from calib.procedure.excitation import coefficients
+from calib.procedure.excitation.waypoints import read_waypoints
+from calib.robot import description
+from calib.robot.formats import urdf_write
+from calib.robot.load import load
+
+CHECKS = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]
+FEW = settings(max_examples=8, deadline=None, derandomize=True, suppress_health_check=CHECKS)
+MANY = settings(max_examples=400, deadline=None, suppress_health_check=CHECKS)
+JOINTS = ("joint1", "joint2", "joint3")
+
+
+def poses(names: str, seed: int = 0) -> bytes:
+    rng = np.random.default_rng(seed)
+    rows = [",".join(f"{value:.6g}" for value in rng.uniform(-0.5, 0.5, names.count(",") + 1)) for _ in range(12)]
+    return "\n".join([names, *rows, ""]).encode()
+
+
+def archive(**more: Any) -> bytes:
+    stream = io.BytesIO()
+    series = {key: value[:400] for key, value in planted.series(0).items()}
+    np.savez(stream, **series, joint_names=np.array(JOINTS), use_range=[0, 390], drive_gain=np.ones(3), **more)
+    return stream.getvalue()
+
+
+def log() -> bytes:
+    series = {key: value[:400:2] for key, value in planted.series(0).items()}
+    table = np.column_stack(list(series.values()))
+    head = ",".join(["t", *(f"q{j}" for j in (1, 2, 3)), *(f"tau{j}" for j in (1, 2, 3))])
+    return "\n".join([head, *(",".join(f"{x:.7g}" for x in row) for row in table), ""]).encode()
+
+
+FIT_OPTIONS = (
+    b'kind = "position"\n[sigma]\nposition = [1e-5, 1e-5, 2e-5]\n[prior]\ntheta2 = 1e-3\n[where]\ntool = ["a"]\n'
+)
+IDENTIFY_OPTIONS = b"gains = [1.0, 2.0, 3.0]\n[filter]\ncutoff = 20.0\n[payload.tool]\nmass = 2.8\ncom = [0, 0, 0.05]\n"
+TRAJECTORY = (
+    b'robot = "ur5"\nfamily = "fourier"\nperiod = 20.0\nrate = 1000.0\nrepeat = 5\n'
+    b'[[joint]]\nname = "a"\nq0 = 0.1\na = [0.1]\nb = [0.2]\n'
+)
+
+
+def in_folder(read: Callable[[Path], Any]) -> Callable[[Path], Any]:
+    return lambda path: read(path.parent)
+
+
+def robot_toml(tmp: Path) -> bytes:
+    return description.write(tmp / "made.toml", planted.arm()).read_bytes()
+
+
+ARM = load("ur5")
+KINDS: dict[str, tuple[str, Callable[[Path], bytes], Callable[[Path], Any]]] = {
+    "positions": ("m.csv", lambda tmp: poses("q1,q2,q3,x,y,z"), lambda path: read_measurements(path, JOINTS)),
+    "poses": (
+        "m.csv", lambda tmp: b"q1,q2,q3,x,y,z,qx,qy,qz,qw\n" + b"0.1,0.2,0.3,0.4,0.5,0.6,0,0,0,1\n" * 4,
+        lambda path: read_measurements(path, JOINTS),
+    ),
+    "sockets": (
+        "m.csv", lambda tmp: b"q1,q2,q3,tool_position,socket\n" + b"0.1,0.2,0.3,high,0\n0.2,0.3,0.1,high,1\n" * 4,
+        lambda path: read_measurements(path, JOINTS),
+    ),
+    "plan": ("p.csv", lambda tmp: poses("joint1,joint2,joint3"), lambda path: read_poses(path, JOINTS)),
+    "log": ("l.csv", lambda tmp: log(), lambda path: read_recording(path, Joints(JOINTS))),
+    "archive": ("l.npz", lambda tmp: archive(), lambda path: read_recording(path, Joints(JOINTS))),
+    "fit options": ("o.toml", lambda tmp: FIT_OPTIONS, read_options),
+    "identify options": ("o.toml", lambda tmp: IDENTIFY_OPTIONS, identify_options.read_options),
+    "robot.toml": ("r.toml", robot_toml, lambda path: load(path)),
+    "urdf": ("r.urdf", lambda tmp: urdf_write.write_new(ARM).encode(), lambda path: load(path)),
+    "trajectory": ("trajectory.toml", lambda tmp: TRAJECTORY, in_folder(coefficients.read)),
+    "waypoints": (
+        "w.csv", lambda tmp: poses("q1,q2,q3,q4,q5,q6"), lambda path: read_waypoints(path, ARM, ARM.lower, ARM.upper),
+    ),
+}  # fmt: skip
+
+
+def read_damaged(kind: str, data: st.DataObject, tmp_path: Path) -> None:
+    """Read a damaged file: nothing but an error of the toolkit may come of it."""
+    name, make, read = KINDS[kind]
+    content = data.draw(damaged(make(tmp_path)))
+    path = tmp_path / "here" / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(content)
+    try:
+        read(path)
+    except CalibError as error:
+        assert 0 < len(str(error)) < 3000
+    assert path.read_bytes() == content and [one.name for one in path.parent.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@FEW
+@given(data=st.data())
+def test_a_damaged_file_is_read_or_refused(kind: str, data: st.DataObject, tmp_path: Path) -> None:
+    read_damaged(kind, data, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+@MANY
+@given(data=st.data())
+def test_damaged_files_by_the_hundred(kind: str, data: st.DataObject, tmp_path: Path) -> None:
+    read_damaged(kind, data, tmp_path)
+
+
+ODD_MEMBERS = (
+    5, 0.0, "text", True, 1j, [], [np.nan], [[1.0]], np.zeros((6, 6)), np.array(["a", "b", "c"]), np.zeros(3),
+    np.array([1, 2], dtype="datetime64[s]"), np.zeros(2, dtype=[("a", float)]), np.full(3, 1e300), -1, 10**18,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["t", "q", "tau", "joint_names", "use_range", "drive_gain", "rate", "periods"])
+def test_an_archive_with_an_odd_member_is_read_or_refused(name: str, tmp_path: Path) -> None:
+    series = {key: value[:200] for key, value in planted.series(0).items()}
+    for odd in ODD_MEMBERS:
+        read_odd(series, name, odd, tmp_path)
+
+
+def read_odd(series: dict[str, np.ndarray], name: str, odd: Any, tmp_path: Path) -> None:
+    members: dict[str, Any] = series | {"joint_names": np.array(JOINTS)}
+    if name == "rate":
+        del members["t"]
+    np.savez(tmp_path / "l.npz", **(members | {name: odd, "variance_tau": members["tau"] ** 2}))
+    try:
+        read_recording(tmp_path / "l.npz", Joints(JOINTS))
+    except CalibError as error:
+        assert str(error).startswith(str(tmp_path))
