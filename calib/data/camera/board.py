@@ -64,7 +64,7 @@ class Board:
             )
         if self.kind == "chessboard" and min(self.columns, self.rows) < 4:
             raise ValueError("a chessboard needs 4 squares each way at least")
-        if self.tags > (count := dictionary_size(self.dictionary)):
+        if self.dictionary in DICTIONARIES and self.tags > (count := dictionary_size(self.dictionary)):
             raise ValueError(f"{self.tags} markers are needed, the dictionary {self.dictionary} has {count}")
 
     @property

@@ -123,13 +123,13 @@ class CameraView:
         """
         rng, goal = np.random.default_rng(seed), Goal(self.cell, 6, lower, upper)
         result = np.zeros((0, self.cell.chain.n))
-        for _ in range(TRIES):
+        for attempt in range(TRIES):
             wanted = self._views(4 * count, rng)
             targets = invert(wanted) if self.mounting == IN_HAND else wanted
             q = reach(goal, targets, rng.uniform(lower, upper, (len(targets), len(lower))), 30)
             q = q[np.linalg.norm(seen_at(goal, q).poses() - targets, axis=(1, 2)) < 1e-3]
             result = np.concatenate([result, q[feasible(q)] if len(q) else q])
-            if len(result) >= count:
+            if len(result) >= count or (attempt >= TRIES // 10 and len(result) < count // 50):
                 break
         return result[:count]
 

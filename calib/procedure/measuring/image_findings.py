@@ -18,6 +18,7 @@ from calib.procedure.measuring.boards import coverage_words
 
 ODD = 8.0  # sigmas from which on a corner is named (our choice)
 NAMED = 3
+LOOSE = 4.0  # times their stated sigmas that corners lie off within an image, from which on it is worth a word
 
 
 def reprojection(cell: Installation, blocks: Sequence[PoseMeasurements], torques: Torques = None) -> float | None:
@@ -55,6 +56,12 @@ def image_notes(found: GeometricFit) -> list[str]:
             f"rest, {1e3 * noise.displacement:.3f} mm and {1e3 * noise.turn:.3f} mrad per axis and image, is what "
             "the arm does not repeat or the model does not explain"
         )
+        if noise.factor > LOOSE and block.sigma is not None:
+            lines.append(
+                f"{name}: within an image corners lie {noise.factor:.1f} times as far off as their detection explains: "
+                "is the board flat, and does the lens fit (model, camera.yaml)? Options: [camera] board = ['bend'] "
+                "fits a bent board, intrinsics = 'fit' the lens"
+            )
         pixels = block.pixel[block.seen]
         lines.append(f"{name}: {coverage_words(pixels, block.size)}")
         lines += _odd_corners(name, block, part, piece.sigma)

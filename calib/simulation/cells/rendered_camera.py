@@ -20,7 +20,7 @@ from calib.data.camera.lens import Lens, project, rays
 from calib.geometry.images.optics import BoardShape, shaped_points
 
 SUB = 3  # sub-pixels each way
-NODES = 8  # pixels between the nodes at which rays are computed; cubic in between
+NODES = 16  # pixels between the nodes at which rays are computed; cubic in between
 PAPER = 0.02  # white margin around the pattern [m]
 
 
@@ -133,7 +133,7 @@ def _on_sheet(
         rise = shaped_points(board, shape, np.column_stack([hit, np.zeros(len(hit))]))[:, 2]
         depth = (normal @ pose[:3, 3] + rise) / (ray @ normal)
         hit = ((ray * depth[:, None] - pose[:3, 3]) @ turned)[:, :2] / shape.scale
-    nodes = hit.reshape(grid.shape)
+    nodes = hit.reshape(grid.shape).astype(np.float32)  # 1e-4 px
     down, across = (_cubic(count, len(line)) for count, line in zip((high - low)[::-1], knots[::-1]))
     return np.stack([down @ nodes[:, :, k] @ across.T for k in (0, 1)], axis=-1)
 
@@ -142,7 +142,7 @@ def _cubic(count: int, columns: int) -> np.ndarray:
     """Return the matrix that interpolates nodes to the sub-pixels of `count` pixels (Catmull & Rom 1974)."""
     at = (np.arange(count * SUB) + 0.5) / SUB - 0.5 + NODES  # pixels after the first node
     first, t = np.divmod(at / NODES, 1.0)
-    result = np.zeros((len(at), columns))
+    result = np.zeros((len(at), columns), dtype=np.float32)
     weights = [-t * (1 - t) ** 2, 2 - 5 * t**2 + 3 * t**3, t * (1 + 4 * t - 3 * t**2), -(t**2) * (1 - t)]
     for offset, weight in zip((-1, 0, 1, 2), weights):
         result[np.arange(len(at)), first.astype(int) + offset] += 0.5 * weight

@@ -1,0 +1,131 @@
+"""Claims: poses chosen for a camera see the board; boards are made; a session with images goes to its certificate."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from calib.cli import run
+from calib.data.camera.board import read_board
+from calib.data.camera.corner_file import Detection, Found
+from calib.data.poses.image_bags import ImageBag, write_image_folder
+from calib.data.poses.plans import read_poses
+from calib.errors import UsageError
+from calib.geometry.observability import targets_of
+from calib.procedure.kinematic_stage import selection
+from calib.procedure.kinematic_stage.pose_limits import read_limits
+from calib.procedure.kinematic_stage.settings import SelectionSettings
+from calib.procedure.measuring.boards import make
+from calib.procedure.measuring.camera_view import image_observation
+from calib.procedure.session.commands import NewSession, begin, go_on
+from calib.procedure.session.folder import open_session
+from calib.robot.deflection import Deflection
+from calib.robot.load import load
+from calib.simulation.cells import camera_cell as camera
+from calib.simulation.cells import camera_files
+from calib.simulation.cells.cell import SimulatedInstrument
+from calib.simulation.cells.virtual_cells import rigid, virtual_cell
+from poses.space import is_feasible
+
+SILENT = partial(lambda *words: None)
+
+
+@pytest.fixture(scope="module")
+def cell() -> camera.CameraCell:
+    arm = rigid(virtual_cell("lwr4plus", instrument=SimulatedInstrument(encoder_sigma=1e-5)))
+    return camera.camera_cell(arm, lens=camera_files.LENS, reach_of_arm=0.75)
+
+
+def test_a_posture_is_in_view_where_the_cell_sees_the_whole_board(cell):
+    """Against the projection of every corner; the places in the file are rounded to centimetres."""
+    with camera_files.limits_of(cell) as path:
+        limits = read_limits(path, targets_of(cell.cell.nominal))
+    view = limits.camera
+    assert view is not None and "the whole board in the camera's view, its range and its tilt" in limits.checked
+    exact = replace(
+        view, cell=replace(cell.cell.truth, deflection=Deflection()), margin=6.0, tilt=np.pi / 2, span=(0.0, 9.0)
+    )
+    q = camera.views(cell, 200, 3, camera.Views((0.2, 0.7), 0.9, whole=False))
+    seen, kept = camera.visible(cell, q).all(axis=1), (exact(q) <= 0.0).all(axis=1)
+    assert 0.2 < seen.mean() < 0.9 and (seen == kept).mean() > 0.97
+    space = limits.space(image_observation(view, limits.lower, limits.upper))
+    found = view.draw(30, partial(is_feasible, space), limits.lower, limits.upper, 0)
+    assert len(found) == 30 and is_feasible(space, found).all()
+    assert "view past the arm" in limits.checked
+
+
+def test_chosen_poses_see_the_board_and_tell_what_images_tell(cell, tmp_path):
+    with camera_files.limits_of(cell) as path:
+        chosen = selection.choose("lwr4plus", 15, SelectionSettings(candidates=120), constraints=path)
+        limits = read_limits(path, targets_of(cell.cell.nominal))
+    assert chosen.parameters == 42  # 34 of the arm with both placements, 8 of the lens
+    assert chosen.selection.value > 1.05 * chosen.selection.random_baseline
+    assert (limits.camera(chosen.selection.q) <= 1e-8).all()
+
+
+def test_a_camera_that_sees_no_board_is_refused(cell, tmp_path):
+    with camera_files.limits_of(cell) as path:
+        path.write_text(path.read_text().replace("tilt", "# tilt").replace("stands = {xyz = [0", "stands = {xyz = [9"))
+        with pytest.raises(UsageError, match="sees the board at hardly any posture"):
+            selection.choose("lwr4plus", 15, SelectionSettings(candidates=60), constraints=path)
+        path.write_text(path.read_text().replace("camera.yaml", "lens.yaml"))
+        with pytest.raises(UsageError, match=r"camera: no file 'lens.yaml' beside it"):
+            read_limits(path, targets_of(load("lwr4plus")))
+
+
+def test_boards_are_made_and_impossible_ones_refused(tmp_path, capsys):
+    given = ["--square", "25", "--columns", "7", "--rows", "5", "--paper", "A4"]
+    assert run(["board", "--out", str(tmp_path), *given]) == 0
+    made = read_board(tmp_path)
+    assert (made.square, made.columns, made.rows, made.marker) == pytest.approx((0.025, 7, 5, 0.0175))
+    assert (tmp_path / "board.pdf").read_bytes().startswith(b"%PDF") and (tmp_path / "board.svg").exists()
+    for wrong, words in (
+        (["--kind", "dots"], "expected one of charuco, chessboard, apriltag"),
+        (["--paper", "a4"], "squares of 25 mm would fit"),
+        (["--paper", "b5"], "--paper b5: expected one of a4"),
+        (["--dictionary", "5x5"], "dictionary: expected one of"),
+        (["--square", "0"], "square: expected"),
+    ):
+        assert run(["board", "--out", str(tmp_path), *wrong]) == 2
+        assert words in capsys.readouterr().err
+    assert make(tmp_path, "apriltag", 4, 3, 30.0, None, None, None)[0].startswith(
+        "AprilTag grid 4 x 3, 30 mm, 48 corners"
+    )
+
+
+def shots(cell, q, seed, folder):
+    """Write what a detector would have found, as a folder without images."""
+    block = camera.photograph(cell, q, 0.05, seed)
+    images = {name: Detection(pixel, sigma) for name, pixel, sigma in zip(block.names, block.pixel, block.sigma)}
+    images[block.names[2]] = Detection(np.full_like(block.pixel[2], np.nan), block.sigma[2], "blurred: still moving")
+    write_image_folder(
+        ImageBag(block.names, block.joint_names, block.q, Found(images, block.size), ()), block.board, folder
+    )
+
+
+@pytest.mark.slow
+def test_a_session_with_images_goes_to_its_certificate(cell, tmp_path):
+    with camera_files.limits_of(cell) as path:
+        begin(tmp_path / "s", NewSession("lwr4plus", "camera", 30, 10, 0, limits=path, dynamics=False))
+    said: list[str] = []
+    stop = go_on(tmp_path / "s", said.append, SILENT, "test", plots=False)
+    asked = " ".join(stop.lines)
+    assert "take an image of the board" in asked and "joints.csv (image, joint1 [deg]" in asked
+    assert "board.toml" in asked and "3-measured/validation" in asked
+    session, names = open_session(tmp_path / "s"), cell.cell.nominal.joint_names
+    for seed, (plan, name) in enumerate((("poses", "measured"), ("validation", "validation"))):
+        q = read_poses(session.path(f"2-poses/{plan}.csv"), names)
+        shots(cell, q, seed, session.path(f"3-measured/{name}"))
+    stop = go_on(tmp_path / "s", said.append, SILENT, "test", plots=False)
+    told = " ".join(said)
+    assert "of no use (blurred: still moving): 0003.png" in told and "the arm carries the camera" in told
+    assert "the board gives the scale (30 mm a square)" in told
+    assert stop.verdict == "pass"
+    found = json.loads(session.path("5-validation/metrics.json").read_text())
+    unseen = found["validation"]["validation"]
+    assert unseen["reprojection_px"]["calibrated"] < 0.2 < unseen["reprojection_px"]["nominal"]
+    assert go_on(tmp_path / "s", said.append, SILENT, "test", plots=False).verdict == "pass"
