@@ -1,22 +1,23 @@
-"""Least squares under inequalities h(b) >= 0 by a primal-dual interior point, from a triangle of [W y].
+"""Least squares under equalities and inequalities h(b) >= 0 by a primal-dual interior point, from a triangle of [W y].
 
-min ½ ‖R b - z‖² over h(b) = s, s > 0 with the barrier -ν Σ log s. With R from `triangles.combine` it is constrained
+min ½ ‖R b - z‖² under h(b) = s, s > 0 with the barrier -ν Σ log s. With R from `triangles.combine` it is constrained
 least squares, with `instruments.projected` the inner problem of PC-IDIM-IV (Janot's slides on the TX40, where the sign
-of the multipliers' term must be read as minus). Constraints add knowledge, not consistency: where they bind at wrong
-values the estimate is biased, and they do not cure the bias of least squares in a loop.
+of the multipliers' term must be read as minus). Equalities are eliminated beforehand: b = b0 + N t. Constraints add
+knowledge, not consistency: where they bind at wrong values the estimate is biased, and they do not cure the bias of
+least squares in a loop.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
 
 from calib.arrays import frozen, shaped
 from calib.errors import CalibError, NotConverged
-from calib.estimation.triangles import require_rank
+from calib.estimation.triangles import require_rank, retriangulate
 
 Vector = Callable[[np.ndarray], np.ndarray]
 Curvature = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -33,6 +34,7 @@ class Constrained:
         multipliers: (c,) μ >= 0 of the constraints.
         slack: (c,) h(b).
         binding: (c,) bool; where the data want to go on, symptom of a constraint too tight or of a biased estimate.
+        normals: (c, p) ∂h/∂b at the optimum.
         stationarity: largest |Rᵀ(R b - z) - Aᵀ μ| with columns of R of unit norm and ‖z‖ = 1.
         gap: largest μ_i s_i, scaled likewise.
         covariance: (p, p) unscaled (multiply by σ²), binding constraints taken as equalities.
@@ -43,34 +45,201 @@ class Constrained:
     multipliers: np.ndarray
     slack: np.ndarray
     binding: np.ndarray
+    normals: np.ndarray
     stationarity: float
     gap: float
     covariance: np.ndarray
     iterations: int
 
 
-def within(factor: np.ndarray, matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> Constrained:
-    """Minimise ½ ‖R b - z‖² under lower <= A b <= upper; infinite bounds are left out.
+@dataclass(frozen=True)
+class Curved:
+    """Curved constraints h(b) >= 0, each concave.
 
-    Multipliers, slack and binding come in the order of the finite lower bounds, then the finite upper ones.
+    Attributes:
+        h: b (p,) -> (c,).
+        jacobian: b (p,) -> ∂h/∂b (c, p).
+        curvature: b (p,), μ (c,) -> Σ μ_i ∇²h_i (p, p). None: taken as zero; where one binds the steps may then
+            converge slowly or not at all.
+    """
+
+    h: Vector
+    jacobian: Vector
+    curvature: Curvature | None = None
+
+
+def within(
+    factor: np.ndarray, matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray, curved: Curved | None = None
+) -> Constrained:
+    """Minimise ½ ‖R b - z‖² under lower <= A b <= upper, with equality where both are the same, and curved h(b) >= 0.
+
+    Infinite bounds are left out. Multipliers, slack, binding and normals come in the order of the finite lower bounds,
+    the finite upper ones, the curved ones, the equalities, whose multipliers have either sign.
 
     Args:
         factor: (p + 1, p + 1) triangle [R z; 0 ρ], R of full rank.
         matrix: A (c, p); the identity for bounds on single parameters.
         lower, upper: (c,), -inf and inf allowed.
+
+    Raises:
+        CalibError: for crossed bounds, and for equalities that contradict each other or leave nothing to estimate.
+        NotConverged: where inequalities contradict each other.
     """
     p = len(factor) - 1
     matrix = shaped(matrix, (None, p), "constraint matrix A")
     lower, upper = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
     if lower.shape != (len(matrix),) or upper.shape != lower.shape or np.isnan(lower).any() or np.isnan(upper).any():
         raise CalibError(f"bounds: expected {len(matrix)} lower and upper ones, none of them NaN")
-    if (lower >= upper).any():
+    if (lower > upper).any():
         worst = int(np.argmax(lower - upper))
-        raise CalibError(f"bounds: lower {lower[worst]:g} is not below upper {upper[worst]:g} in row {worst}")
-    low, high = np.isfinite(lower), np.isfinite(upper)
+        raise CalibError(f"bounds: lower {lower[worst]:g} is above upper {upper[worst]:g} in row {worst}")
+    same = lower == upper
+    low, high = np.isfinite(lower) & ~same, np.isfinite(upper) & ~same
     rows = np.vstack([matrix[low], -matrix[high]])
     offset = np.concatenate([-lower[low], upper[high]])
-    return minimise(factor, lambda b: rows @ b + offset, lambda b: rows)
+    bent = curved or Curved(lambda b: np.zeros(0), lambda b: np.zeros((0, p)))
+    curvature = bent.curvature
+
+    def h(b: np.ndarray) -> np.ndarray:
+        return np.concatenate([rows @ b + offset, bent.h(b)])
+
+    def jacobian(b: np.ndarray) -> np.ndarray:
+        return np.vstack([rows, bent.jacobian(b)])
+
+    ahead = None if curvature is None else lambda b, mu: curvature(b, mu[len(rows) :])
+    if not same.any():
+        return minimise(factor, h, jacobian, curvature=ahead)
+    return _on_equalities(factor, h, jacobian, ahead, matrix[same], lower[same])
+
+
+def _on_equalities(
+    factor: np.ndarray, h: Vector, jacobian: Vector, curvature: Curvature | None, rows: np.ndarray, held: np.ndarray
+) -> Constrained:
+    """Minimise over b = b0 + N t, E N = 0, E b0 = d, in units that give the columns of R unit norm."""
+    p = len(factor) - 1
+    norms = np.linalg.norm(factor[:p, :p], axis=0)
+    unit = 1.0 / np.where(norms > 0.0, norms, 1.0)
+    scaled = rows * unit
+    size = np.linalg.norm(scaled, axis=1)
+    if not size.all():
+        raise CalibError(f"equality {int(np.argmin(size)) + 1} acts on no parameter")
+    left, values, right = np.linalg.svd(scaled / size[:, None])
+    rank = int(np.sum(values > 1e-10 * values[0]))
+    origin = right[:rank].T @ ((left[:, :rank].T @ (held / size)) / values[:rank])
+    away = np.abs(scaled @ origin - held) / np.maximum(np.abs(held), size * max(float(np.abs(origin).max()), 1e-300))
+    if away.max() > 1e-8:
+        raise CalibError("equalities contradict each other: no point satisfies all of them")
+    if rank == p:
+        raise CalibError(f"equalities fix all {p} parameters: they leave nothing to estimate")
+    origin, basis = unit * origin, unit[:, None] * right[rank:].T
+    reduced = retriangulate(np.column_stack([factor[:, :p] @ basis, factor[:, p] - factor[:, :p] @ origin]))
+    found = minimise(
+        reduced[: p - rank + 1], lambda t: h(origin + basis @ t), lambda t: jacobian(origin + basis @ t) @ basis,
+        curvature=None if curvature is None else lambda t, mu: basis.T @ curvature(origin + basis @ t, mu) @ basis,
+    )  # fmt: skip
+    whole = origin + basis @ found.values
+    normals = jacobian(whole)
+    slope = factor[:p, :p].T @ (factor[:p, :p] @ whole - factor[:p, p]) - normals.T @ found.multipliers
+    pushing = np.linalg.lstsq((scaled / size[:, None]).T, slope * unit)[0] / size
+    return replace(
+        found, values=frozen(whole), covariance=frozen(basis @ found.covariance @ basis.T),
+        multipliers=frozen(np.append(found.multipliers, pushing)),
+        slack=frozen(np.append(found.slack, np.zeros(len(rows)))),
+        binding=frozen(np.append(found.binding, np.ones(len(rows), bool)), bool),
+        normals=frozen(np.vstack([normals, rows])),
+    )  # fmt: skip
+
+
+def contradicting(matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[int, ...]:
+    """Return rows of lower <= A b <= upper that no b satisfies together; none where some b satisfies all.
+
+    A linear program over the excess of each row; the rows are those with a multiplier, Farkas' certificate.
+    """
+    from scipy.optimize import linprog
+
+    unit = np.linalg.norm(matrix, axis=0)
+    scaled = matrix / np.where(unit > 0.0, unit, 1.0)
+    low, high = np.isfinite(lower), np.isfinite(upper)
+    rows = np.vstack([-scaled[low], scaled[high]])
+    limit = np.concatenate([-lower[low], upper[high]])
+    size = np.maximum(np.linalg.norm(rows, axis=1), 1e-300)
+    count, p = rows.shape
+    found = linprog(
+        np.concatenate([np.zeros(p), np.ones(count)]), np.hstack([rows / size[:, None], -np.eye(count)]), limit / size,
+        bounds=[(None, None)] * p + [(0.0, None)] * count,
+    )  # fmt: skip
+    if found.fun <= 1e-9 * max(1.0, float(np.abs(limit / size).max(initial=0.0))):
+        return ()
+    places = np.concatenate([np.flatnonzero(low), np.flatnonzero(high)])
+    return tuple(sorted({int(places[k]) for k in np.flatnonzero(found.ineqlin.marginals < -1e-9)}))
+
+
+def from_free(factor: np.ndarray, free: np.ndarray, normals: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """Return the estimate under A b = d from the free one, b_f - Q⁻¹Aᵀ (A Q⁻¹ Aᵀ)⁻¹ (A b_f - d), Q = RᵀR.
+
+    Gouriéroux & Monfort (1995, section 10.3): under inequalities the same, A and d those that bind.
+
+    Args:
+        factor: (p + 1, p + 1) triangle [R z; 0 ρ].
+        free: (p,) b_f.
+        normals: A (k, p), of full rank.
+        held: d (k,).
+    """
+    p = len(free)
+    turned = scipy.linalg.solve_triangular(factor[:p, :p], normals.T, trans="T")  # R⁻ᵀ Aᵀ
+    push = np.linalg.lstsq(turned, np.linalg.lstsq(turned.T, normals @ free - held)[0])[0]
+    return np.asarray(free - scipy.linalg.solve_triangular(factor[:p, :p], turned @ push))
+
+
+def from_free_holding(moments: np.ndarray, free: np.ndarray, fixed: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """Return the estimate with some parameters held at d, from the free one: b_U + M_UU⁻¹ M_UC (b_C - d).
+
+    M = WᵀW for least squares and Wᵀ P_Z W for two-stage least squares: the optimum under those constraints. M = ZᵀW,
+    as on Janot's slides, solves Z_Uᵀ (y - W b) = 0 instead, with the held columns' instruments left out: as consistent,
+    and not the optimum of ½ ‖P_Z ε‖².
+
+    Args:
+        moments: M (p, p).
+        free: (p,) b.
+        fixed: (p,) bool, C.
+        held: d, one per held parameter.
+    """
+    result = np.array(free, dtype=float)
+    result[fixed] = held
+    left = moments[np.ix_(~fixed, ~fixed)]
+    result[~fixed] += np.linalg.solve(left, moments[np.ix_(~fixed, fixed)] @ (free[fixed] - held))
+    return result
+
+
+def restricted(covariance: np.ndarray, factor: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Return the covariance of an estimate held on A b = d, P C Pᵀ with P = I - Q⁻¹Aᵀ (A Q⁻¹ Aᵀ)⁻¹ A, Q = RᵀR.
+
+    C may be any covariance of the free estimate, that of correlated residuals too.
+
+    Args:
+        covariance: C (p, p).
+        factor: (p + 1, p + 1) triangle [R z; 0 ρ] that the estimate minimises.
+        normals: A (k, p), of any rank.
+    """
+    if not len(normals):
+        return covariance
+    p = len(covariance)
+    norms = np.linalg.norm(factor[:p, :p], axis=0)
+    free = _null_space(normals / norms)
+    if not free.shape[1]:
+        return np.zeros((p, p))
+    upper = factor[:p, :p] / norms
+    shrink = free @ np.linalg.lstsq(upper @ free, upper)[0] * norms / norms[:, None]  # P
+    return np.asarray(shrink @ covariance @ shrink.T)
+
+
+def _null_space(rows: np.ndarray) -> np.ndarray:
+    """Return an orthonormal basis (p, p - rank) of what the rows do not see; exact zeros where they fix a parameter."""
+    size = np.linalg.norm(rows, axis=1)
+    rows = rows[size > 0.0] / size[size > 0.0, None]
+    _, values, right = np.linalg.svd(rows)
+    basis = right[int(np.sum(values > 1e-9)) :].T
+    return np.where(np.abs(basis) < 1e-14, 0.0, basis)
 
 
 def minimise(
@@ -231,7 +400,8 @@ def _result(
 ) -> Constrained:
     """Return the optimum in the caller's units."""
     binding = mu > s
-    normal = problem.jacobian(b)[binding]
+    jacobian = problem.jacobian(b)
+    normal = jacobian[binding]
     free = np.linalg.svd(normal)[2][np.linalg.matrix_rank(normal) :] if binding.any() else np.eye(len(b))
     root = np.linalg.pinv(problem.upper @ free.T)
     spread = free.T @ root * (problem.unit / problem.length)[:, None] if len(free) else np.zeros((len(b), 1))
@@ -239,5 +409,6 @@ def _result(
     multipliers = mu * problem.length**2 / problem.rows
     return Constrained(
         frozen(values), frozen(multipliers), frozen(slack), frozen(binding, bool),
-        residuals[0], residuals[2], frozen(spread @ spread.T), count,
+        frozen(jacobian * problem.rows[:, None] / problem.unit), residuals[0], residuals[2], frozen(spread @ spread.T),
+        count,
     )  # fmt: skip

@@ -8,7 +8,7 @@ The samples stay in memory, since each round weights them anew: meant for decima
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,12 +57,14 @@ class SampleFit:
         noise: (n, n) covariance S of one sample's residual.
         weights: (N,) in 0..1.
         outliers: (N,) bool, samples beyond the gate.
+        factor: (p + 1, p + 1) triangle [R z; 0 ρ] of the samples whitened and weighted.
     """
 
     fit: LinearFit
     noise: np.ndarray
     weights: np.ndarray
     outliers: np.ndarray
+    factor: np.ndarray
 
     @property
     def estimate(self) -> Estimate:
@@ -105,6 +107,7 @@ def irls(
     gate: float | None = 0.999,
     noise: np.ndarray | None = None,
     inflation: float = 1.0,
+    solve: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> SampleFit:
     """Estimate x and S by iteratively reweighted least squares over whole samples (Maronna 1976), with a gate.
 
@@ -115,8 +118,10 @@ def irls(
         data, noise, inflation: as in `gls`.
         loss: one of `robust.LOSSES`.
         gate: probability of a good sample to stay in; None: no gate.
+        solve: triangle [R z; 0 ρ] of a round -> its x (p,); None: that of least squares. Others keep x within
+            constraints, of which the covariance then says nothing.
     """
-    return _iterate(data, row_irls(data), loss, gate, noise, inflation)
+    return _iterate(data, row_irls(data), loss, gate, noise, inflation, solve)
 
 
 def by_joint(data: Samples) -> LinearFit:
@@ -159,8 +164,9 @@ class _Weighing:
 
 
 def _iterate(
-    data: Samples, start: LinearFit, loss: str, gate: float | None, noise: np.ndarray | None, inflation: float
-) -> SampleFit:
+    data: Samples, start: LinearFit, loss: str, gate: float | None, noise: np.ndarray | None, inflation: float,
+    solve: Callable[[np.ndarray], np.ndarray] | None = None,
+) -> SampleFit:  # fmt: skip
     """Alternate S, weights and x until x moves by less than 1e-4 of its standard deviation."""
     how, std = _Weighing(loss, gate, noise is not None), start.group_std
     left = np.sqrt(_share_left(data, std))
@@ -173,7 +179,7 @@ def _iterate(
         if not how.stated:
             covariance = _scatter(data, residual, weights * _consistent(data, how), weights)
         factor, last = _factor(data, covariance, weights), values
-        values = solve_triangle(factor, data.names)[0]
+        values = solve_triangle(factor, data.names)[0] if solve is None else solve(factor)
         if np.sum((factor[:-1, :-1] @ (values - last)) ** 2) <= 1e-8 * len(values):
             return _pack(data, how, values, covariance, size, weights, factor, inflation)
     raise NotConverged("the weights of the samples do not settle; try the other loss or a wider gate", values)
@@ -193,7 +199,7 @@ def _pack(
     estimate = Estimate(data.names, data.units, values, covariance, residual_std, dof)
     outliers = (weights == 0.0) & (data.joints > 0)
     fit = LinearFit(estimate, np.sqrt(np.diag(noise)), *conditions)
-    return SampleFit(fit, frozen(noise), frozen(weights), frozen(outliers, bool))
+    return SampleFit(fit, frozen(noise), frozen(weights), frozen(outliers, bool), frozen(factor))
 
 
 def sizes(residual: np.ndarray, noise: np.ndarray, present: np.ndarray) -> np.ndarray:

@@ -27,7 +27,7 @@ from calib.identification.friction.time_folds import estimate
 from calib.identification.methods.bias import LoopTest, compare_with_loop, require_loop
 from calib.identification.methods.least_squares import residual_inflation, scaled
 from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate
-from calib.identification.methods.registry import method_named
+from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.prediction import Dynamics, Model, predict, transmitted
 from calib.identification.prior import Prior, find_prior
 from calib.identification.rows import (
@@ -150,6 +150,7 @@ def identify_model(
         raise UsageError("no recording to identify from")
     method = method_named(settings.method)
     settings = require_loop(settings) if method.simulates else settings
+    _require_constrainable(method, settings)
     _require_motion(cases)
     noise = _repeats_noise(cases, settings)
     say("base parameters")
@@ -173,6 +174,7 @@ def identify_model(
     problem = IdentificationProblem(
         model, base, cases, decimator, full, (*own, *friction.terms),
         np.concatenate([np.full(base.b, -1), friction.groups]), noise, prior, settings.loop, cad,
+        settings.constraints,
     )  # fmt: skip
     say("simulating the closed loop" if method.simulates else "estimate")
     found = method.estimate(problem)
@@ -360,6 +362,15 @@ def _essential(found: MethodEstimate, settings: IdentificationSettings, prior: P
         drop=[bases.standard_name(name, data.names) for name in settings.drop],
         std=std, inflation=inflation,
     )  # fmt: skip
+
+
+def _require_constrainable(method: Method, settings: IdentificationSettings) -> None:
+    """Refuse constraints that the method would not see."""
+    if settings.constraints is not None and not method.takes_constraints:
+        known = [name for name, one in METHODS.items() if one.takes_constraints]
+        own = f"pc-{method.name}"
+        advice = f"take '{own}'" if own in known else f"methods that do: {', '.join(known)}"
+        raise UsageError(f"[constraints]: method '{method.name}' does not know them; {advice}")
 
 
 def _require_motion(cases: Sequence[Case]) -> None:

@@ -4,7 +4,8 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
 
     friction = "auto"                # auto, standard, or a rung: load, presliding, stribeck, asymmetric, root, cubic,
                                      # ripple
-    method = "wls"                   # ols, wls, irls, tls; iv and didim simulate the closed loop, see [loop]
+    method = "wls"                   # ols, wls, irls, tls; iv and didim simulate the closed loop, see [loop]; pc-ols,
+                                     # pc-wls, pc-irls, pc-iv, pc-didim: the same under [constraints]
     weights = "residuals"            # of the joints' rows in wls: from their residuals; repeats: from the variance over
                                      # the periods that `calib recall` averaged, relative between joints
     drives = "Ia Fv Fc off"          # a text for all joints, or one per joint; default by rows: motor as here, link
@@ -58,6 +59,14 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     loaded = "run_load.npz"
     [loop]                           # the closed loop they came from: see calib.identification.loop.loop_settings
     controller = "identify"
+    [constraints]                    # what parameters must satisfy, for the methods pc-*
+    signs = true                     # inertia and friction of drives are not negative
+    inertia = 50                     # random postures in which M(q) is positive definite; 0: not asked
+    bounds = { Fv1 = [0.5, 5.0], ZZ1R = [0.0, inf] }   # [lower, upper]; both alike fix a parameter
+    [[constraints.sum]]              # a weighted sum of parameters: equal, or least and most
+    weights = { Fv5 = 1.0, Fv6 = -1.0 }
+    equal = 0.0
+    name = "wrist joints alike"
     [files."run_load.npz"]           # for this file only: payload, gains, reference; keys of filter and recording
     payload = ["tool"]
 """
@@ -99,6 +108,7 @@ from calib.dynamics.torque_rows import ROWS, TorqueRows
 from calib.errors import CalibError, UsageError
 from calib.identification.friction.friction_ladder import NAMES
 from calib.identification.loop.loop_settings import LoopSettings, check_loop
+from calib.identification.methods.constraints import ConstraintSettings
 from calib.identification.methods.registry import METHODS
 from calib.identification.settings import PRIORS, RULES, WEIGHTS, Coupling, IdentificationSettings, Payload
 
@@ -171,6 +181,7 @@ class OptionsFile:
     term: tuple[TermTable, ...] = ()
     payload: Mapping[str, Payload] = field(default_factory=dict)
     loop: Annotated[LoopSettings, Checked(check_loop)] | None = None
+    constraints: ConstraintSettings | None = None
     slow: Annotated[float | tuple[float, ...], OneOrMany(Real(above=0))] | None = None
     cut_slow: Flag = False
     accept: tuple[Annotated[str, OneOf(FINDINGS)], ...] = ()

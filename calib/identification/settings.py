@@ -17,6 +17,7 @@ from calib.dynamics.shapes import V0
 from calib.dynamics.torque_rows import MOTOR, TorqueRows
 from calib.errors import UsageError
 from calib.identification.loop.loop_settings import LoopSettings
+from calib.identification.methods.constraints import ConstraintSettings
 from calib.robot.chain import Chain
 
 T = TypeVar("T")
@@ -66,6 +67,7 @@ class IdentificationSettings:
         samples: most rows (per torque) that are held; of longer recordings every second, third, ... row alone.
         folds: number of time blocks for cross-validation.
         loop: the closed loop that recordings came from, for instrumental variables.
+        constraints: what parameters must satisfy, for the methods pc-*; None: their defaults.
         seed: for random states.
     """
 
@@ -89,6 +91,7 @@ class IdentificationSettings:
     samples: int = 20_000
     folds: int = 6
     loop: LoopSettings | None = None
+    constraints: ConstraintSettings | None = None
     seed: int = 0
 
 

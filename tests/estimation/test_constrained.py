@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from calib.errors import CalibError, NotConverged, Unidentifiable
-from calib.estimation.constrained import minimise, within
+from calib.estimation.constrained import (
+    contradicting,
+    from_free,
+    from_free_holding,
+    minimise,
+    restricted,
+    within,
+)
+from calib.estimation.instrumental_variables import instrument, projected
 from calib.estimation.linear import ols
 from calib.estimation.triangles import collect, combine
 
@@ -115,3 +123,80 @@ def test_dependent_columns_are_refused():
     matrix[:, 1] = matrix[:, 0]
     with pytest.raises(Unidentifiable):
         within(combine(collect(matrix, target)), np.eye(8), np.zeros(8), np.ones(8))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_equalities_beside_inequalities_give_the_optimum_of_cvxpy(seed):
+    cvxpy = pytest.importorskip("cvxpy")
+    matrix, target, rng = problem(seed)
+    unit = np.linalg.norm(matrix, axis=0)
+    rows = rng.normal(size=(6, 8)) * unit
+    lower, upper = np.full(6, -0.1), np.full(6, np.inf)
+    lower[:2] = upper[:2] = [0.2, -0.1]
+    found = within(combine(collect(matrix, target)), rows, lower, upper)
+    b = cvxpy.Variable(8)
+    conditions = [(rows[:2] / unit) @ b == lower[:2], (rows[2:] / unit) @ b >= -0.1]
+    cvxpy.Problem(cvxpy.Minimize(0.5 * cvxpy.sum_squares(target - (matrix / unit) @ b)), conditions).solve(
+        solver="CLARABEL", tol_gap_abs=1e-12, tol_gap_rel=1e-12, tol_feas=1e-12
+    )
+    assert found.values * unit == pytest.approx(b.value, abs=1e-6 * np.abs(b.value).max())
+    assert rows[:2] @ found.values == pytest.approx(lower[:2], rel=1e-9)
+    slope = matrix.T @ (matrix @ found.values - target)
+    assert found.normals.T @ found.multipliers == pytest.approx(slope, abs=1e-6 * np.abs(matrix.T @ target).max())
+    assert found.multipliers[:4] == pytest.approx(conditions[1].dual_value, abs=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_gourieroux_and_monfort_lead_from_the_free_estimate_to_the_solvers(seed):
+    """With the constraints that bind as equalities, in the general form; with held parameters, in the partition's."""
+    matrix, target, _ = problem(seed)
+    triangle, free = combine(collect(matrix, target)), np.linalg.lstsq(matrix, target)[0]
+    found = within(triangle, np.eye(8), np.zeros(8), np.full(8, np.inf))
+    normals = found.normals[found.binding]
+    assert from_free(triangle, free, normals, np.zeros(len(normals))) == pytest.approx(found.values, abs=1e-6)
+    other = from_free_holding(matrix.T @ matrix, free, found.binding, np.zeros(int(found.binding.sum())))
+    unit = np.linalg.norm(matrix, axis=0)
+    assert other * unit == pytest.approx(found.values * unit, abs=1e-6 * np.linalg.norm(target))
+
+
+def test_the_slides_relation_for_instruments_is_not_the_optimum_of_two_stage_least_squares():
+    rng = np.random.default_rng(0)
+    instruments = rng.normal(size=(400, 3))
+    matrix = instruments + 0.5 * rng.normal(size=(400, 3)) @ rng.normal(size=(3, 3))
+    target = matrix @ [1.0, -0.5, 2.0] + rng.normal(size=400)
+    found = instrument(instruments, matrix, target)
+    triangle, cross = projected(found), instruments.T @ matrix
+    free = np.linalg.solve(cross, instruments.T @ target)
+    solved = within(triangle, np.eye(3), np.zeros(3), np.full(3, np.inf))
+    assert solved.binding.tolist() == [False, True, False]
+    moments = triangle[:3, :3].T @ triangle[:3, :3]
+    assert from_free_holding(moments, free, solved.binding, np.zeros(1)) == pytest.approx(solved.values, abs=1e-7)
+    slides = from_free_holding(cross, free, solved.binding, np.zeros(1))
+    rest = instruments[:, [0, 2]]
+    assert rest.T @ (target - matrix @ slides) == pytest.approx(np.zeros(2), abs=1e-9)
+    assert np.abs(slides - solved.values).max() > 1e-4
+
+
+def test_the_restricted_covariance_is_that_of_estimates_over_many_noises():
+    rng = np.random.default_rng(3)
+    matrix, normals = rng.normal(size=(60, 4)), np.array([[1.0, -1.0, 0.0, 0.0]])
+    triangles = [combine(collect(matrix, matrix @ np.ones(4) + rng.normal(size=60))) for _ in range(3000)]
+    free = [np.linalg.solve(one[:4, :4], one[:4, 4]) for one in triangles]
+    drawn = np.array([from_free(one, b, normals, np.zeros(1)) for one, b in zip(triangles, free)])
+    covariance = restricted(np.linalg.inv(matrix.T @ matrix), triangles[0], normals)
+    assert np.cov(drawn.T) == pytest.approx(covariance, abs=0.1 * covariance.max())
+    assert normals @ covariance == pytest.approx(np.zeros((1, 4)), abs=1e-15)
+
+
+def test_equalities_that_contradict_or_determine_everything_are_refused():
+    matrix, target, _ = problem(5)
+    triangle = combine(collect(matrix, target))
+    twice, values = np.vstack([np.eye(8)[:1], 2.0 * np.eye(8)[:1]]), np.array([1.0, 3.0])
+    with pytest.raises(CalibError, match="contradict"):
+        within(triangle, twice, values, values)
+    with pytest.raises(CalibError, match="nothing to estimate"):
+        within(triangle, np.eye(8), np.ones(8), np.ones(8))
+    found = within(triangle, twice, np.array([1.0, 2.0]), np.array([1.0, 2.0]))
+    assert found.values[0] == pytest.approx(1.0)
+    assert contradicting(twice, np.array([1.0, 3.0]), np.array([np.inf, np.inf])) == ()
+    assert contradicting(twice, np.array([2.0, -np.inf]), np.array([np.inf, 3.0])) == (0, 1)

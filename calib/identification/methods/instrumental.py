@@ -5,8 +5,8 @@
 (Janot, Vandanjon & Gautier 2014). Same reference, same controller: the simulation feels what the robot was asked to do,
 and not its noise, so Z is uncorrelated with the noise that the feedback brings into W. It starts from a regular robot:
 inertia diag(J), no gravity, no friction. DIDIM (Gautier, Janot & Vandanjon 2013) estimates from the simulated W alone,
-x_{k+1} = W_s⁺ y. Inequalities on base parameters make it PC-IDIM-IV (`calib.estimation.constrained`); they do not cure
-a bias.
+x_{k+1} = W_s⁺ y. Constraints on base parameters, min ½ ‖P_Z (y - W x)‖² in every round, make it PC-IDIM-IV
+(`calib.identification.methods.constraints`); they do not cure a bias.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from calib.dynamics.drives import standard
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import CalibError, CannotSimulate, Diverged, NotConverged, UsageError
 from calib.estimation import instrumental_variables
-from calib.estimation.constrained import Constrained, within
 from calib.estimation.instrumental_variables import ExogeneityTest, Instruments, InstrumentStrength
 from calib.estimation.linear import LinearFit, settled_std, wls
-from calib.estimation.triangles import absorb, empty, residual_squares, select
+from calib.estimation.triangles import Triangles, absorb, combine, empty, residual_squares, select
 from calib.estimation.whiteness import inflation
 from calib.identification.cases import Case
 from calib.identification.loop.loop_recordings import Loop
+from calib.identification.methods.constraints import Constraints, Held, hold, signs
 from calib.identification.rows import ObservationRows, observe
 from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, inertia_diagonal, simulate, with_parameters
 from calib.simulation.loop.controllers import scaled
@@ -48,11 +48,13 @@ class RoundEstimator:
     Attributes:
         name: what options and files call it.
         fit: of triangles, (g,) std of the groups and inflation.
+        triangle: [R z; 0 ρ] that it minimises, of triangles and (g,) std: where constraints enter.
         measured: whether the measured motion, W, is in the estimate.
     """
 
     name: str
     fit: Callable[[Instruments, np.ndarray, float], LinearFit]
+    triangle: Callable[[Instruments, np.ndarray], np.ndarray]
     measured: bool
 
 
@@ -90,7 +92,7 @@ class Instrumental:
         std, inflation: of the rows, (rows,), and of all together.
         distance: (n,) 100 ‖q - q_s‖ / ‖q - mean q‖ [%] of filtered measured and simulated positions: large where the
             controller is not the robot's.
-        constrained: the optimum under constraints, where there are any; `fit` has its values and covariance.
+        constrained: what constraints made of the estimate, where there are any; `fit` has its values and covariance.
         problem: triangles of [Z W y], one group per torque row.
         estimator: what each round made of them.
     """
@@ -105,7 +107,7 @@ class Instrumental:
     std: np.ndarray
     inflation: float
     distance: np.ndarray
-    constrained: Constrained | None
+    constrained: Held | None
     problem: Instruments
     estimator: RoundEstimator
 
@@ -147,6 +149,7 @@ def identify_instrumental(
     columns: np.ndarray | None = None,
     inertia: np.ndarray | None = None,
     positive: Sequence[str] = (),
+    constraints: Constraints | None = None,
     tolerance: float = 0.025,
     limit: int = LIMIT,
 ) -> Instrumental:
@@ -162,6 +165,7 @@ def identify_instrumental(
         inertia: (n,) of the regular robot it starts from [kg m²]; None: kd² / (2 kp), for which the first controller
             would be damped by 0.7.
         positive: names of base parameters that must not be negative (PC-IDIM-IV).
+        constraints: on the base parameters that are estimated; None: those of `positive`.
         tolerance: of parameters and of the residual, relative.
         limit: most iterations.
 
@@ -174,7 +178,10 @@ def identify_instrumental(
         raise UsageError(f"method '{method}' is none of {', '.join(ROUNDS)}")
     if not model.torque_rows.motors_alone or not cases:
         raise UsageError("instruments from simulation need motor torques, and a recording with its reference")
-    task = _task(model, base, cases, decimator, ROUNDS[method], columns, positive)
+    task = _task(model, base, cases, decimator, ROUNDS[method], columns)
+    if constraints is None and positive:
+        constraints = signs(task.observed[0].names, positive)
+    task = replace(task, constraints=constraints)
     ordinary = _ordinary(task.observed)
     plant, std = _regular(model, cases[0][1], inertia), ordinary.group_std
     before: LinearFit | None = None
@@ -214,7 +221,7 @@ class _Fixed:
     decimator: Decimator
     observed: Sequence[ObservationRows]
     estimator: RoundEstimator
-    positive: Sequence[str]
+    constraints: Constraints | None = None
 
     def standard(self, values: np.ndarray) -> np.ndarray:
         """Return standard parameters with the values of those base parameters that are estimated."""
@@ -230,17 +237,17 @@ class _Found:
     problem: Instruments
     fit: LinearFit
     tau: float
-    bound: Constrained | None
+    bound: Held | None
 
 
 def _task(
     model: IdentificationModel, base: Base, cases: Sequence[tuple[Case, Loop]], decimator: Decimator,
-    estimator: RoundEstimator, columns: np.ndarray | None, positive: Sequence[str],
+    estimator: RoundEstimator, columns: np.ndarray | None,
 ) -> _Fixed:  # fmt: skip
     kept = np.arange(base.b) if columns is None else np.asarray(columns, dtype=int)
     observed = [observe(model, base.kept[kept], case, decimator) for case, _ in cases]
     observed = [replace(rows, names=tuple(base.names[k] for k in kept)) for rows in observed]
-    return _Fixed(model, base, kept, cases, decimator, observed, estimator, positive)
+    return _Fixed(model, base, kept, cases, decimator, observed, estimator)
 
 
 def _estimate_round(task: _Fixed, runs: Runs, std: np.ndarray, tau: float) -> _Found:
@@ -251,7 +258,7 @@ def _estimate_round(task: _Fixed, runs: Runs, std: np.ndarray, tau: float) -> _F
         for (case, loop), run in runs
     ]
     problem = _stack(task.observed, simulated)
-    fit, bound = _constrain(problem, task.estimator.fit(problem, std, tau), std, task.positive)
+    fit, bound = _held_fit(task, problem, std, tau)
     return _Found(problem, fit, _inflation(task.observed, fit), bound)
 
 
@@ -259,13 +266,12 @@ def _result(
     task: _Fixed, found: _Found, ordinary: LinearFit, plant: Plant, rounds: Sequence[Round], std: np.ndarray, runs: Runs
 ) -> Instrumental:  # fmt: skip
     """Return the last round, sigmas with its own inflation, with what the tests say of it."""
-    fit = task.estimator.fit(found.problem, std, found.tau)
-    fit = replace(fit, estimate=replace(fit.estimate, values=found.fit.estimate.values))
+    fit, bound = _held_fit(task, found.problem, std, found.tau)
     verdict = instrumental_variables.exogeneity(found.problem, std, found.tau)
     strength = instrumental_variables.strength(found.problem, std)
     return Instrumental(
         fit, ordinary, frozen(task.kept, int), plant, tuple(rounds), strength, verdict, frozen(std), found.tau,
-        _distance(runs), found.bound, found.problem, task.estimator,
+        _distance(runs), bound, found.problem, task.estimator,
     )  # fmt: skip
 
 
@@ -371,9 +377,12 @@ def _ordinary(observed: Sequence[ObservationRows]) -> LinearFit:
 
 def _from_simulation(problem: Instruments, std: np.ndarray, tau: float) -> LinearFit:
     """Return DIDIM's estimate, from [Z y] alone."""
-    p = len(problem.names)
-    simulated = replace(select(problem.data, np.arange(p)), names=problem.names)
-    return wls(simulated, std, np.full(problem.data.groups, tau))
+    return wls(_simulated(problem), std, np.full(problem.data.groups, tau))
+
+
+def _simulated(problem: Instruments) -> Triangles:
+    """Return the triangles of [Z y]."""
+    return replace(select(problem.data, np.arange(len(problem.names))), names=problem.names)
 
 
 def _inflation(observed: Sequence[ObservationRows], fit: LinearFit) -> float:
@@ -383,20 +392,13 @@ def _inflation(observed: Sequence[ObservationRows], fit: LinearFit) -> float:
     return max(1.0, float(np.mean([inflation(longest[:, row]) for row in range(longest.shape[1])])))
 
 
-def _constrain(
-    problem: Instruments, fit: LinearFit, std: np.ndarray, positive: Sequence[str]
-) -> tuple[LinearFit, Constrained | None]:
-    """Return the estimate under x_j >= 0 for the names given (two-stage least squares; see the module)."""
-    if not positive:
+def _held_fit(task: _Fixed, problem: Instruments, std: np.ndarray, tau: float) -> tuple[LinearFit, Held | None]:
+    """Return a round's estimate, under the constraints where there are any."""
+    fit, own = task.estimator.fit(problem, std, tau), task.estimator
+    if task.constraints is None:
         return fit, None
-    unknown = [name for name in positive if name not in problem.names]
-    if unknown:
-        raise UsageError(f"'{unknown[0]}' is none of the estimated parameters {', '.join(problem.names)}")
-    lower = np.where([name in positive for name in problem.names], 0.0, -np.inf)
-    found = within(
-        instrumental_variables.projected(problem, std), np.eye(len(lower)), lower, np.full(len(lower), np.inf)
-    )
-    return replace(fit, estimate=replace(fit.estimate, values=found.values)), found
+    data = instrumental_variables.least_squares(problem) if own.measured else _simulated(problem)
+    return hold(fit, own.triangle(problem, std), data, std, task.constraints, stated=not own.measured)
 
 
 def _change(before: LinearFit | None, now: LinearFit) -> float:
@@ -420,7 +422,7 @@ def _distance(runs: Runs) -> np.ndarray:
 ROUNDS = {
     one.name: one
     for one in (
-        RoundEstimator("iv", instrumental_variables.iv, True),
-        RoundEstimator("didim", _from_simulation, False),
+        RoundEstimator("iv", instrumental_variables.iv, instrumental_variables.projected, True),
+        RoundEstimator("didim", _from_simulation, lambda problem, std: combine(_simulated(problem), std), False),
     )
 }

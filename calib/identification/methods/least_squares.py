@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -10,11 +10,12 @@ import numpy as np
 import scipy.linalg
 
 from calib.estimation.linear import LinearFit, ols, ridge, settled_std, wls
-from calib.estimation.samples import irls, stack
+from calib.estimation.samples import SampleFit, irls, stack
 from calib.estimation.total import tls
 from calib.estimation.triangles import Triangles, combine, residual_squares, retriangulate
 from calib.estimation.whiteness import inflation
 from calib.identification.friction.time_folds import estimate
+from calib.identification.methods.constraints import Constraints, hold
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, MethodEstimate, attempted
 from calib.identification.prior import Prior, bounded
 from calib.identification.rows import ObservationRows
@@ -44,6 +45,10 @@ class LeastSquares:
 
     @property
     def simulates(self) -> bool:
+        return False
+
+    @property
+    def takes_constraints(self) -> bool:
         return False
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
@@ -165,11 +170,67 @@ def _bounded(
     return bounded(retriangulate(np.vstack([combine(data, std), rows])), nonnegative)
 
 
+@dataclass(frozen=True)
+class ConstrainedLeastSquares:
+    """A method that solves the rows directly, under constraints: physically consistent least squares.
+
+    Weights are those that the residuals of the free estimate tell; only IRLS weighs by those of the constrained one,
+    as there a sample's weight hangs on it.
+
+    Attributes:
+        name, assumes: see `calib.identification.methods.method.Method`.
+        free: the method without constraints.
+    """
+
+    name: str
+    assumes: str
+    free: LeastSquares
+
+    @property
+    def takes_prior(self) -> bool:
+        return False
+
+    @property
+    def simulates(self) -> bool:
+        return False
+
+    @property
+    def takes_constraints(self) -> bool:
+        return True
+
+    def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
+        """Return the estimate under the problem's constraints; its covariance takes those that bind as equalities.
+
+        Raises:
+            UsageError: for constraints that cannot be.
+        """
+        constraints = problem.constrained
+        return attempted(self.name, problem, lambda: self._estimate(problem, constraints))
+
+    def _estimate(self, problem: IdentificationProblem, constraints: Constraints) -> MethodEstimate:
+        std, tau = _weighing(problem)
+        pooled, free = problem.pooled, self.free.solve(problem, std, tau)
+        weights = std if self.free.weighted else np.ones(len(std))
+        factor = combine(pooled, weights)
+        if self.free is IRLS:
+            factor = _reweighted(problem, tau, lambda triangle: constraints.solve(triangle).values).factor
+        fit, held = hold(free, factor, pooled, weights, constraints, stated=self.free.weighted)
+        return MethodEstimate(
+            self.name, EstimateStatus.FOUND, fit, pooled, std, tau, self.free.weighted, held=held
+        )  # fmt: skip
+
+
 def _irls(problem: IdentificationProblem, std: np.ndarray, tau: np.ndarray) -> LinearFit:
+    return _reweighted(problem, tau).fit
+
+
+def _reweighted(
+    problem: IdentificationProblem, tau: np.ndarray, solve: Callable[[np.ndarray], np.ndarray] | None = None
+) -> SampleFit:
     rows = problem.rows
     matrix, target, present = (np.concatenate([getattr(part, key) for part in rows]) for key in _STACKED)
     samples = stack(matrix, target, present, rows[0].names, rows[0].units)
-    return irls(samples, inflation=float(np.median(tau))).fit
+    return irls(samples, inflation=float(np.median(tau)), solve=solve)
 
 
 _STACKED = ("matrix", "target", "present")
@@ -192,3 +253,7 @@ TLS = LeastSquares(
     "residuals, all up to one factor that the data tell, independently from row to row; offsets and signs are exact",
     lambda problem, std, tau: scaled_tls(problem.pooled, std, problem.exact),
 )
+_CONSISTENT = "; parameters satisfy [constraints]"
+PC_OLS = ConstrainedLeastSquares("pc-ols", OLS.assumes + _CONSISTENT, OLS)
+PC_WLS = ConstrainedLeastSquares("pc-wls", WLS.assumes + _CONSISTENT, WLS)
+PC_IRLS = ConstrainedLeastSquares("pc-irls", IRLS.assumes + _CONSISTENT, IRLS)

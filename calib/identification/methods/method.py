@@ -28,6 +28,7 @@ from calib.estimation.triangles import Triangles
 from calib.identification.cases import Case
 from calib.identification.loop.loop_recordings import ClosedLoops
 from calib.identification.loop.loop_settings import LoopSettings
+from calib.identification.methods.constraints import Constraints, ConstraintSettings, Held, make_constraints
 from calib.identification.methods.instrumental import Instrumental
 from calib.identification.prior import Prior
 from calib.identification.rows import ObservationRows, pool, triangulate
@@ -67,6 +68,7 @@ class IdentificationProblem:
         prior: of the base parameters; None where nothing is known beforehand.
         loop: the closed loop that the recordings came from; None where none is stated.
         cad: standard parameters of the bodies by the robot's description, for a loop that feeds them forward.
+        constraints: what the options ask of the estimate of a method that takes constraints; None: the defaults.
     """
 
     model: RegressorModel
@@ -80,6 +82,7 @@ class IdentificationProblem:
     prior: Prior | None = None
     loop: LoopSettings | None = None
     cad: np.ndarray | None = None
+    constraints: ConstraintSettings | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "groups", frozen(self.groups, int))
@@ -88,6 +91,17 @@ class IdentificationProblem:
     def pooled(self) -> Triangles:
         """Triangles of all rows, one group per torque row."""
         return pool(triangulate(self.rows), self.rows[0].target.shape[1])
+
+    @cached_property
+    def constrained(self) -> Constraints:
+        """What the columns must satisfy.
+
+        Raises:
+            UsageError: see `make_constraints`.
+        """
+        settings = self.constraints or ConstraintSettings()
+        names = (*self.base.names, *self.rows[0].names[self.base.b :])
+        return make_constraints(settings, self.model, self.base, names, self.terms)
 
     @property
     def nonnegative(self) -> np.ndarray:
@@ -119,6 +133,7 @@ class MethodEstimate:
         failure: why there is no solution, and what to do.
         instrumental: what the simulated closed loop says besides, where the method simulates.
         loops: what was simulated.
+        held: what constraints made of it, where the method takes them.
     """
 
     method: str
@@ -135,6 +150,7 @@ class MethodEstimate:
     failure: Unidentifiable | NotConverged | None = None
     instrumental: Instrumental | None = None
     loops: ClosedLoops | None = None
+    held: Held | None = None
 
     @property
     def found(self) -> bool:
@@ -188,6 +204,11 @@ class Method(Protocol):
     @property
     def simulates(self) -> bool:
         """Whether it needs a closed loop, and a model that can be simulated."""
+        ...
+
+    @property
+    def takes_constraints(self) -> bool:
+        """Whether its estimate satisfies what the options' [constraints] ask."""
         ...
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:

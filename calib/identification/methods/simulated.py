@@ -21,11 +21,13 @@ class Simulated:
         name, assumes: see `calib.identification.methods.method.Method`.
         instruments: what it makes of the simulated motion, see `calib.identification.methods.instrumental.ROUNDS`;
             "": what the loop's settings say.
+        takes_constraints: see `calib.identification.methods.method.Method`.
     """
 
     name: str
     assumes: str
     instruments: str = ""
+    takes_constraints: bool = False
 
     @property
     def takes_prior(self) -> bool:
@@ -64,11 +66,12 @@ class Simulated:
         found = identify_instrumental(
             model, problem.base, loops.pairs, problem.decimator, method=self.instruments or loop.instruments,
             inertia=per_joint(loop, "inertia", model.n) if loop.inertia else None, positive=loop.positive,
+            constraints=problem.constrained if self.takes_constraints else None,
         )  # fmt: skip
         return replace(
             plain, method=self.name, solution=found.fit, std=found.std, iterations=len(found.rounds),
             simulations=len(loops.pairs) * sum(1 + one.retreats for one in found.rounds), beforehand=None,
-            instrumental=found, loops=loops,
+            instrumental=found, loops=loops, held=found.constrained,
         )  # fmt: skip
 
 
@@ -81,3 +84,5 @@ DIDIM = Simulated(
     "that of the robot; no measured position takes part",
     "didim",
 )
+PC_IV = Simulated("pc-iv", f"{IV.assumes}; parameters satisfy [constraints]", "iv", takes_constraints=True)
+PC_DIDIM = Simulated("pc-didim", f"{DIDIM.assumes}; parameters satisfy [constraints]", "didim", takes_constraints=True)

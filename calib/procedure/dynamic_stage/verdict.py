@@ -187,6 +187,8 @@ def model_warnings(
         )
     if excitation and all(report.poor for report in excitation.values()) and found.settings.friction == "auto":
         told.append("friction: standard only, since on so poor a motion no block of time judges another")
+    if found.fitted.held is not None:
+        told += found.fitted.held.lines()
     told += found.bias.lines(found.fitted.instrumental is not None)
     told += _rests(found)
     told += _elastic(cases)

@@ -18,6 +18,7 @@ from calib.estimation import instrumental_variables
 from calib.identification.cases import make_case
 from calib.identification.loop.controller import identify_controller
 from calib.identification.loop.loop_recordings import Loop
+from calib.identification.methods.constraints import ConstraintSettings, make_constraints
 from calib.identification.methods.instrumental import identify_instrumental
 from calib.robot import mdh
 from calib.simulation.loop import controllers, references
@@ -118,6 +119,20 @@ def test_didim_and_constraints_come_to_the_same():
     assert np.allclose(plain.fit.estimate.values, positive.fit.estimate.values, atol=1e-6)
     assert error(didim.fit.estimate) < 0.05 and error(plain.fit.estimate) < 0.05
     assert error(plain.ordinary.estimate) > 2.0 * error(plain.fit.estimate)
+
+
+def test_a_bound_that_binds_leaves_no_spread_of_its_parameter_and_less_of_the_others():
+    case = log(1e-3, 3, np.inf)
+    plain = found(case, v0=np.inf)
+    names = list(plain.names)
+    place = names.index("Fv1")
+    _, model, base = arm(np.inf)
+    limit = 1.3 * plain.fit.estimate.values[place]
+    bounds = ConstraintSettings(signs=False, inertia=10, bounds={names[place]: (limit, np.inf)})
+    held = found(case, v0=np.inf, constraints=make_constraints(bounds, model, base, base.names, [None] * base.b))
+    assert held.fit.estimate.values[place] == pytest.approx(limit, rel=1e-6)
+    assert held.fit.estimate.sigma[place] < 1e-9 * plain.fit.estimate.sigma[place]
+    assert held.constrained is not None and "sits on its bound" in held.constrained.lines()[0]
 
 
 @pytest.mark.parametrize("wrong", [controllers.slower(PD, 3.0), controllers.pd(1.4 * PD.kp, 0.7 * PD.kd)])

@@ -1,0 +1,147 @@
+"""Claims of the PC methods: constraints by name hold, cost what they must, and those that say nothing are refused."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import replace
+
+import numpy as np
+import planted_motion as planted
+import pytest
+
+from calib.errors import UsageError
+from calib.estimation.triangles import combine
+from calib.identification.identify import chain_states, common_decimator, find_base, identify
+from calib.identification.identify_options import parse_options
+from calib.identification.methods.constraints import LEAST, ConstraintSettings, WeightedSum
+from calib.identification.methods.method import IdentificationProblem
+from calib.identification.methods.registry import METHODS
+from calib.identification.rows import observe
+from calib.identification.settings import IdentificationSettings, make_model
+
+FREE = {"pc-ols": "ols", "pc-wls": "wls", "pc-irls": "irls"}
+
+
+@pytest.fixture(scope="module")
+def problem() -> IdentificationProblem:
+    settings, cases = IdentificationSettings(), [planted.case("a", 0)]
+    model, decimator = make_model(planted.arm(), settings), common_decimator(cases, settings)
+    base = find_base(model, cases, chain_states(planted.arm(), model))
+    rows = tuple(observe(model, base.kept, case, decimator) for case in cases)
+    terms = [None if k < model.inertial else model.columns[k - model.inertial] for k in base.kept]
+    return IdentificationProblem(model, base, cases, decimator, rows, tuple(terms), np.full(base.b, -1))
+
+
+def asked(problem: IdentificationProblem, **settings) -> IdentificationProblem:
+    return replace(problem, constraints=ConstraintSettings(**settings))
+
+
+def value(found, name: str) -> float:
+    return float(found.estimate.values[found.estimate.names.index(name)])
+
+
+@pytest.mark.parametrize("name", FREE)
+def test_constraints_that_do_not_bind_change_nothing(problem, name):
+    held, free = METHODS[name].estimate(problem), METHODS[FREE[name]].estimate(problem)
+    moved = (held.estimate.values - free.estimate.values) / free.estimate.sigma
+    assert np.abs(moved).max() < 0.02
+    assert np.allclose(held.estimate.sigma, free.estimate.sigma, rtol=1e-3)
+    assert held.held is not None and not held.held.binding and held.held.lines() == []
+
+
+@pytest.mark.parametrize("name", FREE)
+def test_a_bound_that_excludes_the_truth_holds_and_is_told(problem, name):
+    free = METHODS[FREE[name]].estimate(problem)
+    limit = 1.2 * value(free, "Fv1")
+    found = METHODS[name].estimate(asked(problem, bounds={"Fv1": (limit, np.inf)}))
+    assert value(found, "Fv1") == pytest.approx(limit, rel=1e-6)
+    place = found.estimate.names.index("Fv1")
+    assert found.estimate.sigma[place] < 1e-9 * free.estimate.sigma[place]
+    others = np.arange(len(found.estimate.names)) != place
+    assert np.all(found.estimate.sigma[others] > 0.0)
+    assert found.held is not None and [one.name for one in found.held.binding] == [f"Fv1 >= {limit:g}"]
+    assert found.held.binding[0].multiplier > 0.0
+    assert "sits on its bound" in found.held.lines()[0] and "exclude the truth" in found.held.lines()[0]
+
+
+def test_ordinary_least_squares_weighs_no_row_and_weighted_does(problem):
+    """PC-OLS minimises ‖y - W x‖² with the covariance σ² (WᵀW)⁻¹, PC-WLS that of whitened rows."""
+    limit = 1.5 * value(METHODS["wls"].estimate(problem), "Fv1")
+    wanted = asked(problem, bounds={"Fv1": (limit, np.inf)}, inertia=0)
+    for name, weigh in (("pc-ols", False), ("pc-wls", True)):
+        found = METHODS[name].estimate(wanted)
+        triangle = combine(problem.pooled, found.std if weigh else None)
+        p = len(triangle) - 1
+        slope = triangle[:p, :p].T @ (triangle[:p, :p] @ found.estimate.values - triangle[:p, p])
+        slope[found.estimate.names.index("Fv1")] = 0.0
+        assert np.abs(slope / np.linalg.norm(triangle[:p, :p], axis=0)).max() < 1e-6 * np.linalg.norm(triangle[:p, p])
+
+
+def test_an_equality_between_parameters_holds_and_disagreement_is_told(problem):
+    same = WeightedSum({"Fv1": 1.0, "Fv2": -1.0}, equal=0.0, name="joints alike")
+    found = METHODS["pc-wls"].estimate(asked(problem, sum=(same,)))
+    assert value(found, "Fv1") == pytest.approx(value(found, "Fv2"), rel=1e-9)
+    assert found.held is not None and found.held.lines()[0].startswith("the data speak against joints alike")
+
+
+def test_a_robot_that_cannot_be_is_made_one_that_can(problem):
+    """A bound that wants an inertia away makes M(q) indefinite; held definite, every posture's least eigenvalue is."""
+    pulled = {"ZZ2R": (-np.inf, -0.2 * value(METHODS["wls"].estimate(problem), "ZZ2"))}
+    loose = METHODS["pc-wls"].estimate(asked(problem, bounds=pulled, inertia=0))
+    wanted = asked(problem, bounds=pulled, inertia=30)
+    held = METHODS["pc-wls"].estimate(wanted)
+    tensor = wanted.constrained.inertia
+    assert np.linalg.eigvalsh(tensor @ loose.estimate.values).min() < 0.0
+    assert np.linalg.eigvalsh(tensor @ held.estimate.values).min() > 0.1 * LEAST * np.abs(tensor).min()
+    assert held.held is not None and held.held.postures > 0
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"bounds": {"XX1": (0.0, 1.0)}}, "XX1 has no effect on the torques"),
+        ({"bounds": {"M2": (0.0, 1.0)}}, "(no effect|in sums with others only)"),
+        ({"bounds": {"Fz1": (0.0, 1.0)}}, "'Fz1' is no parameter of this model"),
+        (
+            {"bounds": {"Fv1": (5.0, 6.0)}, "sum": (WeightedSum({"Fv1": 2.0}, most=3.0, name="twice Fv1"),)},
+            "contradict each other: 5 <= Fv1 <= 6; twice Fv1 <= 3",
+        ),
+        (
+            {"sum": (WeightedSum({"Fv1": 1.0}, equal=1.0), WeightedSum({"Fv1": 2.0}, equal=1.0))},
+            "contradict each other: 1 Fv1 = 1; 2 Fv1 = 1",
+        ),
+        ({"sum": (WeightedSum({"Fv1": 1.0, "Fv2": 1.0}),)}, "expected equal, or least <= most"),
+    ],
+)
+def test_constraints_that_cannot_be_are_refused_with_their_names(problem, settings, words):
+    with pytest.raises(UsageError, match=words):
+        METHODS["pc-wls"].estimate(asked(problem, **settings))
+
+
+def test_a_sum_of_standard_parameters_that_the_torques_tell_is_its_base_parameter(problem):
+    base = problem.base
+    name = next(name for name, row in zip(base.names, base.split.coefficients) if np.abs(row).max() > 1e-6)
+    row = base.transform[base.names.index(name)]
+    weights = {base.standard[k]: float(row[k]) for k in np.flatnonzero(row)}
+    made = asked(problem, sum=(WeightedSum(weights, least=0.0),), signs=False, inertia=0).constrained
+    assert made.matrix[0] == pytest.approx(np.eye(base.b)[base.names.index(name)])
+
+
+def test_the_options_file_says_them_and_other_methods_refuse_them():
+    text = """
+    method = "pc-wls"
+    friction = "standard"
+    essential = "none"
+    [constraints]
+    bounds = { Fv1 = [0.0, inf] }
+    [[constraints.sum]]
+    weights = { Fv1 = 1.0, Fv2 = -1.0 }
+    equal = 0.0
+    """
+    settings = parse_options(tomllib.loads(text)).settings
+    found = identify(planted.arm(), [planted.case("a", 0)], settings)
+    assert found.fitted.held is not None and "1 Fv1 + -1 Fv2 = 0" in found.fitted.held.names
+    with pytest.raises(UsageError, match="method 'wls' does not know them; take 'pc-wls'"):
+        identify(planted.arm(), [planted.case("a", 0)], replace(settings, method="wls"))
+    with pytest.raises(UsageError, match="lower bound 2 is above the upper 1"):
+        parse_options({"constraints": {"bounds": {"Fv1": [2.0, 1.0]}}})
