@@ -17,6 +17,7 @@ from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_e
 from calib.folders import METRICS, REPORT, check_target, write_staged
 from calib.identification.cases import Case
 from calib.identification.gains import DriveGains
+from calib.identification.methods.constraints import Held
 from calib.identification.methods.registry import METHODS
 from calib.identification.model_file import MODEL, read_dynamics, to_table
 from calib.identification.possible import information
@@ -330,6 +331,7 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
         ],
         "elimination": _elimination_table(outcome),
         "loop": loop_table(found.bias),
+        "constraints": _constraint_table(found.fitted.held),
         "tracking": tracking_table(outcome.tracking),
         "filters": {case.name: _filter_table(case.motion) for case in (*outcome.inputs.cases, *outcome.inputs.unseen)},
         "geometry": geometry_tables.metrics(outcome.carried, outcome.geometries),
@@ -390,6 +392,20 @@ def _filter_table(motion: Any) -> dict[str, Any]:
         "band": float(motion.band),
         "decimation": int(motion.decimator.factor),
     }
+
+
+def _constraint_table(held: Held | None) -> dict[str, Any] | None:
+    """Return all constraints of an estimate and those that hold it; None where the method takes none."""
+    if held is None:
+        return None
+    binding = [
+        {
+            "name": one.name, "multiplier": one.multiplier, "bound": one.bound, "equality": one.equality,
+            "free": one.free, "free_sigma": one.sigma,
+        }
+        for one in held.binding
+    ]  # fmt: skip
+    return {"names": list(held.names), "binding": binding, "postures_binding": held.postures}
 
 
 def _elimination_table(outcome: IdentificationOutcome) -> list[dict[str, Any]]:
