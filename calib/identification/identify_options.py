@@ -106,9 +106,9 @@ from calib.dynamics.drives import DriveTerm, term
 from calib.dynamics.shapes import SHAPES
 from calib.dynamics.torque_rows import ROWS, TorqueRows
 from calib.errors import CalibError, UsageError
+from calib.identification.constraints import ConstraintSettings
 from calib.identification.friction.friction_ladder import NAMES
 from calib.identification.loop.loop_settings import LoopSettings, check_loop
-from calib.identification.methods.constraints import ConstraintSettings
 from calib.identification.methods.registry import METHODS
 from calib.identification.settings import PRIORS, RULES, WEIGHTS, Coupling, IdentificationSettings, Payload
 

@@ -14,8 +14,8 @@ from calib.estimation.samples import SampleFit, irls, stack
 from calib.estimation.total import tls
 from calib.estimation.triangles import Triangles, combine, residual_squares, retriangulate
 from calib.estimation.whiteness import inflation
+from calib.identification.constraints import Constraints, hold
 from calib.identification.friction.time_folds import estimate
-from calib.identification.methods.constraints import Constraints, hold
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, MethodEstimate, attempted
 from calib.identification.prior import Prior, bounded
 from calib.identification.rows import ObservationRows

@@ -1,8 +1,8 @@
 """What an identification's data say about the standard parameters: ‖R T χ - z‖², and nothing else.
 
 T regroups the p parameters χ of the model into the b that the motion tells apart. R and z are the estimate β and its
-covariance Σ as rows, RᵀR = Σ⁻¹ and z = R β. Where a prior took part in the estimate, they are the data's own triangle
-instead (``information.csv``), so that what was known beforehand is not counted twice.
+covariance Σ as rows, RᵀR = Σ⁻¹ and z = R β. Where a prior took part in the estimate, or constraints hold it, they are
+the data's own triangle instead (``information.csv``), so that what was known beforehand is not counted twice.
 """
 
 from __future__ import annotations
@@ -76,13 +76,14 @@ class Information:
 
 
 def _information(found: Identification) -> np.ndarray:
-    """Return the triangle [R z] (b + 1, b + 1) of an identification's data, without its prior of base parameters.
+    """Return the triangle [R z] (b + 1, b + 1) of an identification's data, without prior or constraints.
 
     Rows count as their residuals' autocorrelation lets them. The ridge of richer friction stays in: those terms have
     no other prior.
     """
     fitted, own = found.fitted, found.base.b
-    rows = [combine(fitted.pooled, fitted.std * np.sqrt(fitted.inflation))]
+    data, std, inflation = fitted.testable()
+    rows = [combine(data, std * np.sqrt(inflation))]
     count = len(found.names) - own
     if count:
         group = np.concatenate([np.full(own, -1), found.friction.groups]).astype(int)

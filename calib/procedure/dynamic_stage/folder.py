@@ -16,8 +16,8 @@ from calib.errors import UsageError
 from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
 from calib.folders import METRICS, REPORT, check_target, write_staged
 from calib.identification.cases import Case
+from calib.identification.constraints import Held
 from calib.identification.gains import DriveGains
-from calib.identification.methods.constraints import Held
 from calib.identification.methods.registry import METHODS
 from calib.identification.model_file import MODEL, read_dynamics, to_table
 from calib.identification.possible import information
@@ -213,7 +213,8 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     write_covariance(folder / COVARIANCE, found.names, covariance)
     geometry_tables.write(outcome, folder)
     write_instrumental(found.bias, folder)
-    if found.prior is not None:  # else estimate and covariance say it all
+    held = found.fitted.held is not None and found.fitted.held.solution.binding.any()
+    if found.prior is not None or held:  # else estimate and covariance say it all
         information.write(found, folder)
     first = (*inputs.unseen, *inputs.cases)[0]
     _write_torques(first, outcome.predictions[first.name], folder / "torques_1.csv")

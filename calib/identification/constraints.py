@@ -47,8 +47,8 @@ class WeightedSum:
     """A weighted sum of parameters, and what it must be: `equal`, or not below `least`, not above `most`."""
 
     weights: Mapping[str, float]
-    least: Annotated[float, Real(infinite=True)] = -np.inf
-    most: Annotated[float, Real(infinite=True)] = np.inf
+    least: float | None = None
+    most: float | None = None
     equal: float | None = None
     name: Text = ""
 
@@ -189,9 +189,10 @@ def make_constraints(
         lower.append(low)
         upper.append(high)
     for number, one in enumerate(settings.sum, 1):
-        low, high = (one.least, one.most) if one.equal is None else (one.equal, one.equal)
+        low = one.equal if one.equal is not None else -np.inf if one.least is None else one.least
+        high = one.equal if one.equal is not None else np.inf if one.most is None else one.most
         named = one.name or " + ".join(f"{weight:g} {name}" for name, weight in one.weights.items())
-        if one.equal is not None and (one.least > -np.inf or one.most < np.inf):
+        if one.equal is not None and (one.least, one.most) != (None, None):
             raise UsageError(f"[[constraints.sum]] number {number}: 'equal' goes without 'least' and 'most'")
         if low > high or not (np.isfinite(low) or np.isfinite(high)):
             raise UsageError(f"[[constraints.sum]] number {number} ({named}): expected equal, or least <= most")
