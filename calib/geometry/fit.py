@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements
-from calib.errors import MeasurementError
+from calib.errors import MeasurementError, Unidentifiable
 from calib.estimation.base_columns import ColumnSplit
 from calib.estimation.nonlinear import covariance, solve
 from calib.estimation.relevance import gram, relevance
@@ -67,6 +67,11 @@ def fit(
     blocks = prepare(cell, measured, torques)
     split = base_columns(cell, blocks, candidates, settings.tolerance)
     free = candidates[split.kept]
+    if split is not None and not len(free):
+        raise Unidentifiable(
+            "these rows tell nothing of the robot: a socket, a bar, a plane or a pair says something by several rows, "
+            "at different joint values"
+        )
     _enough(cell, blocks, len(free))
     stated = np.full(len(table.names), np.inf) if prior is None else prior
     if drawn:

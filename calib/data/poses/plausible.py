@@ -13,6 +13,7 @@ from calib.errors import MeasurementError
 from calib.units import ANGLES
 
 TURN = 2.1 * math.pi  # a joint value beyond this needs limits that allow it [rad]; our choice, as all of these
+FINEST = 1e-10  # no instrument's sigma is smaller [m or rad]
 FAR = 50.0  # no instrument measures a robot from further away [m]
 STILL = 1e-6  # a joint that moves less has not moved [rad or m]
 SLACK = 1e-3  # encoders stand a little beyond a limit [rad or m]
@@ -105,11 +106,13 @@ def rotation_matrices(values: np.ndarray, table: Table, columns: Sequence[str]) 
 
 
 def check_positive(values: np.ndarray, table: Table, columns: Sequence[str], advice: str) -> None:
-    """Refuse values (m, k) that are not above zero; NaN passes."""
-    bad = np.argwhere(values <= 0)
+    """Refuse sigmas and distances (m, k) that are not above zero, or that no instrument has; NaN passes."""
+    bad = np.argwhere((values <= 0) | (values < FINEST) | (values > FAR))
     if len(bad):
         row, k = (int(i) for i in bad[0])
-        raise MeasurementError(f"found {values[row, k]:g}: {advice}", table.file, int(table.rows[row]), columns[k])
+        found = values[row, k]
+        words = advice if found <= 0 else f"expected {FINEST:g} to {FAR:g}, in SI: is the unit right?"
+        raise MeasurementError(f"found {found:g}: {words}", table.file, int(table.rows[row]), columns[k])
 
 
 def _units(kind: str) -> tuple[str, str, float]:

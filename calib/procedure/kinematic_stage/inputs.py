@@ -13,7 +13,7 @@ from calib.data.poses.image_folders import JOINTS, is_image_folder, read_images
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.data.poses.pixels import Pixels
 from calib.data.poses.pose_files import joint_columns, read_measurements
-from calib.errors import MeasurementError, UsageError
+from calib.errors import CalibError, MeasurementError, UsageError
 from calib.geometry.checks.copied_rows import repeated
 from calib.geometry.checks.orientations import check_orientations
 from calib.geometry.checks.repeatability import repeated_rows
@@ -188,8 +188,24 @@ def load_rigid(
     if isinstance(robot, CalibratedChain):
         return robot.chain, Path(robot.source or robot.chain.name)
     chain, source = load_robot(robot, measured, FitOptions(), base, tip)
+    if measured is not None and tip is None and source.suffix == ".urdf":
+        _check_whole(chain, source, measured, base)
     found = CalibratedChain(chain) if source.suffix == ".urdf" else calibrated.read(source)
     return (chain if found.corrections is None else found.chain), source
+
+
+def _check_whole(chain: Chain, source: Path, measured: Path, base: str | None) -> None:
+    """Refuse a table of joints that leaves out turning joints of the arm: they would stand wherever they are."""
+    try:
+        whole = load(source, base)
+    except CalibError:  # the URDF does not say by itself where its arm ends
+        return
+    missing = [one.name for one in whole.joints if one.name not in chain.joint_names and one.kind != "prismatic"]
+    if missing and set(chain.joint_names) < set(whole.joint_names):
+        raise UsageError(
+            f"{measured}: column '{missing[0]}' is missing: the arm of {source.name} has {whole.n} joints, {chain.n} "
+            f"are given; where it does end at {chain.tip}, say so: --tip {chain.tip}"
+        )
 
 
 def read_file(

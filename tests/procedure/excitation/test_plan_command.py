@@ -237,3 +237,14 @@ def test_a_payload_on_board_takes_longer(room):
         for on in ((), ("tool",))
     )
     assert free < loaded
+
+
+def test_waypoints_that_leave_a_joint_out_plan_no_shorter_arm(room, capsys):
+    from calib.robot.formats.urdf_write import write_new
+
+    Path("arm.urdf").write_text(write_new(CHAIN))
+    names = CHAIN.joint_names[:-1]
+    Path("short.csv").write_text(",".join(names) + "\n" + ",".join("0" for _ in names) + "\n")
+    assert run("plan", "arm.urdf", "--waypoints", "short.csv", "--out", "p") == 2
+    said = capsys.readouterr().err
+    assert f"column '{CHAIN.joint_names[-1]}' is missing" in said and "--tip" in said and not Path("p").exists()

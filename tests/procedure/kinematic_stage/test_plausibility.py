@@ -76,3 +76,21 @@ def test_computed_positions_are_noted(cell, calib):
     _, out, err = calib("fit", "ur5", path, "--out", "o", "--model", "frames")
     assert not err
     assert verdict()[2] == ["commanded"] and "not measured ones?" in out
+
+
+@pytest.mark.parametrize("columns", ["tool_position,socket", "bar,distance"])
+def test_one_row_per_socket_or_bar_tells_nothing(cell, calib, columns):
+    rows = ["0.1,0.2,0.3,0.4,0.5,0.6,a,0.5", "0.2,0.2,0.3,0.4,0.5,0.6,b,0.5"]
+    Path("m.csv").write_text("\n".join([f"q1,q2,q3,q4,q5,q6,{columns}", *rows, ""]))
+    code, _, err = calib("fit", "ur5", "m.csv", "--out", "o")
+    assert code == 3 and "tell nothing of the robot" in err
+
+
+@pytest.mark.parametrize(
+    "sigma, said", [("1e-300", "is the unit right"), ("1e300", "is the unit right"), ("0", "above 0")]
+)
+def test_sigmas_that_no_instrument_has_are_refused(cell, calib, sigma, said):
+    rows = [row | dict.fromkeys(("sigma_x", "sigma_y", "sigma_z"), sigma) for row in cell.measure(20)]
+    columns = [*(f"q{j + 1}" for j in range(6)), *"xyz", "sigma_x", "sigma_y", "sigma_z"]
+    code, _, err = calib("fit", "ur5", cell.write("m.csv", rows, columns), "--out", "o")
+    assert code == 2 and said in err and "sigma_x" in err
