@@ -123,6 +123,9 @@ def select(
 ) -> None:
     """Choose the poses at which the geometry of ROBOT shows best."""
     from calib.api.kinematic import select_poses
+    from calib.procedure.parallel_stage.robots import refuse_parallel
+
+    refuse_parallel(robot, "select")
     from calib.files import check_target
     from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
 

@@ -52,8 +52,10 @@ def new(
     """
     from calib.api.sessions import new_session
     from calib.errors import command_line
+    from calib.procedure.parallel_stage.robots import refuse_parallel
     from calib.procedure.session.questions import Answers, checked
 
+    refuse_parallel(robot, "new")
     given = Answers(robot, instrument, tool, limits, dynamics, tuple(payload or ()), torques)
     if robot is None or instrument is None:
         given = _asked(given)

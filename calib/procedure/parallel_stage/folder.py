@@ -170,7 +170,10 @@ def designed_lines(robot: FoundRobot, design: ParallelDesign) -> list[str]:
         pairs = zip(robot.known.robot.joint_names, design.peak)
         lines.append("peak torques: " + ", ".join(f"{name} {peak:.3g}" for name, peak in pairs))
     worst = min(design.proof.margins, key=lambda one: one.share)
-    return [*lines, f"closest limit: {worst.name} of {worst.label}, {worst.margin:.3g} {worst.unit} left"]
+    label = worst.label
+    for k, name in enumerate(robot.known.robot.freedom if worst.name != "torque" else ()):
+        label = label.replace(f"joint {k + 1} ", f"platform {name} ")
+    return [*lines, f"closest limit: {worst.name} of {label}, {worst.margin:.3g} {worst.unit} left"]
 
 
 def _write_robot(robot: FoundRobot, folder: Path) -> None:

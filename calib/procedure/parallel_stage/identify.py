@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.data.recordings.recording import Joints, Recording
 from calib.dynamics.regressor_model import RegressorModel
-from calib.errors import UsageError
+from calib.errors import MeasurementError, UsageError
 from calib.identification.cases import Case, case_names, make_case
 from calib.identification.identify import Identification, identify_model
 from calib.identification.identify_options import IdentifyOptions, file_settings
@@ -18,6 +18,7 @@ from calib.identification.methods.registry import method_named
 from calib.identification.prediction import predict
 from calib.identification.scores import Score, score
 from calib.identification.settings import IdentificationSettings, per_joint
+from calib.mechanism.closure import NoPosture
 from calib.mechanism.parallel_model import ParallelModel, make_parallel_model, rows_named
 from calib.mechanism.parallel_robot import ParallelRobot
 from calib.procedure.dynamic_stage.inputs import read_motion
@@ -104,7 +105,10 @@ def identify_parallel(
         if motion.kind == "current" and gains is None and motion.drive_gain is None:
             raise UsageError(f"{name}: currents without drive gains; state gains = [...] (N m/A) in the options file")
         gains = motion.drive_gain if gains is None and motion.kind == "current" else gains
-        cases.append(make_case(name, motion, rows, gains=gains, carried=own.payload))
+        try:
+            cases.append(make_case(name, motion, rows, gains=gains, carried=own.payload))
+        except NoPosture as error:
+            raise MeasurementError(f"{error}", name) from error
     learnt, unseen = tuple(cases[: len(recordings)]), tuple(cases[len(recordings) :])
     settings = replace(settings, torque_rows=rows, prior="none")
     found = identify_model(model, learnt, settings, progress=progress)
