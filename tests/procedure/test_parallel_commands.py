@@ -21,7 +21,7 @@ HEAD = "t,q1,q2,q3,q4,tau1,tau2,tau3,tau4"
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Return a folder with logs of a DualV without and with payload, and measured poses of one with another geometry."""
+    """Return a folder with logs of a DualV without and with payload, and measured poses of another geometry."""
     path = tmp_path_factory.mktemp("dualv")
     known = closed(parallel_files.read(parallel.path("dualv")))
     model = make_parallel_model(known, ["Fv Fc"], v0=0.05, payloads=["5"])
@@ -62,7 +62,7 @@ def calib(*words) -> int:
     return run([str(word) for word in words])
 
 
-@pytest.mark.parametrize("options", ["options", "power"])
+@pytest.mark.parametrize("options", ["options", pytest.param("power", marks=pytest.mark.slow)])
 def test_identify_finds_the_payload_and_predicts_other_motion(folder, tmp_path, options):
     out = tmp_path / "id"
     files = [folder / name for name in ("empty.csv", "load.csv")]
@@ -79,6 +79,7 @@ def test_identify_finds_the_payload_and_predicts_other_motion(folder, tmp_path, 
     )
 
 
+@pytest.mark.slow
 def test_fit_then_identify_on_the_calibrated_geometry(folder, tmp_path, capsys):
     fitted = tmp_path / "fit"
     assert calib("fit", "dualv", folder / "poses.csv", "--out", fitted) == 0
@@ -89,6 +90,7 @@ def test_fit_then_identify_on_the_calibrated_geometry(folder, tmp_path, capsys):
     assert "scale and place" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_excite_writes_a_motion_within_the_limits(tmp_path):
     out = tmp_path / "motion"
     words = ("--period", 1, "--harmonics", 3, "--starts", 1, "--evaluations", 8, "--drives", "Fv Fc", "--out", out)
@@ -115,14 +117,14 @@ def test_excite_writes_a_motion_within_the_limits(tmp_path):
     ],
 )
 def test_what_is_wrong_is_said(folder, tmp_path, capsys, words, said):
-    words = [folder / word if str(word).endswith(".csv") else word for word in words]
-    target = [tmp_path / "out"] if words[0] == "new" else ["--out", tmp_path / "out"]
-    assert (
-        calib(words[0], *(target if words[0] == "new" else ()), *words[1:], *(() if words[0] == "new" else target)) == 2
-    )
+    command, *rest = [folder / word if word.endswith(".csv") else word for word in words]
+    out = tmp_path / "out"
+    given = [out, *rest] if command == "new" else [*rest, "--out", out]
+    assert calib(command, *given) == 2
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_payload_on_board_of_every_run_is_told(folder, tmp_path, capsys):
     words = ("--options", folder / "options.toml", "--out", tmp_path / "id", "--no-plots")
     assert calib("identify", "dualv", folder / "load.csv", *words) == 0
