@@ -17,7 +17,7 @@ from calib.geometry.observability import observation, targets_of
 from calib.procedure.kinematic_stage.inputs import joint_kinds, load_robot
 from calib.procedure.kinematic_stage.pose_limits import read_limits
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
-from calib.procedure.measuring.camera_view import image_observation
+from calib.procedure.measuring.camera_view import ImageObservation, Predicted, image_observation, predict
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
 from poses.indices import observability
@@ -25,6 +25,7 @@ from poses.select import SearchSettings, Selection, select_poses
 from poses.space import is_feasible
 
 Progress = Callable[[int, int, str], None]
+EVERYWHERE = 600  # postures that accuracy is predicted at (our choice)
 VIEWS = 600  # postures that see a camera's board, to choose from (our choice)
 
 
@@ -48,6 +49,7 @@ class Chosen:
     checked: tuple[str, ...]
     unchecked: tuple[str, ...]
     notes: tuple[str, ...]
+    predicted: Predicted | None = None
 
 
 def choose(
@@ -111,7 +113,13 @@ def choose(
     found = select_poses(None, m, search, q=joints, space=space, existing=before, map=map, progress=progress)
     assert found.q is not None
     found = replace(found, q=fewest_turns(chain, found.q, limits.lower, limits.upper))
-    return Chosen(chain, found, len(jacobian.free), value, limits.checked, limits.unchecked, tuple(notes))
+    predicted = None
+    if isinstance(jacobian, ImageObservation) and found.q is not None:
+        everywhere = np.random.default_rng(settings.seed).uniform(limits.lower, limits.upper, (EVERYWHERE, chain.n))
+        predicted = predict(jacobian, found.q, everywhere)
+        notes.append(predicted.words)
+    checked = limits.checked, limits.unchecked
+    return Chosen(chain, found, len(jacobian.free), value, *checked, tuple(notes), predicted)
 
 
 def fewest_turns(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:

@@ -37,6 +37,7 @@ from calib.geometry.inverse import Goal, reach, seen_at
 from calib.geometry.observation import observe, prepare
 from calib.geometry.parameters import layout
 from calib.geometry.pixel_residuals import PixelPart
+from calib.geometry.spread import pose_sigmas
 from calib.robot.chain import Chain
 from calib.robot.tables import placement
 from calib.transforms import invert, pose
@@ -233,3 +234,32 @@ def camera_view(stated: CameraTable, chain: Chain, where: str, folder: Path) -> 
     optics = Optics((lens,), ("camera",), (BoardShape(),), ("board",), free)
     cell = Installation(chain, invert(stands)[None], carried[None], names[:1], names[1:], optics=optics)
     return CameraView(cell, board, stated.mounting, stated.tilt, stated.range, stated.margin)
+
+
+@dataclass(frozen=True, eq=False)
+class Predicted:
+    """How well the arm will be known: where the tool is in its base (m, 3) [m], and sigma there (m,) [m]."""
+
+    points: np.ndarray
+    sigma: np.ndarray
+
+    @property
+    def words(self) -> str:
+        """The prediction in a sentence."""
+        rms, most = (1e3 * float(value) for value in (np.sqrt(np.mean(self.sigma**2)), np.quantile(self.sigma, 0.95)))
+        return (
+            f"predicted before measuring: these images tell the tool's position to {rms:.3f} mm rms over the joint "
+            f"range ({most:.3f} mm at 95 %), for corners of {CORNER:g} px and an arm that repeats to "
+            f"{1e3 * DISPLACEMENT:g} mm and {1e3 * TURN:g} mrad per axis; what no model holds comes on top"
+        )
+
+
+def predict(seen: ImageObservation, q: np.ndarray, everywhere: np.ndarray) -> Predicted:
+    """Return what images at q (m, n) will tell of the tool at postures all over (k, n) [rad or m]."""
+    rows = seen(q).reshape(-1, len(seen.free))
+    size = np.linalg.norm(rows, axis=0) + 1e-300
+    factor = np.linalg.qr(rows / size, mode="r")
+    covariance = np.linalg.pinv(factor.T @ factor, rcond=1e-12, hermitian=True) / np.outer(size, size)
+    cell = seen.view.cell
+    sigma = pose_sigmas(cell, everywhere, seen.free, covariance, station=-1)[:, 0]
+    return Predicted(see(cell, everywhere, -1).point.T, sigma)

@@ -134,13 +134,14 @@ def _decades(sizes: np.ndarray) -> tuple[float, float]:
     return float(max(np.percentile(sizes, 2), 1e-9)) * 0.5, float(max(sizes.max(), 1e-8)) * 1.3
 
 
-def error_map(points: np.ndarray, sizes: np.ndarray, names: str = "xyz") -> Figure:
+def error_map(points: np.ndarray, sizes: np.ndarray, names: str = "xyz", words: str = "at most {} remain") -> Figure:
     """Draw where in the workspace errors remain, seen from above and from the side.
 
     Args:
         points: (m, 3) target positions in the arm's base [m].
         sizes: (m,) errors that remain [m].
         names: of the axes.
+        words: of the title, around the largest.
     """
     order = np.argsort(sizes)
     top = 1e3 * float(np.max(sizes, initial=1e-9))
@@ -157,7 +158,7 @@ def error_map(points: np.ndarray, sizes: np.ndarray, names: str = "xyz") -> Figu
             plot.locator_params(nbins=6)
             plot.set(xlabel=f"{names[i]} [m]", ylabel=f"{names[j]} [m]")
             plot.grid(True)
-        axes[0].set_title(f"from above: at most {top:.3g} mm remain")
+        axes[0].set_title(f"from above: {words.format(f'{top:.3g} mm')}")
         axes[1].set_title("from the side")
         colour_scale(figure, axes[1], drawn, "[mm]")
     return figure

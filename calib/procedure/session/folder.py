@@ -48,6 +48,7 @@ EXPORT = {False: "6-export", True: "9-export"}  # without, with dynamics
 MARK = "simulated.txt"
 SETTINGS, CHECKED = "session.toml", "checked.txt"
 SUMMARY, SELECTION, CUTS = "1-robot/summary.txt", "2-poses/selection.json", "7-recorded/cuts.json"
+PREDICTED = "2-poses/predicted.png"  # sigma of the tool, where the instrument is a camera whose place is known
 POSES, UNSEEN = "poses.csv", "validation.csv"  # as planned, in 2-poses
 POSES_CHECKED, MOTION_CHECKED = f"3-measured/{CHECKED}", f"7-recorded/{CHECKED}"
 

@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from calib import files
 from calib.data.poses.pixels import Pixels
 from calib.geometry.observability import observation, targets_of
 from calib.procedure.kinematic_stage import selection
 from calib.procedure.kinematic_stage.pose_limits import read_limits
 from calib.procedure.kinematic_stage.settings import SelectionSettings
-from calib.procedure.session.folder import Session
+from calib.procedure.session.folder import PREDICTED, Session
 from calib.robot.chain import Chain
 from poses.candidates import draw_candidates
 from poses.space import is_feasible
@@ -56,6 +57,12 @@ def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], N
         f"random sets, {100 * found.efficiency:.1f} % of the convex bound ({selection.bound_words(found)})"
     )
     record = {"words": words, **selection.record(chosen), "seed": settings.seed}
+    if chosen.predicted is not None and session.plots:
+        from calib.procedure.report.geometry_figures import error_map
+        from calib.procedure.report.style import png
+
+        figure = error_map(chosen.predicted.points, chosen.predicted.sigma, words="sigma up to {}")
+        files.write(session.path(PREDICTED), png(figure))
     unseen = _unseen(session, robot_file, chain, wanted.validation)
     return Plan(found.q, unseen, words, tuple(selection.kept(chosen)), record)
 

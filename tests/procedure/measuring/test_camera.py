@@ -129,3 +129,26 @@ def test_a_session_with_images_goes_to_its_certificate(cell, tmp_path):
     unseen = found["validation"]["validation"]
     assert unseen["reprojection_px"]["calibrated"] < 0.2 < unseen["reprojection_px"]["nominal"]
     assert go_on(tmp_path / "s", said.append, SILENT, "test", plots=False).verdict == "pass"
+
+
+def test_the_prediction_is_what_a_fit_then_states(cell):
+    """Sigma over the workspace from poses alone, against that of a fit of noisy images at them."""
+    from calib.geometry.first_guess import install
+    from calib.geometry.fit import fit
+    from calib.geometry.images.camera_guess import complete_camera
+    from calib.geometry.parameters import layout
+    from calib.geometry.spread import pose_sigmas
+    from calib.procedure.measuring.camera_view import predict
+    from calib.robot.chain import random_joints
+
+    with camera_files.limits_of(cell) as path:
+        limits = read_limits(path, targets_of(cell.cell.nominal))
+    q, everywhere = camera.views(cell, 40, 5), random_joints(cell.cell.nominal, 200, 1)
+    predicted = predict(image_observation(limits.camera, limits.lower, limits.upper), q, everywhere)
+    block = complete_camera(cell.cell.nominal, camera.photograph(cell, q, 0.05, 5))
+    start = install(cell.cell.nominal, [block])
+    table = layout(start)
+    found = fit(start, [block], np.concatenate([table.arm_index, table.frame_index]))
+    stated = pose_sigmas(found.cell, everywhere, found.free, found.estimate.covariance, station=-1)[:, 0]
+    assert 0.4 < np.median(stated / predicted.sigma) < 2.5  # the noise of the arm is our choice there
+    assert np.corrcoef(np.log(stated), np.log(predicted.sigma))[0, 1] > 0.5
