@@ -9,7 +9,6 @@ from typing import Generic, TypeGuard, cast
 import numpy as np
 
 from calib.data.signals.decimation import Decimator, design_decimator
-from calib.data.signals.persistency import report_excitation
 from calib.dynamics import base as bases
 from calib.dynamics.base import Base
 from calib.dynamics.bodies import standard_parameters
@@ -25,11 +24,11 @@ from calib.identification.friction.friction_ladder import FrictionCandidates, Fr
 from calib.identification.friction.ripple import Ripple, find_all
 from calib.identification.friction.time_folds import estimate
 from calib.identification.methods.bias import LoopTest, compare_with_loop, require_loop
-from calib.identification.methods.least_squares import residual_inflation, scaled
 from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate
 from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.prediction import Dynamics, Model, predict, transmitted
-from calib.identification.prior import Prior, find_prior
+from calib.identification.prior import FirstFit, Prior, find_prior, residual_inflation, scaled
+from calib.identification.rods import rods
 from calib.identification.rows import (
     ObservationRows,
     by_recording,
@@ -44,10 +43,7 @@ from calib.identification.settings import IdentificationSettings, make_model, pe
 from calib.robot.calibrated import CalibratedChain, as_calibrated
 from calib.robot.chain import Chain, sampling_limits
 
-CONDITION = 150.0  # of the observation matrix, unit columns, from which on the prior is used
-
 Progress = Callable[[str], None]
-FirstFit = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +109,9 @@ def identify(
     nominal = None if robot.nominal is None or not robot.moved else make_model(robot.nominal, settings)
     states = chain_states(robot.chain, nominal or model, settings.seed)
     found = identify_model(
-        model, cases, settings, nominal=nominal, states=states, cad=_known_masses(robot.chain), progress=progress
+        model, cases, settings, nominal=nominal, states=states, cad=_known_masses(robot.chain),
+        shape=np.where(model.bodies.coordinates[:, None] >= 0, rods(robot.chain, model), 0.0).ravel(),
+        progress=progress,
     )  # fmt: skip
     return cast(Identification, found)  # its model is the chain's
 
@@ -126,6 +124,7 @@ def identify_model(
     nominal: RegressorModel | None = None,
     states: States | None = None,
     cad: np.ndarray | None = None,
+    shape: np.ndarray | None = None,
     progress: Progress | None = None,
 ) -> Identification[RegressorModel]:
     """Identify the parameters of a model that is linear in them from recordings.
@@ -140,6 +139,7 @@ def identify_model(
         nominal: the same model on the geometry that base columns are chosen on; None: `model`.
         states: to choose base columns over; None: the model's own.
         cad: the first of the model's parameters by the robot's description; None where it holds no masses.
+        shape: the same of a robot of one kilogram, where it holds none; None: not known either.
         progress: called with a few words at each stage.
 
     Raises:
@@ -163,14 +163,18 @@ def identify_model(
         rows = [by_recording(part, k, len(cases)) for k, part in enumerate(rows)]
     _require_enough(rows, base)
     say("first fit")
-    first = first_fit(rows, noise)
-    prior = _prior(method, model, base, rows, cases, first, settings, cad)
+    whole, source = (shape, "sizes") if cad is None else (cad, "cad")
+    prior = find_prior(model, base, rows, whole, source, noise) if _drawn(method, model, settings, source) else None
+    first = first_fit(rows, noise) if prior is None else prior.first
     friction, loads = _richer_friction(model, base, rows, cases, decimator, first, prior, settings, progress)
     own = [None if k < model.inertial else model.columns[k - model.inertial] for k in base.kept]
     full = tuple(
         extend(part, friction.terms, observe_terms(friction.terms, case, decimator, load))
         for part, case, load in zip(rows, cases, loads)
     )
+    if prior is not None and friction.terms:
+        say("sizes beside richer friction")
+        prior = find_prior(model, base, full, whole, prior.source, noise, np.array(friction.groups), prior)
     problem = IdentificationProblem(
         model, base, cases, decimator, full, (*own, *friction.terms),
         np.concatenate([np.full(base.b, -1), friction.groups]), noise, prior, settings.loop, cad,
@@ -187,7 +191,7 @@ def identify_model(
     dynamics, ripples = _with_ripple(dynamics, cases, settings, say)
     dynamics = _with_payloads(dynamics, cases, settings)
     say("essential parameters")
-    gone = _essential(found, settings, prior)
+    gone = _essential(found, settings)
     condition = condition_numbers(problem.pooled.factors.reshape(-1, len(values) + 1)[:, : base.b])
     return Identification(dynamics, base, found, gone, friction, settings, full, condition, prior, ripples, bias)
 
@@ -227,19 +231,13 @@ def _richer_friction(
     if not _joint_by_joint(model):
         return FrictionSelection((), (), ()), nothing
     std, tau, values = first
-    friction = _wanted_friction(cases, settings)
     plain = Dynamics(model, bases.to_standard(base, values))
-    loads = nothing if friction in ("standard", "ripple") else [transmitted(plain, case) for case in cases]
+    loads = nothing if settings.friction in ("standard", "ripple") else [transmitted(plain, case) for case in cases]
     candidates = FrictionCandidates(
         cases, rows, loads, decimator, std, tau, np.array(per_joint(settings.v0, model.n, "v0")), model.prismatic,
         None if prior is None else prior.rows,
     )  # fmt: skip
-    return select_friction(candidates, friction, progress), loads
-
-
-def _wanted_friction(cases: Sequence[Case], settings: IdentificationSettings) -> str:
-    """Return what friction is asked for; of poor motion, whose blocks of time judge nothing, the standard one."""
-    return "standard" if settings.friction == "auto" and _all_poor(cases) else settings.friction
+    return select_friction(candidates, settings.friction, progress), loads
 
 
 def _with_ripple(
@@ -247,7 +245,7 @@ def _with_ripple(
 ) -> tuple[Dynamics[RegressorModel], tuple[Ripple, ...]]:
     """Return the model with gear ripple found in what it leaves, where that is asked for."""
     model = dynamics.model
-    if not _joint_by_joint(model) or _wanted_friction(cases, settings) not in ("auto", "ripple"):
+    if not _joint_by_joint(model) or settings.friction not in ("auto", "ripple"):
         return dynamics, ()
     say("ripple")
     ripples = tuple(find_all(cases, [case.target - predict(dynamics, case) for case in cases]))
@@ -329,31 +327,23 @@ def first_fit(rows: Sequence[ObservationRows], noise: np.ndarray | None = None) 
         used = np.concatenate([part.present for part in rows]).sum(axis=0)
         std = np.sqrt((residuals**2).sum(axis=0) / np.maximum(used, 1))
         std = scaled(noise, np.maximum(std, 1e-9 * max(float(std.max()), 1e-300)), used)
-    return std, residual_inflation(rows, values), values
+    return FirstFit(std, residual_inflation(rows, values), values)
 
 
-def _prior(
-    method: Method, model: RegressorModel, base: Base, rows: Sequence[ObservationRows], cases: Sequence[Case],
-    first: FirstFit, settings: IdentificationSettings, cad: np.ndarray | None,
-) -> Prior | None:  # fmt: skip
-    """Return the prior, where it is asked for or the motion is too poor to do without."""
-    if settings.prior == "none" or not method.takes_prior or not model.inertial:
-        return None
-    data = pool(triangulate(rows), rows[0].target.shape[1])
-    normalised = condition_numbers(data.factors.reshape(-1, data.parameters + 1)[:, :-1])[1]
-    if settings.prior == "auto" and not _all_poor(cases) and normalised < CONDITION:
-        return None
-    return find_prior(cad, model, base, data, first[0], first[1], settings.prior)
+def _drawn(method: Method, model: RegressorModel, settings: IdentificationSettings, source: str) -> bool:
+    """Say whether the parameters have a prior: it is asked for, and the method and the model take one.
+
+    Raises:
+        UsageError: where the CAD is asked for, and there is none.
+    """
+    if settings.prior == "cad" and source != "cad":
+        raise UsageError("prior = 'cad', but the robot's description holds no masses")
+    return settings.prior != "none" and method.takes_prior and model.inertial > 0
 
 
-def _all_poor(cases: Sequence[Case]) -> bool:
-    """Say whether no case can tell parameters apart: then blocks of time repeat each other, and judge nothing."""
-    return all(report_excitation(case.motion).poor for case in cases)
-
-
-def _essential(found: MethodEstimate, settings: IdentificationSettings, prior: Prior | None) -> Elimination | None:
-    """Return the elimination; none where the data alone do not determine the base parameters."""
-    if settings.essential == "none" or prior is not None:
+def _essential(found: MethodEstimate, settings: IdentificationSettings) -> Elimination | None:
+    """Return the elimination, where it is asked for."""
+    if settings.essential == "none":
         return None
     data, std, inflation = found.testable()
     return eliminate(

@@ -22,7 +22,8 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     level = 0.05                     # of the F rule
     keep = ["ZZ1R"]                  # parameters never left out
     drop = ["offl3"]                 # parameters left out first
-    prior = "auto"                   # auto, none, cad: draw what the motion does not tell to the robot's own inertias
+    prior = "auto"                   # auto, none, cad: draw what the motion does not tell to the robot's own inertias;
+                                     # auto: where there are none, to rods between the joints
     folds = 6                        # time blocks of the cross-validation
     accept = []                      # findings that are meant so: masses, speed, clock, lag
 

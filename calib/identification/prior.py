@@ -1,19 +1,32 @@
-"""What is known before any data: the CAD's inertias, or only the order of sizes; how strongly, the evidence says.
+"""What is known before any data: a proper prior, always on, whose sizes the data's evidence tells.
 
-Base parameters θ = T χ of standard ones χ ~ N(χ_CAD, f² S) have the prior N(T χ_CAD, f² T S Tᵀ). The one number f is
-where the marginal likelihood of the data is largest,
+Standard parameters χ of one kind (masses, first moments, inertias; rotor inertia, viscous friction, Coulomb friction,
+offsets: whatever has one shape and one unit) are about equally large, and the robot as a whole is about s times a known
+one, u: its CAD, or rods between the joints,
 
-    log p(y | f) = -½ [log det C + eᵀ C⁻¹ e] + const,   C = I + R P Rᵀ,   e = z - R μ,
+    χ = s u + δ,    δ_i ~ N(0, σ_kind²),    s ~ N(0, κ²),
 
-with [R z] the triangle of the whitened [W y], μ and P the prior's mean and covariance (MacKay 1992). Directions that
-the motion tells well do not feel the prior; those that it does not tell stay at the CAD's values. It does not make the
-parameters those of possible bodies: that is the semidefinite fit of another module; but with a prior, `bounded` keeps
+so the base parameters T χ have the prior N(0, T (diag σ² + κ² u uᵀ) Tᵀ). Sizes σ and κ are where the marginal
+likelihood of the data is largest (MacKay 1992, automatic relevance of groups),
+
+    log p(y | σ, κ) = -½ [log det K + zᵀ K⁻¹ z] + const,   K = I + R P Rᵀ,
+
+with [R z] the triangle of the whitened [W y] and P the prior covariance, times a wide prior of their logarithms: what
+a kind would be if it alone explained `SHARE` of all torque, within a factor exp(`WIDTH`) (our choice; errors on other
+motion hardly depend on either). Rows are weighed by their joint's residual, which tells as many independent values as
+its autocorrelation lets it, but not fewer than one in `MOST`: residuals of a short record look like one wave whatever
+the model is.
+
+Directions that the motion tells well do not feel the prior; those that it does not tell follow the whole robot. It does
+not make the parameters those of possible bodies: that is the semidefinite fit of another module; but `bounded` keeps
 inertia and friction of the drives from being negative.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -22,114 +35,240 @@ import scipy.optimize
 from calib.arrays import frozen
 from calib.dynamics.base import Base
 from calib.dynamics.regressor_model import RegressorModel
-from calib.errors import UsageError
 from calib.estimation.triangles import Triangles, retriangulate
+from calib.estimation.whiteness import inflation
+from calib.identification.rows import ObservationRows, pool, triangulate
 
-SCALES = tuple(float(10.0 ** (k / 4)) for k in range(-6, 7))  # f from 0.03 to 30
-MOST = 1.0  # largest f of a CAD prior: what no model explains must not pass for a wrong CAD (our choice)
-SPREAD = 0.3  # of a CAD value: standard deviation at f = 1 (our choice)
-LEVER = 0.03  # of a centre of mass [m]
-RADIUS = 0.08  # of gyration [m]
+SHARE = 0.2  # of all torque, what a kind of parameters explains before any data (our choice)
+WIDTH = 3.0  # of a kind's logarithm of size, one standard deviation (our choice)
+NEAREST = 0.03  # of the whole robot's parameters of a kind, rms: no CAD is known to be nearer (our choice)
+WHOLE = 1.0  # the same of κ, of which the size is known: the whole robot explains all torque (our choice)
+MOST = 10.0  # rows of a residual that count as one, at most, where they are weighed (our choice)
+EXACT = 1e-9  # of the largest joint's torque: exact data must not turn into infinite weights
+NOISE = 0.03  # of a joint's torque: the residual at the start (our choice); larger ones start on the smooth side
+ROUNDS = 12
+SETTLED = 0.03  # of every parameter's sigma, and of every residual
+TOLD = 0.5  # a parameter whose variance the data lower by less than this share rests on the prior
 DRIVES = 3.0  # terms without CAD: standard deviation in units of what would explain all of the torque
 ROTOR = 0.15  # [m]: motor inertias are of the order of the robot's mass times its square, seen from the joint
-TOLD = 0.5  # a parameter whose variance the data lower by less than this share rests on the prior
+
+
+class FirstFit(NamedTuple):
+    """A fit of the base parameters to weigh rows by: (rows,) std and inflation of its residuals, (b,) values."""
+
+    std: np.ndarray
+    inflation: np.ndarray
+    values: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """A normal prior of b base parameters.
+    """A normal prior of b base parameters, of mean zero.
 
     Attributes:
-        mean: (b,).
         covariance: (b, b).
-        scale: f.
-        source: ``cad`` or ``sizes``.
+        own: (b,) standard deviations about the whole robot's share, s u.
+        sizes: kind → σ, and ``whole`` → κ.
+        source: of u, ``cad`` or ``sizes``.
+        first: the fit with it, of the base parameters alone.
     """
 
-    mean: np.ndarray
     covariance: np.ndarray
-    scale: float
+    own: np.ndarray
+    sizes: Mapping[str, float]
     source: str
+    first: FirstFit
 
     @property
     def rows(self) -> np.ndarray:
         """(b, b + 1) the prior as rows of [W y], already whitened."""
         unit = np.sqrt(np.diag(self.covariance))
-        lower = np.linalg.cholesky(self.covariance / np.outer(unit, unit) + 1e-9 * np.eye(len(unit)))
+        lower = np.linalg.cholesky(self.covariance / np.outer(unit, unit))
         inverse = scipy.linalg.solve_triangular(lower, np.diag(1.0 / unit), lower=True)
-        return np.hstack([inverse, (inverse @ self.mean)[:, None]])
+        return np.hstack([inverse, np.zeros((len(unit), 1))])
+
+
+@dataclass(frozen=True, eq=False)
+class _Sizes:
+    """Prior standard deviations exp(E t) of p parameters and of s, as a function of the k logarithms t of sizes."""
+
+    names: tuple[str, ...]
+    member: np.ndarray  # (p + 1,) which size each has
+    centre: np.ndarray  # (k,) of t
+    width: np.ndarray  # (k,)
+    least: np.ndarray  # (k,) of t
+
+    def deviations(self, t: np.ndarray) -> np.ndarray:
+        return np.exp(np.clip(t, -40.0, 40.0))[self.member]
 
 
 def find_prior(
-    cad: np.ndarray | None, model: RegressorModel, base: Base, data: Triangles, std: np.ndarray,
-    inflation: np.ndarray, wanted: str = "auto",
-) -> Prior:  # fmt: skip
-    """Return the prior whose strength the evidence chose.
+    model: RegressorModel,
+    base: Base,
+    rows: Sequence[ObservationRows],
+    whole: np.ndarray | None = None,
+    source: str = "sizes",
+    noise: np.ndarray | None = None,
+    groups: np.ndarray | None = None,
+    start: Prior | None = None,
+) -> Prior:
+    """Return the prior of the base parameters whose sizes the evidence chose.
 
     Args:
-        cad: the first of the model's parameters by the robot's description; None where it holds no masses.
-        data: triangles of the base columns, one group per row.
-        std, inflation: (rows,) of the residuals.
-        wanted: ``cad``: these must be there; ``auto``: sizes alone serve where they are not.
+        rows: in the base columns, and those of richer friction behind them.
+        whole: u, the first of the model's parameters, up to a factor; None: nothing is known of the whole robot.
+        source: of `whole`: ``cad`` or ``sizes``.
+        noise: (rows,) of the torques up to a common factor; None: from the residuals.
+        groups: (k,) of the columns of richer friction, each of a size of its own, which serves here alone.
+        start: the prior without that friction, to start from.
     """
-    weight = 1.0 / (std * np.sqrt(inflation))
-    factor = retriangulate((data.factors * weight[:, None, None]).reshape(-1, data.parameters + 1))
-    mean, covariance, source = _shape(cad, model, base, data, wanted)
-    drives = model.inertial
-    inertial = np.array([k < drives for k in base.kept])
-    both = np.outer(inertial, inertial)
-    scales = [f for f in SCALES if source != "cad" or f <= MOST]
-    found = [_evidence(factor, mean, np.where(both, f**2, 1.0) * covariance) for f in scales]
-    scale = scales[int(np.argmax(found))]
-    return Prior(frozen(mean), frozen(np.where(both, scale**2, 1.0) * covariance), scale, source)
+    n = rows[0].target.shape[1]
+    data = pool(triangulate(rows), n)
+    transform = base.transform
+    known = np.zeros(model.p)
+    if whole is not None:
+        known[: len(whole)] = whole
+    more = np.zeros(0, int) if groups is None else groups
+    columns = scipy.linalg.block_diag(transform, np.eye(len(more)))  # the rows' parameters by each of χ, and by s
+    columns = np.column_stack([columns, np.append(transform @ known, np.zeros(len(more)))])
+    sizes = _sizes(model, data, columns, known, more)
+    squares, count = np.sum(data.factors[:, :, -1] ** 2, axis=1), np.maximum(data.rows, 1)
+    std, tau = NOISE * np.sqrt(squares / count), np.full(n, 3.0)
+    std = np.maximum(std, EXACT * max(float(std.max()), 1e-300))
+    t, values = np.array(sizes.centre), np.zeros(len(columns))
+    if start is not None:
+        std, tau = start.first.std, start.first.inflation
+        t[[*range(len(start.sizes) - 1), -1]] = np.log([*start.sizes.values()])
+    for _ in range(ROUNDS):
+        factor = retriangulate((data.factors / (std * np.sqrt(tau))[:, None, None]).reshape(-1, len(columns) + 1))
+        t = _most_probable(factor, columns, sizes, t)
+        before, (values, covariance) = values, _posterior(factor, columns, sizes.deviations(t))
+        last, (std, tau) = std, weighing(rows, data, values, covariance, std, tau, noise)
+        still = np.abs(values - before) < SETTLED * np.sqrt(np.diag(covariance))
+        if still.all() and (np.abs(std / last - 1.0) < SETTLED).all():
+            break
+    deviation = sizes.deviations(t)
+    spread, whole_part = transform * deviation[: model.p], columns[: base.b, -1] * deviation[-1]
+    own = spread @ spread.T
+    own[np.diag_indices(base.b)] *= 1.0 + 1e-9
+    return Prior(
+        frozen(own + np.outer(whole_part, whole_part)), frozen(np.sqrt(np.diag(own))),
+        {name: float(np.exp(one)) for name, one in zip(sizes.names, t) if name}, source,
+        FirstFit(frozen(std), frozen(tau), frozen(values[: base.b])),
+    )  # fmt: skip
+
+
+def weighing(
+    rows: Sequence[ObservationRows], data: Triangles, values: np.ndarray, covariance: np.ndarray, std: np.ndarray,
+    tau: np.ndarray, noise: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Return standard deviation and inflation of the residuals (rows,), with as many degrees of freedom as are left.
+
+    Args:
+        data: triangles of the rows, one group per torque row.
+        values, covariance: (p,), (p, p) the estimate.
+        std, tau: (rows,) that it was weighed with.
+        noise: (rows,) of the torques up to a common factor; None: from the residuals.
+    """
+    columns = data.factors[:, :, :-1]
+    taken = np.einsum("gik,gik->g", columns @ covariance, columns) / (std**2 * tau)  # of the parameters, by row
+    tau = np.minimum(residual_inflation(rows, values), MOST)
+    squares = np.sum((data.factors @ np.append(values, -1.0)) ** 2, axis=1)
+    std = np.sqrt(squares / np.maximum(data.rows - tau * taken, 0.1 * np.maximum(data.rows, 1)))
+    size = np.sqrt(np.sum(data.factors[:, :, -1] ** 2, axis=1) / np.maximum(data.rows, 1))
+    std = np.maximum(std, EXACT * max(float(size.max()), 1e-300))
+    return scaled(noise, std, data.rows), tau
+
+
+def scaled(noise: np.ndarray | None, std: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Return the rows' noise times one factor, that of the residuals' `std` (rows,) of `counts` samples; None: `std`.
+
+    Relative between joints, with a common scale (our choice): the variance over repeats does not see what every period
+    has alike, so as it stands it would promise too much; and the decimation filter's gain for white noise, one number
+    for all joints, drops out.
+    """
+    return std if noise is None else noise * np.sqrt(np.average((std / noise) ** 2, weights=np.maximum(counts, 1)))
+
+
+def residual_inflation(all_rows: Sequence[ObservationRows], values: np.ndarray) -> np.ndarray:
+    """Return the integrated autocorrelation of each row's residuals (rows,), averaged over cases by length."""
+    rows = all_rows[0].target.shape[1]
+    total, weight = np.zeros(rows), np.zeros(rows)
+    for part in all_rows:
+        residual, seen = part.target - part.matrix @ values, np.asarray(part.present.any(axis=0))
+        own = [inflation(residual[:, row]) if seen[row] else 0.0 for row in range(rows)]
+        total += len(residual) * np.array(own)
+        weight += len(residual) * seen
+    return np.maximum(total / np.maximum(weight, 1.0), 1.0)
 
 
 def resting(prior: Prior, covariance: np.ndarray) -> np.ndarray:
-    """Return (b,) which parameters rest on the prior: the data lower their variance by less than `TOLD`."""
-    b = len(prior.mean)
-    return np.diag(covariance)[:b] > (1.0 - TOLD) * np.diag(prior.covariance)
+    """Return (b,) which parameters rest on the prior: the data lower their variance by less than `TOLD`.
+
+    Counted about the whole robot's share: its factor s is one number, and soon told.
+    """
+    b = len(prior.own)
+    return np.diag(covariance)[:b] > (1.0 - TOLD) * prior.own**2
 
 
-def _shape(
-    own: np.ndarray | None, model: RegressorModel, base: Base, data: Triangles, wanted: str
-) -> tuple[np.ndarray, np.ndarray, str]:
-    """Return mean, covariance at f = 1, and where they come from."""
-    bodies = model.inertial
-    squares = np.sum(data.factors**2, axis=(0, 1))
-    size = np.sqrt(squares[-1] / np.maximum(squares[:-1], 1e-12 * squares[:-1].max()))  # would explain all of y
-    if own is None:
-        if wanted == "cad":
-            raise UsageError("prior = 'cad', but the robot's description holds no masses")
-        return np.zeros(base.b), np.diag(np.where(base.kept < bodies, size, DRIVES * size) ** 2), "sizes"
-    cad = np.zeros(len(base.standard))
-    cad[: len(own)] = own
-    spread = np.zeros(len(base.standard))
-    for first in range(0, len(own), 10):
-        body = own[first : first + 10]
-        mass = max(body[9], 0.02 * float(own[9::10].max()))
-        spread[first : first + 6] = SPREAD * np.abs(body[:6]) + mass * RADIUS**2
-        spread[first + 6 : first + 9] = SPREAD * np.abs(body[6:9]) + mass * LEVER
-        spread[first + 9] = SPREAD * mass
-    covariance = base.transform @ np.diag(spread**2) @ base.transform.T
-    mean = base.transform @ cad
-    for row, k in enumerate(base.kept):
-        if k >= len(own):  # drives, payloads
-            covariance[row, :] = covariance[:, row] = 0.0
-            covariance[row, row] = (DRIVES * size[row]) ** 2
-            if k >= bodies and model.columns[k - bodies].shape == "acceleration":
-                covariance[row, row] = min(covariance[row, row], (float(own[9::10].sum()) * ROTOR**2) ** 2)
-    return mean, covariance, "cad"
+def _sizes(model: RegressorModel, data: Triangles, columns: np.ndarray, whole: np.ndarray, more: np.ndarray) -> _Sizes:
+    """Return the kinds of parameters, and what is known of their sizes before any data; groups of `more` unnamed."""
+    kinds = [f"bodies [{unit}]" for unit in model.units[: model.inertial]]
+    kinds += [f"{one.shape} [{one.unit}]" for one in model.columns]
+    names = tuple(dict.fromkeys(kinds))
+    found, group = np.unique(more, return_inverse=True)
+    member = np.array([*(names.index(kind) for kind in kinds), *(len(names) + group), len(names) + len(found)], int)
+    names = (*names, *("" for _ in found))
+    seen = data.factors[:, :, :-1] @ columns
+    squares = np.sum(seen**2, axis=(0, 1))  # of the torque, per unit of each parameter
+    total = max(float(np.sum(data.factors[:, :, -1] ** 2)), 1e-300)
+    each = np.bincount(member, squares, len(names) + 1)
+    least = max(1e-12 * float(each.max()), 1e-300)  # of what no torque tells, nothing is known
+    alone = 0.5 * np.log(total / np.maximum(each, least))  # log of the size that explains all torque
+    width = np.append(np.full(len(names), WIDTH), WHOLE)
+    mean_square = np.bincount(member[: model.p], whole**2, len(names) + 1) / np.maximum(np.bincount(member), 1)
+    near = alone[-1] + np.log(NEAREST) + 0.5 * np.log(np.maximum(mean_square, 1e-300))
+    centre = alone + np.append(np.full(len(names), np.log(SHARE)), 0.0)
+    return _Sizes((*names, "whole"), member, np.maximum(centre, near), width, near)
 
 
-def _evidence(factor: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> float:
-    """Return the log marginal likelihood but for a constant."""
-    p = len(mean)
-    upper, target = factor[:p, :p], factor[:p, p]
-    rest = target - upper @ mean
-    c = np.eye(p) + upper @ covariance @ upper.T
-    lower = np.linalg.cholesky(c)
-    white = scipy.linalg.solve_triangular(lower, rest, lower=True)
-    return float(-np.log(np.diag(lower)).sum() - 0.5 * white @ white)
+def _posterior(factor: np.ndarray, columns: np.ndarray, deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return values (b,) and their covariance (b, b)."""
+    _, solution, inverse, _ = _whitened(factor, columns, deviations)
+    root = columns * deviations @ inverse
+    return columns * deviations @ solution, root @ root.T
+
+
+def _whitened(
+    factor: np.ndarray, columns: np.ndarray, deviations: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Return, in units of the prior's deviations, R, the solution, the inverse of the posterior's root, and log det."""
+    b, p = columns.shape
+    own = factor[:b, :b] @ (columns * deviations)
+    stacked = np.zeros((b + p, p + 1))
+    stacked[:b, :p], stacked[:b, p], stacked[b:, :p] = own, factor[:b, b], np.eye(p)
+    upper = np.linalg.qr(stacked, mode="r")[:p]
+    inverse = scipy.linalg.solve_triangular(upper[:, :p], np.eye(p))
+    return own, inverse @ upper[:, p], inverse, float(np.log(np.abs(np.diag(upper))).sum())
+
+
+def _most_probable(factor: np.ndarray, columns: np.ndarray, sizes: _Sizes, start: np.ndarray) -> np.ndarray:
+    """Return the logarithms of sizes (k,) where evidence and their own prior are largest together."""
+    b = len(columns)
+
+    def lost(t: np.ndarray) -> tuple[float, np.ndarray]:
+        deviations = sizes.deviations(t)
+        own, solution, inverse, log_det = _whitened(factor, columns, deviations)
+        rest, away = factor[:b, b] - own @ solution, (t - sizes.centre) / sizes.width
+        value = 0.5 * float(rest @ rest + solution @ solution + away @ away) + log_det
+        told = solution**2 + np.sum(inverse**2, axis=1) - 1.0  # slope of the evidence by each log deviation
+        return value, away / sizes.width - np.bincount(sizes.member, told, len(t))
+
+    found = scipy.optimize.minimize(
+        lost, np.maximum(start, sizes.least), jac=True, method="L-BFGS-B", bounds=[(one, None) for one in sizes.least],
+        options={"maxiter": 60, "ftol": 1e-8},
+    )  # fmt: skip
+    return np.asarray(found.x)
 
 
 def bounded(factor: np.ndarray, nonnegative: np.ndarray) -> np.ndarray:

@@ -59,7 +59,7 @@ class IdentificationSettings:
         essential: when to stop leaving out, one of `RULES`.
         ratio, level: r_σ of the RSD rule, level of the F rule.
         keep, drop: parameters never, or first, left out.
-        prior: draw what the motion cannot tell to the CAD's values: ``auto`` where it has to.
+        prior: of the parameters, its sizes by evidence, drawn to the CAD or to rods (``auto``), to the CAD, or none.
         payloads: label → what is known of it.
         payload_values: label → its ten standard parameters in the tip's frame, where they are known from elsewhere;
             they serve for predictions where no recording to learn from carries it.

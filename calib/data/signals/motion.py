@@ -135,6 +135,8 @@ def make_motion(recording: Recording, options: FilterOptions | None = None, samp
         check_cutoff(float(value), sampled.rate, recording.file)
     decimator = _decimator(cutoffs, options, sampled.rate, recording.file)
     q, v, a, mask = _derive(sampled, cutoff, options)
+    while options.band is None and decimator.factor > 1 and not len(kept(sampled.segment[mask], decimator)):
+        decimator = design_decimator(sampled.rate, decimator.factor // 2, options.decimator)  # whose window fits
     if not len(kept(sampled.segment[mask], decimator)):
         raise too_short(int(mask.sum()), decimator)
     inside = _span(mask)

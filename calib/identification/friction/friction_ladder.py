@@ -3,8 +3,9 @@
     standard → + load → + presliding → + stribeck → + asymmetric → + root → + cubic → + ripple
 
 Every step is tried on top of those taken: all joints get its terms, every time block is predicted by a fit to the
-others, and the terms stay at the joints whose error on unseen time falls by `GAIN`. Terms of a step have a ridge per
-joint, chosen by evidence, so that a rich step (ripple) may offer more than the data can tell.
+others, and the terms stay at the joints whose error on unseen time falls by `GAIN`, and does not grow where one half of
+the time predicts the other: neighbouring blocks judge what holds between them, not what holds elsewhere. Terms of a
+step have a ridge per joint, chosen by evidence, so that a rich step (ripple) may offer more than the data can tell.
 """
 
 from __future__ import annotations
@@ -154,19 +155,27 @@ def _try(
     """Return the columns that stay, the errors with them, and their joints."""
     joint = {k: every[k - len(base)].acts[0][0] for k in columns}
     everyone = tuple(sorted(set(joint.values())))
-    new = validation.errors(np.array([*base, *taken, *columns]))
     if forced:
-        return columns, new, everyone
-    at = tuple(j for j in everyone if _pays(error[:, j], new[:, j]))
-    if not at:
-        return [], error, ()
-    some = [k for k in columns if joint[k] in at]
-    if len(some) < len(columns):
+        return columns, validation.errors(np.array([*base, *taken, *columns])), everyone
+    half = validation.errors(np.array([*base, *taken]), 2)
+    at, some = everyone, columns
+    for _ in range(2):  # with the joints left that it pays at, once more
+        tried = np.array([*base, *taken, *some])
+        new, other = validation.errors(tried), validation.errors(tried, 2)
+        at = tuple(j for j in at if _pays(error[:, j], new[:, j]) and _carries(half[:, j], other[:, j]))
+        some, before = [k for k in some if joint[k] in at], some
+        if not some:
+            return [], error, ()
+        if some == before:
+            break
+    else:
         new = validation.errors(np.array([*base, *taken, *some]))
-        at = tuple(j for j in at if _pays(error[:, j], new[:, j]))
-        some = [k for k in some if joint[k] in at]
-        new = validation.errors(np.array([*base, *taken, *some])) if some else error
     return some, new, at
+
+
+def _carries(before: np.ndarray, after: np.ndarray) -> bool:
+    """Say whether a joint's squared errors, one half of the time predicting the other, did not grow by `GAIN`."""
+    return bool(after.sum() <= (1.0 + GAIN) ** 2 * before.sum())
 
 
 def _pays(before: np.ndarray, after: np.ndarray) -> bool:

@@ -37,6 +37,11 @@ def _dissipated(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
     return np.where(moved > 0.0, taken / np.where(moved > 0.0, moved, 1.0), 0.0)
 
 
+def driving(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
+    """Return which joints friction drives, (n,) bool."""
+    return np.asarray(_dissipated(dynamics, cases) < LEAST)
+
+
 def driven(dynamics: Dynamics, cases: Sequence[Case]) -> tuple[int, ...]:
     """Return the joints, from 0, that friction drives: their torque's sign is reversed, or it is another joint's.
 

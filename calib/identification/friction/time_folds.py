@@ -37,16 +37,23 @@ class CrossValidation:
     prior: np.ndarray | None = None
     _known: dict[bytes, np.ndarray] = field(default_factory=dict, init=False)
 
-    def errors(self, columns: np.ndarray) -> np.ndarray:
-        """Return the squared errors (blocks, rows) on each block of the model with these columns, fitted to the others.
+    def errors(self, columns: np.ndarray, folds: int | None = None) -> np.ndarray:
+        """Return the squared errors (blocks, rows) on each block of the model with these columns, fitted to others.
 
         Squares are of samples, not whitened; blocks that a recording's gaps left empty hold zeros.
+
+        Args:
+            folds: in how many runs of neighbouring blocks the time is left out; None: block by block. Two: each half
+                predicts the other, as far as one recording can extrapolate.
         """
         columns = np.asarray(columns, dtype=int)
-        key = columns.tobytes()
+        runs = np.array_split(np.arange(self.blocks), folds or self.blocks)
+        key = len(runs).to_bytes(4, "little") + columns.tobytes()
         if key not in self._known:
             fitted = self._fitted if (self.group[columns] < 0).all() else self._drawn
-            self._known[key] = self._errors(columns, fitted(columns))
+            values = fitted(columns, runs)
+            each = [own for run, own in zip(runs, values) for _ in run]
+            self._known[key] = self._errors(columns, each)
         return self._known[key].copy()
 
     def _errors(self, columns: np.ndarray, values: list[np.ndarray]) -> np.ndarray:
@@ -59,24 +66,25 @@ class CrossValidation:
             result[block] = np.sum((factors @ np.append(x, -1.0)) ** 2, axis=1)
         return result
 
-    def _fitted(self, columns: np.ndarray) -> list[np.ndarray]:
-        """Return least squares on the blocks beside each one, from their triangles."""
+    def _fitted(self, columns: np.ndarray, runs: list[np.ndarray]) -> list[np.ndarray]:
+        """Return least squares on the blocks beside each run, from their triangles."""
         chosen, group = select(self.data, columns), self.group[columns]
         prior = None if self.prior is None else self.prior[:, np.append(columns, -1)]
-        folds = [[other for other in range(self.blocks) if other != block] for block in range(self.blocks)]
+        folds = [[other for other in range(self.blocks) if other not in run] for run in runs]
         pooled = (pool(chosen, self.rows, others) for others in folds)
         return [estimate(data, self.std, self.inflation, group, prior)[0] for data in pooled]
 
-    def _drawn(self, columns: np.ndarray) -> list[np.ndarray]:
-        """Return the estimates with ridges on the blocks beside each one: these need no more than [W y]ᵀ[W y]."""
+    def _drawn(self, columns: np.ndarray, runs: list[np.ndarray]) -> list[np.ndarray]:
+        """Return the estimates with ridges on the blocks beside each run: these need no more than [W y]ᵀ[W y]."""
         index, blocks = np.append(columns, self.data.parameters), np.arange(self.blocks)
         squares = self._squares.take(index, 1).take(index, 2)
         known = 0.0 if self.prior is None else self.prior[:, index].T @ self.prior[:, index]
         samples = self.counts()
         found = []
-        for block in range(self.blocks):
-            whole = squares[blocks != block].sum(axis=0) + known
-            rows = int(np.sum(samples[blocks != block].sum(axis=0) / self.inflation))
+        for run in runs:
+            others = ~np.isin(blocks, run)
+            whole = squares[others].sum(axis=0) + known
+            rows = int(np.sum(samples[others].sum(axis=0) / self.inflation))
             found.append(_drawn(whole, rows, self.group[columns])[0])
         return found
 

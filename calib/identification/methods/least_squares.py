@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 import scipy.linalg
 
+from calib.dynamics.base import to_standard
+from calib.dynamics.idim import IdentificationModel, with_terms
 from calib.estimation.linear import LinearFit, ols, ridge, settled_std, wls
 from calib.estimation.samples import SampleFit, irls, stack
 from calib.estimation.total import tls
-from calib.estimation.triangles import Triangles, combine, residual_squares, retriangulate
-from calib.estimation.whiteness import inflation
+from calib.estimation.triangles import Triangles, combine, retriangulate
 from calib.identification.constraints import Constraints, hold
+from calib.identification.friction.passivity import driving
 from calib.identification.friction.time_folds import estimate
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, MethodEstimate, attempted
-from calib.identification.prior import Prior, bounded
-from calib.identification.rows import ObservationRows
+from calib.identification.prediction import Dynamics
+from calib.identification.prior import Prior, bounded, residual_inflation, weighing
 
 COLUMN_NOISE = 0.01  # of a column's rms: what filtered derivatives miss (our choice)
+ROUNDS = 2  # of weighing rows by the residuals that richer friction leaves
 
 
 class _Solve(Protocol):
@@ -65,32 +68,9 @@ class LeastSquares:
             fit = self.solve(problem, std, tau)
             ridges = self.takes_prior and bool((problem.groups >= 0).any())
             fit, known = _drawn(problem, None, std, tau) if ridges else (fit, None)
-        else:  # what the data leave open, the prior decides
-            std, tau = _least_norm_weighing(problem)
-            fit, known = _drawn(problem, prior, std, tau)
+        else:
+            fit, known, std, tau = _settled(problem, prior)
         return MethodEstimate(self.name, EstimateStatus.FOUND, fit, problem.pooled, std, tau, self.weighted, known)
-
-
-def scaled(noise: np.ndarray | None, std: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return the rows' noise times one factor, that of the residuals' `std` (rows,) of `counts` samples; None: `std`.
-
-    Relative between joints, with a common scale (our choice): the variance over repeats does not see what every period
-    has alike, so as it stands it would promise too much; and the decimation filter's gain for white noise, one number
-    for all joints, drops out.
-    """
-    return std if noise is None else noise * np.sqrt(np.average((std / noise) ** 2, weights=np.maximum(counts, 1)))
-
-
-def residual_inflation(all_rows: Sequence[ObservationRows], values: np.ndarray) -> np.ndarray:
-    """Return the integrated autocorrelation of each row's residuals (rows,), averaged over cases by length."""
-    rows = all_rows[0].target.shape[1]
-    total, weight = np.zeros(rows), np.zeros(rows)
-    for part in all_rows:
-        residual, seen = part.target - part.matrix @ values, np.asarray(part.present.any(axis=0))
-        own = [inflation(residual[:, row]) if seen[row] else 0.0 for row in range(rows)]
-        total += len(residual) * np.array(own)
-        weight += len(residual) * seen
-    return np.maximum(total / np.maximum(weight, 1.0), 1.0)
 
 
 def scaled_tls(pooled: Triangles, std: np.ndarray, exact: np.ndarray) -> LinearFit:
@@ -118,56 +98,59 @@ def _weighing(problem: IdentificationProblem) -> tuple[np.ndarray, np.ndarray]:
     return std, residual_inflation(problem.rows, wls(pooled, std).estimate.values)
 
 
-def _least_norm_weighing(problem: IdentificationProblem) -> tuple[np.ndarray, np.ndarray]:
-    """Return the same from a fit of least norm, whose values serve for its residuals alone."""
-    pooled = problem.pooled
-    std, tau = np.ones(pooled.groups), np.ones(pooled.groups)
-    values = np.zeros(pooled.parameters)
-    for _ in range(4):
-        values = estimate(pooled, std, tau, np.full(pooled.parameters, -1))[0]
-        std = np.sqrt(residual_squares(pooled, values) / np.maximum(pooled.rows, 1))
-        std = scaled(problem.noise, np.maximum(std, 1e-9 * max(float(std.max()), 1e-300)), pooled.rows)
-    return std, residual_inflation(problem.rows, values)
-
-
 def _drawn(
     problem: IdentificationProblem, prior: Prior | None, std: np.ndarray, tau: np.ndarray
 ) -> tuple[LinearFit, np.ndarray]:
     """Return WLS with ridges of richer friction as strong as the evidence says, and with a prior of the base columns.
 
-    Beside it the rows (k, p) that say both, whitened. With a prior, drive parameters are kept from being negative; the
-    covariance is that without these bounds.
+    Beside it the rows (k, p) that say both, whitened.
     """
     pooled, group = problem.pooled, problem.groups
     own, more = problem.base.b, pooled.parameters - problem.base.b
     known = None if prior is None else np.hstack([prior.rows[:, :-1], np.zeros((own, more)), prior.rows[:, -1:]])
     ridges = estimate(pooled, std, tau, group, known)[1]
     covariance = np.diag(np.where(group < 0, np.inf, np.maximum(ridges, 1e-12) ** 2))
-    mean = np.zeros(len(ridges))
     if prior is not None:
-        covariance[:own, :own], mean[:own] = prior.covariance, prior.mean
-    fit = ridge(pooled, mean, covariance, std * np.sqrt(tau))
+        covariance[:own, :own] = prior.covariance
+    fit = ridge(pooled, np.zeros(len(ridges)), covariance, std * np.sqrt(tau))
     finite = np.isfinite(np.diag(covariance))
-    rows = np.zeros((int(finite.sum()), len(mean)))
+    rows = np.zeros((int(finite.sum()), len(ridges)))
     root = np.linalg.cholesky(covariance[np.ix_(finite, finite)])
     rows[:, np.flatnonzero(finite)] = scipy.linalg.solve_triangular(root, np.eye(len(root)), lower=True)
-    if prior is None:
-        return fit, rows
-    values = _bounded(pooled, std * np.sqrt(tau), mean, covariance, problem.nonnegative)
-    return replace(fit, estimate=replace(fit.estimate, values=values)), rows
+    return fit, rows
 
 
-def _bounded(
-    data: Triangles, std: np.ndarray, mean: np.ndarray, covariance: np.ndarray, nonnegative: np.ndarray
-) -> np.ndarray:
-    """Return the values of data and prior with some parameters not negative."""
-    known = np.isfinite(np.diag(covariance))
-    unit = np.sqrt(np.diag(covariance)[known])
-    lower = np.linalg.cholesky(covariance[np.ix_(known, known)] / np.outer(unit, unit) + 1e-9 * np.eye(len(unit)))
-    rows = np.zeros((len(unit), data.parameters + 1))
-    rows[:, np.flatnonzero(known)] = np.linalg.solve(lower, np.diag(1.0 / unit))
-    rows[:, -1] = rows[:, :-1] @ mean
-    return bounded(retriangulate(np.vstack([combine(data, std), rows])), nonnegative)
+def _settled(problem: IdentificationProblem, prior: Prior) -> tuple[LinearFit, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the fit with a prior, its rows (k, p), and the (rows,) std and inflation that its own residuals say.
+
+    Drive parameters are kept from being negative; the covariance is that without these bounds. Not so the friction of
+    a joint that it drives instead of braking it: that says that something is wrong, and is to be seen.
+    """
+    pooled, noise = problem.pooled, problem.noise
+    std, tau = prior.first.std, prior.first.inflation
+    fit, known = _drawn(problem, prior, std, tau)
+    for _ in range(ROUNDS):
+        std, tau = weighing(problem.rows, pooled, fit.estimate.values, fit.estimate.covariance, std, tau, noise)
+        fit, known = _drawn(problem, prior, std, tau)
+    bound = problem.nonnegative & ~_driving(problem, fit.estimate.values)
+    values = bounded(
+        retriangulate(np.vstack([combine(pooled, std * np.sqrt(tau)), np.pad(known, ((0, 0), (0, 1)))])), bound
+    )
+    return replace(fit, estimate=replace(fit.estimate, values=values)), known, std, tau
+
+
+def _driving(problem: IdentificationProblem, values: np.ndarray) -> np.ndarray:
+    """Return (p,) which columns are friction of a joint that it drives, by an estimate without bounds."""
+    model, own = problem.model, problem.base.b
+    if not isinstance(model, IdentificationModel) or not model.torque_rows.motors_alone:
+        return np.zeros(len(values), dtype=bool)
+    richer = with_terms(model, *(one for one in problem.terms[own:] if one is not None))
+    standard = np.concatenate([to_standard(problem.base, values[:own]), values[own:]])
+    wrong = driving(Dynamics(richer, standard), problem.cases)
+    return np.array(
+        [one is not None and one.form.dissipative and any(wrong[row] for row, _ in one.acts) for one in problem.terms],
+        dtype=bool,
+    )
 
 
 @dataclass(frozen=True)

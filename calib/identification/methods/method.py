@@ -24,7 +24,7 @@ from calib.errors import CannotSimulate, Diverged, NotConverged, Unidentifiable
 from calib.estimation import instrumental_variables
 from calib.estimation.estimate import Estimate
 from calib.estimation.linear import LinearFit
-from calib.estimation.triangles import Triangles
+from calib.estimation.triangles import Triangles, retriangulate
 from calib.identification.cases import Case
 from calib.identification.constraints import Constraints, ConstraintSettings, Held, make_constraints
 from calib.identification.loop.loop_recordings import ClosedLoops
@@ -173,8 +173,15 @@ class MethodEstimate:
 
     def testable(self) -> tuple[Triangles, np.ndarray, np.ndarray]:
         """Return triangles on which least squares gives this estimate, (g,) std and (g,) inflation: to test with."""
-        if self.instrumental is None:
+        if self.instrumental is None and self.beforehand is None:
             return self.pooled, self.std, self.inflation
+        if self.instrumental is None:  # what was known beforehand is one more group of rows
+            known = retriangulate(np.pad(self.beforehand, ((0, 0), (0, 1))))
+            data = replace(
+                self.pooled, factors=frozen(np.concatenate([self.pooled.factors, known[None]])),
+                rows=frozen([*self.pooled.rows, len(self.beforehand)], int),
+            )  # fmt: skip
+            return data, np.append(self.std, 1.0), np.append(self.inflation, 1.0)
         own = self.instrumental
         data = instrumental_variables.testable(own.problem, own.fit, own.std)
         return data, np.ones(1), np.array([own.inflation])

@@ -11,12 +11,11 @@ from calib.arrays import frozen
 from calib.dynamics import pseudo_inertia
 from calib.dynamics.bodies import standard_parameters
 from calib.dynamics.idim import IdentificationModel
+from calib.identification.rods import PAYLOAD, RADIUS, rods
 from calib.robot.chain import Chain
 
 THIN = 5e-3  # [m]: no body of a robot's arm has its mass within less, as a standard deviation (our choice)
 LIGHT = 0.02  # of the heaviest body: the mass of one whose CAD has none
-RADIUS = 0.1  # [m] of the balls that rods are made of
-PAYLOAD = (2.0, 0.1)  # [kg, m]
 TOTALS = tuple(float(10.0 ** (k / 2)) for k in range(0, 7))  # [kg] of an arm without CAD, 1 kg to 1 t
 
 
@@ -50,9 +49,9 @@ def find_prior_bodies(chain: Chain, model: IdentificationModel) -> Iterator[Prio
         yield _cad(chain, model, carried)
         return
     for total in TOTALS:
-        rods = _rods(chain, model, total)
+        bodies = rods(chain, model, total)
         words = f"no masses in the robot's description: rods between the joints, {total:.3g} kg in all, by the evidence"
-        yield PriorBodies(rods, ~carried, False, words)
+        yield PriorBodies(bodies, ~carried, False, words)
 
 
 def _cad(chain: Chain, model: IdentificationModel, carried: np.ndarray) -> PriorBodies:
@@ -80,21 +79,3 @@ def _thickened(body: np.ndarray) -> np.ndarray:
     size, axes = np.linalg.eigh(pseudo[:3, :3] / mass - np.outer(centre, centre))
     pseudo[:3, :3] = mass * ((axes * np.maximum(size, THIN**2)) @ axes.T + np.outer(centre, centre))
     return pseudo_inertia.to_standard(pseudo)
-
-
-def _rods(chain: Chain, model: IdentificationModel, total: float) -> np.ndarray:
-    """Return rods from each body's frame to the next one's, mass by length and thickness."""
-    arm = model.bodies
-    ends = np.array([np.asarray(chain.tail)[:3, 3]] * arm.count)
-    for i, parent in enumerate(arm.parents):
-        if parent >= 0 and arm.coordinates[i] >= 0:
-            ends[parent] = arm.placements[i][:3, 3]
-    moving = arm.coordinates >= 0
-    share = np.where(moving, np.linalg.norm(ends, axis=1) + 2 * RADIUS, 0.0)
-    masses = total * share / share.sum()
-    return np.array(
-        [
-            pseudo_inertia.rod(mass, end, RADIUS) if moves else pseudo_inertia.ball(*PAYLOAD)
-            for mass, end, moves in zip(masses, ends, moving)
-        ]
-    )

@@ -185,8 +185,6 @@ def model_warnings(
             f"condition number {normalised:.0f} (columns of unit norm): the motion tells some parameters apart badly; "
             "design an excitation"
         )
-    if excitation and all(report.poor for report in excitation.values()) and found.settings.friction == "auto":
-        told.append("friction: standard only, since on so poor a motion no block of time judges another")
     if found.fitted.held is not None:
         told += found.fitted.held.lines()
     told += found.bias.lines(found.fitted.instrumental is not None)
@@ -224,7 +222,7 @@ def _rests(found: Identification) -> list[str]:
     if found.prior is None or not names:
         return []
     source = "the robot's own inertias" if found.prior.source == "cad" else "nothing but the order of their sizes"
-    how = f"drawn to {source} (f = {found.prior.scale:.2g}; {len(names)} of {found.base.b})"
+    how = f"drawn to {source} ({len(names)} of {found.base.b})"
     return [f"not identifiable from this motion, {how}: {', '.join(names)}"]
 
 

@@ -46,7 +46,7 @@ def values(out: Path) -> dict[str, float]:
     [("@0:9.387", "@9.387:", 3.25, 3.55), ("@3.13:", "@0:3.13", 3.65, 4.2)],
 )
 def test_panda_on_the_rest_of_its_record(data, tmp_path, train, unseen, most, plain):
-    """Measured 3.16 and 3.53 %; without richer friction and ripple 3.44 and about 4.0 %; published model 3.66 %.
+    """Measured 2.9 and 3.4 %; without richer friction and ripple 3.4 and about 4.0 %; published model 3.66 %.
 
     The issue's plain 2.8 % was not reproduced (another stretch, most likely): plain WLS left out second by second over
     all 12.5 s gives 2.93 beside the published model's 3.76. Its goal of 2.3 is not met here.
@@ -67,6 +67,29 @@ def test_panda_on_the_rest_of_its_record(data, tmp_path, train, unseen, most, pl
     assert total(found, f"traj1_first60pct.npz{unseen}") < total(bare, f"traj1_first60pct.npz{unseen}") < plain
     lobes = {(wave["gear"], wave["order_per_turn"]) for one in found["ripple"] for wave in one["waves"]}
     assert {(1, 240), (1, 242), (4, 240), (4, 242)} <= lobes
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seconds", "most"), [(1, 6.5), (2, 5.5), (4, 4.2), (6, 3.3)])
+def test_panda_on_the_first_seconds(data, tmp_path, seconds, most):
+    """Measured 5.5, 4.8, 3.7 and 3.2 %; weighted least squares with its switches gave 481, 25, 7.3 and 3.3."""
+    folder = data / "franka_panda_inria"
+    log = folder / "traj1_first60pct.npz"
+    unseen = f"{log}@9.387:11.9"
+    found = identify(tmp_path / "out", folder / "model.urdf", f"{log}@0:{seconds}", "--validate", unseen)
+    assert total(found, Path(unseen).name) < most
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("end", "most"), [(10, 10.3), (12, 5.7), (16, 5.8), (24, 4.4)])
+def test_ur10e_on_the_first_seconds(data, tmp_path, end, most):
+    """Measured 9.7, 5.1, 5.3 and 4.1 %; weighted least squares with its switches: refused, 25, 7.8 and 4.1."""
+    folder = data / "ur10e_innopolis"
+    unseen = folder / "ur-20_02_19_14harm50sec.npz"
+    train = f"{folder / 'ur-20_02_10-30sec_12harm.npz'}@8:{end}"
+    gains = "gains = [14.87, 13.26, 11.13, 10.62, 11.03, 11.47]"
+    found = identify(tmp_path / "out", folder / "model.urdf", train, "--validate", unseen, options=gains)
+    assert total(found, unseen.name) < most
 
 
 UR10E = """
@@ -217,7 +240,7 @@ def test_lwr_with_one_sine_says_what_it_cannot_tell(data, tmp_path):
     assert found["verdict"] == "marginal"
     assert total(found, "measurements_1.npz@18:") < 10.0, "the untouched CAD's error"
     own = values(tmp_path / "out")
-    assert all(own[name] >= 0.0 for name in own if name[:2] in ("Ia", "Fv", "Fc"))
+    assert all(own[name] >= 0.0 for name in own if name[:2] in ("Ia", "Fv", "Fc") and name[2:].isdigit())
 
 
 @pytest.mark.slow
