@@ -107,14 +107,50 @@ def within(
         return np.vstack([rows, bent.jacobian(b)])
 
     ahead = None if curvature is None else lambda b, mu: curvature(b, mu[len(rows) :])
-    if not same.any():
-        return minimise(factor, h, jacobian, curvature=ahead)
-    return _on_equalities(factor, h, jacobian, ahead, matrix[same], lower[same])
+    count = len(offset) + len(bent.h(np.zeros(p)))
+
+    def solve(used: int) -> Constrained:
+        part = _Part(h, jacobian, ahead if used > len(rows) else None, used)
+        if same.any():
+            return _on_equalities(factor, part, matrix[same], lower[same])
+        return minimise(factor, part.h, part.jacobian, curvature=part.curvature)
+
+    for used in (0, len(rows)):  # an optimum that satisfies what was left out is that of the whole problem
+        found = solve(used)
+        left = h(found.values)[used:]
+        if (left >= 0.0).all():
+            return _widened(found, used, left, jacobian(found.values)[used:])
+    return solve(count)
 
 
-def _on_equalities(
-    factor: np.ndarray, h: Vector, jacobian: Vector, curvature: Curvature | None, rows: np.ndarray, held: np.ndarray
-) -> Constrained:
+@dataclass(frozen=True)
+class _Part:
+    """The first `used` of all inequalities."""
+
+    whole_h: Vector
+    whole_jacobian: Vector
+    curvature: Curvature | None
+    used: int
+
+    def h(self, b: np.ndarray) -> np.ndarray:
+        return self.whole_h(b)[: self.used]
+
+    def jacobian(self, b: np.ndarray) -> np.ndarray:
+        return self.whole_jacobian(b)[: self.used]
+
+
+def _widened(found: Constrained, used: int, left: np.ndarray, normals: np.ndarray) -> Constrained:
+    """Return the optimum with the inequalities that were left out, none of which binds, behind the first `used`."""
+    zero = np.zeros(len(left))
+    return replace(
+        found, multipliers=frozen(np.insert(found.multipliers, used, zero)),
+        slack=frozen(np.insert(found.slack, used, left)),
+        binding=frozen(np.insert(found.binding, used, zero > 0.0), bool),
+        normals=frozen(np.insert(found.normals, used, normals, axis=0)),
+    )  # fmt: skip
+
+
+def _on_equalities(factor: np.ndarray, part: _Part, rows: np.ndarray, held: np.ndarray) -> Constrained:
     """Minimise over b = b0 + N t, E N = 0, E b0 = d, in units that give the columns of R unit norm."""
     p = len(factor) - 1
     norms = np.linalg.norm(factor[:p, :p], axis=0)
@@ -133,6 +169,7 @@ def _on_equalities(
         raise CalibError(f"equalities fix all {p} parameters: they leave nothing to estimate")
     origin, basis = unit * origin, unit[:, None] * right[rank:].T
     reduced = retriangulate(np.column_stack([factor[:, :p] @ basis, factor[:, p] - factor[:, :p] @ origin]))
+    h, jacobian, curvature = part.h, part.jacobian, part.curvature
     found = minimise(
         reduced[: p - rank + 1], lambda t: h(origin + basis @ t), lambda t: jacobian(origin + basis @ t) @ basis,
         curvature=None if curvature is None else lambda t, mu: basis.T @ curvature(origin + basis @ t, mu) @ basis,

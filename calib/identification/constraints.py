@@ -360,16 +360,30 @@ def _definite(inertia: np.ndarray, free: np.ndarray) -> Curved | None:
     scale = 1.0 / np.sqrt(np.maximum(size, 1e-6 * size.max()))
     scaled = inertia * scale[:, None, None] * scale[None, :, None]
 
-    def modes(b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return np.linalg.eigh(scaled @ b)
+    count, n, _, p = scaled.shape
+    flat, known = scaled.reshape(count, n * n, p), {}
 
-    def slopes(vectors: np.ndarray) -> np.ndarray:
-        return np.einsum("ki,kijp,kj->kp", vectors[:, :, 0], scaled, vectors[:, :, 0])
+    def modes(b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        key = b.tobytes()
+        if key not in known:
+            known.clear()
+            known[key] = np.linalg.eigh((flat @ b).reshape(count, n, n))
+        return known[key]
+
+    def least(b: np.ndarray) -> np.ndarray:
+        return modes(b)[0][:, 0] - LEAST
+
+    def slopes(b: np.ndarray) -> np.ndarray:
+        first = modes(b)[1][:, :, 0]
+        pairs = first[:, :, None] * first[:, None, :]
+        return np.asarray((pairs.reshape(count, 1, n * n) @ flat)[:, 0])
 
     def curvature(b: np.ndarray, mu: np.ndarray) -> np.ndarray:
         values, vectors = modes(b)
-        mixed = np.einsum("kil,kijp,kj->klp", vectors[:, :, 1:], scaled, vectors[:, :, 0])
+        pairs = vectors[:, :, None, 1:] * vectors[:, None, :, :1]
+        mixed = pairs.reshape(count, n * n, n - 1).transpose(0, 2, 1) @ flat
         gap = np.maximum(values[:, 1:] - values[:, :1], 1e-9)
-        return -2.0 * np.einsum("k,klp,klr->pr", mu, mixed / gap[:, :, None], mixed, optimize=True)
+        root = (np.sqrt(2.0 * mu[:, None] / gap)[:, :, None] * mixed).reshape(-1, p)
+        return -root.T @ root
 
-    return Curved(lambda b: modes(b)[0][:, 0] - LEAST, lambda b: slopes(modes(b)[1]), curvature)
+    return Curved(least, slopes, curvature)

@@ -145,3 +145,23 @@ def test_the_options_file_says_them_and_other_methods_refuse_them():
         identify(planted.arm(), [planted.case("a", 0)], replace(settings, method="wls"))
     with pytest.raises(UsageError, match="lower bound 2 is above the upper 1"):
         parse_options({"constraints": {"bounds": {"Fv1": [2.0, 1.0]}}})
+
+
+def test_definite_inertia_gives_the_optimum_of_cvxpy(problem):
+    cvxpy = pytest.importorskip("cvxpy")
+    limit = -0.2 * value(METHODS["wls"].estimate(problem), "ZZ2")
+    made = asked(problem, bounds={"ZZ2R": (-np.inf, limit)}, inertia=6, signs=False).constrained
+    triangle = combine(problem.pooled, METHODS["wls"].estimate(problem).std)
+    p = problem.base.b
+    found = made.solve(triangle)
+    norms = np.linalg.norm(triangle[:p, :p], axis=0)
+    free = np.linalg.solve(triangle[:p, :p], triangle[:p, p])
+    size = np.abs(np.einsum("kiip,p->ki", made.inertia, free)).mean(axis=0)
+    b = cvxpy.Variable(p)
+    scaled = made.inertia / np.sqrt(size)[:, None, None] / np.sqrt(size)[:, None] / norms
+    cones = [sum(b[k] * one[:, :, k] for k in range(p)) - LEAST * np.eye(len(size)) >> 0 for one in scaled]
+    bound = made.matrix / norms @ b <= made.upper
+    aim = cvxpy.sum_squares((triangle[:p, :p] / norms @ b - triangle[:p, p]) / np.linalg.norm(triangle[:p, p]))
+    cvxpy.Problem(cvxpy.Minimize(aim), [*cones, bound]).solve(solver="CLARABEL", tol_gap_abs=1e-12, tol_gap_rel=1e-12)
+    assert found.values * norms == pytest.approx(b.value, abs=1e-4 * np.abs(b.value).max())
+    assert found.binding.sum() > 1
