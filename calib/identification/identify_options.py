@@ -13,6 +13,7 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     v0 = 0.01                        # smoothing of the Coulomb sign [rad/s or m/s], or one per joint
     rows = "motor"                   # which torques are explained: motor; with joint torque sensors (columns tau_l and
                                      # tau_m or tau) also link (Model 1), both (Model 2), drive (Model 3: tau_m - tau_l)
+                                     # or power: one row, the power of all motors (no accelerations)
     gravity = [0, 0, -9.81]          # in the robot's base frame; default the robot's own
     gains = [10.0, 10.7]             # torque per current of each joint, signed; default the file's own
     slow = 0.01                      # a joint stands below this share of its peak speed; or a speed per joint

@@ -47,6 +47,14 @@ TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     ),
     "constraints": ("the TOML file of calib select --constraints", ("calib.procedure.kinematic_stage.pose_limits",)),
     "mdh": ("a robot as a table of modified Denavit-Hartenberg rows", ("calib.robot.mdh", "calib.robot.tables")),
+    "parallel": (
+        "a parallel robot as legs and a platform, and what commands write of one",
+        (
+            "calib.mechanism.parallel_files",
+            "calib.procedure.parallel_stage.fit",
+            "calib.procedure.parallel_stage.folder",
+        ),
+    ),
     "robot": (
         "robot.toml as calib fit writes it",
         ("calib.robot.description", "calib.geometry.installation_file", "calib.robot.calibrated"),
