@@ -84,7 +84,10 @@ def _checked(function: Callable[..., Any], name: str, annotated: Any, method: bo
         for argument, value in bound.arguments.items():
             variadic = wanted.parameters[argument].kind in (2, 4)  # *args, **kwargs
             if argument in hints and not variadic and not _fits(value, hints[argument]):
-                raise UsageError(f"{name}: {argument}: expected {_words(hints[argument])}, found {shown(value)}")
+                hint = hints[argument]
+                if get_origin(hint) is Annotated and _fits(value, get_args(hint)[0]):  # of its type, beyond its range
+                    raise UsageError(f"{argument} {shown(value)}: expected {_words(hint)}")
+                raise UsageError(f"{name}: {argument}: expected {_words(hint)}, found {shown(value)}")
         return function(*args, **kwargs)
 
     return call

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from functools import lru_cache
 from typing import Annotated, Any
 
@@ -51,6 +52,8 @@ def options(
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit with one of the codes above."""
+    if not os.environ.get("CALIB_DEBUG"):  # what numpy and others say to programmers helps nobody at a cell
+        warnings.filterwarnings("ignore")
     sys.exit(run(arguments))
 
 

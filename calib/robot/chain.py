@@ -17,6 +17,7 @@ from calib.errors import RobotError
 
 AXES = ("tx", "ty", "tz", "rx", "ry", "rz")
 GRAVITY = (0.0, 0.0, -9.81)
+HEAVIEST = 100.0  # [m/s²] (our choice)
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,9 @@ class Joint:
             raise RobotError(f"joint '{self.name}': kind '{self.kind}' is neither 'revolute' nor 'prismatic'")
         if not self.lower < self.upper:
             raise RobotError(f"joint '{self.name}': lower limit {self.lower:g} is not below the upper {self.upper:g}")
+        for what in ("velocity", "effort"):
+            if not getattr(self, what) >= 0.0:
+                raise RobotError(f"joint '{self.name}': {what} {getattr(self, what):g} is no limit: expected 0 or more")
 
     @property
     def unit(self) -> str:
@@ -107,6 +111,11 @@ class Chain:
     def __post_init__(self) -> None:
         object.__setattr__(self, "tail", frozen(self.tail))
         object.__setattr__(self, "gravity", frozen(self.gravity))
+        if not np.linalg.norm(self.gravity) < HEAVIEST:
+            raise RobotError(f"'{self.name}': gravity {self.gravity.tolist()} is none: expected m/s², some 9.81 in all")
+        for what in ("tail", "inertias"):
+            if (value := getattr(self, what)) is not None and not np.isfinite(value).all():
+                raise RobotError(f"'{self.name}': {what}: found a number that is not finite")
         if self.inertias is not None:
             object.__setattr__(self, "inertias", frozen(self.inertias))
         for what, names in (("joint", self.joint_names), ("element", self.names)):

@@ -126,6 +126,8 @@ def plan(
     """
     say = progress or (lambda words: None)
     _check(settings)
+    if settings.payloads and model is None:
+        raise UsageError(f"payloads {', '.join(settings.payloads)}: they are identified ones: name the model")
     chain, source = load_rigid(robot, waypoints, base, tip)
     known = read_motion_limits(limits, chain, source, given_way=True)
     law, notes, uncertain = _law(chain, model, settings.payloads, drives, known)

@@ -197,11 +197,20 @@ def compensate(
         start: (n,) where a target without joints is sought from [rad or m]; None for the middle of the limits.
         tolerance: position [m] and orientation [rad] that a command may leave.
         seed: of further starts, where the first one fails.
+
+    Raises:
+        UsageError: for a tolerance that is none, and a start beyond the limits.
     """
+    if not (np.isfinite(tolerance).all() and min(tolerance) > 0.0):
+        raise UsageError(
+            f"tolerance {1e3 * tolerance[0]:g} mm, {1e3 * tolerance[1]:g} mrad: expected two sizes above 0"
+        )
     say = progress or (lambda words: None)
     one, two = placements(fitted, frame, tool)
     count, notes = _dof(targets, one.chain, dof)
     lower, upper = one.chain.lower, one.chain.upper
+    if start is not None and not ((np.asarray(start) >= lower - SLACK) & (np.asarray(start) <= upper + SLACK)).all():
+        raise UsageError(f"start {list(start)}: beyond the joints' limits {lower.tolist()} to {upper.tolist()}")
     before = Goal(one, count, lower, upper)
     after = Goal(two, count, lower, upper, torques_of(fitted))
     say("the nominal robot at the targets")
