@@ -21,6 +21,7 @@ from calib.estimation.estimate import Estimate
 from calib.procedure.kinematic_stage import compensation, compensation_file, fit, folder, inputs, selection
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSettings, SelectionSettings
 from calib.procedure.kinematic_stage.verdict import Verdict
+from calib.procedure.measuring.run import write_run
 from calib.procedure.report.fit_report import fit_metrics
 from calib.robot.calibrated import CalibratedChain
 
@@ -49,6 +50,10 @@ class PoseSelection:
     def save(self, path: str | Path) -> Path:
         """Write the poses as CSV under the joints' names [rad or m]."""
         return selection.write(self.chosen, Path(path))
+
+    def save_run(self, path: str | Path) -> Path:
+        """Write the run through the poses, in their order, as CSV: t [s], pose (0 for a via-point), joints."""
+        return write_run(Path(path), self.chosen.run, self.chosen.chain)
 
     def to_dict(self) -> dict[str, Any]:
         """Return what the selection came to: index, its value, that of random sets, efficiency, seconds, notes."""

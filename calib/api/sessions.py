@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ def new_session(
     poses: int = 40,
     validation: int = 20,
     tool: Sequence[float] | None = None,
-    limits: str | Path | None = None,
+    limits: str | Path | Mapping[str, Any] | None = None,
     dynamics: bool = True,
     base: str = "",
     tip: str = "",
@@ -35,7 +35,7 @@ def new_session(
         instrument: ``cmm``, ``tracker``, ``tracker6d``, ``mocap``, ``camera``, ``other-pose`` or ``other-position``.
         poses, validation: how many to choose for the fit, and to measure and never fit.
         tool: (3,) where the target roughly sits in the tip's frame [m].
-        limits: TOML file that both poses and motions keep (``calib formats limits``).
+        limits: TOML file that both poses and motions keep (``calib formats limits``), or its tables.
         dynamics: identify the dynamics, too.
         seed: of everything random.
         motion: other keys of ``[dynamics]`` (``calib formats session``): torques, payloads, period …
@@ -46,8 +46,9 @@ def new_session(
     Raises:
         UsageError: where the folder is in use, or a value is none of these.
     """
+    known = limits if isinstance(limits, Mapping) else optional(limits)
     wanted = commands.NewSession(
-        str(robot), instrument, poses, validation, seed, base, tip, tool, optional(limits), dynamics, motion
+        str(robot), instrument, poses, validation, seed, base, tip, tool, known, dynamics, motion
     )
     made = commands.begin(Path(folder), wanted)
     return made.folder

@@ -111,6 +111,12 @@ def select(
             "repeated"
         ),
     ] = None,
+    run: Annotated[
+        Path | None,
+        typer.Option(help="CSV of the run: t, pose (0: via-point), joints; calib view rehearses it"),
+    ] = None,
+    speed: Annotated[float, typer.Option(help="share of the joints' speeds that the run is driven at")] = 0.3,
+    dwell: Annotated[float, typer.Option(help="seconds that each pose takes to settle and be measured")] = 6.0,
     candidates: Annotated[int, typer.Option(help="poses to choose from")] = 2000,
     existing: Annotated[Path | None, typer.Option(help="CSV of poses measured before, which count")] = None,
     sigma: Annotated[
@@ -128,30 +134,27 @@ def select(
     refuse_parallel(robot, "select")
     from calib.files import check_target
     from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
+    from calib.procedure.measuring.run import RunSettings
 
     check_target(out, [robot, existing, constraints])
+    if run:
+        check_target(run, [robot, existing, constraints, out])
     targets = tuple(tuple(numbers(text, 3, "--tool")) for text in tool or [])
     sigmas = None if sigma is None else numbers(sigma, 2, "--sigma")
     stated = None if sigmas is None else (sigmas[0], sigmas[1])
     settings = SelectionSettings(
-        kind,
-        targets,
-        index,
-        method or DEFAULT_SELECTION.method,
-        candidates,
-        stated,
-        seed,
-        starts,
-        evaluations,
-        seconds,
-        climbs,
-    )
+        kind, targets, index, method or DEFAULT_SELECTION.method, candidates, stated, seed, starts, evaluations,
+        seconds, climbs, tuple(without or ()), RunSettings(speed, dwell),
+    )  # fmt: skip
     with progress() as show:
         chosen = select_poses(
             robot, m, settings, constraints=constraints, existing=existing, base=base, tip=tip, workers=workers,
             progress=show,
         )  # fmt: skip
     chosen.save(out)
+    if run:
+        chosen.save_run(run)
+        say(f"the run: {run}; calib view {run} --robot {robot}")
     say(str(chosen))
     say(f"{m} poses written to {out}")
 

@@ -31,6 +31,19 @@ def new(
         str | None, typer.Option(help="x,y,z: where the target roughly sits in the tip's frame [m]")
     ] = None,
     limits: Annotated[Path | None, typer.Option(help="TOML: where, how fast the arm may go; poses and motions")] = None,
+    instrument_at: Annotated[
+        str | None, typer.Option(help="x,y,z: where the instrument stands in the robot's base frame [m], or unknown")
+    ] = None,
+    cone: Annotated[
+        str | None, typer.Option(help="half angle in which the target sees the instrument [deg], or unknown")
+    ] = None,
+    facing: Annotated[str | None, typer.Option(help="where the target faces in the tip's frame: z, -x …")] = None,
+    box: Annotated[
+        str | None, typer.Option(help="x,x,y,y,z,z that no part of the arm leaves [m]; unknown, or none")
+    ] = None,
+    obstacle: Annotated[
+        list[str] | None, typer.Option(help="'table box 1.2,0.8,0.05 at 0.7,0,-0.03' [m]; unknown, none; repeatable")
+    ] = None,
     dynamics: Annotated[
         bool | None, typer.Option("--dynamics/--geometry-only", help="identify the dynamics, too (default)")
     ] = None,
@@ -48,7 +61,8 @@ def new(
 
     What is to be measured goes into FOLDER/3-measured as CSV (calib formats measurements), what is to be recorded into
     FOLDER/7-recorded (calib formats recordings); how the session goes on is said in FOLDER/session.toml (calib formats
-    session). Without --robot or --instrument, at a terminal, it asks.
+    session). Without --robot or --instrument, at a terminal, it asks; what is not known of the cell is not checked, and
+    stands on the certificate.
     """
     from calib.api.sessions import new_session
     from calib.errors import command_line
@@ -56,7 +70,10 @@ def new(
     from calib.procedure.session.questions import Answers, checked
 
     refuse_parallel(robot, "new")
-    given = Answers(robot, instrument, tool, limits, dynamics, tuple(payload or ()), torques)
+    told = tuple(obstacle) if obstacle else None
+    given = Answers(
+        robot, instrument, tool, limits, dynamics, tuple(payload or ()), torques, instrument_at, cone, facing, box, told
+    )
     if robot is None or instrument is None:
         given = _asked(given)
     made = new_session(
@@ -211,7 +228,9 @@ def _go_on(folder: Path, command: str, again: str = "", plots: bool = True) -> N
 
 @app.command()
 def view(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="of a fit, a session, an identification, or a motion")],
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="of a fit, a session, an identification, a motion; or a CSV")
+    ],
     save: Annotated[Path | None, typer.Option(help="write a Rerun recording (.rrd), and open no window")] = None,
     spawn: Annotated[
         bool | None, typer.Option("--spawn/--no-spawn", help="open Rerun's window; by default where nothing is saved")

@@ -61,6 +61,7 @@ class Capsules:
         names: (C,) of the capsules.
         bodies: (C,) how many moving elements stand before each: 0 is the fixed base.
         radii: (C,) [m].
+        solid: (S,) which of the capsules have a length; the others are no bodies.
         targets: (T, 3) in the tip's frame [m]; their capsules are the last T.
         own: (P, 2) which capsules are compared with each other.
         world: (W, 2) which capsules with which of walls and obstacles, walls first.
@@ -73,6 +74,7 @@ class Capsules:
     names: tuple[str, ...]
     bodies: np.ndarray
     radii: np.ndarray
+    solid: np.ndarray
     targets: np.ndarray
     own: np.ndarray
     world: np.ndarray
@@ -103,7 +105,13 @@ class Capsules:
 
     def free(self, q: np.ndarray, margin: float = 0.0) -> np.ndarray:
         """Tell (m,) for which joint values q (m, n) every distance is larger than `margin` [m]."""
-        return np.all(self.distances(q) > margin, axis=1)
+        lines = self._lines(q)
+        good = np.all(self._measured(lines, rough=True)[0] > margin, axis=1)
+        unsure = np.flatnonzero(~good)
+        if len(unsure) and self.obstacles:
+            some = Lines(*(part[unsure] for part in (lines.start, lines.end, lines.axes, lines.places)))
+            good[unsure] = np.all(self._measured(some)[0] > margin, axis=1)
+        return good
 
     def beam(self, q: np.ndarray, start: np.ndarray, slope: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, ...]:
         """Measure the links against lines of sight from a target that the last body carries.
@@ -117,7 +125,7 @@ class Capsules:
             Distances (m, L) [m] of the L capsules of all other bodies, and their derivatives (m, L, n).
         """
         lines = self._lines(q)
-        others = np.flatnonzero(self.bodies < self.bodies.max())
+        others = self.solid[self.bodies[self.solid] < self.bodies.max()]
         shape = (len(q), len(others), 3)
         first, last = np.broadcast_to(start[:, None], shape), np.broadcast_to(np.atleast_2d(end)[:, None], shape)
         along, place = _nearest(first, last, lines.start[:, others], lines.end[:, others])
@@ -133,10 +141,11 @@ class Capsules:
         walked = sweep(self.chain, q)
         return _lines_of(self.chain, walked, q, self.targets)
 
-    def _measured(self, lines: Lines) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def _measured(self, lines: Lines, rough: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return distances (m, P + W), normals (m, P + W, 3) towards the second body, and the nearest points.
 
-        For the W pairs with the world the second body is the arm's.
+        For the W pairs with the world the second body is the arm's. `rough` takes from obstacles what they are at least
+        away, by the middles of the lines.
         """
         m, count = len(lines.start), len(self.own) + len(self.world)
         normal, one, two = (np.empty((m, count, 3)) for _ in range(3))
@@ -158,9 +167,10 @@ class Capsules:
                 distance[:, at], normal[:, at] = two[:, at] @ wall.normal - wall.offset, wall.normal
             else:
                 obstacle = self.obstacles[thing - len(self.walls)]
-                place = nearest_on_lines(obstacle, start, end)
+                place = np.full(start.shape[:2], 0.5) if rough else nearest_on_lines(obstacle, start, end)
                 two[:, at] = start + place[..., None] * (end - start)
                 distance[:, at], normal[:, at] = signed_distance(obstacle, two[:, at])
+                distance[:, at] -= np.linalg.norm(end - start, axis=-1) / 2 if rough else 0.0
             distance[:, at] -= self.radii[body]
         return distance, normal, one, two
 
@@ -236,7 +246,7 @@ def from_chain(
     planes = (*([] if floor is None else [Wall("floor", np.array([0.0, 0.0, 1.0]), floor)]), *walls)
     world = [(i, k) for k in range(len(planes) + len(obstacles)) for i in there if bodies[i]]
     found = Capsules(
-        chain, tuple(names), bodies, radii, places, np.array(own, dtype=int).reshape(-1, 2),
+        chain, tuple(names), bodies, radii, there, places, np.array(own, dtype=int).reshape(-1, 2),
         np.array(world, dtype=int).reshape(-1, 2), planes, tuple(obstacles),
     )  # fmt: skip
     if not found.pairs:

@@ -354,6 +354,25 @@ def find_mesh(name: str, folders: Sequence[Path]) -> Path | None:
     return next((path for path in found if path.is_file()), None)
 
 
+def meshes_beside(path: Path) -> dict[str, Path | str]:
+    """Return the meshes of a URDF's collision shapes by where they go beside a copy of it, in ``1-robot``.
+
+    Names from the root, or that lead out of their folder, are left out: a copy of the URDF finds them, or nothing does.
+    """
+    if path.suffix != ".urdf":
+        return {}
+    folders, found = list(path.resolve().parents), dict[str, Path | str]()
+    for link in parse(text(path)[0], str(path)).all("link"):
+        for node in link.all("collision"):
+            kinds = [each for shape in node.all("geometry") for each in shape.all("mesh")]
+            for name in (each.attributes.get("filename", "") for each in kinds):
+                inner = name.removeprefix("package://")
+                mesh = find_mesh(name, folders)
+                if mesh is not None and not inner.startswith(("/", "file:")) and ".." not in Path(inner).parts:
+                    found[f"1-robot/{inner}"] = mesh
+    return found
+
+
 def _libraries() -> tuple[Any, Any]:
     """Import Pinocchio and coal where they are needed: only collisions need them here."""
     import coal

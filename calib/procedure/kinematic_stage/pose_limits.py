@@ -239,14 +239,12 @@ class Limits:
             seen: all targets' rows.
             sight: False leaves the lines of sight out, to tell what they cost.
         """
-        kept = self.constraints
+        looked = self.sight.constraints() if self.sight is not None and sight else ()
+        kept, rows = (*self.constraints, *looked), seen  # what is quick to tell, and excludes most, comes first
         if self.collision is not None and self.collision.pairs:
             slope = partial(_closing, self.collision)
             kept = (*kept, PoseConstraint("collision", partial(_shortfall, self.collision, self.clearance), slope))
-        if self.sight is None or not sight:
-            return SearchSpace(seen, self.lower, self.upper, seen.product, kept)
-        kept, rows = (*kept, *self.sight.constraints()), seen
-        if len(self.sight.targets) > 1 and isinstance(seen, Observation):
+        if self.sight is not None and sight and len(self.sight.targets) > 1 and isinstance(seen, Observation):
             rows = SeenOnly(seen, self.sight)
         return SearchSpace(rows, self.lower, self.upper, rows.product, kept)
 
@@ -435,9 +433,13 @@ def _orientation(stated: ConstraintsFile, cell: Installation, where: str) -> lis
 
 
 def _sight(stated: ConstraintsFile, cell: Installation, where: str, model: Any) -> Sight | None:
-    """Return the lines of sight: cone and range where they are stated, and past the arm where either is."""
+    """Return the lines of sight: cone and range where they are stated, and past the arm.
+
+    An instrument with roll and pitch alone is a camera whose view these state.
+    """
     table, facing = stated.instrument, stated.target.facing
-    if table is None or (table.sight is None and table.range is None):
+    turned = table is not None and (table.roll is not None or table.pitch is not None)
+    if table is None or (table.sight is None and table.range is None and (turned or not table.stated)):
         return None
     if len(facing) not in (1, len(cell.tools)):
         raise UsageError(f"{where}: target.facing: {len(facing)} directions for {len(cell.tools)} targets")

@@ -13,20 +13,47 @@ import numpy as np
 from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.plans import read_poses, write_poses
 from calib.errors import UsageError
-from calib.geometry.observability import observation, targets_of
+from calib.geometry.observability import Observation, observation, targets_of
 from calib.procedure.kinematic_stage.inputs import joint_kinds, load_robot
-from calib.procedure.kinematic_stage.pose_limits import read_limits
+from calib.procedure.kinematic_stage.pose_limits import Limits, read_limits
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
 from calib.procedure.measuring.camera_view import ImageObservation, Predicted, image_observation, predict
+from calib.procedure.measuring.prediction import Prediction, by_count
+from calib.procedure.measuring.prediction import predicted as foretold
+from calib.procedure.measuring.prediction import table as outlook_table
+from calib.procedure.measuring.run import Run, RunSettings, plan_run
+from calib.procedure.measuring.run import lines as ways
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
+from poses.candidates import draw_candidates
+from poses.errors import NothingFeasible
 from poses.indices import observability
 from poses.select import SearchSettings, Selection, select_poses
-from poses.space import is_feasible
+from poses.space import SearchSpace, is_feasible
 
 Progress = Callable[[int, int, str], None]
 EVERYWHERE = 600  # postures that accuracy is predicted at (our choice)
 VIEWS = 600  # postures that see a camera's board, to choose from (our choice)
+
+
+TYPICAL = 300  # poses all over the workspace, seen or not, at which the tool's sigma is predicted; our choice
+
+
+@dataclass(frozen=True, eq=False)
+class Outlook:
+    """What a selection will tell, before anything is moved.
+
+    Attributes:
+        poses: of the fit on the chosen poses.
+        others: with other numbers of poses, chosen greedily.
+        blind: index and prediction if no pose had to be seen; None where nothing is asked of the sight.
+        comparable: the index of the chosen poses by the same choice as `blind`.
+    """
+
+    poses: Prediction
+    others: tuple[Prediction, ...]
+    blind: tuple[float, Prediction] | None
+    comparable: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +67,8 @@ class Chosen:
         existing: index of the poses measured before alone; None without them, or where they are too few.
         checked, unchecked: what the poses were held against, and what they could not be, in words.
         notes: what else a user should know.
+        outlook: what the poses will tell; None for a camera.
+        run, driven: the poses' order, in which `selection.q` is, and the ways between them; how they are driven.
     """
 
     chain: Chain
@@ -49,6 +78,9 @@ class Chosen:
     checked: tuple[str, ...]
     unchecked: tuple[str, ...]
     notes: tuple[str, ...]
+    outlook: Outlook | None
+    run: Run
+    driven: RunSettings
     predicted: Predicted | None = None
 
 
@@ -110,24 +142,91 @@ def choose(
         index, method, settings.candidates, settings.seed, starts=settings.starts, evaluations=settings.evaluations,
         seconds=np.inf if settings.seconds is None else settings.seconds, climbs=settings.climbs,
     )  # fmt: skip
-    found = select_poses(None, m, search, q=joints, space=space, existing=before, map=map, progress=progress)
+    candidates = _drawn(space, limits, settings) if joints is None else joints
+    found = select_poses(None, m, search, q=candidates, space=space, existing=before, map=map, progress=progress)
     assert found.q is not None
-    found = replace(found, q=fewest_turns(chain, found.q, limits.lower, limits.upper))
-    predicted = None
-    if isinstance(jacobian, ImageObservation) and found.q is not None:
+    outlook = predicted = None
+    if isinstance(jacobian, Observation):
+        comparable = float(found.history[0]) if method == "polish" else found.value
+        outlook = _outlook(jacobian, limits, search, m, found.q, candidates, before, comparable)
+    if isinstance(jacobian, ImageObservation):
         everywhere = np.random.default_rng(settings.seed).uniform(limits.lower, limits.upper, (EVERYWHERE, chain.n))
         predicted = predict(jacobian, found.q, everywhere)
         notes.append(predicted.words)
-    checked = limits.checked, limits.unchecked
-    return Chosen(chain, found, len(jacobian.free), value, *checked, tuple(notes), predicted)
+    q = same_turn(chain, found.q, limits.lower, limits.upper)
+    run = plan_run(chain, q, limits, settings.run, settings.seed, lambda words: progress and progress(0, 1, words))
+    indices = None if found.indices is None else found.indices[run.order]
+    found = replace(found, q=q[run.order], indices=indices)
+    return Chosen(
+        chain, found, len(jacobian.free), value, limits.checked, limits.unchecked, tuple(notes), outlook, run,
+        settings.run, predicted,
+    )  # fmt: skip
 
 
-def fewest_turns(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Return the same poses (m, n) with every revolute joint at the turn nearest to the middle of its range."""
-    middle = (lower + upper) / 2
-    turns = np.where([joint.kind == "revolute" for joint in chain.joints], np.round((q - middle) / (2 * np.pi)), 0.0)
-    moved = q - 2 * np.pi * turns
-    return np.where((moved >= lower) & (moved <= upper), moved, q)
+def _drawn(space: SearchSpace, limits: Limits, settings: SelectionSettings) -> np.ndarray:
+    """Return the candidates; where too few poses are feasible, say what excludes them."""
+    try:
+        return draw_candidates(
+            space.lower, space.upper, settings.candidates, partial(is_feasible, space), seed=settings.seed
+        )
+    except NothingFeasible as error:
+        q = np.random.default_rng(settings.seed).uniform(limits.lower, limits.upper, (2000, len(limits.lower)))
+        shares = [(one.name, (np.asarray(one.function(q)) <= 0.0).all(1).mean()) for one in space.constraints]
+        named = ", ".join(f"{name} {100 * share:.2g} %" for name, share in sorted(shares, key=lambda each: each[1]))
+        hint = " (a target that faces the arm itself? see [target] facing)" if limits.sight is not None else ""
+        raise UsageError(f"{error}; of random postures keep: {named}{hint}") from error
+
+
+def _outlook(
+    seen: Observation,
+    limits: Limits,
+    search: SearchSettings,
+    m: int,
+    q: np.ndarray,
+    candidates: np.ndarray,
+    before: np.ndarray | None,
+    comparable: float,
+) -> Outlook:
+    """Return what chosen poses q (m, n) will tell, and what others would."""
+    space, free = limits.space(seen), limits.space(seen, sight=False)
+    stream = np.random.default_rng([search.seed, 2])
+    typical = draw_candidates(free.lower, free.upper, TYPICAL, partial(is_feasible, free), seed=stream)
+    rows = space.jacobian(q)
+    past = np.zeros((0, *rows.shape[1:])) if before is None else before
+    blind = _blind(seen, free, typical, search, m, past) if limits.sight is not None else None
+    others = by_count(seen, space.jacobian(candidates), typical, before)
+    return Outlook(foretold(seen, np.concatenate([rows, past]), typical, m), others, blind, comparable)
+
+
+def _blind(
+    seen: Observation, free: SearchSpace, typical: np.ndarray, search: SearchSettings, m: int, past: np.ndarray
+) -> tuple[float, Prediction]:
+    """Return the index that would be reached if every pose were seen, by the same choice, and what would be known."""
+    quick = replace(search, method="detmax", climbs=0)
+    other = select_poses(None, m, quick, space=free, existing=past if len(past) else None)
+    assert other.q is not None
+    return other.value, foretold(seen, np.concatenate([free.jacobian(other.q), past]), typical, m)
+
+
+def same_turn(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Return the same poses (m, n) with each revolute joint on one turn, cut where the fewest poses are passed.
+
+    A joint with more than one turn can stand everywhere on two; the cut is the middle of the largest gap between the
+    poses' angles (where there is one of more than 30 degrees, else half a turn from the middle of the range), so that
+    moves between them need not go the long way round.
+    """
+    result, full = q.copy(), 2 * np.pi
+    for j, joint in enumerate(chain.joints):
+        if joint.kind != "revolute" or upper[j] - lower[j] <= full:
+            continue
+        middle, angles = (lower[j] + upper[j]) / 2, np.sort(np.mod(q[:, j], full))
+        gaps = np.diff(np.append(angles, angles[0] + full))
+        k = int(gaps.argmax())
+        cut = angles[k] + gaps[k] / 2 if gaps[k] > np.radians(30.0) else middle - np.pi
+        cut += full * np.round((middle - np.pi - cut) / full)
+        moved = cut + np.mod(q[:, j] - cut, full)
+        result[:, j] = np.where((moved >= lower[j]) & (moved <= upper[j]), moved, q[:, j])
+    return result
 
 
 def write(chosen: Chosen, path: Path) -> Path:
@@ -137,9 +236,10 @@ def write(chosen: Chosen, path: Path) -> Path:
 
 
 def kept(chosen: Chosen) -> list[str]:
-    """Return lines on what the poses were held against, and on what they were not."""
+    """Return lines on what the poses were held against, on what they were not, and on the run."""
     lines = [f"kept: {', '.join(chosen.checked)}"] if chosen.checked else []
-    return lines + ([f"NOT checked: {', '.join(chosen.unchecked)}"] if chosen.unchecked else [])
+    lines += [f"NOT checked: {', '.join(chosen.unchecked)}"] if chosen.unchecked else []
+    return [*lines, *ways(chosen.run, chosen.driven)]
 
 
 def bound_words(found: Selection) -> str:
@@ -164,6 +264,8 @@ def record(chosen: Chosen) -> dict[str, Any]:
         "efficiency": found.efficiency,
         "efficiency_covers": bound_words(found),
         "seconds": found.seconds,
+        "tool_sigma": None if chosen.outlook is None else chosen.outlook.poses.rms,
+        "run_seconds": chosen.run.seconds,
         "checked": list(chosen.checked),
         "unchecked": list(chosen.unchecked),
         "notes": list(chosen.notes),
@@ -186,4 +288,19 @@ def table(chosen: Chosen) -> list[tuple[str, str]]:
         ("efficiency against the convex bound", f"{found.efficiency:.4f} (det^(1/p); {bound_words(found)})"),
         ("seconds", f"{found.seconds:.2f}"),
     ]
-    return rows
+    return [*rows, *promised(chosen)]
+
+
+def promised(chosen: Chosen) -> list[tuple[str, str]]:
+    """Return what the poses will tell, and what it costs that the instrument has to see them where that is asked."""
+    if chosen.outlook is None:
+        return []
+    rows = outlook_table(chosen.outlook.poses, chosen.outlook.others)
+    if chosen.outlook.blind is None:
+        return rows
+    (index, blind), one = chosen.outlook.blind, chosen.outlook.poses
+    words = (
+        f"index {chosen.outlook.comparable:.5g} instead of {index:.5g}, "
+        f"σ of the tool {1e3 * one.rms:.3g} instead of {1e3 * blind.rms:.3g} mm"
+    )
+    return [*rows, ("what the lines of sight cost", words)]

@@ -8,6 +8,7 @@ from typing import Annotated
 from calib.arguments import Within, checked
 from calib.data.poses.fit_options import LOSSES, MODELS
 from calib.errors import UsageError
+from calib.procedure.measuring.run import DEFAULT_RUN, RunSettings
 
 Place = Annotated[float, Within(-100.0, 100.0)]  # of a target in the tip's frame [m]
 Sigma = Annotated[float, Within(above=0.0, most=10.0)]  # [m or rad]
@@ -81,6 +82,7 @@ class SelectionSettings:
         climbs: searches for feasible poses beyond the bound; 0 bounds the candidates and the chosen poses only.
         without: defaults that poses need not keep, and what the cell does not have
             (`calib.procedure.kinematic_stage.pose_limits`).
+        run: how fast the poses are driven, and how long each is measured.
     """
 
     kind: str = "pose"
@@ -95,6 +97,7 @@ class SelectionSettings:
     seconds: float | None = None
     climbs: int = 0
     without: tuple[str, ...] = ()
+    run: RunSettings = DEFAULT_RUN
 
     def __post_init__(self) -> None:
         for option, least in (("starts", 1), ("evaluations", 1), ("climbs", 0)):

@@ -23,6 +23,7 @@ from calib.geometry.installation import Installation, see
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.excitation import coefficients
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
+from calib.procedure.measuring.run import is_run, rehearsed_samples
 from calib.robot import calibrated, library
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward, joint_frames
@@ -111,13 +112,15 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
     """Gather what `folder` holds.
 
     Args:
-        folder: of a fit, an identification, an excitation, a plan, or a session.
+        folder: of a fit, an identification, an excitation, a plan, or a session; or a CSV of poses or of a run.
         robot: the arm to draw; None for the folder's own.
 
     Raises:
         UsageError: where there is nothing to see.
     """
     folder = Path(folder)
+    if folder.is_file() and folder.suffix == ".csv":
+        return _of_poses(folder, robot)
     if not folder.is_dir():
         raise UsageError(f"{folder} is no folder; give that of a fit, a session, an identification or a motion")
     chain, source = _arm(folder, robot)
@@ -125,13 +128,14 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
     fits = [place for place in (folder, folder / IN_SESSION) if FitFolder(place).residuals.is_file()]
     motions = [path for name in (coefficients.SAMPLES, coefficients.PLANNED) for path in _below(folder, name)]
     torques = [path for path in _below(folder, "torques_*.csv") if not (path.parent / "unseen").is_dir()]
+    plans = sorted(folder.glob("2-poses/*.csv"))
     scene = Scene(
         folder.resolve().name,
         chain,
         tuple(meshes),
         tuple(_joined(_measured(place), ValidationFolder(folder / VALIDATED).errors) for place in fits),
-        tuple((path.stem, _chosen(path, chain)) for path in sorted(folder.glob("2-poses/*.csv"))) if chain else (),
-        tuple(_played(path, folder) for path in motions),
+        tuple((path.stem, _chosen(path, chain)) for path in plans if not is_run(path)) if chain else (),
+        (*(rehearsed(path, chain) for path in plans if chain and is_run(path)), *(_played(p, folder) for p in motions)),
         tuple(_torques(path, folder, chain) for path in torques),
         tuple(notes),
     )
@@ -143,6 +147,17 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
         words = "no robot is drawn: the folder does not say which; give --robot"
         return replace(scene, notes=(*scene.notes, words))
     return scene
+
+
+def _of_poses(path: Path, robot: str | None) -> Scene:
+    """Return a scene of chosen poses, or of a run through them."""
+    if robot is None:
+        raise UsageError(f"{path}: say whose poses these are: --robot")
+    chain, source = load(robot), resolve(robot)
+    meshes, notes = _meshes(chain, source)
+    if is_run(path):
+        return Scene(path.stem, chain, tuple(meshes), played=(rehearsed(path, chain),), notes=tuple(notes))
+    return Scene(path.stem, chain, tuple(meshes), chosen=((path.stem, _chosen(path, chain)),), notes=tuple(notes))
 
 
 def _below(folder: Path, pattern: str) -> list[Path]:
@@ -246,6 +261,11 @@ def _points(cell: Installation, q: np.ndarray, station: int, tool: int) -> np.nd
 
         torque = gravity_torques(cell.chain, q)
     return see(cell, q, station, tool, evaluate(cell.deflection, q, torque) if terms else None).point.T
+
+
+def rehearsed(path: Path, chain: Chain) -> Played:
+    """Return a measuring run as it will play, poses and ways between them."""
+    return Played(path.stem, *rehearsed_samples(path, chain))
 
 
 def _played(path: Path, folder: Path) -> Played:

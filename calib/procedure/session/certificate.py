@@ -112,6 +112,7 @@ def _setup(session: Session, found: fit_report.Report) -> list[tuple[str, str]]:
         ("session made", settings.created.replace("T", " ")),
         ("measurements", _named([*fitted[0], *fitted[1]])),
         ("pose plan", _session_plan(session)),
+        *_pose_checks(session),
         ("model", found.metrics.model),
         ("tolerance", certificate.tolerance(settings.fit.tolerance_mm)),
         *_dynamic_setup(session),
@@ -160,6 +161,16 @@ def _filed(paths: list[Path]) -> list[Path]:
         (path / CORNERS if (path / CORNERS).exists() else path / JOINTS) if path.is_dir() else path for path in paths
     ]
     return [*own, *(path / JOINTS for path in paths if path.is_dir() and (path / CORNERS).exists())]
+
+
+def _pose_checks(session: Session) -> list[tuple[str, str]]:
+    """Return lines on what the planned poses were held against, and what was not known."""
+    path = session.path(SELECTION)
+    if not session.settings.poses.plan or not path.exists():
+        return []
+    found = json.loads(path.read_text())
+    rows = [("poses kept", found.get("checked")), ("poses NOT checked for", found.get("unchecked"))]
+    return [(words, ", ".join(names)) for words, names in rows if names]
 
 
 def listed(session: Session) -> list[tuple[str, str, str, str]]:

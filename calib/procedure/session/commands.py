@@ -12,12 +12,13 @@ from rich.markup import escape
 from rich.table import Table
 
 from calib.arguments import checked
-from calib.config import check_keys
+from calib.config import check_keys, parse
 from calib.errors import UsageError, command_line
 from calib.folders import CERTIFICATE
+from calib.geometry.observability import targets_of
 from calib.procedure.excitation.limits import read_motion_limits
 from calib.procedure.kinematic_stage.folder import URDF
-from calib.procedure.kinematic_stage.pose_limits import beside
+from calib.procedure.kinematic_stage.pose_limits import ConstraintsFile, beside, limits_of, read_limits
 from calib.procedure.session import instructions, steps
 from calib.procedure.session.folder import Session, create, locked, open_session, verdict_of
 from calib.procedure.session.questions import instrument_named
@@ -29,10 +30,14 @@ from calib.procedure.session.settings import (
     RobotSection,
     SessionSettings,
 )  # fmt: skip
+from calib.robot.chain import Chain
+from calib.robot.collision import meshes_beside
 from calib.robot.load import load, resolve
+from calib.robot.tables import dumps
 
 Say = Callable[[str], None]
 LIMITS = "limits.toml"
+HEAD = "# What the cell is like, as calib new was told; calib formats limits says what may stand here.\n"
 COLOURS = {"done": "green", "kept": "green", "ready": "cyan", "stale": "yellow", "waiting": "yellow", "after": "dim"}
 
 
@@ -56,7 +61,7 @@ class NewSession:
         seed: of everything random.
         base, tip: of a URDF, empty for its own.
         tool: (3,) where the target roughly sits in the tip's frame [m].
-        limits: a file of limits, copied, that both poses and motions keep.
+        limits: a file of limits, copied, that both poses and motions keep; or its tables.
         dynamics: identify the dynamics, too.
         motion: other keys of ``[dynamics]``: ``torques``, ``payloads``, ``period`` …
     """
@@ -69,7 +74,7 @@ class NewSession:
     base: str = ""
     tip: str = ""
     tool: Sequence[float] | None = None
-    limits: Path | None = None
+    limits: Path | Mapping[str, Any] | None = None
     dynamics: bool = True
     motion: Mapping[str, Any] = field(default_factory=dict)
 
@@ -82,10 +87,7 @@ def begin(folder: Path, wanted: NewSession) -> Session:
     check_keys(wanted.motion, [key.name for key in fields(DynamicsSection)], "keys of [dynamics]")
     device, source = instrument_named(wanted.instrument), resolve(wanted.robot)
     chain = load(wanted.robot, wanted.base or None, wanted.tip or None)
-    copied, named = ({}, "") if wanted.limits is None else ({LIMITS: wanted.limits}, LIMITS)
-    if wanted.limits is not None:
-        read_motion_limits(wanted.limits, chain, source)
-        copied |= beside(wanted.limits)
+    copied, named = _limits(wanted.limits, chain, source)
     measured = InstrumentSection(device.label, device.measures, device.sigma_position, device.sigma_orientation)
     if wanted.tool is not None:
         x, y, z = (float(value) for value in wanted.tool)
@@ -95,7 +97,19 @@ def begin(folder: Path, wanted: NewSession) -> Session:
         PosesSection(wanted.poses, wanted.validation, constraints=named), FitSection(),
         DynamicsSection(wanted=wanted.dynamics, limits=named, **wanted.motion),
     )  # fmt: skip
-    return create(folder, source, settings, copied)
+    return create(folder, source, settings, copied | meshes_beside(source))
+
+
+def _limits(stated: Path | Mapping[str, Any] | None, chain: Chain, source: Path) -> tuple[dict[str, Path | str], str]:
+    """Return what is to be copied of stated limits, which are read once to see that they can be, and its name."""
+    if stated is None:
+        return {}, ""
+    if isinstance(stated, Path):
+        read_motion_limits(stated, chain, source)
+        read_limits(stated, targets_of(chain), source)
+        return {LIMITS: stated, **beside(stated)}, LIMITS
+    limits_of(parse(ConstraintsFile, stated, "the cell"), targets_of(chain), source, "the cell")
+    return {LIMITS: f"{HEAD}{dumps(stated)}"}, LIMITS
 
 
 def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", plots: bool = True) -> Stop:

@@ -2,7 +2,8 @@
 
 session.toml     what is to be calibrated, with what, how; written by `calib new`, edited by people
 1-robot/         the robot's description, copied, so that the folder can move
-2-poses/         poses.csv to measure and fit, validation.csv to measure and never fit
+2-poses/         poses.csv to measure and fit, in the order of least time, poses_run.csv the ways between them, and
+                 validation.csv to measure and never fit
 3-measured/      what people bring: measured.csv (any name), files whose name starts with validation, and drift.csv,
                  some of the poses measured once more at the end (never fitted); columns: `calib formats measurements`
 4-fit/  5-validation/
@@ -49,7 +50,7 @@ MARK = "simulated.txt"
 SETTINGS, CHECKED = "session.toml", "checked.txt"
 SUMMARY, SELECTION, CUTS = "1-robot/summary.txt", "2-poses/selection.json", "7-recorded/cuts.json"
 PREDICTED = "2-poses/predicted.png"  # sigma of the tool, where the instrument is a camera whose place is known
-POSES, UNSEEN = "poses.csv", "validation.csv"  # as planned, in 2-poses
+POSES, UNSEEN, WAYS = "poses.csv", "validation.csv", "poses_run.csv"  # as planned, in 2-poses
 POSES_CHECKED, MOTION_CHECKED = f"3-measured/{CHECKED}", f"7-recorded/{CHECKED}"
 
 
@@ -125,7 +126,7 @@ def verdict_of(session: Session) -> str:
 
 
 def create(
-    folder: Path, robot_file: Path, settings: SessionSettings, copied: Mapping[str, Path] | None = None
+    folder: Path, robot_file: Path, settings: SessionSettings, copied: Mapping[str, Path | str] | None = None
 ) -> Session:
     """Make a session folder, whole or not at all.
 
@@ -133,7 +134,7 @@ def create(
         folder: new, or empty.
         robot_file: the description, copied into ``1-robot``.
         settings: what ``session.toml`` is to say; the robot's file and the date are filled in here.
-        copied: other files to copy, by their names in the folder.
+        copied: other files to copy, or texts to write, by their names in the folder.
 
     Raises:
         SessionError: where something is there already, or the folder cannot be written.
@@ -152,7 +153,11 @@ def create(
         for name in (*FOLDERS, *(DYNAMIC if wanted else ()), EXPORT[wanted]):
             (staging / name).mkdir(parents=True)
         for name, source in (copied or {}).items():
-            shutil.copyfile(source, staging / name)
+            (staging / name).parent.mkdir(parents=True, exist_ok=True)
+            if isinstance(source, Path):
+                shutil.copyfile(source, staging / name)
+            else:
+                files.write(staging / name, source)
         shutil.copyfile(robot_file, staging / target)
         text = written(settings)
         parse(SessionSettings, tomllib.loads(text), str(folder / SETTINGS), SessionError)

@@ -25,9 +25,10 @@ from calib.procedure.kinematic_stage import inputs
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import assess
 from calib.procedure.measuring.image_findings import image_words
+from calib.procedure.measuring.run import write_run
 from calib.procedure.report import certificate, fit_report
 from calib.procedure.session import arrival
-from calib.procedure.session.folder import POSES, POSES_CHECKED, SELECTION, SUMMARY, UNSEEN, Session, verdicts
+from calib.procedure.session.folder import POSES, POSES_CHECKED, SELECTION, SUMMARY, UNSEEN, WAYS, Session, verdicts
 from calib.robot.chain import Chain
 from calib.units import JOINT
 
@@ -116,6 +117,7 @@ def select(session: Session, say: Say) -> list[str]:
     kinds = [joint.kind for joint in chain.joints]
     names = chain.joint_names
     write_poses(session.path(f"2-poses/{POSES}"), chosen.fit, names, unit="deg", kinds=kinds)
+    write_run(session.path(f"2-poses/{WAYS}"), chosen.run, chain)
     notes = [f"{len(chosen.fit)} poses for the fit: {chosen.words}"]
     if wanted.validation:
         write_poses(session.path(f"2-poses/{UNSEEN}"), chosen.validation, names, unit="deg", kinds=kinds)

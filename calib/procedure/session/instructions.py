@@ -8,7 +8,7 @@ from calib.data.poses.pixels import Pixels
 from calib.errors import SessionError, command_line
 from calib.procedure.excitation.coefficients import RUN, SAMPLES
 from calib.procedure.session import dynamics_steps, geometry_steps
-from calib.procedure.session.folder import UNSEEN, Session
+from calib.procedure.session.folder import UNSEEN, WAYS, Session
 from calib.procedure.session.steps import WAITING, State
 from calib.robot.chain import Chain
 
@@ -36,7 +36,8 @@ def _at_the_robot(session: Session, name: str, both: bool) -> str:
         return f"Measure the target's {what} with the {device} at poses all over the workspace."
     count = sum(1 for _ in path.open()) - 1
     return (
-        f"Drive the {count} poses of {path}{_and_validation(session) if both else ''}, let the arm settle, measure the "
+        f"Drive the {count} poses of {path}{_in_order(session) if name == 'poses' else ''}"
+        f"{_and_validation(session) if both else ''}, let the arm settle, measure the "
         f"target's {what} with the {device} and log the joint angles read back; the first three once more at the end "
         "show drift "
         "(into drift.csv, if you like)."
@@ -52,6 +53,12 @@ def _take_images(session: Session, path: Path, both: bool) -> str:
         f"Drive {where}; at each let the arm settle for a second, take an image of the board (focus, zoom and exposure "
         "fixed, no automatic ones, no image turned or scaled), and log the joint angles read back."
     )
+
+
+def _in_order(session: Session) -> str:
+    """Name the ways between the poses."""
+    path = session.path(f"2-poses/{WAYS}")
+    return f" in their order (ways: {path}; calib view {session.folder} rehearses them)" if path.exists() else ""
 
 
 def _and_validation(session: Session) -> str:

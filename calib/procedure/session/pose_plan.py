@@ -11,10 +11,11 @@ import numpy as np
 
 from calib import files
 from calib.data.poses.pixels import Pixels
-from calib.geometry.observability import observation, targets_of
+from calib.geometry.observability import SIGMA_ORIENTATION, observation, targets_of
 from calib.procedure.kinematic_stage import selection
 from calib.procedure.kinematic_stage.pose_limits import read_limits
 from calib.procedure.kinematic_stage.settings import SelectionSettings
+from calib.procedure.measuring.run import Run
 from calib.procedure.session.folder import PREDICTED, Session
 from calib.robot.chain import Chain
 from poses.candidates import draw_candidates
@@ -30,6 +31,7 @@ class Plan:
     words: str
     kept: tuple[str, ...]
     record: dict[str, Any]
+    run: Run
 
 
 def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], None]) -> Plan:
@@ -41,7 +43,7 @@ def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], N
     stated = (instrument.sigma_position, instrument.sigma_orientation)
     choice = SelectionSettings(
         kind=seen_as(instrument.measures), tools=(tuple(instrument.tool),), index=wanted.index, method=wanted.method,
-        sigmas=stated if all(stated) else None, seed=settings.seed,
+        sigmas=_sigmas(*stated), seed=settings.seed,
     )  # fmt: skip
     chosen = selection.choose(
         robot_file, wanted.fit, choice, constraints=constraints, base=links[0], tip=links[1],
@@ -64,7 +66,13 @@ def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], N
         figure = error_map(chosen.predicted.points, chosen.predicted.sigma, words="sigma up to {}")
         files.write(session.path(PREDICTED), png(figure))
     unseen = _unseen(session, robot_file, chain, wanted.validation)
-    return Plan(found.q, unseen, words, tuple(selection.kept(chosen)), record)
+    kept = (*selection.kept(chosen), *(f"{words}: {number}" for words, number in selection.promised(chosen)))
+    return Plan(found.q, unseen, words, kept, record, chosen.run)
+
+
+def _sigmas(position: float, orientation: float) -> tuple[float, float] | None:
+    """Return the sigmas that are stated, with our own for an orientation that is not; None where none is."""
+    return (position, orientation or SIGMA_ORIENTATION) if position else None
 
 
 def seen_as(measures: str) -> str:
@@ -85,4 +93,4 @@ def _unseen(session: Session, robot_file: Any, chain: Chain, count: int) -> np.n
     if limits.camera is not None:
         return limits.camera.draw(count, partial(is_feasible, space), limits.lower, limits.upper, stream)
     q = draw_candidates(limits.lower, limits.upper, count, lambda q: is_feasible(space, q), seed=stream)
-    return selection.fewest_turns(chain, q, limits.lower, limits.upper)
+    return selection.same_turn(chain, q, limits.lower, limits.upper)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from calib.errors import UsageError
+from calib.procedure.session.cell_answers import cell_tables
 from calib.procedure.session.settings import TORQUES
 from calib.robot import library
 from calib.robot.load import resolve
@@ -74,6 +75,16 @@ class Answers:
     dynamics: bool | None = None
     payloads: tuple[str, ...] = ()
     torques: str | None = None
+    instrument_at: str | None = None
+    cone: str | None = None
+    facing: str | None = None
+    box: str | None = None
+    obstacles: tuple[str, ...] | None = None
+
+    @property
+    def cell(self) -> dict[str, Any]:
+        """What was said of the cell."""
+        return {name: value for name in CELL if (value := getattr(self, name)) is not None}
 
 
 @dataclass(frozen=True)
@@ -90,11 +101,43 @@ def _unanswered(name: str) -> Callable[[Answers], bool]:
     return lambda given: getattr(given, name) is None
 
 
+def _of_the_cell(name: str) -> Callable[[Answers], bool]:
+    """Put a question on the cell where no file states it, and on the target's cone where the instrument is known."""
+    known = "instrument" if name in ("cone", "facing") else ""
+
+    def is_open(given: Answers) -> bool:
+        told = not known or known in cell_tables(given.instrument_at)
+        return given.limits is None and getattr(given, name) is None and told
+
+    return is_open
+
+
+CELL = ("instrument_at", "cone", "facing", "box", "obstacles")
 QUESTIONS = (
     Question("robot", f"robot (.urdf, .toml, or {' '.join(library.names())})", "", _unanswered("robot")),
     Question("instrument", f"instrument ({' '.join(INSTRUMENTS)})", "tracker", _unanswered("instrument")),
     Question("tool", "where the target sits in the tip's frame, x,y,z [m]", "0.05,0,0.05", _unanswered("tool")),
-    Question("limits", "file of limits: obstacles, speeds (none: the robot's own)", "none", _unanswered("limits")),
+    Question(
+        "limits", "file that states the cell: instrument, obstacles, speeds (none: asked for now)", "none",
+        lambda given: given.limits is None and not given.cell,
+    ),
+    Question(
+        "instrument_at", "where the instrument roughly stands, x,y,z [m] in the robot's base frame (unknown; none: "
+        "it sees from everywhere)", "unknown", _of_the_cell("instrument_at"),
+    ),
+    Question(
+        "cone", "half angle of the cone in which the target sees it [deg] (a reflector: 30; unknown)", "unknown",
+        _of_the_cell("cone"),
+    ),
+    Question("facing", "the direction the target faces in the tip's frame (x, -z …)", "z", _of_the_cell("facing")),
+    Question(
+        "box", "box that no part of the arm leaves, x,x,y,y,z,z [m] in its base frame (unknown; none)", "unknown",
+        _of_the_cell("box"),
+    ),
+    Question(
+        "obstacles", "what stands there: table box 1.2,0.8,0.05 at 0.7,0,-0.03; … [m], middles (unknown; none)",
+        "unknown", _of_the_cell("obstacles"),
+    ),
     Question("dynamics", "identify the dynamics, too (yes, no)", "yes", _unanswered("dynamics")),
     Question(
         "torques", "torques in the log (motor, link, both)", "motor",
@@ -118,7 +161,11 @@ def with_answer(given: Answers, question: Question, text: str) -> Answers:
         if text.lower() not in ("yes", "no", "y", "n"):
             raise UsageError(f"'{text}': yes or no")
         return replace(given, dynamics=text.lower().startswith("y"))
-    values: dict[str, Any] = {"limits": None if empty else Path(text), "payloads": () if empty else tuple(text.split())}
+    values: dict[str, Any] = {
+        "limits": None if empty else Path(text),
+        "payloads": () if empty else tuple(text.split()),
+        "obstacles": (text,),
+    }
     found = replace(given, **{question.name: values.get(question.name, text)})
     if question.name == "robot":
         resolve(text) if text else _fail("a robot is needed")
@@ -147,7 +194,12 @@ def checked(given: Answers) -> dict[str, Any]:
     if given.limits is not None:
         if not given.limits.is_file():
             raise UsageError(f"--limits {given.limits}: no such file")
+        if given.cell:
+            told = f"--{next(iter(given.cell)).replace('_', '-').removesuffix('s')}"
+            raise UsageError(f"{told} and --limits both say what the cell is like; put it into {given.limits}")
         result["limits"] = given.limits
+    elif tables := cell_tables(**given.cell):
+        result["limits"] = tables
     if given.torques is not None:
         if given.torques not in TORQUES:
             raise UsageError(f"--torques {given.torques}: expected {', '.join(TORQUES)}")

@@ -20,6 +20,7 @@ from calib.procedure.session.folder import (
     SELECTION,
     SUMMARY,
     UNSEEN,
+    WAYS,
     Session,
 )
 
@@ -150,7 +151,7 @@ STEPS = (
     SessionStep("describe", "read the robot", ("robot",), _robot, geometry_steps.describe, (SUMMARY,)),
     SessionStep(
         "select", "choose the poses to measure", ("robot", "instrument", "poses", "seed"), _plan, geometry_steps.select,
-        (f"2-poses/{POSES}", f"2-poses/{UNSEEN}", SELECTION, PREDICTED),
+        (f"2-poses/{POSES}", f"2-poses/{WAYS}", f"2-poses/{UNSEEN}", SELECTION, PREDICTED),
     ),
     SessionStep(
         "measure", "check what was measured", ("robot", "instrument", "poses", "fit"), _arrived, geometry_steps.arrive,

@@ -1,0 +1,226 @@
+"""A measuring run: poses in the order of least time, ways between them that keep clear, and how long it all takes.
+
+Moves are straight in joint space, as a controller's joint moves are, held against the arm, the floor and obstacles at
+places so dense that no point of the arm goes further than the clearance between two of them. Where a straight move does
+not keep clear, via-points lead around; the arm is taken to stop at each.
+
+The file of a run has a row per stop, in time order::
+
+    t, pose, q1 [deg], …             t [s]; pose: number of the pose in its list, counted from 1; 0 for a via-point
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib import files
+from calib.data.csv_table import read_table
+from calib.errors import UsageError
+from calib.robot.chain import Chain, stretched_length
+from trajectories.tour import move_times, tour
+from trajectories.ways import Room, way
+
+LEISURE = {
+    "revolute": 1.0,
+    "prismatic": 0.25,
+}  # [rad/s, m/s] full speed of a joint whose limit nobody knows; our choice
+RISE = 2.0  # acceleration [1/s] times the speed: half a second to get there; our choice
+BLOCKED = 3.0  # times that a straight move which does not keep clear is taken to last; our choice
+PLACES = 8  # of a straight move that are looked at to guess whether it keeps clear
+ROUNDS, QUICK, PATIENT = 4, 250, 1000  # orders tried, and random places per way in them and in the last; our choice
+FORBIDDEN = 1e4  # [s] a move for which no way was found
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """How a run is driven.
+
+    Attributes:
+        speed: share of the joints' largest speeds.
+        dwell: that the arm stands still at each pose, to settle and to be measured [s].
+    """
+
+    speed: float = 0.3
+    dwell: float = 6.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.speed <= 1.0:
+            raise UsageError(f"--speed {self.speed:g}: expected a share of the joints' speeds, above 0 and up to 1")
+        if not 0.0 <= self.dwell < 3600.0:
+            raise UsageError(f"--dwell {self.dwell:g}: expected the seconds that each pose takes to be measured")
+
+
+DEFAULT_RUN = RunSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A run through m poses.
+
+    Attributes:
+        order: (m,) the poses' numbers in the order they are visited.
+        ways: m - 1 ways (k, n) from one to the next, both included [rad or m].
+        times: (m - 1,) how long each lasts [s].
+        dwell: at each pose [s].
+        found: duration in the order the poses came in, by straight moves, clear or not [s].
+        around: how many ways lead around something.
+        blocked: numbers of the ways for which no clear one was found; they are straight.
+    """
+
+    order: np.ndarray
+    ways: tuple[np.ndarray, ...]
+    times: np.ndarray
+    dwell: float
+    found: float
+    around: int
+    blocked: tuple[int, ...]
+
+    @property
+    def seconds(self) -> float:
+        """The run's duration [s]."""
+        return float(self.times.sum()) + self.dwell * len(self.order)
+
+
+def plan_run(
+    chain: Chain,
+    q: np.ndarray,
+    limits: Any,
+    settings: RunSettings = DEFAULT_RUN,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Run:
+    """Order poses q (m, n) [rad or m], and find the ways between them.
+
+    Args:
+        chain: the arm, for its speeds.
+        limits: with lower, upper, collision and clearance (`calib.procedure.kinematic_stage.pose_limits.Limits`).
+        settings: speed and dwell.
+        seed: of the search for ways around.
+        progress: called with a few words now and then.
+    """
+    say, (velocity, acceleration) = progress or (lambda words: None), _speeds(chain, settings.speed)
+    seconds = partial(move_times, velocity=velocity, acceleration=acceleration)
+    room = _room(chain, limits, velocity)
+    say("which moves keep clear")
+    cost = np.where(_clear_at_places(room, q), 1.0, BLOCKED) * seconds(q[:, None], q)
+    known: dict[tuple[int, int], np.ndarray | None] = {}
+    for tries in (*[QUICK] * ROUNDS, PATIENT):
+        order = tour(cost)
+        fresh = [pair for pair in map(_pair, order[:-1], order[1:]) if known.get(pair) is None]
+        for number, (one, two) in enumerate(fresh, 1):
+            say(f"way {number} of {len(fresh)}")
+            found = way(room, q[one], q[two], seed=seed + number, most=tries)
+            known[one, two] = found
+            spent = FORBIDDEN if found is None else float(seconds(found[:-1], found[1:]).sum())
+            cost[one, two] = cost[two, one] = spent
+        if all(known[_pair(*pair)] is not None for pair in pairwise(order)):
+            break
+    ways, blocked = [], []
+    for number, (one, two) in enumerate(pairwise(order)):
+        own = known[_pair(one, two)]
+        if own is None:
+            blocked.append(number)
+        ways.append(q[[one, two]] if own is None else own if one < two else own[::-1])
+    times = np.array([seconds(each[:-1], each[1:]).sum() for each in ways])
+    before = float(seconds(q[:-1], q[1:]).sum()) + settings.dwell * len(q)
+    return Run(order, tuple(ways), times, settings.dwell, before, sum(len(w) > 2 for w in ways), tuple(blocked))
+
+
+def _pair(one: int, two: int) -> tuple[int, int]:
+    return (int(min(one, two)), int(max(one, two)))
+
+
+def _clear_at_places(room: Room, q: np.ndarray) -> np.ndarray:
+    """Tell (m, m) which straight moves are clear at `PLACES` places: a guess, to find an order by."""
+    one, two = np.triu_indices(len(q), 1)
+    share = ((np.arange(PLACES) + 0.5) / PLACES)[:, None, None]
+    places = q[one] + share * (q[two] - q[one])
+    good = np.concatenate([room.clear(block) for block in np.array_split(places.reshape(-1, q.shape[1]), 16)])
+    clear = np.ones((len(q), len(q)), dtype=bool)
+    clear[one, two] = clear[two, one] = good.reshape(PLACES, -1).all(axis=0)
+    return clear
+
+
+def lines(run: Run, settings: RunSettings) -> list[str]:
+    """Return what a run comes to, in words."""
+    minutes, before = run.seconds / 60, run.found / 60
+    found = [
+        f"run: {len(run.order)} poses in {minutes:.1f} min at {settings.speed:.0%} of the joints' speed, "
+        f"{settings.dwell:g} s at each pose ({before:.1f} min in the order they were found, by straight moves)"
+    ]
+    if run.around:
+        found.append(f"{run.around} of {len(run.ways)} ways lead around something: drive their via-points, too")
+    if run.blocked:
+        pairs = ", ".join(f"{k + 1} to {k + 2}" for k in run.blocked)
+        found.append(f"NO clear way was found from pose {pairs}: drive there by hand, or leave a pose out")
+    return found
+
+
+def write_run(path: Path, run: Run, chain: Chain) -> Path:
+    """Write a run as the head of this module says; its poses are numbered in the order they are visited."""
+    factors = [180.0 / np.pi if joint.kind == "revolute" else 1.0 for joint in chain.joints]
+    units = ["deg" if joint.kind == "revolute" else "m" for joint in chain.joints]
+    header = ["t", "pose", *(f"{joint.name} [{unit}]" for joint, unit in zip(chain.joints, units))]
+    velocity, acceleration = _speeds(chain, 1.0)
+    rows, clock = [], 0.0
+    for k in range(len(run.order)):
+        if k:
+            own = run.ways[k - 1]
+            parts = move_times(own[:-1], own[1:], velocity, acceleration)
+            parts = parts * (run.times[k - 1] / parts.sum())
+            for place, spent in zip(own[1:-1], parts[:-1]):
+                clock += float(spent)
+                rows.append([round(clock, 3), 0, *(place * factors)])
+            clock += float(parts[-1])
+        place = run.ways[k][0] if k < len(run.ways) else run.ways[-1][-1]
+        rows.append([round(clock, 3), k + 1, *(place * factors)])
+        clock += run.dwell
+        rows.append([round(clock, 3), k + 1, *(place * factors)])
+    return files.write_table(path, header, rows)
+
+
+def is_run(path: Path) -> bool:
+    """Tell whether a CSV is a run's."""
+    with path.open(encoding="utf-8", errors="replace") as file:
+        return file.readline().startswith("t,pose,")
+
+
+def rehearsed_samples(path: Path, chain: Chain, rate: float = 10.0) -> tuple[np.ndarray, np.ndarray]:
+    """Return a run's file as times (N,) [s] and joint values (N, n) [rad or m] at `rate` [Hz], for a rehearsal.
+
+    Raises:
+        MeasurementError: where it lacks a joint.
+    """
+    table = read_table(path)
+    names = [
+        next((each for each in table.header if each.split(" [")[0] == joint), joint) for joint in chain.joint_names
+    ]
+    stops = np.column_stack([table.numbers(name, "joint") for name in names])
+    times = table.numbers("t")
+    t = np.linspace(times[0], times[-1], max(int((times[-1] - times[0]) * rate), 2))
+    return t, np.column_stack([np.interp(t, times, column) for column in stops.T])
+
+
+def _speeds(chain: Chain, share: float) -> tuple[np.ndarray, np.ndarray]:
+    limits = [j.velocity if np.isfinite(j.velocity) else LEISURE[j.kind] for j in chain.joints]
+    velocity = share * np.array(limits)
+    return velocity, RISE * velocity
+
+
+def _room(chain: Chain, limits: Any, velocity: np.ndarray) -> Room:
+    """Return where ways may go: half the clearance is kept at places no further apart than it, for any point."""
+    model, clearance = limits.collision, limits.clearance
+    reach = np.array([stretched_length(chain) if joint.kind == "revolute" else 1.0 for joint in chain.joints])
+
+    def clear(q: np.ndarray) -> np.ndarray:
+        return np.ones(len(q), dtype=bool) if model is None else model.free(q, 0.5 * clearance)
+
+    return Room(limits.lower, limits.upper, clear, max(clearance, 1e-3) / reach, velocity)

@@ -1,0 +1,121 @@
+"""What `calib new` is told of the cell, as tables of the limits file (`calib formats limits`) that the session keeps.
+
+"unknown" is an answer to every question: what it is about is then not checked, and the certificate says so. "none" says
+that there is no such thing, and nothing is missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from calib.config import number
+from calib.errors import UsageError
+
+UNKNOWN = ("", "unknown", "not known", "?", "-")
+NONE = "none"
+FAR, WIDE = 100.0, 10.0  # [m]: an instrument, an arm's cell, beyond which a number is taken for millimetres
+AXES = {
+    f"{sign}{axis}": [(-1.0 if sign == "-" else 1.0) * (k == j) for j in range(3)]
+    for k, axis in enumerate("xyz")
+    for sign in ("", "+", "-")
+}
+
+
+def cell_tables(
+    instrument_at: str | None = None,
+    cone: str | None = None,
+    facing: str | None = None,
+    box: str | None = None,
+    obstacles: Sequence[str] | None = None,
+) -> dict[str, Any]:
+    """Return the tables of a limits file that answers come to; empty where nothing is known.
+
+    Args:
+        instrument_at: x,y,z of the instrument in the robot's base frame [m].
+        cone: half angle in which the target sees it [deg].
+        facing: the target's direction in the tip's frame: x, -z … or three numbers.
+        box: x,x,y,y,z,z that the arm stays in, in its base frame [m].
+        obstacles: ``NAME KIND SIZES at X,Y,Z`` each: ``table box 1.2,0.8,0.05 at 0.7,0,-0.03`` [m].
+
+    Raises:
+        UsageError: for an answer that cannot be one, with what can.
+    """
+    found: dict[str, Any] = {}
+    without = [name for name, text in (("instrument", instrument_at), ("box", box)) if _plain(text) == NONE]
+    if (place := _known(instrument_at)) is not None:
+        table: dict[str, Any] = {"xyz": _numbers("--instrument-at", place, 3, "x,y,z in metres", FAR)}
+        found["instrument"] = table
+    if (angle := _known(cone)) is not None:
+        if "instrument" not in found:
+            raise UsageError(f"--cone {angle}: say where the instrument stands, too (--instrument-at x,y,z)")
+        found["instrument"]["sight"] = _cone(angle)
+    if (direction := _known(facing)) is not None:
+        found["target"] = {"facing": _direction(direction)}
+    if (walls := _known(box)) is not None:
+        sides = _numbers("--box", walls, 6, "x,x,y,y,z,z in metres, the smaller one first", WIDE)
+        found["collision"] = {"box": [sides[k : k + 2] for k in (0, 2, 4)]}
+        if any(low >= high for low, high in found["collision"]["box"]):
+            raise UsageError(f"--box {walls}: expected x,x,y,y,z,z in metres, the smaller one first")
+        _check_inside(found["collision"]["box"], walls)
+    stated = [text for each in obstacles or () for text in each.split(";") if _plain(text) not in UNKNOWN]
+    without += ["obstacles"] if [_plain(text) for text in stated] == [NONE] else []
+    things = [_obstacle(text) for text in stated if _plain(text) != NONE]
+    found |= {"obstacle": things} if things else {}
+    return {**({"without": without} if without else {}), **found}
+
+
+def _plain(text: str | None) -> str:
+    return (text or "").strip().lower()
+
+
+def _known(text: str | None) -> str | None:
+    return None if _plain(text) in (*UNKNOWN, NONE) else (text or "").strip()
+
+
+def _numbers(option: str, text: str, count: int, form: str, most: float) -> list[float]:
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count or not np.isfinite(values).all():
+        raise UsageError(f"{option} {text}: expected {form}, or unknown")
+    if max(map(abs, values)) > most:
+        raise UsageError(f"{option} {text}: {max(map(abs, values)):g} m? These look like mm; give metres")
+    return values
+
+
+def _cone(text: str) -> float:
+    angle = number(text if any(map(str.isalpha, text)) else f"{text} deg", f"--cone {text}", "angle")
+    if not np.radians(1.0) <= angle <= np.pi:
+        raise UsageError(f"--cone {text}: expected the half angle of the cone in degrees, 1 to 180, or unknown")
+    return angle
+
+
+def _direction(text: str) -> list[float]:
+    if (axis := AXES.get(text.lower())) is not None:
+        return axis
+    values = _numbers("--facing", text, 3, "an axis of the tip's frame (x, -z …) or three numbers", FAR)
+    if not any(values):
+        raise UsageError(f"--facing {text}: no direction")
+    return values
+
+
+def _check_inside(box: list[list[float]], text: str) -> None:
+    if not all(low <= 0.0 <= high for low, high in box[:2]):
+        raise UsageError(f"--box {text}: the robot's base, at 0,0, stands outside; places are in its base frame")
+
+
+def _obstacle(text: str) -> dict[str, Any]:
+    form = "NAME box|sphere|cylinder SIZES at X,Y,Z in metres, e.g. table box 1.2,0.8,0.05 at 0.7,0,-0.03"
+    words = text.replace(" at ", " ").split()
+    counts = {"box": 3, "sphere": 1, "cylinder": 2}
+    if len(words) != 4 or words[1] not in counts:
+        raise UsageError(f"--obstacle {text.strip()}: expected {form}")
+    sizes = _numbers(f"--obstacle {words[0]}", words[2], counts[words[1]], f"{counts[words[1]]} sizes: {form}", WIDE)
+    if min(sizes) <= 0:
+        raise UsageError(f"--obstacle {words[0]} {words[2]}: sizes are above 0")
+    place = _numbers(f"--obstacle {words[0]}", words[3], 3, f"its middle x,y,z: {form}", WIDE)
+    return {"name": words[0], "kind": words[1], "size": sizes, "xyz": place}

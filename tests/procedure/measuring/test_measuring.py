@@ -1,0 +1,173 @@
+"""Poses that one can drive and see: lines of sight change the choice, ways keep clear, predictions hold."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from differences import check
+
+import calib
+from calib.geometry.observability import observation, targets_of
+from calib.procedure.kinematic_stage.pose_limits import ConstraintsFile, Limits, limits_of, read_limits
+from calib.procedure.measuring.prediction import predicted
+from calib.procedure.measuring.run import RunSettings, is_run, plan_run, rehearsed_samples, write_run
+from calib.procedure.session.cell_answers import cell_tables
+from calib.robot.chain import Chain, random_joints
+from calib.robot.load import load
+from poses.candidates import draw_candidates
+from poses.space import is_feasible
+
+CELL = """
+[instrument]
+xyz = [3.0, 0.0, 1.0]
+sight = "30 deg"
+range = [1.0, 5.0]
+[[obstacle]]
+name = "table"
+kind = "box"
+size = [1.2, 1.6, 0.05]
+xyz = [0.9, 0.0, -0.06]
+"""
+
+
+def four_joints() -> Chain:
+    arm = load("ur5")
+    return replace(arm, joints=arm.joints[:4], elements=tuple(e for e in arm.elements if e.owner < 4), links=())
+
+
+ARMS = {"4 joints": four_joints, "6 joints": lambda: load("ur5"), "7 joints": lambda: load("lwr4plus")}
+
+
+def limits(name: str, tmp_path, text: str = CELL, tools=((0.05, 0.0, 0.05),)) -> tuple[Chain, Limits, object]:
+    (tmp_path / "c.toml").write_text(text)
+    chain = ARMS[name]()
+    cell = targets_of(chain, tools)
+    return chain, read_limits(tmp_path / "c.toml", cell), observation(cell, "position")
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_every_candidate_is_seen_and_keeps_clear(name, tmp_path):
+    chain, found, seen = limits(name, tmp_path)
+    space = found.space(seen)
+    q = draw_candidates(space.lower, space.upper, 30, lambda x: is_feasible(space, x), seed=1)
+    assert found.sight is not None and found.sight.visible(q).all()
+    assert (found.collision.distances(q) >= found.clearance - 1e-9).all()
+    assert not is_feasible(space, random_joints(chain, 300)).all()
+
+
+def test_several_reflectors_let_more_poses_be_seen_and_only_seen_rows_count(tmp_path):
+    sides = "[target]\nfacing = [[0, 0, 1], [1, 0, 0], [-1, 0, 0]]\n" + CELL
+    tools = ((0.0, 0.0, 0.08), (0.08, 0.0, 0.05), (-0.08, 0.0, 0.05))
+    chain, one, _ = limits("6 joints", tmp_path, tools=tools[:1])
+    _, three, seen = limits("6 joints", tmp_path, sides, tools)
+    q = random_joints(chain, 2000, 3)
+    spaces = [each.space(seen) for each in (one, three)]
+    shares = [is_feasible(space, q).mean() for space in spaces]
+    assert shares[1] > 1.5 * shares[0] > 0
+    own = q[is_feasible(spaces[1], q)]
+    rows, visible = spaces[1].jacobian(own), three.sight.visible(own)
+    assert visible.any(axis=1).all() and not visible.all()
+    assert np.array_equal(np.abs(rows).reshape(len(own), 3, -1).max(axis=2) > 0, visible)
+    for constraint in spaces[1].constraints:
+        for pose in own[:3]:
+            check(
+                lambda x, one=constraint: one.function(x[None])[0],
+                constraint.gradient(pose[None])[0],
+                pose,
+                tolerance=1e-5,
+            )
+
+
+def test_the_cell_as_told_becomes_tables():
+    told = cell_tables(
+        "3,0,1", "30", "-z", "none", ["table box 1.2,0.8,0.05 at 0.7,0,-0.04; pole cylinder 0.1,2 at 1,1,1"]
+    )
+    assert told["instrument"] == {"xyz": [3.0, 0.0, 1.0], "sight": pytest.approx(np.pi / 6)}
+    assert told["target"] == {"facing": [0.0, 0.0, -1.0]} and told["without"] == ["box"]
+    assert [one["name"] for one in told["obstacle"]] == ["table", "pole"]
+    assert cell_tables("unknown", "unknown", "unknown", "", ["?"]) == {}
+
+
+@pytest.mark.parametrize(
+    ("answers", "words"),
+    [
+        ({"instrument_at": "3000,0,1"}, "look like mm"),
+        ({"instrument_at": "3,0"}, "expected x,y,z in metres, or unknown"),
+        ({"cone": "30"}, "say where the instrument stands"),
+        ({"instrument_at": "3,0,1", "cone": "wide"}, "--cone wide"),
+        ({"instrument_at": "3,0,1", "cone": "0"}, "1 to 180"),
+        ({"facing": "up"}, "an axis of the tip's frame"),
+        ({"box": "1,2,-1,1,0,2"}, "the robot's base, at 0,0, stands outside"),
+        ({"box": "1,-1,-1,1,0,2"}, "the smaller one first"),
+        ({"obstacles": ["table"]}, "expected NAME box|sphere|cylinder SIZES at"),
+        ({"obstacles": ["table box 1,0,1 at 0,0,0"]}, "sizes are above 0"),
+    ],
+)
+def test_answers_that_cannot_be(answers, words):
+    with pytest.raises(calib.CalibError, match=words.replace("|", r"\|")):
+        cell_tables(**answers)
+
+
+def test_what_is_unknown_is_named_and_what_is_not_there_is_not():
+    cell = targets_of(load("ur5"))
+    bare = limits_of(ConstraintsFile(), cell)
+    assert len(bare.unchecked) == 3 and "obstacles (not known)" in bare.unchecked
+    none = limits_of(ConstraintsFile(without=("instrument", "box", "obstacles")), cell)
+    assert none.unchecked == ()
+    off = limits_of(ConstraintsFile(), cell, without=("self-collision", "floor", "joint-margin"))
+    assert off.collision is None and off.checked == () and len(off.unchecked) == 6
+    assert (off.lower == cell.chain.lower).all() and (bare.lower > cell.chain.lower).all()
+
+
+def test_ways_keep_clear_and_their_order_takes_less_time(tmp_path):
+    wall = '[[obstacle]]\nname = "wall"\nkind = "box"\nsize = [1.0, 0.04, 1.0]\nxyz = [0.7, 0.0, 0.3]\n'
+    chain, found, seen = limits("6 joints", tmp_path, wall)
+    space = found.space(seen)
+    q = draw_candidates(np.maximum(space.lower, -2.5), np.minimum(space.upper, 2.5), 8, lambda x: is_feasible(space, x))
+    run = plan_run(chain, q, found, RunSettings(dwell=2.0))
+    assert (sorted(run.order) == list(range(8)) and run.seconds <= run.found + 1e-6) or run.around
+    for k, way in enumerate(run.ways):
+        assert np.array_equal(way[0], q[run.order[k]]) and np.array_equal(way[-1], q[run.order[k + 1]])
+        if k not in run.blocked:
+            dense = np.concatenate([a + np.linspace(0, 1, 400)[:, None] * (b - a) for a, b in pairwise(way)])
+            assert (found.collision.distances(dense) > 0).all()
+    path = write_run(tmp_path / "run.csv", run, chain)
+    t, played = rehearsed_samples(path, chain)
+    assert is_run(path) and t[-1] == pytest.approx(run.seconds, abs=0.01)
+    assert np.abs(played[0] - q[run.order[0]]).max() < 1e-6 and np.abs(played[-1] - q[run.order[-1]]).max() < 1e-6
+
+
+def test_the_predicted_sigma_is_that_of_many_fits():
+    """The tool's error after linear fits to noise, over typical poses, is as large as said."""
+    chain = load("ur5")
+    seen = observation(targets_of(chain, [(0.05, 0, 0.05)]), "position", (2e-5, 1e-4))
+    q, typical = random_joints(chain, 30, 1), random_joints(chain, 200, 2)
+    rows = seen(q).reshape(-1, len(seen.free))
+    noise = np.random.default_rng(0).normal(size=(len(rows), 300))
+    steps = np.linalg.lstsq(rows, noise, rcond=None)[0]
+    errors = seen(typical)[:, :3] * seen.sigmas[0] @ steps
+    real = np.sqrt((errors**2).sum(axis=1).mean())
+    assert predicted(seen, seen(q), typical).rms == pytest.approx(real, rel=0.05)
+    assert not np.isfinite(predicted(seen, seen(q[:5]), typical).rms)
+
+
+def test_a_selection_tells_run_prediction_and_what_seeing_costs(tmp_path):
+    (tmp_path / "c.toml").write_text(CELL)
+    wanted = calib.SelectionSettings("position", ((0.05, 0, 0.05),), candidates=200)
+    chosen = calib.select_poses("lwr4plus", 14, wanted, constraints=tmp_path / "c.toml")
+    told = str(chosen)
+    for words in (
+        "predicted σ of the tool's position",
+        "what the lines of sight cost",
+        "run: 14 poses in",
+        "NOT checked: walls",
+    ):
+        assert words in told
+    outlook = chosen.chosen.outlook
+    assert outlook.blind is not None and outlook.blind[0] > outlook.comparable
+    with pytest.raises(calib.CalibError, match="of random postures keep: line of sight 0 %"):
+        (tmp_path / "d.toml").write_text(CELL.replace("30 deg", "0.1 deg"))
+        calib.select_poses("lwr4plus", 14, wanted, constraints=tmp_path / "d.toml")
