@@ -17,15 +17,18 @@ choice: the unstructured TLS lets every joint's current be noisy in every row).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calib.arrays import frozen
 from calib.errors import NotConverged, Unidentifiable
 from calib.estimation.triangles import Triangles, retriangulate
+from calib.identification.rows import pool
 
 ROUNDS = 60
+TOLD = 0.3  # sigma of a relative gain, of it, up to which the motion tells it
+UNLIKE = 10.0  # factor between gains of one robot's motors beyond which one is not told
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +41,7 @@ class DriveGains:
         names, values: of all parameters in torque units, base ones and the payload's.
         std: (n,) of the residual currents [A].
         scale: what fixed the scale, in words.
+        own: joints, from 0, whose gain the motion does not tell: one, in amperes of their own.
     """
 
     gains: np.ndarray
@@ -46,6 +50,7 @@ class DriveGains:
     values: np.ndarray
     std: np.ndarray
     scale: str
+    own: tuple[int, ...] = ()
 
     @property
     def sigma(self) -> np.ndarray:
@@ -58,6 +63,7 @@ def identify_gains(
     inflation: np.ndarray | None = None,
     start: Sequence[float] | None = None,
     reference: int | None = None,
+    own: Sequence[int] = (),
 ) -> DriveGains:
     """Estimate gains from triangles of [W P | i], one group per joint.
 
@@ -68,6 +74,7 @@ def identify_gains(
         start: (n,) first guess of the gains; None: from least squares on the torques of the known ones.
         reference: where nothing is known, the joint whose gain is set to 1: the others follow relative to it, and
             torques come out in amperes of that joint.
+        own: joints whose gain stays at one, their torque in amperes of their own.
 
     Raises:
         Unidentifiable: where nothing known is felt by a joint, directly or through others.
@@ -99,7 +106,7 @@ def identify_gains(
         jacobian = np.zeros((n, factors.shape[1], len(free) + n))
         jacobian[:, :, : len(free)] = body / gain[:, None, None]
         for j in range(n):
-            if j != reference:
+            if j != reference and j not in own:
                 jacobian[j, :, len(free) + j] = -torque[j] / gain[j]  # by log K_j
         stacked = retriangulate(
             np.hstack(
@@ -120,7 +127,7 @@ def identify_gains(
             values[free], values[fixed] = x / norms, given
             told = ", ".join(f"{name} = {value:g}" for name, value in known.items())
             told = told if reference is None else f"gain of joint {reference + 1} = 1"
-            return DriveGains(frozen(gain), frozen(covariance), names, frozen(values), frozen(std), told)
+            return DriveGains(frozen(gain), frozen(covariance), names, frozen(values), frozen(std), told, tuple(own))
     if reference is None:
         raise NotConverged("the drive gains do not settle; is the payload felt by every joint?", gain)
     raise NotConverged(
@@ -129,6 +136,44 @@ def identify_gains(
         "runs without and with a payload ([gain_identification])",
         gain,
     )
+
+
+def identify_relative_gains(data: Triangles, joints: int, inflation: np.ndarray, reference: int) -> DriveGains:
+    """Estimate gains relative to one joint's, and leave at one those that the motion does not tell.
+
+    Sigmas are the larger of the residuals' and of a jackknife over blocks of time (Efron & Tibshirani 1993, eq. 11.5),
+    which sees what the model leaves. A gain is told where its sigma is below `TOLD` of it and it is within a factor
+    `UNLIKE` of the others: what links share with one motor at the wrist is little beside friction, and a fit then
+    takes what the model leaves for inertia (our choice).
+
+    Args:
+        data: triangles of [W i] by block and joint, group = block · joints + joint.
+        inflation: (joints,) how many rows count as one.
+        reference: the joint whose gain is one.
+    """
+    blocks = [k for k in range(data.groups // joints) if data.rows[k * joints : (k + 1) * joints].any()]
+    own: tuple[int, ...] = ()
+    while True:
+        found = identify_gains(pool(data, joints, blocks), {}, inflation, reference=reference, own=own)
+        logs, again = np.log(found.gains), []
+        for block in blocks if len(blocks) > 2 else ():
+            others = pool(data, joints, [other for other in blocks if other != block])
+            try:
+                again.append(np.log(identify_gains(others, {}, inflation, found.gains, reference, own).gains))
+            except NotConverged:
+                again.append(np.where(np.arange(joints) == reference, 0.0, np.inf))
+        formal = found.sigma / found.gains
+        with np.errstate(invalid="ignore"):
+            spread = np.array(again) - np.mean(again, axis=0) if again else np.zeros((1, joints))
+        jackknife = np.sqrt((len(spread) - 1) / len(spread) * np.sum(np.nan_to_num(spread, nan=np.inf) ** 2, axis=0))
+        sigma = np.maximum(formal, jackknife)
+        free = np.array([j != reference and j not in own for j in range(joints)])
+        apart = np.abs(logs - np.median(logs))
+        doubt = np.where(free, np.maximum(sigma / TOLD, apart / np.log(UNLIKE)), 0.0)
+        if doubt.max() <= 1.0:
+            factor = np.where(free & (formal > 0.0), sigma / np.where(formal > 0.0, formal, 1.0), 1.0)
+            return replace(found, covariance=frozen(found.covariance * np.outer(factor, factor)))
+        own = (*own, int(np.argmax(doubt)))
 
 
 def _start(body: np.ndarray, load: np.ndarray, current: np.ndarray) -> np.ndarray:

@@ -80,8 +80,15 @@ def relative_error_sigma(measured: np.ndarray, predicted: np.ndarray, blocks: in
     return float(np.sqrt((blocks - 1) / blocks * np.sum((each - each.mean()) ** 2)))
 
 
-def score(case: Case, predicted: np.ndarray, slow: float | tuple[float, ...] | None = None) -> Score:
-    """Return the errors of a prediction (N, rows) at the full rate; lost samples count nowhere."""
+def score(
+    case: Case, predicted: np.ndarray, slow: float | tuple[float, ...] | None = None, apart: Sequence[int] = ()
+) -> Score:
+    """Return the errors of a prediction (N, rows) at the full rate; lost samples count nowhere.
+
+    Args:
+        slow: what stands, see `calib.data.signals.motion.moving`.
+        apart: rows in a unit of their own, which no total holds.
+    """
     motion = case.motion
     known = motion.weight > 0.5
     moves = moving(motion) if slow is None else moving(motion, slow)
@@ -89,7 +96,7 @@ def score(case: Case, predicted: np.ndarray, slow: float | tuple[float, ...] | N
     rows = [_row(case, np.asarray(predicted)[:, k], k, known, moves[:, k % motion.n]) for k in range(count)]
     every = motion.decimator.factor
     residual = np.stack([row.low for row in rows], axis=1)
-    raw, filtered, moved, stood = (_together([row.sums[k] for row in rows]) for k in range(4))
+    raw, filtered, moved, stood = (_together([row.sums[k] for row in rows], apart) for k in range(4))
     return Score(
         raw,
         filtered,
@@ -135,13 +142,14 @@ def _sums(target: np.ndarray, residual: np.ndarray, used: np.ndarray) -> tuple[f
     return float(np.sum(residual[used] ** 2)), float(np.sum(target[used] ** 2)), float(used.sum())
 
 
-def _together(sums: Sequence[np.ndarray]) -> PredictionErrors:
-    """Return the errors of all rows from their sums, each (3,)."""
+def _together(sums: Sequence[np.ndarray], apart: Sequence[int]) -> PredictionErrors:
+    """Return the errors of all rows from their sums, each (3,); the total without the rows `apart`."""
     square, size, count = np.array(sums).T
+    alike = ~np.isin(np.arange(len(square)), apart)
     with np.errstate(divide="ignore", invalid="ignore"):
         joints = 100.0 * np.sqrt(square / size)
         rms = np.sqrt(square / count)
-        total = float(100.0 * np.sqrt(square.sum() / size.sum()))
+        total = float(100.0 * np.sqrt(square[alike].sum() / size[alike].sum()))
     return PredictionErrors(
         total, np.where(size > 0.0, joints, np.nan), np.where(count > 0, rms, np.nan), int(count.sum())
     )

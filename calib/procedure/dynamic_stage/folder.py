@@ -359,6 +359,7 @@ def _gain_table(found: DriveGains | None, unit: str) -> dict[str, Any] | None:
         "covariance": found.covariance.tolist(),
         "unit": f"{unit} per A",
         "scale": found.scale,
+        "not_told": [joint + 1 for joint in found.own],
     }
 
 

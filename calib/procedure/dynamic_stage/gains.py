@@ -13,7 +13,7 @@ from calib.data.recordings.recording_files import read_recording
 from calib.data.signals.motion import Motion, make_motion
 from calib.errors import UsageError
 from calib.identification.cases import Case, make_case
-from calib.identification.gains import DriveGains, identify_gains
+from calib.identification.gains import DriveGains, identify_gains, identify_relative_gains
 from calib.identification.identify import chain_states, common_decimator, find_base, first_fit
 from calib.identification.identify_options import FileSettings, IdentifyOptions, file_settings
 from calib.identification.rows import observe, pool, triangulate, with_blocks
@@ -39,6 +39,11 @@ class FoundGains:
     found: DriveGains | None
     unit: str
     notes: tuple[str, ...]
+
+    @property
+    def own(self) -> tuple[int, ...]:
+        """Joints, from 0, whose torques are in a unit of their own."""
+        return () if self.found is None else self.found.own
 
     def for_motion(self, motion: Motion, own: FileSettings) -> np.ndarray | None:
         """Return the gains (n,) for a motion: the options', those found, or the file's; None for torques."""
@@ -118,12 +123,21 @@ def _relative(chain: Chain, options: IdentifyOptions, currents: Sequence[tuple[s
     squares = sum(np.sum(np.asarray(case.target) ** 2, axis=0) for case in cases)
     reference = int(np.argmax(squares))
     found = _identify(chain, cases, options.settings, {}, reference)
-    told = ", ".join(f"{gain:.4g} ± {sigma:.2g}" for gain, sigma in zip(found.gains, found.sigma))
+    told = ", ".join(
+        "not told" if j in found.own else "1" if j == reference else f"{gain:.4g} ± {sigma:.2g}"
+        for j, (gain, sigma) in enumerate(zip(found.gains, found.sigma))
+    )
     note = (
         f"no drive gains are known: torques are in amperes of joint {reference + 1}, gains relative to it {told}; "
         "for N m give gains, or [gain_identification] with a payload of known mass"
     )
-    return FoundGains(options, found.gains, found, f"A of joint {reference + 1}", (note, *_unsure(found)))
+    apart = [f"joint {j + 1}" for j in sorted(found.own)]
+    own = (
+        f"this motion does not tell the gain of {', '.join(apart)}: torques there are in amperes of their own, and "
+        "totals leave them out",
+    )
+    notes = (note, *(own if apart else ()), *_unsure(found))
+    return FoundGains(options, found.gains, found, f"A of joint {reference + 1}", notes)
 
 
 def relative_warnings(unit: str) -> tuple[str, ...]:
@@ -151,7 +165,9 @@ def _identify(
     decimator = common_decimator(cases, settings)
     rows = with_blocks([observe(model, base.kept, case, decimator) for case in cases], settings.folds)
     tau = first_fit(rows)[1]
-    return identify_gains(pool(triangulate(rows), chain.n), known, tau, reference=reference)
+    if reference is not None:
+        return identify_relative_gains(triangulate(rows), chain.n, tau, reference)
+    return identify_gains(pool(triangulate(rows), chain.n), known, tau)
 
 
 def _case(

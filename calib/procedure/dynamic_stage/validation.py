@@ -95,7 +95,7 @@ def assess(
     for case in (*inputs.cases, *inputs.unseen):
         say(f"predicting {case.name}")
         predictions[case.name] = predict(dynamics, case)
-        scores[case.name] = score(case, predictions[case.name], inputs.options.slow)
+        scores[case.name] = score(case, predictions[case.name], inputs.options.slow, inputs.currents.own)
     say("judging")
     shares = {case.name: max(repeats(own.motion, case.motion) for own in inputs.cases) for case in inputs.unseen}
     repeated = {name: share for name, share in shares.items() if share >= REPEAT}

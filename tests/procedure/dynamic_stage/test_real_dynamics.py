@@ -164,6 +164,23 @@ def test_ur10e_gains_of_one_pair_serve_the_other(data, tmp_path):
         assert total(found, path.name) < 4.0, "measured 3.69 and 3.35; the goal is 4.3"
 
 
+@pytest.mark.slow
+def test_ur10e_currents_alone_tell_what_they_can(data, tmp_path):
+    """Measured 0.96 ± 0.14, 0.81 ± 0.02, 0.91 ± 0.15 and 0.84 ± 0.15 of joint 2's; of the last joint nothing."""
+    folder = data / "ur10e_innopolis"
+    train, unseen = (folder / f"ur-20_02_{name}harm.npz" for name in ("05-20sec_8", "10-30sec_12"))
+    found = identify(
+        tmp_path / "out", folder / "model.urdf", train, "--validate", unseen, "--friction", "standard"
+    )  # fmt: skip
+    told = found["drive_gains"]
+    assert told["not_told"] == [6] and told["values"][5] == 1.0
+    pair = gains(folder, "19_02")[0]
+    away = (np.array(told["values"]) - pair / pair[1])[[0, 2, 3, 4]] / np.array(told["sigma"])[[0, 2, 3, 4]]
+    assert np.abs(away).max() < 2.0
+    joints = found["validation"][unseen.name]["raw"]["relative_error_percent"]["joints"]
+    assert total(found, unseen.name) < max(joints[:5]) and total(found, unseen.name) < 6.0
+
+
 TX40 = """
 cut_slow = true
 friction = "standard"
