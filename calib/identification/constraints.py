@@ -20,7 +20,7 @@ from calib.dynamics import base as bases
 from calib.dynamics.base import Base
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.regressor_model import RegressorModel
-from calib.errors import UsageError, suggestion
+from calib.errors import NotConverged, UsageError, suggestion
 from calib.estimation.constrained import Constrained, Curved, contradicting, restricted, within
 from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import Triangles, residual_squares
@@ -98,10 +98,22 @@ class Constraints:
             object.__setattr__(self, key, frozen(getattr(self, key)))
 
     def solve(self, factor: np.ndarray) -> Constrained:
-        """Return argmin ½ ‖R β - z‖² under these constraints, see `calib.estimation.constrained.within`."""
+        """Return argmin ½ ‖R β - z‖² under these constraints, see `calib.estimation.constrained.within`.
+
+        Raises:
+            NotConverged: with the last β, where no robot of definite inertia satisfies the others.
+        """
         p = len(factor) - 1
         free = np.linalg.solve(factor[:p, :p], factor[:p, p])
-        return within(factor, self.matrix, self.lower, self.upper, _definite(self.inertia, free))
+        try:
+            return within(factor, self.matrix, self.lower, self.upper, _definite(self.inertia, free))
+        except NotConverged as error:
+            raise NotConverged(
+                f"[constraints]: no estimate was found that satisfies {'; '.join(self.names) or 'them'}, with M(q) "
+                f"positive definite in {len(self.inertia)} postures: take bounds back, or look at what the motion tells "
+                f"({error})",
+                error.last,
+            ) from error
 
 
 @dataclass(frozen=True, eq=False)

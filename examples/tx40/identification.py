@@ -37,9 +37,12 @@ from calib.dynamics.base import Base
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import CalibError
 from calib.estimation.essential import Rule, eliminate
+from calib.estimation.instrumental_variables import least_squares
 from calib.estimation.linear import LinearFit, subsystem_std
-from calib.estimation.triangles import collect
+from calib.estimation.triangles import collect, combine
 from calib.identification.cases import Case, make_case
+from calib.identification.constraints import hold
+from calib.identification.constraints import signs as signed
 from calib.identification.loop.controller import identify_controller
 from calib.identification.loop.loop_recordings import Loop
 from calib.identification.methods.instrumental import Instrumental, Round, identify_instrumental, simulated_case
@@ -162,14 +165,13 @@ def judge(
 ) -> dict[str, Any]:
     """Return the errors of least squares and of instrumental methods, direct and cross, and what the tests say."""
     first = next(iter(results.values()))
-    values = {"LS": full(study, first, first.ordinary)}
+    values = {"LS": full(study, first, first.ordinary), "PC-LS": full(study, first, consistent(first))}
     values |= {name: full(study, result, result.fit) for name, result in results.items()}
 
     def predicted(name: str, log: Log) -> tuple[np.ndarray, np.ndarray]:
-        measured = name == "LS"
         return (
-            with_measured(study, log, values["LS"])
-            if measured
+            with_measured(study, log, values[name])
+            if name.endswith("LS")
             else with_simulated(study, log, values[name], controller)
         )
 
@@ -187,6 +189,13 @@ def judge(
         "rounds": {name: [vars(one) for one in finite(result)] for name, result in results.items()},
         "verdict": verdict(first),
     }
+
+
+def consistent(result: Instrumental) -> LinearFit:
+    """Return least squares of the same rows under the signs of PC-IV (PC-IDIM-LS)."""
+    data, std = least_squares(result.problem), result.ordinary.group_std
+    asked = signed(result.names, signs(result.names))
+    return hold(result.ordinary, combine(data, std), data, std, asked, stated=True)[0]
 
 
 def full(study: Study, result: Instrumental, fit: LinearFit) -> np.ndarray:

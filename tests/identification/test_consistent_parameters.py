@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from calib.dynamics import base as bases
@@ -175,3 +176,35 @@ def test_cvxpy_finds_the_same_optimum():
     ours, other = (solve.cost(problem, gamma, one) for one in (values, theirs))
     assert ours <= other + 1e-6 * abs(other)
     assert np.linalg.norm((theirs - values) / scale) < 1e-2
+
+
+@pytest.mark.slow
+def test_log_cholesky_factors_lead_to_the_same_nearest_robot():
+    """An independent way without a cone: P = L Lᵀ with exp on L's diagonal, exp of drive terms, by least squares."""
+    _, model, base, data = planted(1)
+    values = np.array(data.values)
+    values[list(data.names).index("Fv1")] = -0.3  # no robot has that
+    data = told(data.chain, model, base, values, data.covariance)
+    problem = make_problem(data, next(iter(find_prior_bodies(data.chain, model))))
+    solution = nearest(problem)
+    lower, bodies = np.tril_indices(4), problem.bodies
+    start = np.linalg.cholesky(problem.references)
+    positive = problem.positive & (problem.sizes > 0.0)
+
+    def parameters(x: np.ndarray) -> np.ndarray:
+        roots = np.zeros((bodies, 4, 4))
+        roots[:, lower[0], lower[1]] = x[: 10 * bodies].reshape(bodies, 10)
+        diagonal = np.arange(4)
+        roots[:, diagonal, diagonal] = np.exp(roots[:, diagonal, diagonal])
+        terms = x[10 * bodies :]
+        drives = np.where(positive, problem.sizes * np.exp(np.where(positive, terms, 0.0)), terms)
+        pseudo = start @ roots @ roots.transpose(0, 2, 1) @ start.transpose(0, 2, 1)
+        return np.concatenate([pseudo_inertia.to_standard(pseudo).ravel(), drives])
+
+    found = least_squares(
+        lambda x: problem.factor[:, :-1] @ parameters(x) - problem.factor[:, -1],
+        np.zeros(10 * bodies + len(positive)), x_scale="jac", max_nfev=400,
+    )  # fmt: skip
+    away = data.distance(solution)
+    assert away > 5.0
+    assert data.distance(parameters(found.x)) == pytest.approx(away, rel=1e-3)

@@ -118,6 +118,15 @@ def test_constraints_that_cannot_be_are_refused_with_their_names(problem, settin
         METHODS["pc-wls"].estimate(asked(problem, **settings))
 
 
+def test_bounds_that_no_definite_inertia_meets_are_a_failure_that_says_so(problem):
+    """The last joint's own inertia, its entry of M(q) in every posture, below zero."""
+    last = WeightedSum({"ZZ3": 1.0, "Ia3": 1.0}, most=-1.0)
+    found = METHODS["pc-wls"].estimate(asked(problem, sum=(last,), signs=False))
+    assert not found.found and "no estimate was found that satisfies 1 ZZ3 + 1 Ia3 <= -1, with M(q)" in str(
+        found.failure
+    )
+
+
 def test_a_sum_of_standard_parameters_that_the_torques_tell_is_its_base_parameter(problem):
     base = problem.base
     name = next(name for name, row in zip(base.names, base.split.coefficients) if np.abs(row).max() > 1e-6)
