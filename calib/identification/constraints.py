@@ -110,7 +110,7 @@ class Constraints:
         except NotConverged as error:
             raise NotConverged(
                 f"[constraints]: no estimate was found that satisfies {'; '.join(self.names) or 'them'}, with M(q) "
-                f"positive definite in {len(self.inertia)} postures: take bounds back, or look at what the motion tells "
+                f"positive definite in {len(self.inertia)} postures: take bounds back, or tell them apart by motion "
                 f"({error})",
                 error.last,
             ) from error
