@@ -101,3 +101,11 @@ def test_torques_beyond_all_limits_are_another_unit() -> None:
 def test_currents_without_gains_compare_with_no_masses() -> None:
     one = replace(case_of(recorded()), target=5.0 * case_of(recorded()).target)
     assert np.isnan(compare_sizes(one, ARM, newtons=False).masses).all()
+
+
+def test_an_encoder_that_jumps_is_named_with_its_rows() -> None:
+    assert not [note for note in check_recording(recorded()).notes if "jumps" in note]
+    q = recorded().q.copy()
+    q[2000:, 2] += 0.05
+    (note,) = [note for note in check_recording(replace(recorded(), q=q)).notes if "jumps" in note]
+    assert "joint3 jumps by 50" in note and "between rows 2000 and 2001" in note

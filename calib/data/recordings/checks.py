@@ -19,6 +19,7 @@ MOVES = 1e-3  # a joint that goes less far has not moved [rad or m]: above encod
 POSES = 300  # of a recording, among which two alike are looked for
 BACK = 0.05  # of each joint's travel by which two poses may differ to be one
 BEYOND = 3.0  # times its limit: no joint's torque reaches that
+JUMP = 0.02  # no position leaves the slope of the rows around it by that [rad]; real ones do by 7 mrad; in m a tenth
 NEEDED = ("t", "q", "effort", "v", "tau_link", "tau_motor")
 
 
@@ -35,7 +36,12 @@ def check_recording(recording: Recording, joints: Joints | None = None) -> Recor
     _check_time(recording.t, recording.rows, recording.file)
     _check_size(recording, joints)
     _check_speed(recording)
-    notes = (*_still(recording), *_effort_notes(recording, joints), *_limit_notes(recording, joints))
+    notes = (
+        *_still(recording),
+        *_jumps(recording, joints),
+        *_effort_notes(recording, joints),
+        *_limit_notes(recording, joints),
+    )
     return _noted(recording, *notes, *_work_notes(recording))
 
 
@@ -133,6 +139,29 @@ def _check_speed(recording: Recording) -> None:
             if abs(ratio[j] / factor - 1) < 0.1:
                 message = f"v is {ratio[j]:.3g} times the slope of q: {wrong}; if so, say so in the header or the units"
                 raise MeasurementError(message, recording.file, column=column(recording, "v", int(j)))
+
+
+def _jumps(recording: Recording, joints: Joints | None) -> list[str]:
+    """Note positions that jump from one row to the next, whatever the rows around do: an encoder, a clock, a join."""
+    if len(recording) < 5:
+        return []
+    step = np.diff(recording.t)
+    slope = np.diff(recording.q, axis=0) / step[:, None]
+    around = np.median(np.stack([slope[:-4], slope[1:-3], slope[3:-1], slope[4:]]), axis=0)
+    off = np.abs(slope[2:-2] - around) * step[2:-2, None]
+    usual = np.maximum(np.median(off, axis=0), 1e-9)
+    apart = (step[2:-2] < 3 * np.median(step))[:, None]  # not over a gap
+    kinds = joints.kinds if joints is not None else ("revolute",) * recording.n
+    least = np.array([JUMP if kind != "prismatic" else JUMP / 10 for kind in kinds])
+    notes = []
+    for j in np.flatnonzero(((off > least) & (off > 20 * usual) & apart).any(axis=0)):
+        row = int(np.argmax(off[:, j] * apart[:, 0]))
+        size = f"{1e3 * off[row, j]:.3g} {'mm' if kinds[j] == 'prismatic' else 'mrad'}"
+        notes.append(
+            f"{recording.joint_names[j]} jumps by {size} between rows {recording.rows[row + 2]} and "
+            f"{recording.rows[row + 3]}: an encoder, or two logs joined? Cut the file there"
+        )
+    return notes
 
 
 def column(recording: Recording, name: str, joint: int) -> str:
