@@ -189,13 +189,19 @@ def _outlook(
 ) -> Outlook:
     """Return what chosen poses q (m, n) will tell, and what others would."""
     space, free = limits.space(seen), limits.space(seen, sight=False)
-    stream = np.random.default_rng([search.seed, 2])
-    typical = draw_candidates(free.lower, free.upper, TYPICAL, partial(is_feasible, free), seed=stream)
+    typical = typical_poses(limits, seen, search.seed)
     rows = space.jacobian(q)
     past = np.zeros((0, *rows.shape[1:])) if before is None else before
     blind = _blind(seen, free, typical, search, m, past) if limits.sight is not None else None
     others = by_count(seen, space.jacobian(candidates), typical, before)
     return Outlook(foretold(seen, np.concatenate([rows, past]), typical, m), others, blind, comparable)
+
+
+def typical_poses(limits: Limits, seen: Observation, seed: int) -> np.ndarray:
+    """Return poses (s, n) all over the workspace, seen or not, at which the tool's sigma is told."""
+    free = limits.space(seen, sight=False)
+    stream = np.random.default_rng([seed, 2])
+    return draw_candidates(free.lower, free.upper, TYPICAL, partial(is_feasible, free), seed=stream)
 
 
 def _blind(

@@ -203,11 +203,15 @@ def _gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
 
 def fit(session: Session, say: Say) -> list[str]:
     """Fit the geometry to the measured files; validation files are not looked at."""
+    from calib.procedure.session.pose_plan import kept_promise
+
     settings = session.settings
     outcome = fitting.run(_gathered(session), _options_of(session), _fit_settings(session), say)
     outputs.write_folder(outcome, session.fit.path, partial(certificate.write_fit, plots=session.plots))
     count = len(outcome.selection.fit.free)
     notes = [f"model {outcome.selection.chosen}, {count} parameters on {outcome.fit.poses} poses", *outcome.warnings]
+    if promise := kept_promise(session, robot_file(session), chain_of(session)):
+        notes.append(promise)
     if outcome.outliers:
         named = ", ".join(each.words for each in outcome.outliers[:3])
         advice = "" if settings.fit.loss != "none" else '; look at these rows, or set loss = "huber" in session.toml'

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -11,12 +12,14 @@ import numpy as np
 
 from calib import files
 from calib.data.poses.pixels import Pixels
+from calib.dynamics.gravity import gravity_torques
 from calib.geometry.observability import SIGMA_ORIENTATION, observation, targets_of
-from calib.procedure.kinematic_stage import selection
+from calib.geometry.spread import pose_sigmas
+from calib.procedure.kinematic_stage import compensation, selection
 from calib.procedure.kinematic_stage.pose_limits import read_limits
 from calib.procedure.kinematic_stage.settings import SelectionSettings
 from calib.procedure.measuring.run import Run
-from calib.procedure.session.folder import PREDICTED, Session
+from calib.procedure.session.folder import PREDICTED, SELECTION, Session
 from calib.robot.chain import Chain
 from poses.candidates import draw_candidates
 from poses.space import is_feasible
@@ -94,3 +97,29 @@ def _unseen(session: Session, robot_file: Any, chain: Chain, count: int) -> np.n
         return limits.camera.draw(count, partial(is_feasible, space), limits.lower, limits.upper, stream)
     q = draw_candidates(limits.lower, limits.upper, count, lambda q: is_feasible(space, q), seed=stream)
     return selection.same_turn(chain, q, limits.lower, limits.upper)
+
+
+def kept_promise(session: Session, robot_file: Any, chain: Chain) -> str:
+    """Say what the fit states of the tool's sigma, at the poses where it was predicted before anything was moved.
+
+    Returns:
+        A line; "" where nothing was predicted, or the poses were not ours.
+    """
+    path = session.path(SELECTION)
+    if not session.settings.poses.plan or not path.exists():
+        return ""
+    promised = json.loads(path.read_text()).get("tool_sigma")
+    instrument, name = session.settings.instrument, session.settings.poses.constraints
+    if promised is None or seen_as(instrument.measures) != instrument.measures:
+        return ""
+    cell = targets_of(chain, [instrument.tool])
+    limits = read_limits(session.path(name) if name else None, cell, robot_file)
+    q = selection.typical_poses(limits, observation(cell, instrument.measures), session.settings.seed)
+    found = compensation.read(session.fit.path)
+    torque = gravity_torques(found.cell.chain, q) if chain.inertias is not None else None
+    stated = pose_sigmas(found.cell, q, found.free, found.covariance, torque)[:, 0]
+    rms = float(np.sqrt(np.mean(stated**2)))
+    return (
+        f"σ of the tool's position: {1e3 * promised:.3g} mm rms were predicted when the poses were chosen, the fit "
+        f"states {1e3 * rms:.3g} mm (its own noise, and {len(found.free)} parameters)"
+    )
