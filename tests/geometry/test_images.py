@@ -264,7 +264,7 @@ def test_frames_of_unseen_images_are_placed_with_the_lens_of_the_fit():
     later = camera.photograph(cell, camera.views(cell, 15, 8), 0.05, 8)
     later = complete_camera(cell.cell.nominal, later, [block])
     assert later.lens is block.lens and not later.free
-    again = placed_on(found.cell, replace(later, station="moved"), None, Settings())
+    again = placed_on(found.cell, replace(later, station="moved"), None, Settings()).cell
     assert np.array_equal(again.optics.lenses[0].values, found.cell.optics.lenses[0].values)
     assert see(again, later.q).point == pytest.approx(see(found.cell, later.q).point, abs=1e-4)
     assert isinstance(later, Pixels) and not isinstance(later, Positions)

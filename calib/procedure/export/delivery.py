@@ -10,6 +10,7 @@ from calib.errors import RobotError, UsageError
 from calib.folders import check_target, write_staged
 from calib.procedure.export import geometry
 from calib.procedure.export.geometry import results
+from calib.procedure.export.parameters import PARAMETERS
 from calib.procedure.kinematic_stage.folder import CORRECTED_URDF, FORMULA, TERMS, URDF
 from calib.robot.calibrated import ROBOT
 from calib.robot.formats.markup import with_comment
@@ -17,7 +18,7 @@ from calib.robot.formats.markup import with_comment
 COPIED = (ROBOT, TERMS, FORMULA)
 OFFSETS, UR_KINEMATICS = "joint_offsets.csv", "ur_kinematics.yaml"
 WRITTEN = (*COPIED, URDF, CORRECTED_URDF, OFFSETS, UR_KINEMATICS)
-MARKS = (OFFSETS, "parameters.json")  # by which an earlier export is known, of a geometry or of dynamics
+MARKS = (OFFSETS, PARAMETERS)  # by which an earlier export is known, of a geometry or of dynamics
 FIRST = "verdict fail: "  # how a README.txt of ours begins; another's is left alone
 
 
@@ -49,7 +50,7 @@ def check_into(into: Path, folder: Path, urdf: Path | None, written: Sequence[st
         UsageError: with the file or folder concerned.
     """
     earlier = any((into / mark).exists() for mark in MARKS)
-    check_target(into, written, () if earlier else ("parameters.json",), "export", [urdf, *results(folder)])
+    check_target(into, written, () if earlier else (PARAMETERS,), "export", [urdf, *results(folder)])
 
 
 def _write(fit: Path, source: Path, out: Path) -> list[str]:

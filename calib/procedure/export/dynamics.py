@@ -29,7 +29,7 @@ from calib import files
 from calib.folders import write_staged
 from calib.procedure.export.identified import IdentifiedRobot, consistency_lines, drive_notes, read
 from calib.procedure.export.masses import MJCF, as_mjcf, as_urdf
-from calib.procedure.export.parameters import parameters
+from calib.procedure.export.parameters import PARAMETERS, parameters
 from calib.procedure.kinematic_stage.folder import URDF
 from calib.robot.calibrated import nominal_of
 from calib.robot.formats import urdf_write
@@ -37,7 +37,7 @@ from calib.robot.formats.markup import text
 from calib.robot.formats.tesseract import joint_origins
 
 TABLE = ("joint", "armature", "damping", "friction", "offset", "armature_unit", "damping_unit", "friction_unit")
-WRITTEN = (URDF, MJCF, "drives.csv", "joint_origins.yaml", "parameters.json")
+WRITTEN = (URDF, MJCF, "drives.csv", "joint_origins.yaml", PARAMETERS)
 
 
 def deliver_dynamics(identified: Path, source: Path | None, out: Path) -> list[str]:
@@ -64,7 +64,7 @@ def deliver_dynamics(identified: Path, source: Path | None, out: Path) -> list[s
         files.write(staging / URDF, edited.encode(encoding))
         files.write(staging / MJCF, model)
         _export_drives(given, staging / "drives.csv")
-        files.write_json(staging / "parameters.json", parameters(given))
+        files.write_json(staging / PARAMETERS, parameters(given))
         if source is not None:
             files.write(staging / "joint_origins.yaml", joint_origins(content, edited, where))
 

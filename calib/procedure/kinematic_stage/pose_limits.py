@@ -24,7 +24,15 @@ TOML; every table is optional, a key that is none of these is refused. Lengths i
     pitch = ["-20 deg", "20 deg"]
     sight = "40 deg"                 # half angle of the cone, around facing, in which the target sees the instrument
     range = [0.5, 20.0]              # least and largest distance of the target
-    [camera]                         # in place of an instrument, see `calib.procedure.measuring.camera_view`
+    [camera]                         # in place of an instrument; places may be rough, a centimetre and some degrees do
+    mounting = "in hand"             # the arm carries the camera; to hand: the board
+    lens = "camera.yaml"             # beside the file; ROS camera_info
+    board = "board.toml"
+    carried = {xyz = [0.04, 0.0, 0.06], rpy = [0, 0, 0]}       # what the arm carries, in the tip's frame
+    stands = {xyz = [0.5, 0.1, 0.0], rpy = ["180 deg", 0, 0]}  # the other, in the base; cameras look along z
+    tilt = "50 deg"                  # largest angle between the line of sight and the board's normal
+    range = [0.3, 1.2]               # least and largest distance of the board's middle
+    margin = 10                      # pixels that the board keeps to the image's edge
     [collision]                      # by the URDF's collision shapes, or capsules where there are none
     margin = 0.01                    # least distance between parts
     radius = 0.06                    # of the capsules; by default 5 % of the stretched arm, 0.05 or more

@@ -1,16 +1,6 @@
 """Whether a camera sees its board, where from, and what an image would tell: pose selection with a camera.
 
-``[camera]`` of the constraints file; places may be rough, a centimetre and a few degrees do::
-
-    [camera]
-    mounting = "in hand"             # the arm carries the camera; to hand: the board
-    lens = "camera.yaml"             # beside the file; ROS camera_info
-    board = "board.toml"
-    carried = {xyz = [0.04, 0.0, 0.06], rpy = [0, 0, 0]}             # what the arm carries, in the tip's frame
-    stands = {xyz = [0.5, 0.1, 0.0], rpy = ["180 deg", 0, 0]}        # the other, in the base; cameras look along z
-    tilt = "50 deg"                  # largest angle between the line of sight and the board's normal
-    range = [0.3, 1.2]               # least and largest distance of the board's middle [m]
-    margin = 10                      # pixels that the board keeps to the image's edge
+``[camera]`` of the constraints file states the camera (`calib formats constraints`).
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.errors import RobotError, UsageError
+from calib.identification.model_file import MODEL
 from calib.mechanism.parallel_model import ParallelModel, make_parallel_model
 from calib.procedure.excitation.parallel import ParallelDesign, design_parallel
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, ExcitationSettings
@@ -58,7 +59,7 @@ def read_values(model: ParallelModel, folder: Path) -> np.ndarray:
     Raises:
         RobotError: where the folder holds no model, or one of other bodies.
     """
-    path = folder / "dynamics.json"
+    path = folder / MODEL
     try:
         table = json.loads(path.read_text(encoding="utf-8"))["values"]
         values = np.array([float(table.get(name, 0.0)) for name in model.names])

@@ -20,25 +20,26 @@ from calib.dynamics.base import expressions
 from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
 from calib.folders import METRICS, check_target, write_staged
 from calib.identification.cases import Case
+from calib.identification.model_file import MODEL
 from calib.identification.prediction import predict
 from calib.identification.scores import Score
 from calib.mechanism import parallel_files
+from calib.procedure.excitation.coefficients import PLANNED
 from calib.procedure.excitation.parallel import ParallelDesign
 from calib.procedure.parallel_stage.fit import ParallelFit
 from calib.procedure.parallel_stage.identify import ParallelOutcome
 from calib.procedure.parallel_stage.robots import FoundRobot
 from calib.robot.calibrated import ROBOT
 
-DYNAMICS, MOTION = "dynamics.json", "motion.csv"
-IDENTIFIED = (ROBOT, DYNAMICS, ESTIMATE, COVARIANCE, METRICS, "torques_1.csv", "plot_*.png")
+IDENTIFIED = (ROBOT, MODEL, ESTIMATE, COVARIANCE, METRICS, "torques_1.csv", "plot_*.png")
 FITTED = (ROBOT, ESTIMATE, COVARIANCE, METRICS)
-DESIGNED = (ROBOT, MOTION, METRICS)
+DESIGNED = (ROBOT, PLANNED, METRICS)
 RATE = 100.0  # of torques_1.csv [Hz]
 
 
 def write_identified(outcome: ParallelOutcome, out: Path, plots: bool = True) -> Path:
     """Write the folder of an identification, all files or none."""
-    check_target(out, IDENTIFIED, (METRICS, DYNAMICS), "identification", [outcome.robot.source])
+    check_target(out, IDENTIFIED, (METRICS, MODEL), "identification", [outcome.robot.source])
 
     def write(folder: Path) -> None:
         _write_robot(outcome.robot, folder)
@@ -53,7 +54,7 @@ def write_identified(outcome: ParallelOutcome, out: Path, plots: bool = True) ->
         values = dict(zip(outcome.model.names, map(float, found.dynamics.values)))
         table = {"robot": ROBOT, "kind": outcome.model.torque_rows.name, "payloads": list(outcome.model.payloads)}
         base = dict(zip(found.names, words))
-        files.write_json(folder / DYNAMICS, table | {"values": values, "base": base, "covariance": COVARIANCE})
+        files.write_json(folder / MODEL, table | {"values": values, "base": base, "covariance": COVARIANCE})
         files.write_json(folder / METRICS, metrics(outcome))
         case = (*outcome.unseen, *outcome.cases)[0]
         _write_torques(case, predict(found.dynamics, case), folder / "torques_1.csv")
@@ -81,7 +82,7 @@ def write_fitted(fitted: ParallelFit, out: Path) -> Path:
 
 def write_designed(robot: FoundRobot, design: ParallelDesign, rate: float, out: Path) -> Path:
     """Write the folder of an exciting motion, one period at the controller's rate, all files or none."""
-    check_target(out, DESIGNED, (METRICS, MOTION), "excitation", [robot.source])
+    check_target(out, DESIGNED, (METRICS, PLANNED), "excitation", [robot.source])
     known = robot.known.robot
     t = np.arange(round(design.family.period * rate) + 1) / rate
     x, v, a = design.orders(t)
@@ -94,7 +95,7 @@ def write_designed(robot: FoundRobot, design: ParallelDesign, rate: float, out: 
 
     def write(folder: Path) -> None:
         _write_robot(robot, folder)
-        files.write_table(folder / MOTION, header, np.hstack(parts).tolist())
+        files.write_table(folder / PLANNED, header, np.hstack(parts).tolist())
         files.write_json(folder / METRICS, design_metrics(robot, design))
 
     return write_staged(out, DESIGNED, write)

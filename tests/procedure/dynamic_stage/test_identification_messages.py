@@ -34,7 +34,7 @@ def test_ctrl_c_says_what_the_same_command_will_do(monkeypatch, capsys, command,
     def stop(*args, **kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "app", stop)
+    monkeypatch.setattr(cli, "_command", lambda: stop)
     assert cli.run([command, "folder"]) == 130
     assert words in capsys.readouterr().err
 
