@@ -116,7 +116,7 @@ def within(
         return minimise(factor, part.h, part.jacobian, curvature=part.curvature)
 
     for used in (0, len(rows)):  # an optimum that satisfies what was left out is that of the whole problem
-        found = solve(used)
+        found = _on_bounds(factor, solve(used), used, h)
         left = h(found.values)[used:]
         if (left >= 0.0).all():
             return _widened(found, used, left, jacobian(found.values)[used:])
@@ -137,6 +137,34 @@ class _Part:
 
     def jacobian(self, b: np.ndarray) -> np.ndarray:
         return self.whole_jacobian(b)[: self.used]
+
+
+def _on_bounds(factor: np.ndarray, found: Constrained, inequalities: int, h: Vector) -> Constrained:
+    """Return the optimum under linear constraints exactly on those that bind; the barrier keeps it √`TOLERANCE` off.
+
+    Left as it is where it is degenerate: a multiplier of an inequality would change sign, or another be violated.
+    """
+    if not found.binding.any():
+        return found
+    p, normals = len(found.values), found.normals[found.binding]
+    free = scipy.linalg.solve_triangular(factor[:p, :p], factor[:p, p])
+    apart = np.zeros(len(found.slack))
+    apart[:inequalities] = h(found.values)[:inequalities]
+    held = normals @ found.values - apart[found.binding]
+    values = from_free(factor, free, normals, held)
+    for row in np.flatnonzero(np.count_nonzero(normals, axis=1) == 1):  # bounds on single parameters: to the last bit
+        place = int(np.flatnonzero(normals[row])[0])
+        values[place] = held[row] / normals[row, place]
+    slack = np.where(found.binding, 0.0, apart + found.normals @ (values - found.values))
+    away = np.linalg.norm(factor[:p, :p] @ (values - found.values)) / max(np.linalg.norm(factor[:p, p]), 1e-300)
+    unit = 1.0 / np.linalg.norm(factor[:p, :p], axis=0)
+    slope = factor[:p, :p].T @ (factor[:p, :p] @ values - factor[:p, p])
+    size = np.linalg.norm(normals * unit, axis=1)
+    multipliers = np.zeros(len(slack))
+    multipliers[found.binding] = np.linalg.lstsq((normals * unit / size[:, None]).T, slope * unit)[0] / size
+    if (slack < 0.0).any() or (multipliers[:inequalities] < 0.0).any() or away > 1e-3:
+        return found
+    return replace(found, values=frozen(values), slack=frozen(slack), multipliers=frozen(multipliers))
 
 
 def _widened(found: Constrained, used: int, left: np.ndarray, normals: np.ndarray) -> Constrained:

@@ -16,6 +16,7 @@ from without_figures import run
 from calib.errors import CalibError, UsageError
 from calib.identification import identify_options
 from calib.identification.loop import loop_settings
+from calib.identification.possible import information
 from calib.simulation.loop import controllers, references
 from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, simulate
 
@@ -108,6 +109,20 @@ def test_didim_is_a_method_of_its_own(robot, tmp_path):
     )
     assert (named / "estimate.csv").read_text() == (stated / "estimate.csv").read_text()
     assert friction_error(named) < 0.15
+
+
+@pytest.mark.parametrize("method", ["pc-iv", pytest.param("pc-didim", marks=pytest.mark.slow)])
+def test_constraints_hold_in_every_round_and_the_folder_stays_readable(robot, tmp_path, capsys, method):
+    train = log(tmp_path, "train.csv", 1, noise=1e-3)
+    limit = 1.5 * planted.DRIVES["Fv"][0]
+    code, out = identify(robot, tmp_path, train, f"{GAINS}[constraints]\nbounds = {{ Fv1 = [{limit}, inf] }}", method)
+    assert code == 0 and "sits on its bound" in capsys.readouterr().out
+    row = next(row for row in csv.DictReader((out / "estimate.csv").open()) if row["name"] == "Fv1")
+    assert float(row["value"]) == pytest.approx(limit, rel=1e-6) and float(row["sigma"]) < 1e-9
+    told = json.loads((out / "metrics.json").read_text())["constraints"]
+    assert [one["name"] for one in told["binding"]] == [f"Fv1 >= {limit:g}"] and told["binding"][0]["multiplier"] > 0.0
+    read = information.read(out)
+    assert np.isfinite(read.factor).all() and read.best >= 0.0
 
 
 def test_without_noise_in_the_positions_least_squares_stands(robot, tmp_path):
