@@ -1,0 +1,83 @@
+"""Error on other motion against the seconds learnt from, for real recordings: python learning_curves.py [NAME …].
+
+Needs the folder of recordings (``CALIB_DATA``). Rows go to ``learning_curves.json`` in the working folder, one curve at
+a time; ``--figure FILE`` draws those that are there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from pathlib import Path
+
+from calib.identification.identify import identify
+from calib.identification.identify_options import parse_options
+from calib.identification.prediction import predict
+from calib.identification.scores import score
+from calib.procedure.dynamic_stage.inputs import gather
+
+DATA = Path(os.environ.get("CALIB_DATA", "../shared/data"))
+ROWS = Path("learning_curves.json")
+GAINS = {"gains": [14.87, 13.26, 11.13, 10.62, 11.03, 11.47]}
+WRIST = {"coupling": [{"joints": [5, 6], "label": "6"}]}
+PANDA, UR10E, TX40 = (
+    "franka_panda_inria/traj1_first60pct.npz",
+    "ur10e_innopolis/ur-20_0",
+    "staubli_tx40/tx40_first_5p4s.npz",
+)
+KR300, LWR = "kuka_kr300_tuk/traj_", "kuka_lwr4plus_iit/measurements_1.npz"
+CURVES = {  # training, its start, seconds, unseen, options
+    "Panda": (PANDA, 0.0, (1, 2, 4, 6, 9.387), f"{PANDA}@9.387:11.9", {}),
+    "UR10e": (f"{UR10E}2_10-30sec_12harm.npz", 8.0, (2, 4, 8, 16, 22), f"{UR10E}2_19_14harm50sec.npz", GAINS),
+    "TX40": (TX40, 0.0, (0.5, 1, 2, 2.7), f"{TX40}@2.7:", WRIST),
+    "KR300": (f"{KR300}A.npz", 0.0, (4, 6, 8, 10), f"{KR300}B.npz", {}),
+    "LWR4+": (LWR, 2.5, (3, 6.25), f"{LWR}@8.75:15", {}),
+}
+
+
+def error(name: str, seconds: float) -> dict[str, float | str]:
+    """Return the total error on unseen and on training motion [%] of a model of the first `seconds`."""
+    log, start, _, unseen, options = CURVES[name]
+    robot = (DATA / log).parent / "model.urdf"
+    given = gather(
+        robot, [f"{DATA / log}@{start:g}:{start + seconds:g}"], [str(DATA / unseen)], options=parse_options(options)
+    )  # fmt: skip
+    found = identify(given.robot, given.cases, given.options.settings)
+    own, other = (score(case, predict(found.dynamics, case)).raw.total for case in (given.cases[0], given.unseen[0]))
+    return {"robot": name, "seconds": seconds, "training": round(own, 2), "unseen": round(other, 2)}
+
+
+def draw(rows: list[dict], path: Path) -> None:
+    """Draw error against seconds."""
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(figsize=(6.4, 3.6), layout="constrained")
+    for name in CURVES:
+        own = sorted((row["seconds"], row["unseen"]) for row in rows if row["robot"] == name)
+        if own:
+            axes.plot(*zip(*own), "o-", label=name)
+    axes.set(xscale="log", yscale="log", xlabel="learnt from [s]", ylabel="unexplained on other motion [%]")
+    axes.grid(alpha=0.3, which="both")
+    axes.legend()
+    figure.savefig(path, dpi=120)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", default=list(CURVES))
+    parser.add_argument("--figure", type=Path)
+    given = parser.parse_args()
+    rows = json.loads(ROWS.read_text()) if ROWS.exists() else []
+    for name in given.names if given.figure is None else ():
+        for seconds in CURVES[name][2]:
+            rows = [row for row in rows if (row["robot"], row["seconds"]) != (name, seconds)]
+            rows.append(error(name, seconds))
+            print(rows[-1], flush=True)
+            ROWS.write_text(json.dumps(rows, indent=1))
+    if given.figure is not None:
+        draw(rows, given.figure)
+
+
+if __name__ == "__main__":
+    main()
