@@ -54,7 +54,9 @@ def started(cell, block):
 
 
 @pytest.mark.parametrize("mounting", [IN_HAND, TO_HAND])
-@pytest.mark.parametrize("lens", [camera.FIVE_MEGAPIXEL, FISHEYE], ids=["pinhole", "fisheye"])
+@pytest.mark.parametrize(
+    "lens", [camera.FIVE_MEGAPIXEL, pytest.param(FISHEYE, marks=pytest.mark.slow)], ids=["pinhole", "fisheye"]
+)
 def test_the_residuals_slope_is_minus_the_jacobian(mounting, lens):
     """Arm, both placements, every value of the lens, scale and bending; some corners unseen; away from the truth."""
     cell = camera.camera_cell(
@@ -123,6 +125,7 @@ def test_the_arm_is_recovered_with_lens_and_mounting_found(mounting):
     assert np.abs(off).max() < 4.0
 
 
+@pytest.mark.slow
 def test_a_lens_that_was_given_stays():
     cell, block = study()
     block, start, candidates = started(cell, replace(block, lens=cell.lens, known=True, free=()))
@@ -161,6 +164,7 @@ def virtual_cell_points(cell) -> Cell:
     return Cell(cell.cell.nominal, truth, SimulatedInstrument("tracker", 20e-6, None))
 
 
+@pytest.mark.slow
 def test_two_cameras_see_one_board():
     cell, one = study()
     two_cell = camera.camera_cell(cell.cell, TO_HAND, lens=FISHEYE, reach_of_arm=0.75)
@@ -179,6 +183,7 @@ def placed_like(cell):
     return replace(cell, stations=cell.stations[:1], tools=cell.tools[:1])
 
 
+@pytest.mark.slow
 def test_what_an_arm_does_not_repeat_is_told_from_what_a_corner_does_not():
     """Encoders of 0.1 mrad before corners of 0.05 px: the fit finds both, and its sigmas are those of the arm."""
     cell, block = study(count=60, encoder=1e-4)
@@ -232,6 +237,7 @@ def test_images_from_one_direction_do_not_tell_the_focal_length():
         complete_camera(cell.cell.nominal, take(study()[1], [0]))
 
 
+@pytest.mark.slow
 def test_a_flat_board_has_one_pose_even_from_afar():
     """Both poses that a distant plane may have are tried."""
     cell, _ = study(TO_HAND)
@@ -257,6 +263,7 @@ def test_every_closed_form_places_exact_poses(method, monkeypatch):
     assert place_robustly(arm, seen, 1.0).error < 1e-9
 
 
+@pytest.mark.slow
 def test_frames_of_unseen_images_are_placed_with_the_lens_of_the_fit():
     cell, block = study()
     block, start, candidates = started(cell, block)

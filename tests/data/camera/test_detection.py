@@ -77,11 +77,13 @@ def test_why_an_image_is_of_no_use(change, words):
     assert not found.seen.any()
 
 
+@pytest.mark.slow
 def test_another_dictionary_is_named():
     found = detect(image("charuco"), replace(BOARDS["charuco"], dictionary="6x6_50"))
     assert "no markers of 6x6_50, but some of 4x4_100" in found.problem
 
 
+@pytest.mark.slow
 def test_motion_is_told_from_defocus():
     way = np.array([placed(right=shift) for shift in np.linspace(-0.0025, 0.0025, 7)])
     found = detect(render(BOARDS["chessboard"], LENS, way, None, 1), BOARDS["chessboard"])

@@ -145,7 +145,7 @@ def write_bag(path, compressed: bool, moving: int) -> None:
                 stamp += 10_000_000
 
 
-@pytest.mark.parametrize("compressed", [True, False])
+@pytest.mark.parametrize("compressed", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_images_of_a_bag_take_the_joints_of_their_stamps(compressed, folder, tmp_path):
     write_bag.folder = folder
     write_bag(tmp_path / "bag", compressed, moving=2)

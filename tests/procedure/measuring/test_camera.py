@@ -58,6 +58,7 @@ def test_a_posture_is_in_view_where_the_cell_sees_the_whole_board(cell):
     assert "view past the arm" in limits.checked
 
 
+@pytest.mark.slow
 def test_chosen_poses_see_the_board_and_tell_what_images_tell(cell, tmp_path):
     with camera_files.limits_of(cell) as path:
         chosen = selection.choose("lwr4plus", 15, SelectionSettings(candidates=120), constraints=path)
@@ -67,6 +68,7 @@ def test_chosen_poses_see_the_board_and_tell_what_images_tell(cell, tmp_path):
     assert (limits.camera(chosen.selection.q) <= 1e-8).all()
 
 
+@pytest.mark.slow
 def test_a_camera_that_sees_no_board_is_refused(cell, tmp_path):
     with camera_files.limits_of(cell) as path:
         path.write_text(path.read_text().replace("tilt", "# tilt").replace("stands = {xyz = [0", "stands = {xyz = [9"))
@@ -131,6 +133,7 @@ def test_a_session_with_images_goes_to_its_certificate(cell, tmp_path):
     assert go_on(tmp_path / "s", said.append, SILENT, "test", plots=False).verdict == "pass"
 
 
+@pytest.mark.slow
 def test_the_prediction_is_what_a_fit_then_states(cell):
     """Sigma over the workspace from poses alone, against that of a fit of noisy images at them."""
     from calib.geometry.first_guess import install
