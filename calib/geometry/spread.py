@@ -19,7 +19,7 @@ def pose_sigmas(
     covariance: np.ndarray,
     torque: np.ndarray | None = None,
     station: int = 0,
-    tool: int = 0,
+    tool: np.ndarray | int = 0,
 ) -> np.ndarray:
     """Return sigmas (m, 2) of a tool's position [m] and orientation [rad]: sqrt(trace J Σ Jᵀ) of each.
 
@@ -30,7 +30,7 @@ def pose_sigmas(
         covariance: (f, f) of steps along them.
         torque: (m, n) gravity torques [N m], for compliance terms.
         station: seen from which station; -1 for the arm's base.
-        tool: which of its tools.
+        tool: which of its tools, one or (m,).
     """
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.clip(values, 0.0, None))
@@ -38,7 +38,7 @@ def pose_sigmas(
     for first in range(0, len(q), CHUNK):
         rows = slice(first, first + CHUNK)
         some = None if torque is None else torque[rows]
-        parts.append(_sigmas(cell, q[rows], free, root, some, station, tool))
+        parts.append(_sigmas(cell, q[rows], free, root, some, station, np.broadcast_to(tool, len(q))[rows]))
     return np.concatenate(parts)
 
 
@@ -49,11 +49,11 @@ def _sigmas(
     root: np.ndarray,
     torque: np.ndarray | None,
     station: int,
-    tool: int,
+    tool: np.ndarray,
 ) -> np.ndarray:
     m = len(q)
     rows = PoseMeasurements(q, cell.chain.joint_names)
-    block = Block(rows, station, np.full(m, tool), torque, evaluate(cell.deflection, q, torque))
+    block = Block(rows, station, tool, torque, evaluate(cell.deflection, q, torque))
     jacobian = target_jacobian(cell, predict(cell, block), free, block.station, block.tool, block.bases)
     spread = (root.T @ jacobian.reshape(len(free), 6 * m)).reshape(-1, 6, m)
     return np.sqrt(np.stack([np.sum(spread[:, :3] ** 2, axis=(0, 1)), np.sum(spread[:, 3:] ** 2, axis=(0, 1))], axis=1))

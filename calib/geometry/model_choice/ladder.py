@@ -69,6 +69,7 @@ class ModelSelection:
         chosen: name of the chosen model, e.g. ``geometry + harmonics``.
         folds: how the unseen rows were set aside.
         loss: the loss that was used.
+        offered: all terms of the effects that were taken up; those in ``fit`` are the ones the data kept.
     """
 
     fit: GeometricFit
@@ -78,6 +79,7 @@ class ModelSelection:
     chosen: str
     folds: Folds
     loss: str = "none"
+    offered: tuple[Term, ...] = ()
 
 
 def select_model(
@@ -150,6 +152,7 @@ class _Climber:
             blind = blind_folds(self.nominal, measured, folds, torques)
             self.folds = divide(folds, blind, measured, seed) if blind.any() else folds
         self.steps = 0
+        self.offered: tuple[Term, ...] = ()
         self.drawn = not all(block.has_instrument for block in measured)
 
     def rigid(self, model: str) -> None:
@@ -211,6 +214,7 @@ class _Climber:
             self.rungs.append(self._rung(statistics, f"+ {model}", where, True, ""))
         if kept:
             self._tick("final fit")
+            self.offered = tuple(term for name in kept for term in offered[name])
             self.best = self.full
             self.best = self._final(
                 statistics, [term for name in kept for term in offered[name]], [place[n] for n in kept]
@@ -299,7 +303,16 @@ class _Climber:
 
     def result(self) -> ModelSelection:
         loss = "none" if self.settings.loss == "auto" else self.settings.loss
-        return ModelSelection(self.best, self.nominal, self.stiff, tuple(self.rungs), self.chosen, self.folds, loss)
+        return ModelSelection(
+            self.best,
+            self.nominal,
+            self.stiff,
+            tuple(self.rungs),
+            self.chosen,
+            self.folds,
+            loss,
+            self.offered,
+        )
 
 
 def _places(offered: dict[str, list[Term]]) -> dict[str, np.ndarray]:

@@ -1,0 +1,324 @@
+"""How far off a fitted arm may be at any pose: what its parameters leave open, and what the model itself leaves.
+
+    E |e(q)|² = κ trace J Σ Jᵀ + v_0 + v_1 d(q)² + v_2 g(q)²
+
+with Σ the parameters' covariance, d the distance of q from the nearest pose that was learnt from and g that from the
+ranges of single joints that were, every joint counting by its lever [m]. κ and v are the most probable ones of errors
+on rows left out: at random (near), by regions or stations, and by the ends of every joint's range (far). The radius
+that holds 95 % is the quantile of the same rows' errors in units of that sigma: nothing is said of their distribution.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from calib.data.poses.measurements import PoseMeasurements, Positions, take
+from calib.estimation.relevance import Gram, gram, relevance
+from calib.geometry.fit import plausible_deviation
+from calib.geometry.installation import Installation
+from calib.geometry.model_choice.effects import term_groups, term_sizes
+from calib.geometry.model_choice.folds import Folds, random_folds
+from calib.geometry.model_choice.ladder import ModelSelection
+from calib.geometry.observation import observe, prepare
+from calib.geometry.parameters import layout
+from calib.geometry.result import row_weights, used_sigmas
+from calib.geometry.spread import pose_sigmas
+from calib.robot.chain import Chain
+from calib.robot.deflection import Deflection
+from calib.robot.kinematics import forward
+
+COVERED = 0.95
+SOME = 0.02  # share of the poses (our choice)
+END = 0.2  # share of the poses at each end of a joint's range that is left out (our choice)
+FEWEST = 20  # poses from which errors on rows left out are worth a model (our choice)
+ROUNDS = 200  # of the fixed point for κ and v
+MOST = 1500  # poses that folds are judged by (our choice)
+UNTOLD = 1.0  # what is known beforehand of a parameter that a fold does not tell [m, rad] (our choice)
+
+
+@dataclass(frozen=True)
+class Discrepancy:
+    """What makes an error at a pose likely, learnt on rows left out.
+
+    Attributes:
+        parameters: κ, by which the parameters' covariance counts.
+        floor: v_0 [m²], what remains among the poses learnt from, the instrument's noise included.
+        far: v_1 [m²/m²], per squared distance from the nearest of them.
+        beyond: v_2 [m²/m²], per squared distance from the ranges of their joints.
+        radius: sigmas within which 95 % of the errors on rows left out were.
+        levers: (n,) by how much the tool moves with each joint [m/rad or 1], rms over the poses.
+    """
+
+    parameters: float
+    floor: float
+    far: float
+    beyond: float
+    radius: float
+    levers: tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorModel:
+    """Predicts the size of the tool position error of a fitted installation.
+
+    Attributes:
+        cell: the installation.
+        free, covariance: of its parameters (`calib.geometry.parameters`).
+        learnt: (m, n) poses it was learnt from [rad or m].
+        discrepancy: see `Discrepancy`.
+    """
+
+    cell: Installation
+    free: np.ndarray
+    covariance: np.ndarray
+    learnt: np.ndarray
+    discrepancy: Discrepancy
+
+    def position_sigma(
+        self, q: np.ndarray, torque: np.ndarray | None = None, station: int = 0, tool: np.ndarray | int = 0
+    ) -> np.ndarray:
+        """Return the standard deviation of the tool position error (m,) [m], all axes together, at q (m, n) [rad or m].
+
+        Args:
+            q: joint values.
+            torque: (m, n) gravity torques [N m], for compliance terms.
+            station: seen from which station; -1 for the arm's base.
+            tool: which of its tools, one or (m,).
+        """
+        own = pose_sigmas(self.cell, q, self.free, self.covariance, torque, station, tool)[:, 0] ** 2
+        return self._sigma(own, q)
+
+    def sigma_on(
+        self, cell: Installation, block: Positions, torque: np.ndarray | None = None, placed_anew: bool = False
+    ) -> np.ndarray:
+        """Return that sigma on measured rows (m,) [m].
+
+        Args:
+            cell: the installation that predicts them: that of the fit, or one placed anew.
+            block: m rows.
+            torque: (m, n) gravity torques [N m].
+            placed_anew: whether base and tool were placed on these very rows; then errors that a placement takes up
+                do not count.
+        """
+        ready = prepare(cell, [block], [torque])[0]
+        if not placed_anew:
+            return self.position_sigma(block.q, torque, ready.station, ready.tool)
+        own, now = layout(self.cell), layout(cell)
+        stays = (self.free < own.arm) | (self.free >= own.arm + own.stations + own.tools)
+        where = self.free[stays]
+        where = np.where(where < own.arm, where, where - len(own.names) + len(now.names))
+        columns = np.concatenate([now.frame_index, where])
+        jacobian = next(part.jacobian for part in observe(cell, ready, columns) if part.label == "position")
+        frames = len(now.frame_index)
+        jacobian = _placed_anew(jacobian, np.arange(frames))[frames:]
+        values, vectors = np.linalg.eigh(self.covariance[np.ix_(stays, stays)])
+        root = vectors * np.sqrt(np.clip(values, 0.0, None))
+        spread = (root.T @ jacobian.reshape(len(root), -1)).reshape(-1, 3, len(block))
+        return self._sigma(np.sum(spread**2, axis=(0, 1)), block.q)
+
+    def _sigma(self, own: np.ndarray, q: np.ndarray) -> np.ndarray:
+        """Return that sigma (m,) [m], where the parameters' share is known: trace J Σ Jᵀ (m,) [m²]."""
+        found, parts = self.discrepancy, distances(q, self.learnt, np.array(self.discrepancy.levers))
+        return np.sqrt(found.parameters * own + found.floor + found.far * parts[0] + found.beyond * parts[1])
+
+    def beyond(self, q: np.ndarray) -> np.ndarray:
+        """Return which joints (m, n) stand outside the range that was learnt from: there a prediction extrapolates."""
+        return (q < self.learnt.min(axis=0)) | (q > self.learnt.max(axis=0))
+
+
+def distances(q: np.ndarray, learnt: np.ndarray, levers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the squared distances (m,) [m²] of poses from the nearest learnt one, and from single joints' values.
+
+    The latter is, joint by joint, the way to where `SOME` of the learnt poses are within reach: a few of them far off
+    the others do not tell how a joint is there.
+    """
+    nearest = np.asarray(KDTree(learnt * levers).query(q * levers)[0]) ** 2
+    alone, count = np.zeros(len(q)), len(learnt)
+    some = int(np.clip(round(SOME * count), 1, count))
+    for j, lever in enumerate(levers):
+        values = np.sort(learnt[:, j])
+        place = np.searchsorted(values, q[:, j])
+        first = np.clip(place[:, None] - some + np.arange(some + 1), 0, count - some)
+        way = np.maximum(np.abs(values[first] - q[:, j, None]), np.abs(values[first + some - 1] - q[:, j, None]))
+        alone += (lever * way.min(axis=1)) ** 2
+    return nearest, alone
+
+
+def joint_levers(chain: Chain, q: np.ndarray) -> np.ndarray:
+    """Return by how much the tip moves with each joint (n,) [m/rad or 1], rms over poses, by central differences."""
+    rows = q[np.unique(np.linspace(0, len(q) - 1, 50).astype(int))]
+    result, step = np.zeros(chain.n), 1e-4
+    for j in range(chain.n):
+        move = np.zeros(chain.n)
+        move[j] = step
+        way = forward(chain, rows + move)[:, :3, 3] - forward(chain, rows - move)[:, :3, 3]
+        result[j] = np.sqrt(np.mean(np.sum(way**2, axis=1))) / (2.0 * step)
+    return np.maximum(result, 0.05)
+
+
+def learn_errors(
+    selected: ModelSelection,
+    measured: Sequence[PoseMeasurements],
+    torques: Sequence[np.ndarray | None] | None = None,
+    seed: int = 0,
+) -> ErrorModel | None:
+    """Learn what errors to expect from those on rows left out; None without positions, or with too few.
+
+    For every fold the geometry and the ridges of all effects that were taken up are found anew: ridges of all rows know
+    what was left out.
+
+    Args:
+        selected: the model and its fit of all rows.
+        measured: the blocks it was fitted to.
+        torques: gravity torques (m, n) per block [N m].
+        seed: of the random folds.
+    """
+    found = selected.fit
+    if sum(len(block) for block in measured) < FEWEST or not all(isinstance(block, Positions) for block in measured):
+        return None
+    levers = joint_levers(found.cell.chain, np.concatenate([block.q for block in measured]))
+    rows = _Rows(selected, measured, torques)
+    near = np.concatenate([*rows.left_out(random_folds(measured, 5, seed), levers)])
+    groups = [selected.folds, *_range_folds(measured)]
+    far = np.concatenate([errors for each in groups for errors in rows.left_out(each, levers)])
+    scale = _most_probable(np.concatenate([near, far]))
+    radius = max(_radius(near, scale), _radius(far, scale))
+    q = np.concatenate([block.q for block in measured])
+    known = Discrepancy(*map(float, scale), radius, tuple(map(float, levers)))
+    return ErrorModel(found.cell, found.free, found.estimate.covariance, q, known)
+
+
+def _range_folds(measured: Sequence[PoseMeasurements]) -> list[Folds]:
+    """Return folds that leave out both ends of every joint's range, the middle staying in."""
+    q = np.concatenate([block.q for block in measured])
+    edges, result = np.cumsum([len(block) for block in measured])[:-1], []
+    for j in range(q.shape[1]):
+        low, high = np.quantile(q[:, j], [END, 1.0 - END])
+        if high - low < 1e-6:
+            continue
+        fold = np.where(q[:, j] < low, 0, np.where(q[:, j] > high, 1, 2))
+        result.append(Folds("ranges", 2, tuple(np.split(fold, edges))))
+    return result
+
+
+class _Rows:
+    """The rows of a fit, linearised about its geometry without effects: all folds are judged by them."""
+
+    def __init__(
+        self,
+        selected: ModelSelection,
+        measured: Sequence[PoseMeasurements],
+        torques: Sequence[np.ndarray | None] | None,
+    ):
+        found, terms = selected.fit, selected.offered
+        every = max(1, -(-sum(map(len, measured)) // MOST))
+        self.chosen = [np.arange(0, len(block), every) for block in measured]
+        self.measured = [take(block, rows) for block, rows in zip(measured, self.chosen)]
+        torques = [None] * len(measured) if torques is None else torques
+        given = [None if torque is None else torque[rows] for torque, rows in zip(torques, self.chosen)]
+        cell = found.cell
+        if terms:
+            cell = replace(
+                cell, deflection=Deflection(terms, np.zeros(len(terms)), selected.nominal.cell.chain)
+            )  # fmt: skip
+        table = layout(cell)
+        own = np.flatnonzero(found.free < len(table.names) - table.terms)
+        self.free = np.concatenate([found.free[own], table.term_index])
+        self.station = np.flatnonzero(np.isin(self.free, table.station_index))
+        wide = plausible_deviation(cell, self.free[: len(own)])
+        if found.prior is not None:
+            wide = np.minimum(wide, found.prior[own])
+        self.prior = np.where(np.isfinite(wide), wide, UNTOLD)
+        self.groups = np.concatenate([np.full(len(own), -1), term_groups(terms)]).astype(int)
+        self.sizes = np.concatenate([np.ones(len(own)), term_sizes(terms)])
+        scales, weights = used_sigmas(found), row_weights(found)
+        self.whitened: list[list[tuple[np.ndarray, np.ndarray]]] = []
+        self.metric: list[tuple[np.ndarray, np.ndarray]] = []
+        for number, ready in enumerate(prepare(cell, self.measured, given)):
+            parts = observe(cell, ready, self.free)
+            root = np.sqrt(weights[number][self.chosen[number]])
+            self.whitened.append(
+                [(each.value * root / scales[number][each.label],
+                  each.jacobian * root / scales[number][each.label]) for each in parts]
+            )  # fmt: skip
+            self.metric.append(next((each.value, each.jacobian) for each in parts if each.label == "position"))
+        self.total = sum((self._gram(k, slice(None)) for k in range(1, len(self.measured))), self._gram(0, slice(None)))
+
+    def _gram(self, block: int, rows: np.ndarray | slice) -> Gram:
+        p = len(self.free)
+        each = [
+            gram(value[:, rows].ravel(), jacobian[:, :, rows].reshape(p, -1).T)
+            for value, jacobian in self.whitened[block]
+        ]
+        return sum(each[1:], each[0])
+
+    def left_out(self, folds: Folds, levers: np.ndarray) -> Iterator[np.ndarray]:
+        """Yield per fold of its rows (rows, 4): |e|², trace J Σ Jᵀ, squared distances from the rest."""
+        free = np.arange(len(self.prior))
+        for fold in range(folds.count):
+            inside = [np.flatnonzero(members[rows] == fold) for members, rows in zip(folds.members, self.chosen)]
+            if not 0 < sum(map(len, inside)) < sum(map(len, self.measured)):
+                continue
+            data = self.total
+            for number, rows in enumerate(inside):
+                if len(rows):
+                    out = self._gram(number, rows)
+                    data = Gram(
+                        data.square - out.square, data.cross - out.cross, data.total - out.total, data.rows - out.rows
+                    )
+            square = data.square.copy()
+            square[free, free] += 1.0 / self.prior**2
+            found = relevance(replace(data, square=square), self.groups, self.sizes, iterations=8)
+            alive = np.flatnonzero(found.ridge > 0.0)
+            precision = square[np.ix_(alive, alive)] / found.noise**2 + np.diag(found.ridge[alive] ** -2.0)
+            scale = 1.0 / np.sqrt(np.diag(precision))
+            values, vectors = np.linalg.eigh(precision * np.outer(scale, scale))
+            root = scale[:, None] * vectors / np.sqrt(np.maximum(values, 1e-12))
+            learnt = np.concatenate([np.delete(b.q, rows, axis=0) for b, rows in zip(self.measured, inside)])
+            stays = {b.station for b, rows in zip(self.measured, inside) if len(rows) < len(b)}
+            for number, rows in enumerate(inside):
+                if not len(rows):
+                    continue
+                value, jacobian = (each[..., rows] for each in self.metric[number])
+                if self.measured[number].station not in stays:
+                    both = _placed_anew(np.concatenate([jacobian, value[None]]), self.station)
+                    jacobian, value = both[:-1], both[-1]
+                error = value - np.einsum("f,fim->im", found.values, jacobian)
+                own = np.sum((root.T @ jacobian[alive].reshape(len(alive), -1)) ** 2, axis=0)
+                near = distances(self.measured[number].q[rows], learnt, levers)
+                yield np.stack([np.sum(error**2, axis=0), own.reshape(3, -1).sum(axis=0), *near], axis=1)
+
+
+def _placed_anew(columns: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    """Return columns (f, 3, m) with those at `frames` projected out."""
+    flat = columns.reshape(len(columns), -1)
+    basis, size, _ = np.linalg.svd(flat[frames].T, full_matrices=False)
+    basis = basis[:, size > 1e-9 * size[0]]
+    return (flat - (flat @ basis) @ basis.T).reshape(columns.shape)
+
+
+def _most_probable(rows: np.ndarray) -> np.ndarray:
+    """Return κ, v_0, v_1, v_2 of  |e|² ~ variance · χ²_3 / 3  from rows (m, 4), by multiplicative updates.
+
+    Each update multiplies by the ratio of the two halves of the likelihood's gradient, so that all stay positive; gross
+    rows count as three sigmas at most.
+    """
+    size, design = rows[:, 0], np.column_stack([rows[:, 1], np.ones(len(rows)), rows[:, 2:]])
+    scale = np.array([1.0, np.median(size), 0.0, 0.0])
+    scale[2:] = 0.3 * np.median(size) / np.maximum(design[:, 2:].mean(axis=0), 1e-12)
+    for _ in range(ROUNDS):
+        variance = np.maximum(design @ scale, 1e-30)
+        ratio = np.minimum(size / variance, 9.0)
+        push, pull = (ratio / variance) @ design, (1.0 / variance) @ design
+        scale = scale * push / np.maximum(pull, 1e-300)
+    return scale
+
+
+def _radius(rows: np.ndarray, scale: np.ndarray) -> float:
+    """Return how many sigmas hold `COVERED` of the errors of rows (m, 4)."""
+    variance = np.column_stack([rows[:, 1], np.ones(len(rows)), rows[:, 2:]]) @ scale
+    return float(np.quantile(np.sqrt(rows[:, 0] / np.maximum(variance, 1e-30)), COVERED))
