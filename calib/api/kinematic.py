@@ -16,7 +16,7 @@ from calib.arguments import checked
 from calib.data.poses.fit_options import FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.target_files import Targets, read_targets
-from calib.errors import as_ours
+from calib.errors import UsageError, as_ours
 from calib.estimation.estimate import Estimate
 from calib.procedure.kinematic_stage import compensation, compensation_file, fit, folder, inputs, selection
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSettings, SelectionSettings
@@ -98,6 +98,27 @@ class GeometryFit:
     def estimate(self) -> Estimate:
         """The fitted parameters [m, rad] with their covariance."""
         return self.outcome.selection.fit.estimate
+
+    def position_sigma(self, q: Any, tool: int = 0) -> np.ndarray:
+        """Return the standard deviation (m,) [m] of the tool position error, all axes together, at any poses.
+
+        Parameters' covariance and what the model leaves, by rows left out: it grows with the distance from the poses
+        that were learnt from. 95 % of errors are within ``outcome.expected.discrepancy.radius`` times that.
+
+        Args:
+            q: (m, n) joint values [rad or m].
+            tool: which of the fit's tools.
+
+        Raises:
+            UsageError: where no positions were measured.
+        """
+        from calib.procedure.kinematic_stage.comparison import gravity_of
+
+        if self.outcome.expected is None:
+            raise UsageError("this fit knows no errors to expect: it takes 20 measured positions or more")
+        poses = PoseMeasurements(np.atleast_2d(np.asarray(q, dtype=float)), self.robot.chain.joint_names)
+        torque = gravity_of(self.outcome.inputs.chain, poses)
+        return self.outcome.expected.position_sigma(poses.q, torque, tool=tool)
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write the folder that `calib fit --out` writes: robot.toml, URDF, estimate, residuals, certificate."""

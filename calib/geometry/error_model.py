@@ -188,7 +188,8 @@ def learn_errors(
     scale = _most_probable(np.concatenate([near, far]))
     radius = max(_radius(near, scale), _radius(far, scale))
     q = np.concatenate([block.q for block in measured])
-    known = Discrepancy(*map(float, scale), radius, tuple(map(float, levers)))
+    kappa, floor, far, beyond = scale.tolist()
+    known = Discrepancy(kappa, floor, far, beyond, radius, tuple(levers.tolist()))
     return ErrorModel(found.cell, found.free, found.estimate.covariance, q, known)
 
 

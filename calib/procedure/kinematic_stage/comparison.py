@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import PoseMeasurements, Positions
 from calib.geometry.accuracy import Errors, Torques, errors, pair_errors, statistics, summary
 from calib.geometry.checks.repeatability import SAME, Repeats, repeats
+from calib.geometry.error_model import ErrorModel
 from calib.geometry.fit import placed_on
 from calib.geometry.installation import Installation
 from calib.geometry.weighing import Settings
@@ -18,6 +19,41 @@ from calib.procedure.kinematic_stage.inputs import Unseen, pose_count
 from calib.procedure.kinematic_stage.metrics import RepeatedPoses
 from calib.procedure.measuring.image_findings import reprojection
 from calib.robot.chain import Chain
+
+
+@dataclass(frozen=True, eq=False)
+class Intervals:
+    """What a fit expects of its own errors on some rows.
+
+    Attributes:
+        sigma: (m,) standard deviation of the tool position error, all axes together [m].
+        radius: (m,) within which 95 % of such errors are to be [m].
+        size: (m,) the errors found [m].
+        beyond: (m,) whether a joint stands outside the range that was learnt from.
+        joints: names of those that do.
+    """
+
+    sigma: np.ndarray
+    radius: np.ndarray
+    size: np.ndarray
+    beyond: np.ndarray
+    joints: tuple[str, ...] = ()
+
+    @property
+    def covered(self) -> float:
+        """Share of the errors found that are within their radius."""
+        return float(np.mean(self.size <= self.radius))
+
+    def table(self) -> dict[str, object]:
+        """Return coverage, median radius and rows that extrapolate as ``metrics.json`` holds them."""
+        return {
+            "coverage_percent": 100.0 * self.covered,
+            "median_mm": 1e3 * float(np.median(self.radius)),
+            "sigma_rms_mm": 1e3 * float(np.sqrt(np.mean(self.sigma**2))),
+            "rows": len(self.size),
+            "rows_beyond_learnt_range": int(self.beyond.sum()),
+            "joints_beyond_learnt_range": list(self.joints),
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +75,7 @@ class Comparison:
         repeated: what poses that were measured several times say (`calib.procedure.kinematic_stage.comparison`); None
             without any.
         reprojection: rms distance of seen from predicted corners, of each arm [px]; None without images.
+        intervals: what the fit's error model expected of the calibrated arm on these rows; None without one.
         settled: False where the placement of base and tool on these rows did not settle: their errors mean nothing.
     """
 
@@ -55,6 +92,7 @@ class Comparison:
     repeated: Mapping[str, Any] | None = None
     reprojection: tuple[float, float] | None = None
     settled: bool = True
+    intervals: Intervals | None = None
 
     def table(self) -> dict[str, object]:
         """Return the comparison as ``metrics.json`` holds it."""
@@ -69,6 +107,8 @@ class Comparison:
             result["reprojection_px"] = dict(zip(arms, self.reprojection))
         if self.repeated is not None:
             result["iso9283"] = self.repeated
+        if self.intervals is not None:
+            result["interval95"] = self.intervals.table()
         return result
 
 
@@ -104,6 +144,7 @@ def compare_unseen(
     settings: Settings,
     seed: int = 0,
     alone: Installation | None = None,
+    expected: ErrorModel | None = None,
 ) -> Comparison:
     """Return both arms' errors on unseen rows, their frames refitted where the rows have frames of their own."""
     block = unseen.block
@@ -122,9 +163,21 @@ def compare_unseen(
     found = compare(
         nominal, calibrated, [block], torques, words, not unseen.seen, seed, alone=alone, shares_frames=shares
     )
+    if expected is not None and isinstance(block, Positions):
+        found = replace(found, intervals=_intervals(expected, calibrated, found, unseen.own_frames))
     if settled:
         return found
     return replace(found, settled=False, proves=False, frames="base and tool placement did not settle on these rows")
+
+
+def _intervals(expected: ErrorModel, cell: Installation, found: Comparison, placed_anew: bool) -> Intervals:
+    """Return what an error model expects on the rows of a comparison, and how many errors are within it."""
+    block, sizes = found.blocks[0], found.errors[1].position
+    assert isinstance(block, Positions) and sizes is not None
+    sigma = expected.sigma_on(cell, block, found.torques[0], placed_anew)
+    beyond = np.atleast_2d(expected.beyond(block.q))
+    names = tuple(name for name, out in zip(block.joint_names, np.asarray(beyond.any(axis=0)).tolist()) if out)
+    return Intervals(sigma, expected.discrepancy.radius * sigma, sizes, np.asarray(beyond.any(axis=1)), names)
 
 
 def gravity_of(chain: Chain, block: PoseMeasurements) -> np.ndarray | None:

@@ -13,6 +13,7 @@ from calib.errors import NotConverged
 from calib.geometry.accuracy import errors
 from calib.geometry.checks.diagnosis import diagnose
 from calib.geometry.checks.unidentified import unidentified
+from calib.geometry.error_model import ErrorModel, learn_errors
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation
@@ -54,6 +55,7 @@ class Outcome:
         assessment: both arms on fitted and on unseen rows, and the verdict.
         seed: that reproduces it.
         tolerance: largest rms on unseen poses that is good enough [m]; None where none was given.
+        expected: how far off the calibrated arm may be at any pose; None where no positions were measured.
     """
 
     inputs: Inputs
@@ -65,6 +67,7 @@ class Outcome:
     assessment: Assessment
     seed: int = 0
     tolerance: float | None = None
+    expected: ErrorModel | None = None
 
     @property
     def calibrated(self) -> CalibratedChain:
@@ -137,7 +140,10 @@ def run(
     told = *map(remark, diagnose(found.fit)), *image_notes(found.fit)
     notes = *_moved_between(found.nominal.cell, inputs.fit, settings), *told
     findings = _found_of(inputs, found, named, notes, torques, options.accept)
-    arms = Arms(found.nominal.cell, found.fit.cell, rigid.cell.chain)
+    say("learning what errors to expect")
+    expected = learn_errors(found, inputs.fit, torques, seed)
+    findings = replace(findings, discrepancy=None if expected is None else expected.discrepancy)
+    arms = Arms(found.nominal.cell, found.fit.cell, rigid.cell.chain, expected)
     result = assess(arms, inputs, findings, settings, asked=asked, tolerance=wanted.tolerance, seed=seed)
     return Outcome(
         inputs,
@@ -149,13 +155,15 @@ def run(
         result,
         seed,
         wanted.tolerance,
+        expected,
     )
 
 
 def assessed(outcome: Outcome, inputs: Inputs, options: FitOptions, wanted: FitSettings) -> Outcome:
     """Return an outcome judged anew on the unseen rows of `inputs`; nothing is fitted."""
     settings = combine(Settings(), loss=wanted.loss or options.loss, loss_scale=options.loss_scale)
-    arms = Arms(outcome.selection.nominal.cell, outcome.selection.fit.cell, outcome.rigid.cell.chain)
+    fits = outcome.selection
+    arms = Arms(fits.nominal.cell, fits.fit.cell, outcome.rigid.cell.chain, outcome.expected)
     asked = wanted.model or options.model
     result = assess(
         arms, inputs, outcome.findings, settings, asked=asked, tolerance=outcome.tolerance, seed=outcome.seed

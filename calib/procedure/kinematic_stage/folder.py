@@ -18,11 +18,13 @@ from calib.errors import UsageError
 from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
 from calib.folders import CERTIFICATE, METRICS, REPORT, check_target, write_staged
 from calib.geometry import installation_file
+from calib.geometry.error_model import ErrorModel
+from calib.geometry.installation import Installation
 from calib.geometry.weighing import Settings, combine
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import Findings, FitMetrics, ValidationMetrics
-from calib.procedure.kinematic_stage.tables import HEADER, estimate_table, write_residuals
+from calib.procedure.kinematic_stage.tables import HEADER, estimate_table, read_covariance, write_residuals
 from calib.procedure.kinematic_stage.validation import Arms, Assessment, nominal_arm, write_errors
 from calib.records import read_record
 from calib.robot import calibrated
@@ -113,7 +115,16 @@ class FitFolder:
     def arms(self, inputs: Inputs, settings: Settings) -> Arms:
         """Read both arms; the nominal one's frames are fitted to the fit's rows again."""
         chosen = combine(settings, loss=self.findings().loss or settings.loss)
-        return Arms(nominal_arm(inputs, chosen), installation_file.read(self.path), calibrated.read(self.path).chain)
+        cell = installation_file.read(self.path)
+        rigid = calibrated.read(self.path).chain
+        return Arms(nominal_arm(inputs, chosen), cell, rigid, self._expected(cell, inputs))
+
+    def _expected(self, cell: Installation, inputs: Inputs) -> ErrorModel | None:
+        known = self.findings().discrepancy
+        if known is None:
+            return None
+        free, covariance = read_covariance(self.path, cell)
+        return ErrorModel(cell, free, covariance, np.concatenate([block.q for block in inputs.fit]), known)
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from calib.geometry.error_model import Discrepancy
+
 
 @dataclass(frozen=True)
 class ErrorStatistics:
@@ -70,6 +72,18 @@ class RepeatedPoses:
 
 
 @dataclass(frozen=True)
+class IntervalCoverage:
+    """How many errors were within the 95 % interval that the fit states, how wide that was, where it extrapolated."""
+
+    coverage_percent: float
+    median_mm: float
+    sigma_rms_mm: float
+    rows: int
+    rows_beyond_learnt_range: int
+    joints_beyond_learnt_range: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class ComparedRows:
     """Both arms on one set of rows.
 
@@ -82,6 +96,7 @@ class ComparedRows:
         iso9283: of repeated poses.
         unseen: False where rows are none that the fit had not seen.
         parameters: how many were fitted, on the fit's own rows.
+        interval95: how the errors that the fit stated held here.
     """
 
     poses: int
@@ -93,6 +108,7 @@ class ComparedRows:
     iso9283: RepeatedPoses | None = None
     unseen: bool = True
     parameters: int = 0
+    interval95: IntervalCoverage | None = None
 
 
 @dataclass(frozen=True)
@@ -141,6 +157,7 @@ class Findings:
         loss: that was used; empty where it is not known.
         notes: what a user should know of the fit, whatever the unseen rows are.
         blind: stations whose rows were left out by regions only, since the others do not tell where their tool is.
+        discrepancy: what makes an error at a pose likely, learnt on rows left out; None where nothing was.
         odd: what cannot be of this arm, see `calib.procedure.kinematic_stage.plausibility`.
     """
 
@@ -154,6 +171,7 @@ class Findings:
     notes: tuple[str, ...] = ()
     blind: tuple[str, ...] = ()
     odd: tuple[Finding, ...] = ()
+    discrepancy: Discrepancy | None = None
 
 
 @dataclass(frozen=True)

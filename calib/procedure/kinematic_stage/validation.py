@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ import numpy as np
 from calib import files
 from calib.data.poses.measurements import PoseMeasurements, Positions
 from calib.geometry.accuracy import Errors
+from calib.geometry.error_model import ErrorModel
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames, without_corrections
 from calib.geometry.installation import Installation
@@ -34,6 +35,7 @@ from calib.robot.chain import Chain
 from calib.transforms import invert
 
 ELSEWHERE = 20.0  # nominal errors this many times the fit's: the instrument must have stood elsewhere (our choice)
+INTERVAL = ("sigma [mm]", "interval95 [mm]", "extrapolated")
 GROSS = 8.0  # our choice
 PLACES = tuple(
     f"{name} [{unit}]"
@@ -44,11 +46,15 @@ PLACES = tuple(
 
 @dataclass(frozen=True, eq=False)
 class Arms:
-    """The nominal and the calibrated installation, frames fitted to the fit's rows, and the best rigid geometry."""
+    """The nominal and the calibrated installation, frames fitted to the fit's rows, and the best rigid geometry.
+
+    With the error model of the calibrated one, where there is one.
+    """
 
     nominal: Installation
     calibrated: Installation
     rigid: Chain
+    expected: ErrorModel | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +109,7 @@ def assess(
     alone = without_corrections(arms.calibrated, arms.rigid, inputs.fit, settings)
     fitted = compare(*both, inputs.fit, torques, "fitted on these rows", False, seed, alone=alone)
     validation = {
-        name: compare_unseen(*both, unseen, lambda b: gravity_of(inputs.chain, b), settings, seed, alone)
+        name: compare_unseen(*both, unseen, lambda b: gravity_of(inputs.chain, b), settings, seed, alone, arms.expected)
         for name, unseen in inputs.unseen.items()
     }
     verdict = judge(
@@ -118,7 +124,7 @@ def assess(
     warnings = (
         *loud, *(one.words for one in findings.odd),
         *inputs.notes, *(note for block in blocks for note in block.notes), *elsewhere(fitted, validation),
-        *findings.notes, *_doubtful(validation), *_unsettled(validation),
+        *findings.notes, *_doubtful(validation), *_unsettled(validation), *interval_notes(validation),
     )  # fmt: skip
     return Assessment(fitted, validation, verdict, tuple(dict.fromkeys(warnings)))
 
@@ -180,6 +186,24 @@ def _doubtful(validation: Mapping[str, Comparison]) -> list[str]:
     return result
 
 
+def interval_notes(validation: Mapping[str, Comparison]) -> list[str]:
+    """Say how many errors on unseen rows are within the interval that the fit states, and where it extrapolates."""
+    result = []
+    for name, each in validation.items():
+        if (found := each.intervals) is None or not each.settled:
+            continue
+        result.append(
+            f"{name}: {100 * found.covered:.1f} % of {len(found.size)} errors are within the 95 % interval "
+            f"that the fit states (median ± {1e3 * np.median(found.radius):.3f} mm)"
+        )
+        if found.beyond.any():
+            result.append(
+                f"{name}: {int(found.beyond.sum())} of {len(found.size)} poses have {', '.join(found.joints)} outside "
+                "the range that was learnt from: there the model extrapolates"
+            )
+    return result
+
+
 def _unsettled(validation: Mapping[str, Comparison]) -> list[str]:
     """Name unseen files on which the placement of base and tool did not settle."""
     return [
@@ -194,7 +218,9 @@ def write_errors(path: Path, chain: Chain, validation: Mapping[str, Comparison])
     """Write the errors of both arms at every unseen row; where positions were measured, with where and whither.
 
     Then ``x y z`` is where the target was seen, ``to_nominal`` and ``to_calibrated`` lead from there to where each arm
-    puts it, all in the calibrated arm's base.
+    puts it, all in the calibrated arm's base. ``sigma`` is the standard deviation that the fit expects of the
+    calibrated arm's error there, ``interval95`` within which 95 % of such errors are to be, ``extrapolated`` 1 where a
+    joint stands outside the range that was learnt from.
     """
     rows: list[list[object]] = []
     for name, each in validation.items():
@@ -204,11 +230,20 @@ def write_errors(path: Path, chain: Chain, validation: Mapping[str, Comparison])
         if len(sizes[0]) == len(q):
             places = np.concatenate([_places(each, number) for number in range(len(each.blocks))])
             rows += [
-                [name, number, *map(float, joints), 1e3 * float(a), 1e3 * float(b), *map(_cell, place)]
-                for number, joints, a, b, place in zip(numbers, q, *sizes, places)
+                [name, number, *map(float, joints), 1e3 * float(a), 1e3 * float(b), *map(_cell, place), *interval]
+                for number, joints, a, b, place, interval in zip(
+                    numbers, q, *sizes, places, _interval_cells(each, len(q))
+                )
             ]
     joints = [f"{joint.name} [{joint.unit}]" for joint in chain.joints]
-    files.write_table(path, ["file", "row", *joints, "nominal [mm]", "calibrated [mm]", *PLACES], rows)
+    files.write_table(path, ["file", "row", *joints, "nominal [mm]", "calibrated [mm]", *PLACES, *INTERVAL], rows)
+
+
+def _interval_cells(found: Comparison, count: int) -> Iterable[Sequence[float | int | None]]:
+    if found.intervals is None:
+        return [(None, None, None)] * count
+    each = found.intervals
+    return zip((1e3 * each.sigma).tolist(), (1e3 * each.radius).tolist(), each.beyond.astype(int).tolist())
 
 
 def _places(found: Comparison, number: int) -> np.ndarray:

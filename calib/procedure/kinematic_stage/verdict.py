@@ -12,6 +12,7 @@ from calib.procedure.kinematic_stage.remarks import FLOOR
 
 WORSE = 1.01  # calibrated over nominal rms on the unseen from which on it is worse, not only no better
 GAIN = 0.10  # a smaller gain in rms on the unseen is no gain worth a new robot file
+HOLDS, FEWEST = 0.93, 20  # least coverage of the 95 % intervals, beyond chance; errors it takes to say so
 TRANSFER = 3.0  # unseen errors this many times the fit's own: the fit does not transfer
 OUTLIERS = 0.05  # more rows than this share that do not fit: something is wrong with the measurements or the model
 TURNED = 5.0  # rms of the calibrated arm's orientations [deg] that no calibrated arm has
@@ -72,9 +73,11 @@ def judge(
     8. no rigid geometry explains the measurements (`calib.procedure.kinematic_stage.outliers.plateau`), and what else
        the chosen model holds does not explain them either (`remains`): marginal at best;
     9. unseen errors above `TRANSFER` times the fit's own: marginal;
-    10. the gain on the unseen is below `GAIN`: marginal;
-    11. more than `OUTLIERS` of the rows do not fit: marginal;
-    12. else pass.
+    10. the 95 % intervals that the fit states hold less than `HOLDS` of the errors on some unseen file, beyond chance:
+        marginal;
+    11. the gain on the unseen is below `GAIN`: marginal;
+    12. more than `OUTLIERS` of the rows do not fit: marginal;
+    13. else pass.
 
     What cannot be of this arm holds the verdict down afterwards (`calib.procedure.kinematic_stage.plausibility`).
     Without unseen files, both arms are judged by cross-validation.
@@ -115,10 +118,14 @@ def judge(
     worst = max(found, key=lambda proof: proof.after)
     if unexplained:
         return Verdict("marginal", f"{unexplained}; {worst.where}: {worst.both}")
+    broken = _intervals_broken(proofs)
     if worst.after > TRANSFER * own:
         times = f"errors are {worst.after / own:.1f} times those on the fitted poses"
         advice = f"; if the instrument or tool stood elsewhere, {OWN_FRAMES}" if _shares_frames(proofs) else ""
-        return Verdict("marginal", f"{worst.where}, {times}: {worst.both}{advice}")
+        also = f"; {broken}" if broken else ""
+        return Verdict("marginal", f"{worst.where}, {times}: {worst.both}{also}{advice}")
+    if broken:
+        return Verdict("marginal", f"{worst.where}: {worst.both}; {broken}")
     if worst.after > (1.0 - GAIN) * worst.before:
         return Verdict("marginal", f"{worst.where}, the gain is small: {worst.both}; the arm may be calibrated already")
     if outlier_share > OUTLIERS:
@@ -126,6 +133,20 @@ def judge(
         return Verdict("marginal", f"{worst.where}: {worst.both}; but {share}")
     kept = "" if tolerance is None else f", within the tolerance of {1e3 * tolerance:g} mm"
     return Verdict("pass", f"{worst.where}: {worst.both}{kept}")
+
+
+def _intervals_broken(proofs: Mapping[str, Comparison]) -> str:
+    """Say on which unseen file errors are larger than the fit states, beyond chance; empty for none."""
+    for name, comparison in proofs.items():
+        if (found := comparison.intervals) is None or len(found.size) < FEWEST:
+            continue
+        chance = 3.0 * np.sqrt(0.95 * 0.05 / len(found.size))
+        if found.covered < HOLDS - chance:
+            return (
+                f"its 95 % intervals do not hold: {100 * found.covered:.0f} % of {len(found.size)} errors on {name} "
+                f"are within them (median ± {1e3 * np.median(found.radius):.3f} mm); measure poses like these, too"
+            )
+    return ""
 
 
 def _of_files(proofs: Mapping[str, Comparison]) -> Iterator[_Proof]:

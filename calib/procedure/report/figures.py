@@ -95,7 +95,10 @@ def _over_workspace(report: Report, proof: RowErrors, label: str) -> dict[str, C
             joints, f"Errors against each joint, {label}: a trend is something no parameter holds.", True
         ),
         "map": Captioned(
-            partial(geometry_figures.error_map, points, after), f"Remaining error over the workspace, {label}.", True
+            partial(geometry_figures.error_map, points, after, expected=np.array(proof.expected)),
+            f"Remaining error over the workspace, {label}"
+            + ("; below: 95 % are expected within." if proof.expected else "."),
+            True,
         ),
     }
 

@@ -67,6 +67,7 @@ class RowErrors:
         unseen: whether the fit had not seen them.
         poses: how many robot poses.
         nominal, calibrated: by nature, the errors of that arm [m, rad].
+        expected: radius within which 95 % of the calibrated arm's errors are to be [m]; empty where none is known.
         q: (rows, n) joints, and points (rows, 3) in the arm's base, where there is one error per row.
     """
 
@@ -77,6 +78,7 @@ class RowErrors:
     calibrated: Mapping[str, tuple[float, ...]]
     q: tuple[tuple[float, ...], ...] = ()
     points: tuple[tuple[float, ...], ...] = ()
+    expected: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -156,7 +158,8 @@ def rows_of(name: str, comparison: Comparison, unseen: bool) -> RowErrors:
     rows = RowErrors(name, unseen, comparison.poses, nominal, calibrated)
     if len(comparison.errors[1].main) != len(q):
         return rows
-    return replace(rows, q=_plain(q), points=_plain(_points(comparison)))
+    expected = () if comparison.intervals is None else _plain(comparison.intervals.radius)
+    return replace(rows, q=_plain(q), points=_plain(_points(comparison)), expected=expected)
 
 
 def with_unseen(report: Report, found: ValidationMetrics, sets: Sequence[RowErrors]) -> Report:

@@ -134,22 +134,30 @@ def _decades(sizes: np.ndarray) -> tuple[float, float]:
     return float(max(np.percentile(sizes, 2), 1e-9)) * 0.5, float(max(sizes.max(), 1e-8)) * 1.3
 
 
-def error_map(points: np.ndarray, sizes: np.ndarray, names: str = "xyz", words: str = "at most {} remain") -> Figure:
-    """Draw where in the workspace errors remain, seen from above and from the side.
+def error_map(
+    points: np.ndarray,
+    sizes: np.ndarray,
+    names: str = "xyz",
+    words: str = "at most {} remain",
+    expected: np.ndarray | None = None,
+) -> Figure:
+    """Draw where in the workspace errors remain, seen from above and from the side; below, what was expected.
 
     Args:
         points: (m, 3) target positions in the arm's base [m].
         sizes: (m,) errors that remain [m].
         names: of the axes.
         words: of the title, around the largest.
+        expected: (m,) radius within which 95 % of such errors are to be [m]; None or empty where it is not known.
     """
-    order = np.argsort(sizes)
     top = 1e3 * float(np.max(sizes, initial=1e-9))
+    both = [sizes] if expected is None or not len(expected) else [sizes, expected]
     with styled():
-        figure, axes = sheet(1, 2, WIDE, 3.1, across=0.6, right=0.75)
-        for plot, (i, j) in zip(axes, ((0, 1), (0, 2))):
+        figure, axes = sheet(len(both), 2, WIDE, 3.1 * len(both), across=0.6, right=0.75, between=0.7)
+        for plot, (k, i, j) in zip(axes, ((k, 0, j) for k in range(len(both)) for j in (1, 2))):
+            order = np.argsort(both[k])
             drawn = plot.scatter(
-                points[order, i], points[order, j], c=1e3 * sizes[order], cmap=HEAT, vmin=0.0, vmax=top, s=16,
+                points[order, i], points[order, j], c=1e3 * both[k][order], cmap=HEAT, vmin=0.0, vmax=top, s=16,
                 edgecolors=QUIET, linewidths=0.25,
             )  # fmt: skip
             plot.plot(0.0, 0.0, marker="+", color=INK, markersize=9)
@@ -158,9 +166,12 @@ def error_map(points: np.ndarray, sizes: np.ndarray, names: str = "xyz", words: 
             plot.locator_params(nbins=6)
             plot.set(xlabel=f"{names[i]} [m]", ylabel=f"{names[j]} [m]")
             plot.grid(True)
+            if j == 2:
+                colour_scale(figure, plot, drawn, "[mm]")
         axes[0].set_title(f"from above: {words.format(f'{top:.3g} mm')}")
         axes[1].set_title("from the side")
-        colour_scale(figure, axes[1], drawn, "[mm]")
+        if len(both) > 1:
+            axes[2].set_title("from above: 95 % are expected within")
     return figure
 
 

@@ -1,0 +1,66 @@
+"""Errors that a fit expects of itself hold on unseen poses whose truth the model cannot express, and grow away."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.data.poses.measurements import Positions
+from calib.geometry.accuracy import errors
+from calib.geometry.error_model import ErrorModel, learn_errors
+from calib.geometry.first_guess import install
+from calib.geometry.installation import Installation
+from calib.geometry.model_choice.ladder import select_model
+from calib.robot.load import load
+from calib.simulation.cells.cell import SimulatedInstrument, measure
+from calib.simulation.cells.virtual_cells import perturbed_cell
+
+
+def measured(seed: int, count: int, reach: float, outside: float) -> Positions:
+    """Return positions of a UR5 whose joints err by sin(2 q_j + q_j+1), which no rung of the ladder holds."""
+    cell = perturbed_cell(load("ur5"), 3, SimulatedInstrument("tracker", 2e-5, None), hidden=0.3)
+    q = np.random.default_rng(seed).uniform(-reach, reach, (count, 6))
+    seen = measure(cell, q + outside * np.sin(2.0 * q + np.roll(q, -1, axis=1)), seed)
+    return replace(seen, q=q, sigma=None, station="station")
+
+
+@pytest.fixture(scope="module")
+def found() -> tuple[ErrorModel, Installation]:
+    block = measured(1, 150, 1.6, 5e-4)
+    selected = select_model(install(load("ur5"), [block]), [block])
+    model = learn_errors(selected, [block])
+    assert model is not None
+    return model, selected.fit.cell
+
+
+@pytest.mark.parametrize("reach", [1.2, 1.6, 2.4])
+def test_95_of_100_unseen_errors_are_within_the_interval_near_and_far(found, reach):
+    """400 errors of one cell: the coverage is known to ± 2 %; far away the interval may be wider than needed."""
+    model, cell = found
+    block = measured(2, 400, reach, 5e-4)
+    covered = np.mean(errors(cell, [block]).main < model.discrepancy.radius * model.sigma_on(cell, block))
+    assert 0.91 < covered < (0.99 if reach < 2.0 else 1.0)
+
+
+def test_the_covariance_of_the_parameters_alone_would_be_far_too_small(found):
+    model, cell = found
+    block = measured(2, 400, 1.6, 5e-4)
+    from calib.geometry.spread import pose_sigmas
+
+    alone = pose_sigmas(cell, block.q, model.free, model.covariance)[:, 0]
+    assert np.mean(errors(cell, [block]).main < model.discrepancy.radius * alone) < 0.8
+
+
+def test_sigma_grows_away_from_what_was_learnt_and_extrapolation_is_named(found):
+    model, _ = found
+    inside, outside = model.learnt[:50], model.learnt[:50] + 1.5
+    assert np.median(model.position_sigma(outside)) > 1.5 * np.median(model.position_sigma(inside))
+    assert not model.beyond(inside).any() and model.beyond(outside).any(axis=1).all()
+
+
+def test_without_positions_or_with_few_nothing_is_expected(found):
+    block = measured(1, 19, 1.6, 0.0)
+    selected = select_model(install(load("ur5"), [block]), [block], "frames")
+    assert learn_errors(selected, [block]) is None
