@@ -7,7 +7,7 @@ import numpy as np
 from calib.data.poses.measurements import PoseMeasurements
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, predict, target_jacobian
-from calib.robot.deflection import evaluate
+from calib.robot.deflection import evaluate, extra_displacements
 
 CHUNK = 500  # poses at once: the Jacobian has a column per parameter
 
@@ -53,7 +53,9 @@ def _sigmas(
 ) -> np.ndarray:
     m = len(q)
     rows = PoseMeasurements(q, cell.chain.joint_names)
-    block = Block(rows, station, tool, torque, evaluate(cell.deflection, q, torque))
+    known = evaluate(cell.known, q, torque) if cell.known.terms else None
+    given = extra_displacements(cell.chain, cell.known, q, known)
+    block = Block(rows, station, tool, torque, evaluate(cell.deflection, q, torque), given)
     jacobian = target_jacobian(cell, predict(cell, block), free, block.station, block.tool, block.bases)
     spread = (root.T @ jacobian.reshape(len(free), 6 * m)).reshape(-1, 6, m)
     return np.sqrt(np.stack([np.sum(spread[:, :3] ** 2, axis=(0, 1)), np.sum(spread[:, 3:] ** 2, axis=(0, 1))], axis=1))
