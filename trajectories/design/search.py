@@ -95,7 +95,7 @@ def one_start(
         y = run.repaired(y)
         for stage, sharpness in enumerate(stages):
             run.sharpness = sharpness
-            y = run.solve(run.best if run.best is not None and stage else y, evaluations // len(stages), method)
+            y = run.solve(run.best if run.best is not None and stage else y, max(1, evaluations // len(stages)), method)
     except KeyboardInterrupt:
         if run.best is None:
             raise
