@@ -34,7 +34,8 @@ def write(path: str | Path, content: str | bytes) -> Path:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         clear_leftovers(path)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, **staged_name(path))
+        prefix, suffix = staged_name(path)
+        handle, temporary = tempfile.mkstemp(suffix, prefix, path.parent)
         with os.fdopen(handle, "wb") as file:
             file.write(data)
             file.flush()
@@ -49,9 +50,9 @@ def write(path: str | Path, content: str | bytes) -> Path:
     return path
 
 
-def staged_name(path: Path) -> dict[str, str]:
-    """Return how what will become `path` is called while it is written: the process stands in it."""
-    return {"prefix": f".{path.name}.{os.getpid()}.", "suffix": ".part"}
+def staged_name(path: Path) -> tuple[str, str]:
+    """Return prefix and suffix of what will become `path` while it is written: the process stands in it."""
+    return f".{path.name}.{os.getpid()}.", ".part"
 
 
 def clear_leftovers(path: Path) -> None:

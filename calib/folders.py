@@ -63,7 +63,8 @@ def write_staged(out: Path, ours: Collection[str], write: Callable[[Path], None]
         out = out.resolve()  # ``.`` and ``..`` have no name to stage under
         out.parent.mkdir(parents=True, exist_ok=True)
         files.clear_leftovers(out)
-        staging = Path(tempfile.mkdtemp(dir=out.parent, **files.staged_name(out)))
+        prefix, suffix = files.staged_name(out)
+        staging = Path(tempfile.mkdtemp(suffix, prefix, out.parent))
     except (OSError, RuntimeError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise UsageError(f"cannot write beside {out}: {reason}; nothing was changed there") from error
