@@ -129,7 +129,9 @@ def find_prior(
     if whole is not None:
         known[: len(whole)] = whole
     more = np.zeros(0, int) if groups is None else groups
-    columns = scipy.linalg.block_diag(transform, np.eye(len(more)))  # the rows' parameters by each of χ, and by s
+    columns = np.asarray(
+        scipy.linalg.block_diag(transform, np.eye(len(more)))
+    )  # the rows' parameters by each of χ, and by s
     columns = np.column_stack([columns, np.append(transform @ known, np.zeros(len(more)))])
     sizes = _sizes(model, data, columns, known, more)
     squares, count = np.sum(data.factors[:, :, -1] ** 2, axis=1), np.maximum(data.rows, 1)
@@ -247,8 +249,8 @@ def _whitened(
     own = factor[:b, :b] @ (columns * deviations)
     stacked = np.zeros((b + p, p + 1))
     stacked[:b, :p], stacked[:b, p], stacked[b:, :p] = own, factor[:b, b], np.eye(p)
-    upper = np.linalg.qr(stacked, mode="r")[:p]
-    inverse = scipy.linalg.solve_triangular(upper[:, :p], np.eye(p))
+    upper = np.asarray(np.linalg.qr(stacked, mode="r"))[:p]
+    inverse = np.asarray(scipy.linalg.solve_triangular(upper[:, :p], np.eye(p)))
     return own, inverse @ upper[:, p], inverse, float(np.log(np.abs(np.diag(upper))).sum())
 
 
