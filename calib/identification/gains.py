@@ -159,7 +159,7 @@ def identify_relative_gains(data: Triangles, joints: int, inflation: np.ndarray,
         for block in blocks if len(blocks) > 2 else ():
             others = pool(data, joints, [other for other in blocks if other != block])
             try:
-                again.append(np.log(identify_gains(others, {}, inflation, found.gains, reference, own).gains))
+                again.append(np.log(identify_gains(others, {}, inflation, found.gains.tolist(), reference, own).gains))
             except NotConverged:
                 again.append(np.where(np.arange(joints) == reference, 0.0, np.inf))
         formal = found.sigma / found.gains

@@ -129,9 +129,7 @@ def find_prior(
     if whole is not None:
         known[: len(whole)] = whole
     more = np.zeros(0, int) if groups is None else groups
-    columns = np.asarray(
-        scipy.linalg.block_diag(transform, np.eye(len(more)))
-    )  # the rows' parameters by each of χ, and by s
+    columns = np.asarray(scipy.linalg.block_diag(transform, np.eye(len(more))))  # by each of χ, and by s
     columns = np.column_stack([columns, np.append(transform @ known, np.zeros(len(more)))])
     sizes = _sizes(model, data, columns, known, more)
     squares, count = np.sum(data.factors[:, :, -1] ** 2, axis=1), np.maximum(data.rows, 1)
