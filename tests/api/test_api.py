@@ -77,7 +77,10 @@ def model(logs: Path) -> calib.DynamicsModel:
         (lambda: calib.validate("fit", "b.csv"), "validate: result: expected GeometryFit or DynamicsModel"),
         (lambda: calib.new_session("s", "ur5", "cmm", poses=4.5), "new_session: poses: expected a whole number"),
         (lambda: calib.new_session("s", "ur5", "cmm", periode=4.5), "no key 'periode' .did you mean 'period'"),
-        (lambda: calib.ExcitationSettings(period="a"), "ExcitationSettings: period: expected a number, found 'a'"),
+        (
+            lambda: calib.ExcitationSettings(period="a"),
+            "ExcitationSettings: period: expected a number above 0",
+        ),
         (lambda: calib.ExcitationSettings(goals="raw=35"), "ExcitationSettings: goals: expected several, each a text"),
         (lambda: calib.PlanSettings(lines=1), "PlanSettings: lines: expected True or False, found 1"),
         (

@@ -22,7 +22,7 @@ def names(most: int = 12) -> st.SearchStrategy[str]:
 
 def column_names(most: int = 12) -> st.SearchStrategy[str]:
     """Draw names that a header can hold: no brackets at the end, which are a unit's, and no numbers."""
-    return names(most).filter(lambda name: not name.endswith("]") and not _is_number(name))
+    return names(most).filter(lambda name: not name.endswith(("]", ")")) and not _is_number(name))
 
 
 def _is_number(name: str) -> bool:

@@ -1,6 +1,6 @@
 """How the errors that a fit states hold on real recordings: one row per recording and split.
 
-CALIB_DATA=... python examples/coverage.py
+CALIB_DATA=... python examples/interval_coverage.py
 """
 
 from __future__ import annotations
