@@ -251,7 +251,7 @@ def from_free(factor: np.ndarray, free: np.ndarray, normals: np.ndarray, held: n
         held: d (k,).
     """
     p = len(free)
-    turned = scipy.linalg.solve_triangular(factor[:p, :p], normals.T, trans="T")  # R⁻ᵀ Aᵀ
+    turned = scipy.linalg.solve_triangular(factor[:p, :p].T, normals.T, lower=True)  # R⁻ᵀ Aᵀ
     push = np.linalg.lstsq(turned, np.linalg.lstsq(turned.T, normals @ free - held)[0])[0]
     return np.asarray(free - scipy.linalg.solve_triangular(factor[:p, :p], turned @ push))
 

@@ -50,14 +50,12 @@ class RecordingSizes:
     Attributes:
         name: of the case.
         masses: (n,) recorded torque of gravity over that of the robot's own masses; NaN where a joint says nothing.
-        inertia: (n,) the same of torques of acceleration.
         speed: (n,) measured velocities over the slopes of the positions; NaN where there are none, or no travel.
         lag: of the torques; None where the recording is too short to tell.
     """
 
     name: str
     masses: np.ndarray
-    inertia: np.ndarray
     speed: np.ndarray
     lag: Lag | None
 
@@ -77,12 +75,9 @@ def compare_sizes(
     nothing = np.full(n, np.nan)
     known = newtons and case.target.shape[1] == n
     known = known and chain.inertias is not None and bool(np.any(chain.inertias[:, 9] > 0.0))
-    masses, inertia = (
-        share_of_nominal(motion.t, motion.q, case.target, chain, gravity, part) if known else nothing
-        for part in ("gravity", "inertia")
-    )
+    masses = share_of_nominal(motion.t, motion.q, case.target, chain, gravity, static=True) if known else nothing
     speed = nothing if motion.v_measured is None else speed_ratio(motion.t, motion.q, motion.v_measured)
-    return RecordingSizes(case.name, masses, inertia, speed, lag_of(case, _under(chain, gravity)))
+    return RecordingSizes(case.name, masses, speed, lag_of(case, _under(chain, gravity)))
 
 
 def speed_ratio(t: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -28,7 +28,6 @@ EDGE = 0.25  # kept before and after the motion [s], for the filters' borders
 SMOOTH = 10  # half width of the window for derivatives, in steps of the coarse grid
 SURE = 0.8  # partial correlation with the torque of the nominal masses from which on its sign counts
 HEAVY = 0.03  # of the torque limit: rigid-body torques smaller than this say nothing
-INERTIAL = 0.01  # the same for torques of acceleration alone, which are smaller
 UNLIMITED = 100.0  # torque limit of a joint that states none [N m or N]
 CREEP = 0.05  # speed over which the sign of Coulomb friction is smoothed [rad/s or m/s]
 
@@ -183,7 +182,7 @@ def nominal_share(recording: Recording, chain: Chain) -> np.ndarray:
 
 def share_of_nominal(
     t: np.ndarray, q: np.ndarray, effort: np.ndarray, chain: Chain, gravity: Sequence[float] | None = None,
-    part: str = "",
+    static: bool = False,
 ) -> np.ndarray:  # fmt: skip
     """Return what `nominal_share` does, of samples.
 
@@ -191,7 +190,7 @@ def share_of_nominal(
         t: (N,) [s]; q, effort: (N, n).
         chain: the arm with its nominal masses.
         gravity: [m/s²], where it is not the robot's own.
-        part: ``gravity`` or ``inertia`` compares these torques alone, the others left free like friction.
+        static: compare torques of gravity alone, the others left free like friction.
     """
     grid = np.arange(t[0], t[-1], STEP)
     torque, place = _smooth(_sampled(t, effort, grid)), _sampled(t, q, grid)
@@ -200,13 +199,11 @@ def share_of_nominal(
     bodies = bodies if gravity is None else with_gravity(bodies, np.asarray(gravity, dtype=float))
     rigid = inverse_dynamics(bodies, parameters, q, v, a)
     other = None
-    if part:
-        static = inverse_dynamics(bodies, parameters, q, np.zeros_like(v), np.zeros_like(a))
-        rigid, other = (static, rigid - static) if part == "gravity" else (rigid - static, static)
+    if static:
+        still = inverse_dynamics(bodies, parameters, q, np.zeros_like(v), np.zeros_like(a))
+        rigid, other = still, rigid - still
     limit = np.array([joint.effort for joint in chain.joints])
-    heavy = rigid.std(axis=0) > (INERTIAL if part == "inertia" else HEAVY) * np.where(
-        np.isfinite(limit), limit, UNLIMITED
-    )
+    heavy = rigid.std(axis=0) > HEAVY * np.where(np.isfinite(limit), limit, UNLIMITED)
     share = np.full(chain.n, np.nan)
     for j in np.flatnonzero(heavy):
         friction = np.column_stack([v[:, j], np.tanh(v[:, j] / CREEP), np.ones(len(q))])

@@ -173,10 +173,10 @@ class MethodEstimate:
 
     def testable(self) -> tuple[Triangles, np.ndarray, np.ndarray]:
         """Return triangles on which least squares gives this estimate, (g,) std and (g,) inflation: to test with."""
-        if self.instrumental is None and self.beforehand is None:
-            return self.pooled, self.std, self.inflation
-        if self.instrumental is None:  # what was known beforehand is one more group of rows
-            known = retriangulate(np.pad(self.beforehand, ((0, 0), (0, 1))))
+        if self.instrumental is None:
+            if self.beforehand is None:
+                return self.pooled, self.std, self.inflation
+            known = retriangulate(np.pad(self.beforehand, ((0, 0), (0, 1))))  # one more group of rows
             data = replace(
                 self.pooled, factors=frozen(np.concatenate([self.pooled.factors, known[None]])),
                 rows=frozen([*self.pooled.rows, len(self.beforehand)], int),

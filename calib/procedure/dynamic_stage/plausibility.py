@@ -6,7 +6,6 @@ marginal, until the options' ``accept`` says that it is meant. Findings and thei
 masses   torques that pull against the robot's own masses, or `FAR` times as much as these ask for, or a share of it:
          fail; beyond `OFF`, or `FAR` at single joints: marginal
 speed    measured velocities that are not the slope of the positions, by `SLIGHT`: marginal; by `WRONG` times: fail
-clock    torques of acceleration beyond `LIGHT` to `HEAVY` times those of the robot's own inertias: marginal
 lag      torques that come later than the positions of their row, at most joints alike (``[recording] lag = …`` takes
          them earlier): a note; where that explains `HELPS` of what is left: marginal
 """
@@ -23,7 +22,6 @@ from calib.procedure.kinematic_stage.plausibility import LEVELS
 
 FAR, OFF = 3.0, 2.2
 SLIGHT, WRONG = 0.05, 1.5
-LIGHT, HEAVY = 0.5, 5.0
 HELPS = 0.3
 
 
@@ -38,8 +36,8 @@ def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Fin
 def _masses(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
     """Compare with the robot's own masses: signs, then sizes."""
     share = each.masses
-    sure = np.flatnonzero(np.isfinite(share))
-    if not len(sure):
+    sure = np.flatnonzero(np.isfinite(share)).tolist()
+    if not sure:
         return
     against = [joints[j] for j in sure if share[j] < 0.0]
     if against:
@@ -58,26 +56,11 @@ def _masses(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
         yield Finding("masses", "marginal", f"{words}: {advice}")
 
 
-def _clock(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
-    """Compare inertia with the robot's own where gravity agrees: stamps off by a factor leave its square there."""
-    both = np.isfinite(each.inertia)
-    usual = float(np.median(each.inertia[both])) if both.sum() >= 2 else 1.0
-    if LIGHT < usual < HEAVY or not np.isfinite(each.masses).any() or np.nanmin(each.masses) < 0.0:
-        return
-    shown = ", ".join(f"{joints[j]} {each.inertia[j]:.2g}" for j in np.flatnonzero(both))
-    yield Finding(
-        "clock", "marginal",
-        f"{each.name}: the torques of acceleration are not those of the robot's own inertias, but times {shown}: are "
-        f"the stamps some {max(usual, 1 / usual) ** 0.5:.2g} times too {'large' if usual > 1 else 'small'}? What "
-        "measured velocities would show, masses that are not the robot's show as well",
-    )  # fmt: skip
-
-
 def _speed(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
     """Compare measured velocities with the slopes of the positions."""
     ratio = each.speed
-    off = np.flatnonzero(np.abs(np.nan_to_num(ratio, nan=1.0) - 1.0) > SLIGHT)
-    if not len(off):
+    off = np.flatnonzero(np.abs(np.nan_to_num(ratio, nan=1.0) - 1.0) > SLIGHT).tolist()
+    if not off:
         return
     known = np.flatnonzero(np.isfinite(ratio))
     usual = float(np.median(ratio[off]))

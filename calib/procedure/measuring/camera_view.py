@@ -248,7 +248,7 @@ def predict(seen: ImageObservation, q: np.ndarray, everywhere: np.ndarray) -> Pr
     """Return what images at q (m, n) will tell of the tool at postures all over (k, n) [rad or m]."""
     rows = seen(q).reshape(-1, len(seen.free))
     size = np.linalg.norm(rows, axis=0) + 1e-300
-    factor = np.linalg.qr(rows / size, mode="r")
+    factor = np.asarray(np.linalg.qr(rows / size, mode="r"))
     covariance = np.linalg.pinv(factor.T @ factor, rcond=1e-12, hermitian=True) / np.outer(size, size)
     cell = seen.view.cell
     sigma = pose_sigmas(cell, everywhere, seen.free, covariance, station=-1)[:, 0]
