@@ -108,10 +108,10 @@ from calib.dynamics.drives import DriveTerm, term
 from calib.dynamics.shapes import SHAPES
 from calib.dynamics.torque_rows import ROWS, TorqueRows
 from calib.errors import CalibError, UsageError
-from calib.identification.constraints import ConstraintSettings
 from calib.identification.friction.friction_ladder import NAMES
 from calib.identification.loop.loop_settings import LoopSettings, check_loop
 from calib.identification.methods.registry import METHODS
+from calib.identification.parameter_constraints import ConstraintSettings
 from calib.identification.settings import PRIORS, RULES, WEIGHTS, Coupling, IdentificationSettings, Payload
 
 
@@ -121,7 +121,7 @@ def _no_zero(value: Any) -> Any:
     return value
 
 
-FINDINGS = ("masses", "speed", "lag")  # `calib.identification.checks.plausible`
+FINDINGS = ("masses", "speed", "lag")  # `calib.identification.checks.recording_sizes`
 Texts = Annotated[tuple[Name, ...], Spread(words="a text, or a list of them")]
 Gains = Annotated[tuple[float, ...], Expect("a list of numbers, finite and none of them zero"), Checked(_no_zero)]
 

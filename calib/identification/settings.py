@@ -16,8 +16,8 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.shapes import V0
 from calib.dynamics.torque_rows import MOTOR, TorqueRows
 from calib.errors import UsageError
-from calib.identification.constraints import ConstraintSettings
 from calib.identification.loop.loop_settings import LoopSettings
+from calib.identification.parameter_constraints import ConstraintSettings
 from calib.robot.chain import Chain
 
 T = TypeVar("T")

@@ -79,7 +79,7 @@ def simulate(
         CannotSimulate: for a run that leaves its reference.
         UsageError: for a robot whose platform's twist is no plain choice of coordinates, or other drive terms.
     """
-    from calib.mechanism import loop_kernels
+    from calib.mechanism import closure_kernels
 
     known, robot = model.known, model.known.robot
     if not known.fixed:
@@ -101,7 +101,7 @@ def simulate(
         np.array(motion.posture.pose[0, :3, :3]),
         np.array(motion.posture.pose[0, :3, 3]),
     )
-    left = loop_kernels.run(
+    left = closure_kernels.run(
         _compiled(model), _parameters(model, values, carried), *state, np.array(motion.rate[0]),
         tuple(np.ascontiguousarray(part) for part in plan), controller.encoder * noise,
         np.array([joint.effort for joint in robot.joints]), np.array([omega**2, 2.0 * controller.damping * omega]),
@@ -117,7 +117,7 @@ def simulate(
 
 
 def _compiled(model: ParallelModel) -> tuple:
-    """Return the robot as `loop_kernels.accelerate` reads it."""
+    """Return the robot as `closure_kernels.accelerate` reads it."""
     robot = model.known.robot
     legs = [compiled(leg) for leg in robot.legs]
     return (
@@ -128,7 +128,7 @@ def _compiled(model: ParallelModel) -> tuple:
 
 
 def _parameters(model: ParallelModel, values: np.ndarray, carried: Collection[str] | None) -> tuple:
-    """Return parameters as `loop_kernels.accelerate` reads them."""
+    """Return parameters as `closure_kernels.accelerate` reads them."""
     drives = np.zeros((5, int(model.known.robot.starts[-1])))
     drives[4] = 1.0
     for one, value in zip(model.terms, values[model.inertial :]):

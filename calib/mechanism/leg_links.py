@@ -69,13 +69,13 @@ def times(A: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def _links(leg: Leg, q: np.ndarray, pose: np.ndarray) -> LegLinks:
-    from calib.mechanism import loop_kernels
+    from calib.mechanism import closure_kernels
 
     count, n = q.shape
     shapes = ((6, n), (n, leg.held), (leg.held, 6), (leg.held,), (3,))
     full, inverse, carried, gap, lever = (np.zeros((count, *shape)) for shape in shapes)
     bodies, tail = compiled(leg)
-    loop_kernels.legs(
+    closure_kernels.legs(
         bodies.links, bodies.constants, tail, leg.attachment, np.ascontiguousarray(q), np.ascontiguousarray(pose), full,
         inverse, carried, gap, lever,
     )  # fmt: skip

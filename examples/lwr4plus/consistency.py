@@ -33,10 +33,11 @@ from calib.dynamics.torque_rows import torque_rows
 from calib.errors import TaskLost
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit
-from calib.identification import geometry_uncertainty, reweighted
+from calib.identification import reweighted
 from calib.identification.cases import Case, make_case
 from calib.identification.identify import Identification, chain_states, common_decimator, find_base, identify
 from calib.identification.settings import IdentificationSettings, Payload, make_model
+from calib.identification.uncertainty import geometry_uncertainty
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, random_joints
 from calib.simulation.cells import known_robots

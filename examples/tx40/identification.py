@@ -41,11 +41,11 @@ from calib.estimation.instrumental_variables import least_squares
 from calib.estimation.linear import LinearFit, subsystem_std
 from calib.estimation.triangles import collect, combine
 from calib.identification.cases import Case, make_case
-from calib.identification.constraints import hold
-from calib.identification.constraints import signs as signed
 from calib.identification.loop.controller import identify_controller
 from calib.identification.loop.loop_recordings import Loop
 from calib.identification.methods.instrumental import Instrumental, Round, identify_instrumental, simulated_case
+from calib.identification.parameter_constraints import hold
+from calib.identification.parameter_constraints import signs as signed
 from calib.identification.rows import observe
 from calib.simulation.cells import known_robots
 from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, simulate

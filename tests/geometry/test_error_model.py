@@ -9,10 +9,10 @@ import pytest
 
 from calib.data.poses.measurements import Positions
 from calib.geometry.accuracy import errors
-from calib.geometry.error_model import ErrorModel, learn_errors
 from calib.geometry.first_guess import install
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.ladder import select_model
+from calib.geometry.uncertainty.error_model import ErrorModel, learn_errors
 from calib.robot.load import load
 from calib.simulation.cells.cell import SimulatedInstrument, measure
 from calib.simulation.cells.virtual_cells import perturbed_cell
@@ -47,7 +47,7 @@ def test_95_of_100_unseen_errors_are_within_the_interval_near_and_far(found, rea
 def test_the_covariance_of_the_parameters_alone_would_be_far_too_small(found):
     model, cell = found
     block = measured(2, 400, 1.6, 5e-4)
-    from calib.geometry.spread import pose_sigmas
+    from calib.geometry.uncertainty.spread import pose_sigmas
 
     alone = pose_sigmas(cell, block.q, model.free, model.covariance)[:, 0]
     assert np.mean(errors(cell, [block]).main < model.discrepancy.radius * alone) < 0.8

@@ -13,7 +13,7 @@ from calib.data.recordings.recording import Joints, Recording, earlier
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.errors import MeasurementError
 from calib.identification.cases import Case, make_case
-from calib.identification.checks.plausible import compare_sizes
+from calib.identification.checks.recording_sizes import compare_sizes
 from calib.procedure.dynamic_stage.plausibility import findings
 from calib.procedure.kinematic_stage.metrics import Finding
 from calib.procedure.kinematic_stage.plausibility import held_by, told

@@ -6,7 +6,7 @@
 and not its noise, so Z is uncorrelated with the noise that the feedback brings into W. It starts from a regular robot:
 inertia diag(J), no gravity, no friction. DIDIM (Gautier, Janot & Vandanjon 2013) estimates from the simulated W alone,
 x_{k+1} = W_s⁺ y. Constraints on base parameters, min ½ ‖P_Z (y - W x)‖² in every round, make it PC-IDIM-IV
-(`calib.identification.constraints`); they do not cure a bias.
+(`calib.identification.parameter_constraints`); they do not cure a bias.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from calib.estimation.linear import LinearFit, settled_std, wls
 from calib.estimation.triangles import Triangles, absorb, combine, empty, residual_squares, select
 from calib.estimation.whiteness import inflation
 from calib.identification.cases import Case
-from calib.identification.constraints import Constraints, Held, hold, signs
 from calib.identification.loop.loop_recordings import Loop
+from calib.identification.parameter_constraints import Constraints, Held, hold, signs
 from calib.identification.rows import ObservationRows, observe
 from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, inertia_diagonal, simulate, with_parameters
 from calib.simulation.loop.controllers import scaled

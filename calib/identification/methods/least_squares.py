@@ -15,10 +15,10 @@ from calib.estimation.linear import LinearFit, ols, ridge, settled_std, wls
 from calib.estimation.samples import SampleFit, irls, stack
 from calib.estimation.total import tls
 from calib.estimation.triangles import Triangles, combine, retriangulate
-from calib.identification.constraints import Constraints, hold
 from calib.identification.friction.passivity import driving
 from calib.identification.friction.time_folds import estimate
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, MethodEstimate, attempted
+from calib.identification.parameter_constraints import Constraints, hold
 from calib.identification.prediction import Dynamics
 from calib.identification.prior import Prior, bounded, residual_inflation, weighing
 

@@ -26,10 +26,10 @@ from calib.estimation.estimate import Estimate
 from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import Triangles, retriangulate
 from calib.identification.cases import Case
-from calib.identification.constraints import Constraints, ConstraintSettings, Held, make_constraints
 from calib.identification.loop.loop_recordings import ClosedLoops
 from calib.identification.loop.loop_settings import LoopSettings
 from calib.identification.methods.instrumental import Instrumental
+from calib.identification.parameter_constraints import Constraints, ConstraintSettings, Held, make_constraints
 from calib.identification.prior import Prior
 from calib.identification.rows import ObservationRows, pool, triangulate
 

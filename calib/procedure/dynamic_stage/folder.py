@@ -16,10 +16,10 @@ from calib.errors import UsageError
 from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
 from calib.folders import METRICS, REPORT, check_target, write_staged
 from calib.identification.cases import Case
-from calib.identification.constraints import Held
 from calib.identification.gains import DriveGains
 from calib.identification.methods.registry import METHODS
 from calib.identification.model_file import MODEL, read_dynamics, to_table
+from calib.identification.parameter_constraints import Held
 from calib.identification.possible import information
 from calib.identification.prediction import Dynamics
 from calib.identification.scores import PredictionErrors, Score

@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.identification.geometry_uncertainty import NOTHING, TILTS, GeometryUncertainty
-from calib.identification.two_geometries import GeometryComparison
+from calib.identification.uncertainty.geometry_uncertainty import NOTHING, TILTS, GeometryUncertainty
+from calib.identification.uncertainty.two_geometries import GeometryComparison
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.metrics import GeometricEffect, TwoGeometries
 

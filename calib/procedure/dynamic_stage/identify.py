@@ -9,10 +9,10 @@ import numpy as np
 
 from calib.data.signals.persistency import ExcitationReport, report_excitation
 from calib.identification.friction.passivity import driven
-from calib.identification.geometry_uncertainty import GeometryUncertainty, propagate
 from calib.identification.identify import Identification, identify
 from calib.identification.scores import Score
-from calib.identification.two_geometries import GeometryComparison, compare
+from calib.identification.uncertainty.geometry_uncertainty import GeometryUncertainty, propagate
+from calib.identification.uncertainty.two_geometries import GeometryComparison, compare
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, Progress
 from calib.procedure.dynamic_stage.tracking import Tracking
 from calib.procedure.dynamic_stage.validation import Assessment, ModelFindings, assess

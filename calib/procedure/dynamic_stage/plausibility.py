@@ -16,7 +16,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from calib.identification.checks.plausible import Lag, RecordingSizes
+from calib.identification.checks.recording_sizes import Lag, RecordingSizes
 from calib.procedure.kinematic_stage.metrics import Finding
 from calib.procedure.kinematic_stage.plausibility import LEVELS
 

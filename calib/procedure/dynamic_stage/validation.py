@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.data.signals.persistency import ExcitationReport, repeats, report_excitation
-from calib.identification.checks.plausible import compare_sizes
+from calib.identification.checks.recording_sizes import compare_sizes
 from calib.identification.friction.passivity import driven
 from calib.identification.prediction import Dynamics, predict
 from calib.identification.scores import Score, score

@@ -18,7 +18,7 @@ from calib.dynamics.path_dynamics import PathDynamics, of_standard
 from calib.errors import RobotError, UsageError
 from calib.identification.model_file import read_dynamics, refuse_currents
 from calib.identification.prediction import Dynamics
-from calib.identification.torque_uncertainty import Uncertainty, read_uncertainty
+from calib.identification.uncertainty.torque_uncertainty import Uncertainty, read_uncertainty
 from calib.procedure.excitation.limits import MotionLimits, read_motion_limits
 from calib.procedure.excitation.playback import approach_to, check_slower
 from calib.procedure.excitation.settings import DEFAULT_PLAN, PlanSettings

@@ -11,9 +11,9 @@ import numpy as np
 from calib.data.poses.measurements import PoseMeasurements, Positions
 from calib.geometry.accuracy import Errors, Torques, errors, pair_errors, statistics, summary
 from calib.geometry.checks.repeatability import SAME, Repeats, repeats
-from calib.geometry.error_model import ErrorModel
 from calib.geometry.fit import placed_on
 from calib.geometry.installation import Installation
+from calib.geometry.uncertainty.error_model import ErrorModel
 from calib.geometry.weighing import Settings
 from calib.procedure.kinematic_stage.inputs import Unseen, pose_count
 from calib.procedure.kinematic_stage.metrics import RepeatedPoses

@@ -31,7 +31,7 @@ from calib.geometry import installation_file, inverse
 from calib.geometry.installation import Installation, see
 from calib.geometry.inverse import Goal
 from calib.geometry.parameters import layout
-from calib.geometry.spread import pose_sigmas
+from calib.geometry.uncertainty.spread import pose_sigmas
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.kinematic_stage.tables import read_covariance
 from calib.robot.chain import Chain, sampling_limits

@@ -13,7 +13,6 @@ from calib.errors import NotConverged
 from calib.geometry.accuracy import errors
 from calib.geometry.checks.diagnosis import diagnose
 from calib.geometry.checks.unidentified import unidentified
-from calib.geometry.error_model import ErrorModel, learn_errors
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation
@@ -21,6 +20,7 @@ from calib.geometry.model_choice.folds import folds_by_name
 from calib.geometry.model_choice.ladder import ModelSelection, rigid_fit, select_model
 from calib.geometry.parameters import fixed_parameters, stated_prior
 from calib.geometry.result import GeometricFit, calibrated_chain
+from calib.geometry.uncertainty.error_model import ErrorModel, learn_errors
 from calib.geometry.weighing import Settings, combine
 from calib.procedure.kinematic_stage import plausibility
 from calib.procedure.kinematic_stage.comparison import (

@@ -18,8 +18,8 @@ from calib.errors import UsageError
 from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
 from calib.folders import CERTIFICATE, METRICS, REPORT, check_target, write_staged
 from calib.geometry import installation_file
-from calib.geometry.error_model import ErrorModel
 from calib.geometry.installation import Installation
+from calib.geometry.uncertainty.error_model import ErrorModel
 from calib.geometry.weighing import Settings, combine
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.inputs import Inputs

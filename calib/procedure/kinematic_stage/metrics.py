@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from calib.geometry.error_model import Discrepancy
+from calib.geometry.uncertainty.error_model import Discrepancy
 
 
 @dataclass(frozen=True)

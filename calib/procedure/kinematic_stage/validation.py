@@ -15,11 +15,11 @@ import numpy as np
 from calib import files
 from calib.data.poses.measurements import PoseMeasurements, Positions
 from calib.geometry.accuracy import Errors
-from calib.geometry.error_model import ErrorModel
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames, without_corrections
 from calib.geometry.installation import Installation
 from calib.geometry.observation import predict, prepare
+from calib.geometry.uncertainty.error_model import ErrorModel
 from calib.geometry.weighing import Settings
 from calib.procedure.kinematic_stage.comparison import (
     Comparison,

@@ -27,7 +27,7 @@ from calib.geometry.inverse import Goal, reach, seen_at
 from calib.geometry.observation import observe, prepare
 from calib.geometry.parameters import layout
 from calib.geometry.pixel_residuals import PixelPart
-from calib.geometry.spread import pose_sigmas
+from calib.geometry.uncertainty.spread import pose_sigmas
 from calib.robot.chain import Chain
 from calib.robot.tables import placement
 from calib.transforms import invert, pose

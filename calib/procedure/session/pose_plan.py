@@ -14,7 +14,7 @@ from calib import files
 from calib.data.poses.pixels import Pixels
 from calib.dynamics.gravity import gravity_torques
 from calib.geometry.observability import SIGMA_ORIENTATION, observation, targets_of
-from calib.geometry.spread import pose_sigmas
+from calib.geometry.uncertainty.spread import pose_sigmas
 from calib.procedure.kinematic_stage import compensation, selection
 from calib.procedure.kinematic_stage.pose_limits import read_limits
 from calib.procedure.kinematic_stage.settings import SelectionSettings

@@ -11,11 +11,11 @@ import pytest
 
 from calib.errors import UsageError
 from calib.estimation.triangles import combine
-from calib.identification.constraints import LEAST, ConstraintSettings, WeightedSum
 from calib.identification.identify import chain_states, common_decimator, find_base, identify
 from calib.identification.identify_options import parse_options
 from calib.identification.methods.method import IdentificationProblem
 from calib.identification.methods.registry import METHODS
+from calib.identification.parameter_constraints import LEAST, ConstraintSettings, WeightedSum
 from calib.identification.rows import observe
 from calib.identification.settings import IdentificationSettings, make_model
 

@@ -16,10 +16,10 @@ from calib.dynamics.idim import IdentificationModel
 from calib.errors import MeasurementError, NotConverged, Unidentifiable, UsageError
 from calib.estimation import instrumental_variables
 from calib.identification.cases import make_case
-from calib.identification.constraints import ConstraintSettings, make_constraints
 from calib.identification.loop.controller import identify_controller
 from calib.identification.loop.loop_recordings import Loop
 from calib.identification.methods.instrumental import identify_instrumental
+from calib.identification.parameter_constraints import ConstraintSettings, make_constraints
 from calib.robot import mdh
 from calib.simulation.loop import controllers, references
 from calib.simulation.loop.closed_loop import Plant, Sensing, simulate

@@ -140,7 +140,7 @@ def test_the_prediction_is_what_a_fit_then_states(cell):
     from calib.geometry.fit import fit
     from calib.geometry.images.camera_guess import complete_camera
     from calib.geometry.parameters import layout
-    from calib.geometry.spread import pose_sigmas
+    from calib.geometry.uncertainty.spread import pose_sigmas
     from calib.procedure.measuring.camera_view import predict
     from calib.robot.chain import random_joints
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from calib.arrays import frozen
 from calib.identification.cases import Case
-from calib.identification.geometry_uncertainty import GeometryUncertainty
 from calib.identification.identify import Identification
 from calib.identification.reweighted import cut, estimate, estimator, rows_on, stacked, weights
+from calib.identification.uncertainty.geometry_uncertainty import GeometryUncertainty
 from calib.robot.chain import Chain
 
 CHUNK = 2000  # thinned samples at a time, where each needs its own line of a matrix

@@ -26,7 +26,7 @@ from calib.geometry.model_choice.ladder import ModelSelection
 from calib.geometry.observation import observe, prepare
 from calib.geometry.parameters import layout
 from calib.geometry.result import row_weights, used_sigmas
-from calib.geometry.spread import pose_sigmas
+from calib.geometry.uncertainty.spread import pose_sigmas
 from calib.robot.chain import Chain
 from calib.robot.deflection import Deflection
 from calib.robot.kinematics import forward

@@ -1,0 +1,1 @@
+"""How sure an identified model is, the geometry's share included."""
