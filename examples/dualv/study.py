@@ -4,7 +4,8 @@
 
 A simulated DualV (Briot, Gautier & Krut 2013, two papers) runs designed motions without and with a payload of 5.37 kg,
 under computed torque with an internal preload. IDIM-WLS on the platform's coordinates and PIM-WLS on the power identify
-it from encoders and motor torques alone; the papers' Table II stands beside.
+it from encoders and motor torques alone; the papers' Table II stands beside. The truth obeys the model, its friction
+and noise are chosen: methods are compared, not a real robot's errors with the papers'.
 """
 
 from __future__ import annotations

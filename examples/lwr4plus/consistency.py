@@ -4,7 +4,8 @@ Coverage: many whole calibrations. Each measures the poses anew (truth: the cali
 Shiriaev & Jubien 2019, no hidden deflections), fits the geometry, records the torques anew (joint torque sensors or
 motors, encoder noise), identifies the base parameters on the geometry it found, and carries that geometry's covariance
 along. How often do the 95 % intervals hold the true base parameters, with the geometry's part and without it? For a
-fine instrument and many poses, and for a coarse one and few.
+fine instrument and many poses, and for a coarse one and few. The truth is of the model's own form and the noise white:
+this tests the statistics, and is no evidence of how well intervals hold on a real arm.
 
 Geometries: the same torques identified on the true geometry, on calibrated ones, on CAD, and on CADs further off. How
 wrong is the torque on other motion, against the torque without noise, and how far off are the parameters?

@@ -4,6 +4,7 @@ Kolyubin, Shiriaev & Jubien (2019), Int. J. Adv. Manuf. Technol. 101, 243-259, e
 (lwr4plus_truth.toml: geometry, drives, noise). Base parameters are fitted by weighted least squares to a simulated
 motion; Proposition 1 turns them into A, B, Γ of each path. Every planned motion is then judged by the true robot: which
 share of its torque limits would it really need? "with margin" keeps three standard deviations of the predicted torque.
+The truth is of the identified form (no effect is hidden), so the margins are those of noise alone.
 
     python examples/lwr4plus/planning.py --out lwr4plus-planning [--paths 12] [--seed 0]
 

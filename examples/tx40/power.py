@@ -4,7 +4,7 @@
 
 The power of all motors is one row per sample: what the wrist does is lost in the noise of the first three joints'
 torques (Gautier & Briot 2013). Recordings in which these rest, with weights of their own, halve the σ of its drives;
-its bodies, told mostly by what the arm does to them, gain a seventh. Same total time, same
+its bodies, told mostly by what the arm does to them, gain a seventh. The truth obeys the model. Same total time, same
 torque noise (3 % of each joint's rms torque, at least 0.02 N m), inverse dynamics beside.
 """
 
