@@ -28,7 +28,6 @@ T = TypeVar("T")
 LARGEST = 8_000_000  # bytes of a file, and below: levels of tables in tables, signs of an expression (our choices)
 DEEPEST = 32
 LONGEST = 200
-ENDINGS = ("csv", "npz", "txt", "tsv", "dat", "mcap", "bag", "db3")  # of measured files
 _TAG = "\0"  # begins the names of alternatives, which are no part of a place
 UNKNOWN = "unexpected_keyword_argument"  # as pydantic calls it
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
@@ -587,6 +586,5 @@ NotNegative = Annotated[float, Real(least=0)]
 JointNumber = Annotated[int, Index()]
 Length = Annotated[float, Real(quantity="length")]
 Angle = Annotated[float, Real(quantity="angle")]
-Ratio = Annotated[float, Real(quantity="1")]
 Numeric = Annotated[Any, Checked(_numeric, {"type": ["number", "string"]})]
 """A number or a text with a unit that the caller reads by `number`: of what quantity it is, another key says."""

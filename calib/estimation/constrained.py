@@ -256,26 +256,6 @@ def from_free(factor: np.ndarray, free: np.ndarray, normals: np.ndarray, held: n
     return np.asarray(free - scipy.linalg.solve_triangular(factor[:p, :p], turned @ push))
 
 
-def from_free_holding(moments: np.ndarray, free: np.ndarray, fixed: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """Return the estimate with some parameters held at d, from the free one: b_U + M_UU⁻¹ M_UC (b_C - d).
-
-    M = WᵀW for least squares and Wᵀ P_Z W for two-stage least squares: the optimum under those constraints. M = ZᵀW,
-    as on Janot's slides, solves Z_Uᵀ (y - W b) = 0 instead, with the held columns' instruments left out: as consistent,
-    and not the optimum of ½ ‖P_Z ε‖².
-
-    Args:
-        moments: M (p, p).
-        free: (p,) b.
-        fixed: (p,) bool, C.
-        held: d, one per held parameter.
-    """
-    result = np.array(free, dtype=float)
-    result[fixed] = held
-    left = moments[np.ix_(~fixed, ~fixed)]
-    result[~fixed] += np.linalg.solve(left, moments[np.ix_(~fixed, fixed)] @ (free[fixed] - held))
-    return result
-
-
 def restricted(covariance: np.ndarray, factor: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Return the covariance of an estimate held on A b = d, P C Pᵀ with P = I - Q⁻¹Aᵀ (A Q⁻¹ Aᵀ)⁻¹ A, Q = RᵀR.
 

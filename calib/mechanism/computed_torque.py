@@ -15,12 +15,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.dynamics import rigid_body
+from calib.dynamics.drives import added_inertia
 from calib.errors import CannotSimulate, UsageError
 from calib.mechanism.distribution import preload_directions
-from calib.mechanism.forward_dynamics import platform_inertia
 from calib.mechanism.leg_links import compiled
 from calib.mechanism.parallel_model import ParallelModel
+from calib.mechanism.platform_body import wrench_regressor
 from calib.mechanism.platform_motion import along
+from calib.mechanism.velocities import LoopMotion
 
 FAR = 0.3  # [rad or m] between encoders and reference at which a run is given up
 
@@ -88,7 +90,7 @@ def simulate(
     plan = (
         motion.posture.q[:, robot.actuated],
         model.platform_force(controller.values, motion, carried),
-        platform_inertia(model, controller.values, motion, carried),
+        _platform_inertia(model, controller.values, motion, carried),
         np.linalg.pinv(motion.jacobians.readings),
         preload_directions(known, motion.jacobians).sum(axis=2) * controller.preload,
     )
@@ -144,3 +146,21 @@ def _parameters(model: ParallelModel, values: np.ndarray, carried: Collection[st
 
 
 _SIMULATED = {"acceleration": 0, "velocity": 1, "sign": 2, "one": 3}
+
+
+def _platform_inertia(
+    model: ParallelModel, values: np.ndarray, motion: LoopMotion, carried: Collection[str] | None = None
+) -> np.ndarray:
+    """Return M (N, r, r) = Σ J_kᵀ M_k J_k + Dᵀ M_platform D, the inertia that the platform's coordinates feel."""
+    robot, J = model.known.robot, motion.jacobians
+    drives = added_inertia(model.terms, values[model.inertial :], int(robot.starts[-1]))
+    result = J.joints.transpose(0, 2, 1) @ drives @ J.joints
+    parts = zip(model.leg_bodies, model.leg_parameters(values), robot.starts, robot.starts[1:])
+    for bodies, parameters, a, b in parts:
+        own = J.joints[:, a:b]
+        result += own.transpose(0, 2, 1) @ rigid_body.mass_matrix(bodies, parameters, motion.posture.q[:, a:b]) @ own
+    fixed, still = model.platform_parameters(values, carried), np.zeros_like(motion.twist)
+    for i in range(robot.r):
+        need = wrench_regressor(motion.posture.pose, still, J.platform[:, :, i], np.zeros(3)) @ fixed
+        result[:, :, i] += np.einsum("nkr,nk->nr", J.platform, need)
+    return result

@@ -9,7 +9,6 @@ from calib.errors import CalibError, NotConverged, Unidentifiable
 from calib.estimation.constrained import (
     contradicting,
     from_free,
-    from_free_holding,
     minimise,
     restricted,
     within,
@@ -144,6 +143,26 @@ def test_equalities_beside_inequalities_give_the_optimum_of_cvxpy(seed):
     slope = matrix.T @ (matrix @ found.values - target)
     assert found.normals.T @ found.multipliers == pytest.approx(slope, abs=1e-6 * np.abs(matrix.T @ target).max())
     assert found.multipliers[:4] == pytest.approx(conditions[1].dual_value, abs=1e-4)
+
+
+def from_free_holding(moments: np.ndarray, free: np.ndarray, fixed: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """Return the estimate with some parameters held at d, from the free one: b_U + M_UU⁻¹ M_UC (b_C - d).
+
+    M = WᵀW for least squares and Wᵀ P_Z W for two-stage least squares: the optimum under those constraints. M = ZᵀW,
+    as on Janot's slides, solves Z_Uᵀ (y - W b) = 0 instead, with the held columns' instruments left out: as consistent,
+    and not the optimum of ½ ‖P_Z ε‖².
+
+    Args:
+        moments: M (p, p).
+        free: (p,) b.
+        fixed: (p,) bool, C.
+        held: d, one per held parameter.
+    """
+    result = np.array(free, dtype=float)
+    result[fixed] = held
+    left = moments[np.ix_(~fixed, ~fixed)]
+    result[~fixed] += np.linalg.solve(left, moments[np.ix_(~fixed, fixed)] @ (free[fixed] - held))
+    return result
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -70,9 +70,9 @@ class SelectionSettings:
         kind: what will be measured, ``pose`` or ``position``.
         tools: places of the targets in the tip's frame [m]; the tip itself where none is given.
         index: ``O1`` to ``O5``, or ``cond``, see `poses.indices`.
-        method: see `poses.select.select_poses`. Polishing raises the index by 0.1 to 0.6 %, and gathers poses at the
-            ends of the joint range: deflections, which the index does not know, are then learnt worse (virtual LWR4+
-            and UR5, 40 poses, 6 seeds each: 0.09 mm rms left with ``detmax``, 0.12 mm with ``polish``).
+        method: see `poses.select.select_poses`. Polishing raises the index by 0.1 to 0.6 %, which knows
+            nothing of deflections: virtual LWR4+ and UR5 with errors that a model can hold, 40 poses, 6 seeds each,
+            kept 0.09 mm rms with ``detmax`` and 0.12 mm with ``polish``.
         candidates: poses to draw.
         sigmas: of a position [m] and an orientation [rad]; None for equal ones of our choice.
         seed: of everything random.

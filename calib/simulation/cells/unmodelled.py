@@ -19,6 +19,7 @@ with z_k' = v_j while |z_k| < s_k (Iwan 1966), and on the link's side the spring
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,9 +28,15 @@ from calib.dynamics.gravity import gravity_torques
 from calib.robot.chain import Chain, random_joints
 
 WARM_POSES, WARM_TIME = 30.0, 120.0  # i_0 [poses], t_0 [s]
-WIDTHS = (2e-3, 8e-3, 30e-3)  # s_k [rad, or m times 0.3]
+WIDTHS = (2e-3, 8e-3, 30e-3)  # s_k [rad or m]
 TEETH = 100  # N
 CABLE = 0.5  # [rad]
+
+
+def _named(parts: Sequence[tuple[float, str]]) -> str:
+    """Return the words of those of (size, words) that are there, as the end of a sentence; empty where none is."""
+    named = ", ".join(words for size, words in parts if size)
+    return f"; in no model: {named}" if named else ""
 
 
 @dataclass(frozen=True)
@@ -59,8 +66,7 @@ class PositionErrors:
             (self.growth, f"lengths growing by {self.growth * 1e6:.0f} ppm"),
             (self.droop, f"a tool drooping by up to {self.droop * 1e3:.2g} mm"),
         ]
-        named = ", ".join(words for size, words in parts if size)
-        return f"; in no model: {named}" if named else ""
+        return _named(parts)
 
 
 def displacements(
@@ -141,8 +147,7 @@ class TorqueErrors:
             (self.cable, f"cables of {self.cable:.1%} of the limits"),
             (self.push, f"pushes of {self.push:.1%} of the limits"),
         ]
-        named = ", ".join(words for size, words in parts if size)
-        return f"; in no model: {named}" if named else ""
+        return _named(parts)
 
 
 def cable_torques(errors: TorqueErrors, q: np.ndarray, effort: np.ndarray) -> np.ndarray:

@@ -11,25 +11,13 @@ import pytest
 
 from calib.errors import UsageError
 from calib.estimation.triangles import combine
-from calib.identification.identify import chain_states, common_decimator, find_base, identify
+from calib.identification.identify import identify
 from calib.identification.identify_options import parse_options
 from calib.identification.methods.method import IdentificationProblem
 from calib.identification.methods.registry import METHODS
 from calib.identification.parameter_constraints import LEAST, ConstraintSettings, WeightedSum
-from calib.identification.rows import observe
-from calib.identification.settings import IdentificationSettings, make_model
 
 FREE = {"pc-ols": "ols", "pc-wls": "wls", "pc-irls": "irls"}
-
-
-@pytest.fixture(scope="module")
-def problem() -> IdentificationProblem:
-    settings, cases = IdentificationSettings(), [planted.case("a", 0)]
-    model, decimator = make_model(planted.arm(), settings), common_decimator(cases, settings)
-    base = find_base(model, cases, chain_states(planted.arm(), model))
-    rows = tuple(observe(model, base.kept, case, decimator) for case in cases)
-    terms = [None if k < model.inertial else model.columns[k - model.inertial] for k in base.kept]
-    return IdentificationProblem(model, base, cases, decimator, rows, tuple(terms), np.full(base.b, -1))
 
 
 def asked(problem: IdentificationProblem, **settings) -> IdentificationProblem:
