@@ -149,7 +149,7 @@ def identify_model(
     if not cases:
         raise UsageError("no recording to identify from")
     method = method_named(settings.method)
-    settings = require_loop(settings) if method.simulates else settings
+    settings = require_loop(settings) if method.needs_controller else settings
     _require_constrainable(method, settings)
     _require_motion(cases)
     noise = _repeats_noise(cases, settings)
@@ -180,10 +180,10 @@ def identify_model(
         np.concatenate([np.full(base.b, -1), friction.groups]), noise, prior, settings.loop, cad,
         settings.constraints,
     )  # fmt: skip
-    say("simulating the closed loop" if method.simulates else "estimate")
+    say("simulating the closed loop" if method.needs_controller else "estimate")
     found = method.estimate(problem)
     values = found.estimate.values
-    if settings.loop is not None and not method.simulates:
+    if settings.loop is not None and not method.needs_controller:
         say("simulating the closed loop")
     bias = compare_with_loop(problem, found)
     richer = with_terms(model, *friction.terms) if _joint_by_joint(model) else model

@@ -13,7 +13,7 @@ from without_figures import run
 
 from calib.estimation.triangles import collect
 from calib.identification.methods.least_squares import scaled_tls
-from calib.identification.methods.registry import METHODS
+from calib.identification.methods.registry import LISTING, METHODS
 
 
 def identify(robot: Path, log: Path, method: str, out: Path) -> dict[str, tuple[float, float]]:
@@ -79,3 +79,5 @@ def test_every_method_says_what_it_assumes():
     free = {"ols", "wls", "irls", "tls", "iv", "didim"}
     assert set(METHODS) == free | {f"pc-{name}" for name in free - {"tls"}}
     assert all(one.name == name and len(one.assumes) > 20 for name, one in METHODS.items())
+    assert all("\n" not in one.description and one.description and one.source for one in LISTING)
+    assert {one.name for one in LISTING if one.needs_controller} == {"iv", "didim", "pc-iv", "pc-didim"}

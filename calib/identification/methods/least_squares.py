@@ -47,7 +47,11 @@ class LeastSquares:
     weighted: bool = True
 
     @property
-    def simulates(self) -> bool:
+    def needs_controller(self) -> bool:
+        return False
+
+    @property
+    def needs_simulation(self) -> bool:
         return False
 
     @property
@@ -174,7 +178,11 @@ class ConstrainedLeastSquares:
         return False
 
     @property
-    def simulates(self) -> bool:
+    def needs_controller(self) -> bool:
+        return False
+
+    @property
+    def needs_simulation(self) -> bool:
         return False
 
     @property

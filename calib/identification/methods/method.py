@@ -209,8 +209,13 @@ class Method(Protocol):
         ...
 
     @property
-    def simulates(self) -> bool:
-        """Whether it needs a closed loop, and a model that can be simulated."""
+    def needs_controller(self) -> bool:
+        """Whether it simulates the closed loop that a recording came from."""
+        ...
+
+    @property
+    def needs_simulation(self) -> bool:
+        """Whether it needs a model whose motion can be computed from torques."""
         ...
 
     @property

@@ -1,17 +1,76 @@
-"""All methods by the names that options and files call them."""
+"""All methods by the names that options and files call them, each with what a user asks of it before choosing."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
-from calib.errors import UsageError
+from calib.errors import UsageError, suggestion
 from calib.identification.methods.least_squares import IRLS, OLS, PC_IRLS, PC_OLS, PC_WLS, TLS, WLS
 from calib.identification.methods.method import Method
 from calib.identification.methods.simulated import DIDIM, IV, PC_DIDIM, PC_IV
 
-METHODS: Mapping[str, Method] = {
-    one.name: one for one in (OLS, WLS, IRLS, TLS, IV, DIDIM, PC_OLS, PC_WLS, PC_IRLS, PC_IV, PC_DIDIM)
-}
+
+@dataclass(frozen=True)
+class MethodEntry:
+    """A method as a list shows it.
+
+    Attributes:
+        method: itself.
+        description: one line.
+        source: whose it is.
+        tunes: what of it is chosen beforehand and not told by the data; () for nothing.
+    """
+
+    method: Method
+    description: str
+    source: str
+    tunes: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """What options and files call it."""
+        return self.method.name
+
+    @property
+    def needs_controller(self) -> bool:
+        """Whether it simulates the closed loop, and so asks for the controller and its reference."""
+        return self.method.needs_controller
+
+    @property
+    def needs_simulation(self) -> bool:
+        """Whether it asks for a model whose motion can be computed from torques."""
+        return self.method.needs_simulation
+
+
+_CONSTRAINED = " under constraints on its parameters"
+_SOUSA = "Sousa & Cortesão 2014; Wensing et al. 2018"
+LISTING: tuple[MethodEntry, ...] = (
+    MethodEntry(OLS, "least squares, all rows alike", "Gauss; Atkeson, An & Hollerbach 1986"),
+    MethodEntry(WLS, "least squares, each joint by its residuals", "Gautier & Poignet 2001"),
+    MethodEntry(
+        IRLS, "least squares, weighted across joints, odd samples gated out", "Han, Wu, Liu & Xiong 2020",
+        ("gate of 3 sigma",),
+    ),
+    MethodEntry(
+        TLS, "total least squares with scaled columns", "Golub & Van Loan 1980; Van Huffel & Vandewalle 1991",
+        ("ratio of the columns' noise to the torques'",),
+    ),
+    MethodEntry(
+        IV, "instrumental variables from the simulated closed loop", "Janot, Vandanjon & Gautier 2014",
+        ("tolerance 2.5 %", "10 rounds"),
+    ),
+    MethodEntry(
+        DIDIM, "least squares on the simulated motion alone (the slides' CLIE)", "Gautier, Janot & Vandanjon 2013",
+        ("tolerance 2.5 %", "10 rounds"),
+    ),
+    MethodEntry(PC_OLS, "ols" + _CONSTRAINED, _SOUSA),
+    MethodEntry(PC_WLS, "wls" + _CONSTRAINED, _SOUSA),
+    MethodEntry(PC_IRLS, "irls" + _CONSTRAINED, _SOUSA, ("gate of 3 sigma",)),
+    MethodEntry(PC_IV, "iv" + _CONSTRAINED, "Janot & Wensing 2021", ("tolerance 2.5 %", "10 rounds")),
+    MethodEntry(PC_DIDIM, "didim" + _CONSTRAINED, "Leboutet et al. 2021", ("tolerance 2.5 %", "10 rounds")),
+)  # fmt: skip
+METHODS: Mapping[str, Method] = {one.name: one.method for one in LISTING}
 
 
 def method_named(name: str) -> Method:
@@ -21,5 +80,5 @@ def method_named(name: str) -> Method:
         UsageError: for a name that is none of `METHODS`.
     """
     if name not in METHODS:
-        raise UsageError(f"method '{name}' is none of {', '.join(METHODS)}")
+        raise UsageError(f"method '{name}' is none of {', '.join(METHODS)}{suggestion(name, METHODS)}")
     return METHODS[name]

@@ -34,7 +34,11 @@ class Simulated:
         return False
 
     @property
-    def simulates(self) -> bool:
+    def needs_controller(self) -> bool:
+        return True
+
+    @property
+    def needs_simulation(self) -> bool:
         return True
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:

@@ -156,7 +156,7 @@ def _with_choices(options: IdentifyOptions, method: str | None, friction: str | 
         if value is None:
             continue
         if value not in allowed:
-            raise UsageError(f"--{key} {value}: expected {', '.join(allowed)}")
+            raise UsageError(f"--{key} {value}: expected {', '.join(allowed)}{suggestion(value, allowed)}")
         settings = replace(settings, **{key: value})
     return replace(options, settings=settings)
 

@@ -131,7 +131,7 @@ def _refuse(settings: IdentificationSettings, options: IdentifyOptions) -> None:
         raise UsageError(f"friction = '{settings.friction}': a parallel robot has standard friction only (Fv Fc off)")
     if settings.prior == "cad":
         raise UsageError('prior = "cad" is for serial arms yet, not for parallel robots')
-    if method_named(settings.method).simulates:
+    if method_named(settings.method).needs_simulation:
         raise UsageError(f"method '{settings.method}' simulates a serial arm; parallel robots take ols, wls, irls, tls")
 
 
