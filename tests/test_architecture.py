@@ -16,7 +16,12 @@ SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob
 HOMES = {
     "pinocchio": ["calib.dynamics.model", "calib.robot.collision", "calib.robot.formats.readback"],
     "coal": ["calib.robot.collision"],
-    "numba": ["calib.dynamics.kernels", "calib.mechanism.closure_kernels", "calib.simulation.loop.loop_kernels"],
+    "numba": [
+        "calib.dynamics.kernels",
+        "calib.mechanism.closure_kernels",
+        "calib.robot.capsule_kernels",
+        "calib.simulation.loop.loop_kernels",
+    ],
     "yourdfpy": ["calib.robot.formats.readback"],
     "cv2": [
         "calib.data.camera.detection",

@@ -49,11 +49,10 @@ def tour(times: np.ndarray, first: int | None = None) -> np.ndarray:
         closed[count, first] = closed[first, count] = 0.0
         closed[count, :count] = np.minimum(closed[count, :count], cost.sum() + 1.0)
     starts = [first] if first is not None else range(0, count, max(1, count // 12))
-    tours = (_improved([*_nearest_first(cost, start), count], closed) for start in starts)
-    best = min(tours, key=lambda order: _length(order, closed))
-    cut = best.index(count)
-    order = best[cut + 1 :] + best[:cut]
-    return np.array(order if first is None or order[0] == first else order[::-1])
+    tours = (_improved(np.array([*_nearest_first(cost, start), count]), closed) for start in starts)
+    best = min(tours, key=lambda order: closed[order, np.roll(order, -1)].sum())
+    order = np.roll(best, -int(np.argmax(best == count)))[1:]
+    return order if first is None or order[0] == first else order[::-1]
 
 
 def _nearest_first(cost: np.ndarray, start: int) -> list[int]:
@@ -64,36 +63,41 @@ def _nearest_first(cost: np.ndarray, start: int) -> list[int]:
     return order
 
 
-def _length(order: list[int], cost: np.ndarray) -> float:
-    return float(cost[order, np.roll(order, -1)].sum())
-
-
-def _improved(order: list[int], cost: np.ndarray) -> list[int]:
-    """Return a closed tour that neither a reversal nor a relocation shortens."""
-    count, improving = len(order), True
-    while improving:
-        improving = False
-        for i in range(count - 1):
-            a, b = order[i], order[i + 1]
-            ends = np.array(order[i + 2 :] + order[:1])[: count - 2 - (i == 0)]
-            if len(ends) < 2:
-                continue
-            c, d = ends[:-1], ends[1:]
-            gains = cost[a, b] + cost[c, d] - cost[a, c] - cost[b, d]
-            k = int(gains.argmax())
-            if gains[k] > 1e-9:
-                order[i + 1 : i + 3 + k] = order[i + 1 : i + 3 + k][::-1]
-                improving = True
-        for size in (1, 2, 3):
-            for i in range(count - size):
-                part, rest = order[i : i + size], order[:i] + order[i + size :]
-                one, two = np.array(rest), np.roll(rest, -1)
-                before = rest[i - 1]
-                saved = cost[before, part[0]] + cost[part[-1], rest[i % len(rest)]] - cost[before, rest[i % len(rest)]]
-                added = np.array([cost[one, ends[0]] + cost[ends[1], two] - cost[one, two]
-                                  for ends in ((part[0], part[-1]), (part[-1], part[0]))])  # fmt: skip
-                turned, k = np.unravel_index(added.argmin(), added.shape)
-                if saved - added[turned, k] > 1e-9:
-                    order[:] = rest[: k + 1] + (part[::-1] if turned else part) + rest[k + 1 :]
-                    improving = True
+def _improved(order: np.ndarray, cost: np.ndarray) -> np.ndarray:
+    """Return a closed tour that neither a reversal nor a relocation shortens; each time the move that saves most."""
+    while (shorter := _reversed(order, cost)) is not None or (shorter := _relocated(order, cost)) is not None:
+        order = shorter
     return order
+
+
+def _reversed(order: np.ndarray, cost: np.ndarray) -> np.ndarray | None:
+    """Return the tour with the part reversed that saves most: edges a-b and c-d become a-c and b-d."""
+    after = np.roll(order, -1)
+    edge = cost[order, after]
+    gains = np.triu(edge[:, None] + edge - cost[order[:, None], order] - cost[after[:, None], after], 2)
+    i, k = divmod(int(gains.argmax()), len(order))
+    if gains[i, k] <= 1e-9:
+        return None
+    return np.concatenate([order[: i + 1], order[k:i:-1], order[k + 1 :]])
+
+
+def _relocated(order: np.ndarray, cost: np.ndarray) -> np.ndarray | None:
+    """Return the tour with the part of up to three places moved elsewhere, turned or not, that saves most."""
+    count, best = len(order), (1e-9, 0, 0, 0, False)
+    after = np.roll(order, -1)
+    edge = cost[order, after]
+    for size in range(1, min(3, count - 2) + 1):
+        before, last, behind = np.roll(order, 1), np.roll(order, 1 - size), np.roll(order, -size)
+        saved = cost[before, order] + cost[last, behind] - cost[before, behind]
+        own = (np.arange(count) - np.arange(count)[:, None] + 1) % count <= size  # edges at the part itself
+        for turned, (one, two) in enumerate(((order, last), (last, order))):
+            gains = saved[:, None] + edge - cost[one[:, None], order] - cost[two[:, None], after]
+            gains[own] = 0.0
+            i, k = divmod(int(gains.argmax()), count)
+            best = max(best, (float(gains[i, k]), size, i, (k - i - size) % count, bool(turned)))
+    _, size, i, k, turned = best
+    if not size:
+        return None
+    own = np.roll(order, -i)
+    part, rest = own[:size], own[size:]
+    return np.concatenate([rest[: k + 1], part[::-1] if turned else part, rest[k + 1 :]])

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from calib.arrays import shaped
-from calib.robot.chain import Chain, random_joints, stretched_length
+from calib.robot.chain import AXES, Chain, random_joints, stretched_length
 from calib.robot.kinematics import Sweep, sweep
 from calib.robot.obstacles import (
     SAMPLES,
@@ -105,13 +105,43 @@ class Capsules:
 
     def free(self, q: np.ndarray, margin: float = 0.0) -> np.ndarray:
         """Tell (m,) for which joint values q (m, n) every distance is larger than `margin` [m]."""
-        lines = self._lines(q)
-        good = np.all(self._measured(lines, rough=True)[0] > margin, axis=1)
-        unsure = np.flatnonzero(~good)
-        if len(unsure) and self.obstacles:
-            some = Lines(*(part[unsure] for part in (lines.start, lines.end, lines.axes, lines.places)))
-            good[unsure] = np.all(self._measured(some)[0] > margin, axis=1)
+        from calib.robot.capsule_kernels import clear  # numba
+
+        q = shaped(q, (None, self.chain.n), f"joint values of '{self.chain.name}'")
+        good = clear(q, *self._compiled, margin)
+        beside = self._beside
+        if beside is not None and good.any():
+            unsure = np.flatnonzero(good)
+            lines = self._lines(q[unsure])
+            near = ~np.all(beside._measured(lines, rough=True)[0] > margin, axis=1)
+            some = Lines(*(part[near] for part in (lines.start, lines.end, lines.axes, lines.places)))
+            good[unsure[near]] = np.all(beside._measured(some)[0] > margin, axis=1)
         return good
+
+    @cached_property
+    def _compiled(self) -> tuple[np.ndarray | float, ...]:
+        """What `calib.robot.capsule_kernels.clear` takes between the joint values and the margin."""
+        form = [
+            (AXES.index(e.axis), e.sign, e.value, e.ratio, -1.0 if e.joint is None else e.joint)
+            for e in self.chain.elements
+        ]
+        fixed = [np.eye(4) if e.placement is None else e.placement for e in self.chain.elements]
+        place = [np.concatenate([each[:3, :3].ravel(), each[:3, 3]]) for each in (*fixed, self.chain.tail)]
+        faces = [
+            (body, *self.walls[thing].normal, self.walls[thing].offset)
+            for body, thing in self.world
+            if thing < len(self.walls)
+        ]
+        return (
+            np.array(form), np.array(place), min(self.chain.floor, 0.0), self.targets, self.own, self.radii,
+            np.array(faces).reshape(-1, 5),
+        )  # fmt: skip
+
+    @cached_property
+    def _beside(self) -> Capsules | None:
+        """The comparison with the obstacles alone; None where there are none."""
+        world = self.world[self.world[:, 1] >= len(self.walls)]
+        return replace(self, own=self.own[:0], world=world) if len(world) else None
 
     def beam(self, q: np.ndarray, start: np.ndarray, slope: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, ...]:
         """Measure the links against lines of sight from a target that the last body carries.

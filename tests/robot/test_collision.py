@@ -14,7 +14,7 @@ from calib.robot import capsules, collision
 from calib.robot.chain import random_joints
 from calib.robot.kinematics import joint_jacobian, sweep
 from calib.robot.load import load
-from calib.robot.obstacles import Obstacle
+from calib.robot.obstacles import Obstacle, Wall
 from calib.transforms import pose
 
 
@@ -180,6 +180,20 @@ def test_capsules_measure_as_coal_does(arm):
                 assert distance == pytest.approx(oracle, abs=1e-5)
             else:
                 assert distance < 1e-6
+
+
+@pytest.mark.parametrize("arm", ["lwr4plus", "ur5", "rv2sq", "motley"])
+def test_free_is_what_the_distances_say(arm):
+    """Compiled and by distances: fixed and moving bodies, a mimic joint, targets, floor, a wall and an obstacle."""
+    chain = motley() if arm == "motley" else load(arm)
+    box = Obstacle("box", "box", (0.3, 0.4, 0.5), pose(np.eye(3)[[1, 2, 0]], [0.5, 0.1, 0.4]))
+    wall = Wall("side", np.array([0.6, 0.8, 0.0]), -0.5)
+    found = capsules.from_chain(chain, 0.06, -0.2, [box], walls=[wall], targets=[(0.05, 0, 0.05)])
+    q = random_joints(chain, 500, 3)
+    for margin in (0.0, 0.02):
+        free = found.free(q, margin)
+        assert 0.05 < free.mean() < 0.95
+        assert np.array_equal(free, (found.distances(q) > margin).all(axis=1))
 
 
 @pytest.mark.parametrize("arm", ["balls", "lwr4plus", "ur5"])

@@ -1,0 +1,114 @@
+"""Which postures keep an arm of capsules clear, compiled (numba): one posture after the other, ended by the first pair.
+
+A search for ways asks of a few postures at a time, thousands of times: there NumPy's calls cost more than the numbers.
+
+    form      (K, 5): axis (0 to 5 as `calib.robot.chain.AXES`), sign, value, ratio, joint (-1: it does not move)
+    place     (K + 1, 12): rotation by rows and origin before each element; row K the tail
+    targets   (T, 3) in the tip's frame [m]
+    own       (P, 2) capsules compared with each other, radii (C,) [m]
+    faces     (W, 5): capsule, normal, offset of a wall
+"""
+
+from __future__ import annotations
+
+from math import cos, sin, sqrt
+
+import numpy as np
+from numba import njit
+
+OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
+
+
+@njit(**OPTIONS)
+def clear(q, form, place, stand, targets, own, radii, faces, margin):
+    """Tell (m,) where every distance between `own` and from `faces` is above `margin` [m], at joint values q (m, n).
+
+    Args:
+        stand: height of the foot of the base's capsule [m].
+    """
+    count, moving = len(form), 0
+    for k in range(count):
+        moving += form[k, 4] >= 0
+    lines = np.empty((moving + 1 + len(targets), 6))
+    good = np.ones(len(q), dtype=np.bool_)
+    for i in range(len(q)):
+        _lines(q[i], form, place, stand, targets, lines)
+        for p in range(len(faces)):
+            c = int(faces[p, 0])
+            one = faces[p, 1] * lines[c, 0] + faces[p, 2] * lines[c, 1] + faces[p, 3] * lines[c, 2]
+            two = faces[p, 1] * lines[c, 3] + faces[p, 2] * lines[c, 4] + faces[p, 3] * lines[c, 5]
+            if not min(one, two) - faces[p, 4] - radii[c] > margin:
+                good[i] = False
+                break
+        if not good[i]:
+            continue
+        for p in range(len(own)):
+            a, b = own[p, 0], own[p, 1]
+            if not _apart(lines[a], lines[b]) - (radii[a] + radii[b]) > margin:
+                good[i] = False
+                break
+    return good
+
+
+@njit(**OPTIONS)
+def _lines(q, form, place, stand, targets, lines):
+    """Write the capsules' lines: of the base, of each moving body, of each target."""
+    r, x = np.eye(3), np.zeros(3)
+    turned = np.empty((3, 3))
+    lines[0] = 0.0
+    lines[0, 2] = stand
+    body = 0
+    for k in range(len(form) + 1):
+        fixed = place[k]
+        for a in range(3):
+            x[a] += r[a, 0] * fixed[9] + r[a, 1] * fixed[10] + r[a, 2] * fixed[11]
+        for a in range(3):
+            for b in range(3):
+                turned[a, b] = r[a, 0] * fixed[b] + r[a, 1] * fixed[3 + b] + r[a, 2] * fixed[6 + b]
+        r[:] = turned
+        if k == len(form):
+            break
+        axis, sign, joint = int(form[k, 0]) % 3, form[k, 1], int(form[k, 4])
+        way = form[k, 2]
+        if joint >= 0:
+            way += form[k, 3] * q[joint]
+            lines[body, 3:] = x
+            body += 1
+            lines[body, :3] = x
+        if form[k, 0] < 3:
+            for a in range(3):
+                x[a] += sign * way * r[a, axis]
+            if joint >= 0:
+                lines[body, :3] = x
+        else:
+            co, si = cos(sign * way), sin(sign * way)
+            one, two = (axis + 1) % 3, (axis + 2) % 3
+            for a in range(3):
+                u, v = r[a, one], r[a, two]
+                r[a, one], r[a, two] = co * u + si * v, co * v - si * u
+    lines[body, 3:] = x
+    for t in range(len(targets)):
+        for a in range(3):
+            lines[body + 1 + t, a] = x[a]
+            lines[body + 1 + t, 3 + a] = (
+                x[a] + r[a, 0] * targets[t, 0] + r[a, 1] * targets[t, 1] + r[a, 2] * targets[t, 2]
+            )
+
+
+@njit(**OPTIONS)
+def _apart(one, two):
+    """Return the distance of two lines (6,) from a point to another (Ericson 2005, 5.1.9)."""
+    uu = vv = uv = uw = vw = 0.0
+    for a in range(3):
+        u, v, w = one[3 + a] - one[a], two[3 + a] - two[a], one[a] - two[a]
+        uu, vv, uv, uw, vw = uu + u * u, vv + v * v, uv + u * v, uw + u * w, vw + v * w
+    uu, vv = max(uu, 1e-18), max(vv, 1e-18)
+    across = uu * vv - uv**2
+    s = min(max((uv * vw - vv * uw) / across, 0.0), 1.0) if across > 1e-12 * uu * vv else 0.5
+    t = min(max((uv * s + vw) / vv, 0.0), 1.0)
+    s = min(max((uv * t - uw) / uu, 0.0), 1.0)
+    total = 0.0
+    for a in range(3):
+        away = two[a] + t * (two[3 + a] - two[a]) - one[a] - s * (one[3 + a] - one[a])
+        total += away * away
+    return sqrt(total)
