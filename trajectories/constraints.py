@@ -22,7 +22,9 @@ from trajectories.basis import ORDERS, SampledMotion
 from trajectories.errors import BadInput
 
 Regressor = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-Product = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
+Slopes = tuple[np.ndarray, np.ndarray, np.ndarray]
+Product = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Slopes]
+TorqueProduct = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray], Slopes]
 UNITS = ("rad", "rad/s", "rad/s²", "rad/s³")
 
 
@@ -124,6 +126,7 @@ class TorqueLimit:
         covariance: (b, b) Σ of χ; None: exact.
         deviations: k.
         margin: a share of the limits besides.
+        torque_product: (q, v, a, χ, G (N, n)) -> slopes of Σ G · Y χ, where that is cheaper than `product`; or None.
     """
 
     regressor: Regressor
@@ -133,6 +136,7 @@ class TorqueLimit:
     covariance: np.ndarray | None = None
     deviations: float = 2.0
     margin: float = 0.0
+    torque_product: TorqueProduct | None = None
     name: str = "torque"
     unit: str = "N m"
     joints: np.ndarray = field(init=False)
@@ -168,8 +172,11 @@ class TorqueLimit:
 
     def slopes(self, motion: SampledMotion, weights: np.ndarray) -> np.ndarray:
         k = len(self.joints)
-        signed = np.zeros(motion.q.shape)
+        signed, result = np.zeros(motion.q.shape), np.zeros((4, *motion.q.shape))
         signed[:, self.joints] = weights[:, :k] - weights[:, k:]
+        if self.covariance is None and self.torque_product is not None:
+            result[:3] = self.torque_product(motion.q, motion.v, motion.a, self.parameters, signed)
+            return result
         G = signed[:, :, None] * self.parameters
         if self.covariance is not None:
             Y = self.regressor(motion.q, motion.v, motion.a)[:, self.joints]
@@ -177,7 +184,6 @@ class TorqueLimit:
             spread = np.sqrt(np.maximum(np.einsum("njb,njb->nj", seen, Y), 1e-30))
             both = self.deviations * (weights[:, :k] + weights[:, k:]) / spread
             G[:, self.joints] += both[:, :, None] * seen
-        result = np.zeros((4, *motion.q.shape))
         result[:3] = self.product(motion.q, motion.v, motion.a, G)
         return result
 
@@ -218,18 +224,13 @@ def gathered(
     """
     scaled = constraint.values(motion) / constraint.scale + tightening
     groups, count = constraint.groups, int(constraint.groups.max()) + 1
-    c, rows, weights = np.empty(count), list[np.ndarray](), list[np.ndarray]()
-    for r in range(count):
-        columns = np.flatnonzero(groups == r)
-        top = scaled[:, columns].max()
-        shares = np.exp(sharpness * (scaled[:, columns] - top))
-        total = shares.sum()
-        c[r] = top + np.log(total) / sharpness
-        rows.append(np.flatnonzero(shares.max(axis=1) > 1e-9 * total))  # the others do not count to nine digits
-        weights.append(np.zeros((len(rows[-1]), len(groups))))
-        weights[-1][:, columns] = shares[rows[-1]] / total / constraint.scale[columns]
-    found = constraint.slopes(motion.part(np.concatenate(rows)), np.concatenate(weights))
+    own = groups == np.arange(count)[:, None]  # (r, k)
+    top = np.array([scaled[:, columns].max() for columns in own])
+    shares = np.exp(sharpness * (scaled - top[groups]))
+    total = own @ shares.sum(axis=0)
+    shares /= total[groups]
+    group, row = np.nonzero((own[:, None] & (shares > 1e-9)).any(axis=2))  # the others do not count to nine digits
+    weights = np.where(own[group], shares[row] / constraint.scale, 0.0)
     slopes = np.zeros((count, 4, *motion.q.shape))
-    for r, part in enumerate(np.split(found, np.cumsum([len(row) for row in rows])[:-1], axis=1)):
-        slopes[r][:, rows[r]] = part
-    return c, slopes, float(scaled.max())
+    slopes[group, :, row] = constraint.slopes(motion.part(row), weights).transpose(1, 0, 2)
+    return top + np.log(total) / sharpness, slopes, float(top.max())

@@ -125,6 +125,14 @@ class BaseModel:
         """Return the slopes of Σ weights · regressor by q, v, a, each (N, n); weights (N, rows, b)."""
         return self.model.regressor_gradient(q, v, a, weights, self.base.kept)
 
+    def torque_gradient(
+        self, q: np.ndarray, v: np.ndarray, a: np.ndarray, values: np.ndarray, weights: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the slopes of Σ weights · regressor values by q, v, a, each (N, n); values (b,), weights (N, rows)."""
+        standard = np.zeros(self.model.p)
+        standard[self.base.kept] = values
+        return self.model.torque_gradient(q, v, a, standard, weights)
+
 
 def random_samples(
     model: RegressorModel,

@@ -75,7 +75,8 @@ class IdentificationModel:
     @property
     def columns(self) -> tuple[DriveTerm, ...]:
         """The terms that these rows can see."""
-        return tuple(one for one in self.terms if one.side in self.torque_rows.sides)
+        seen = self.torque_rows.sides
+        return tuple(one for one in self.terms if one.side in seen)
 
     @property
     def sides(self) -> tuple[str, ...]:
@@ -142,6 +143,26 @@ class IdentificationModel:
         offered = self.columns
         terms = [offered[k - self.inertial] for k in kept[bodies:]]
         drives.slopes(terms, motions, weights[:, :, bodies:].transpose(2, 1, 0), [out[0].T, out[1].T, out[2].T])
+        return out[0], out[1], out[2]
+
+    def torque_gradient(
+        self, q: np.ndarray, v: np.ndarray, a: np.ndarray, values: np.ndarray, weights: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the slopes of Σ weights · regressor(q, v, a) values by q, v and a, each (N, n); all bodies carried.
+
+        Args:
+            values: (p,) of the parameters.
+            weights: (N, rows) of the torques.
+        """
+        if self.torque_rows.projection is not None or len(self.torque_rows.blocks) > 1:
+            return self.regressor_gradient(q, v, a, weights[:, :, None] * values)
+        out = np.zeros((3, *np.shape(q)))
+        if self.inertial and values[: self.inertial].any():
+            out[:] = rigid_body.torque_gradient(self.bodies, values[: self.inertial], q, v, a, weights)
+        motions = [np.ascontiguousarray(np.asarray(x, dtype=float).T) for x in (q, v, a)]
+        terms = [(one, value) for one, value in zip(self.columns, values[self.inertial :]) if value]
+        share = np.array([value for _, value in terms])[:, None, None] * weights.T
+        drives.slopes([one for one, _ in terms], motions, share, [out[0].T, out[1].T, out[2].T])
         return out[0], out[1], out[2]
 
     def acting(self) -> np.ndarray:

@@ -643,6 +643,44 @@ def regressor_gradient(links, constants, order, amount, cosine, sine, v, a, weig
 
 
 @njit(**OPTIONS)
+def torque_gradient(links, constants, order, amount, cosine, sine, v, a, parameters, weights, gq, gv, ga):
+    """Add the slopes of Σ weights · tau(q, v, a), weights (N, n), by q, v and a to gq, gv, ga (N, n), zero on entry.
+
+    `regressor_gradient` for weights of rank one: the joints' twists enter only as their weighted sum, so one virtual
+    joint, which every body hangs on, does for all of them: O(B) per sample. ``parameters`` (1, 1, 10 B).
+    """
+    bodies = amount.shape[1]
+    chain = links.copy()
+    for i in range(bodies):
+        chain[i, DEPTH], chain[i, PATH], chain[i, COORDINATE] = 1, 0, -1
+    frames, motion, twists = np.empty((bodies, 12)), np.zeros((bodies + 1, 9)), np.zeros((bodies + 1, 1, 6))
+    slopes, bars = np.zeros((bodies + 1, 9)), np.zeros((bodies + 1, 1, 6))
+    motion[0, 6:] = -constants[bodies, :3]
+    for sample in range(v.shape[0]):
+        slopes[:] = 0.0
+        bars[:] = 0.0
+        for i in range(bodies):
+            c, scale = links[i, COORDINATE], constants[i, SCALE]
+            _place(links, constants, i, amount[sample, i], cosine[sample, i], sine[sample, i], frames)
+            _advance(links, i, scale * v[sample, c], scale * a[sample, c], frames, motion)
+            twists[i + 1] = 0.0
+            _carry(chain, constants, i, frames, twists)
+            if c >= 0:
+                twists[i + 1, 0, 2 if links[i, KIND] == REVOLUTE else 5] += scale * weights[sample, c]
+            _share(chain, order, i, 0, parameters, motion, twists, slopes, bars)
+        for i in range(bodies - 1, -1, -1):
+            c, scale = links[i, COORDINATE], constants[i, SCALE]
+            rate = scale * v[sample, c]
+            by_rate, by_change = _unjoint(links, i, rate, motion, slopes)
+            by_amount = _unadvance(links, i, rate, frames, motion, slopes)
+            by_amount += _uncarry(chain, i, frames, twists, bars)
+            if c >= 0:
+                gq[sample, c] += scale * by_amount
+                gv[sample, c] += scale * by_rate
+                ga[sample, c] += scale * by_change
+
+
+@njit(**OPTIONS)
 def stop(x, width):
     """Return the states (N,) of a stop operator driven by x (N,), unstressed at first."""
     out = np.zeros(x.shape[0])

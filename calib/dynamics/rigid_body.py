@@ -97,6 +97,28 @@ def regressor_gradient(
     return slopes[0], slopes[1], slopes[2]
 
 
+def torque_gradient(
+    bodies: Bodies, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the slopes of Σ weights · tau(q, v, a) by q, v and a, three arrays (N, n), exactly; weights (N, n).
+
+    As `regressor_gradient` with weights of rank one, at a fraction of its cost.
+
+    Args:
+        parameters: (10 B,) standard parameters.
+    """
+    from calib.dynamics import kernels
+
+    q, v, a = _states(bodies, q=q, v=v, a=a)
+    weights = _plain(shaped(weights, q.shape, "weights of the torques"))
+    chi = _plain(shaped(parameters, (10 * bodies.count,), "standard parameters")).reshape(1, 1, -1)
+    slopes = np.zeros((3, *q.shape))
+    kernels.torque_gradient(
+        bodies.links, bodies.constants, bodies.order, *_placed(bodies, q), v, a, chi, weights, *slopes
+    )
+    return slopes[0], slopes[1], slopes[2]
+
+
 def inverse_dynamics(bodies: Bodies, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
     """Return the rigid-body torques (N, n) [N m or N]: no motor inertia, no friction.
 

@@ -69,7 +69,8 @@ def problem(
     tool = Points(chain, (0,), np.zeros((1, 3)))
     limits: list[Any] = [*box_limits(chain.lower, chain.upper, velocity)]
     if values is not None:
-        limits.append(TorqueLimit(smooth.regressor, smooth.regressor_gradient, values, effort))
+        product = smooth.torque_gradient
+        limits.append(TorqueLimit(smooth.regressor, smooth.regressor_gradient, values, effort, torque_product=product))
     limits.append(Workspace(tool, tool.product, radius=radius, lowest=lowest))
     objectives = tuple((Excitation("cond", scaling), 0.5) for scaling in ("raw", "normalised"))
     family = fourier_family(5, period, chain.n, rate=1000.0)
@@ -113,18 +114,19 @@ def differenced(spot: ExcitationProblem, basis: Any, y: np.ndarray, sharpness: t
     """Return what `evaluate` returns, its gradients by forward differences over all variables."""
     bare = blind(spot)
     here = evaluate(bare, basis, y, sharpness)
-    slopes, rows = np.empty((len(here.values), len(y))), np.empty((len(here.constraints), len(y)))
+    slopes, rows = np.empty((1, len(y))), np.empty((len(here.constraints), len(y)))
     for k in range(len(y)):
         moved = y.copy()
         moved[k] += STEP
         there = evaluate(bare, basis, moved, sharpness)
-        slopes[:, k], rows[:, k] = (there.values - here.values) / STEP, (there.constraints - here.constraints) / STEP
+        slopes[:, k], rows[:, k] = (there.total - here.total) / STEP, (there.constraints - here.constraints) / STEP
     return replace(here, slopes=slopes, rows=rows)
 
 
 def blind(spot: ExcitationProblem) -> ExcitationProblem:
     """Return the problem without derivative products: values cost what values cost."""
-    limits = [replace(c, product=_none) if isinstance(c, TorqueLimit | Workspace) else c for c in spot.constraints]
+    limits: list[Any] = [replace(c, product=_none) if isinstance(c, Workspace) else c for c in spot.constraints]
+    limits = [replace(c, product=_none, torque_product=None) if isinstance(c, TorqueLimit) else c for c in limits]
     return replace(spot, product=_none, constraints=tuple(limits))
 
 
@@ -143,11 +145,10 @@ def by_scipy(spot: ExcitationProblem, seconds: float, seed: int, exact: bool) ->
         def fun(z: np.ndarray, run: StartSearch = run) -> float:
             if time.process_time() - began > seconds:
                 raise KeyboardInterrupt
-            return sum(w * float(np.log(v)) for (_, w), v in zip(given.objectives, run.at(z).values))
+            return run.at(z).total
 
         def jac(z: np.ndarray, run: StartSearch = run) -> np.ndarray:
-            found = run.at(z)
-            return sum(w * s / v for (_, w), v, s in zip(given.objectives, found.values, found.slopes))
+            return run.at(z).slopes[0]
 
         limits: Any = {"type": "ineq", "fun": lambda z, run=run: -run.at(z).constraints}
         if exact:

@@ -50,7 +50,9 @@ def problem(period: float, harmonics: int, samples: int = 200, goals=(), constra
     points = Points(CHAIN, (0,), np.zeros((1, 3)))
     limits = (
         *box_limits(CHAIN.lower, CHAIN.upper, velocity),
-        TorqueLimit(columns.regressor, columns.regressor_gradient, values, effort),
+        TorqueLimit(
+            columns.regressor, columns.regressor_gradient, values, effort, torque_product=columns.torque_gradient
+        ),
         Workspace(points, points.product, radius=0.3, lowest=-0.2),
     )
     chosen = tuple(AttainmentGoal(Excitation("cond", name), goal) for name, goal in zip(("raw", "normalised"), goals))

@@ -157,6 +157,16 @@ def test_gradient_through_the_base_columns():
     )
 
 
+@pytest.mark.parametrize("rows", [BOTH, MOTOR])
+def test_gradient_of_torques_through_the_base_columns(rows):
+    reduced = base.BaseModel(arm(rows), found(rows))
+    rng = np.random.default_rng(2)
+    state, values = rng.normal(size=(3, 5, 7)), rng.normal(size=reduced.base.b)
+    push = rng.normal(size=(5, reduced.model.rows))
+    of_torques = reduced.torque_gradient(*state, values, push)
+    assert np.allclose(of_torques, reduced.regressor_gradient(*state, push[:, :, None] * values), rtol=0, atol=1e-10)
+
+
 def test_regrouping_on_the_calibrated_geometry():
     """The nominal columns stay, K moves (LWR4+ of the 2019 study, Table 2, rows 2 to 7), and it holds exactly."""
     nominal = IdentificationModel(bodies_of(load("lwr4plus")))

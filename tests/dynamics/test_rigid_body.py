@@ -86,6 +86,10 @@ def test_gradient_of_the_regressor(name):
 
     slopes = np.concatenate([g[0] for g in rigid_body.regressor_gradient(bodies, *x.reshape(3, 1, n), weights)])
     assert check(weighted, slopes, x) < 1e-8
+    chi, push = rng.normal(size=10 * bodies.count), rng.normal(size=(1, n))
+    of_torques = rigid_body.torque_gradient(bodies, chi, *x.reshape(3, 1, n), push)
+    of_rows = rigid_body.regressor_gradient(bodies, *x.reshape(3, 1, n), push[:, :, None] * chi)
+    assert np.allclose(of_torques, of_rows, rtol=0, atol=1e-11)
 
 
 def test_gradient_of_torques_agrees_with_pinocchio_in_batch():

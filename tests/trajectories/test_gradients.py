@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import excited_arm as arm
 import numpy as np
 import pytest
@@ -16,7 +18,7 @@ from trajectories.design.objectives import (  # fmt: skip
     condition_numbers,
     information,
 )
-from trajectories.design.problem import ExcitationProblem, evaluate
+from trajectories.design.problem import AttainmentGoal, ExcitationProblem, evaluate, exact_values
 from trajectories.errors import BadInput, NotExciting
 from trajectories.fourier import fourier_family
 from trajectories.places import Clearance, Workspace
@@ -64,10 +66,25 @@ def test_objectives(objective):
     spot = problem(objective, stretch=(0.5, 2.0))
     basis, y = spot.basis(), drawn(1)
     sharp = (getattr(objective, "sharpness", 1.0), 10.0)
-    f, directions = along(lambda z: evaluate(spot, basis, z, sharp).values[0], y)
+    f, directions = along(lambda z: evaluate(spot, basis, z, sharp).total, y)
     slope = evaluate(spot, basis, y, sharp).slopes[0] @ directions
     scale = max(1.0, np.abs(slope).max())
     check(lambda s: f(s) / scale, slope / scale, np.zeros(6), tolerance=2e-6)
+
+
+def test_several_objectives_and_goals():
+    several = OBJECTIVES[0], OBJECTIVES[2], OBJECTIVES[4], OBJECTIVES[5], OBJECTIVES[9], OBJECTIVES[10]
+    summed = replace(problem(several[0]), objectives=tuple((one, 0.3 + k) for k, one in enumerate(several)))
+    goals = replace(summed, goals=tuple(AttainmentGoal(one, 1.0) for one in several))
+    basis, y = summed.basis(), drawn()
+    f, directions = along(lambda z: evaluate(summed, basis, z, (8.0, 10.0)).total, y)
+    slope = evaluate(summed, basis, y, (8.0, 10.0)).slopes[0] @ directions
+    check(lambda s: f(s) / 100.0, slope / 100.0, np.zeros(6), tolerance=2e-6)
+    f, directions = along(lambda z: evaluate(goals, basis, z, (8.0, 10.0)).values, y)
+    slope = evaluate(goals, basis, y, (8.0, 10.0)).slopes @ directions
+    check(lambda s: f(s) / 100.0, slope / 100.0, np.zeros(6), tolerance=2e-6)
+    found = evaluate(goals, basis, y, (8.0, 10.0))
+    assert found.exact == pytest.approx(exact_values(goals, found.motion, found.regressor), rel=1e-9)
 
 
 def constraints():
@@ -80,6 +97,7 @@ def constraints():
         BoxLimit(2, -bounds, bounds),
         BoxLimit(3, -bounds, bounds),
         TorqueLimit(BASE.regressor, BASE.regressor_gradient, CHI, LIMITS, margin=0.1),
+        TorqueLimit(BASE.regressor, BASE.regressor_gradient, CHI, LIMITS, torque_product=BASE.torque_gradient),
         TorqueLimit(BASE.regressor, BASE.regressor_gradient, CHI, LIMITS, covariance),
         Workspace(points, product, radius=0.3, lowest=-0.2, highest=0.9),
         Clearance(lambda q: q[:, :2] ** 2 + 1, lambda q, G: np.pad(2 * q[:, :2] * G, ((0, 0), (0, 5))), ("a", "b")),

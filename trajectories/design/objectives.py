@@ -18,7 +18,7 @@ least cond and at most b^(1/p) cond; its gradient is exact, too.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
@@ -32,12 +32,38 @@ FLOOR = 1e-15  # eigenvalues below this part of the largest are rounding
 
 
 class Value(NamedTuple):
-    """An objective and its slopes: by the regressor (N, n, b), by q, v, a, jerk (4, N, n), by the duration [1/s]."""
+    """An objective and its slopes: by the regressor (N, n, b), by q, v, a, jerk (4, N, n), by the duration [1/s].
+
+    ``exact`` is the objective without smoothing, ``by_information`` ∂F/∂M (b, b) of the information's own.
+    """
 
     value: float
     by_regressor: np.ndarray | None = None
     by_motion: np.ndarray | None = None
     by_duration: float = 0.0
+    exact: float = np.nan
+    by_information: np.ndarray = np.zeros((0, 0))
+
+
+class Observed(NamedTuple):
+    """A weighted observation matrix W (n N, b), joint after joint, and M = Wᵀ W + M_existing (b, b)."""
+
+    W: np.ndarray
+    M: np.ndarray
+    joints: int
+    sigmas: np.ndarray | None
+
+    def by_regressor(self, by_information: np.ndarray) -> np.ndarray:
+        """Return ∂F/∂regressor (N, n, b) = 2 W S over the sigmas, with S = ∂F/∂M (b, b), symmetric."""
+        b = len(by_information)
+        slope = (2 * by_information @ self.W.T).reshape(b, self.joints, -1).transpose(2, 1, 0)
+        return slope if self.sigmas is None else slope / self.sigmas[:, None]
+
+
+def observed(regressor: np.ndarray, sigmas: np.ndarray | None, existing: np.ndarray | None) -> Observed:
+    """Return the observation matrix of a regressor (N, n, b) and its information."""
+    W = _stacked(regressor if sigmas is None else regressor / sigmas[:, None])
+    return Observed(W, information(W, existing), regressor.shape[1], sigmas)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,20 +98,23 @@ class Excitation:
         return self.index + (f" {self.scaling}" if isinstance(self.scaling, str) else " scaled")
 
     def evaluate(self, motion: SampledMotion, regressor: np.ndarray) -> Value:
-        """Return the index and ∂F/∂regressor."""
-        weighted = regressor if self.sigmas is None else regressor / self.sigmas[:, None]
-        stacked = _stacked(weighted)
-        M = information(stacked, self.existing)
+        """Return the index and its slopes by the regressor and by the information."""
+        seen = observed(regressor, self.sigmas, self.existing)
+        found = self.seen(seen)
+        return found._replace(by_regressor=seen.by_regressor(found.by_information))
+
+    def seen(self, matrix: Observed) -> Value:
+        """Return the index of an observation matrix with this one's sigmas and existing information."""
+        M = matrix.M
         if self.columns is None:
-            value, by_m = self.of_information(M)
+            value, by_m, exact = self.of_information(M)
         else:
             part, by_m = np.ix_(self.columns, self.columns), np.zeros(M.shape)
-            value, by_m[part] = self.of_information(M[part])
-        slope = (2 * stacked @ by_m).reshape(regressor.shape[1], regressor.shape[0], -1).transpose(1, 0, 2)
-        return Value(value, slope if self.sigmas is None else slope / self.sigmas[:, None])
+            value, by_m[part], exact = self.of_information(M[part])
+        return Value(value, exact=exact, by_information=by_m)
 
-    def of_information(self, M: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the index of an information matrix M (b, b) and S = ∂F/∂M, symmetric.
+    def of_information(self, M: np.ndarray) -> tuple[float, np.ndarray, float]:
+        """Return the index of an information matrix M (b, b), S = ∂F/∂M, symmetric, and the index without smoothing.
 
         With C = D M D, D = diag(M)^-1/2 (normalised): ∂F/∂M = D S_C D - diag((C S_C)_kk / M_kk).
         """
@@ -97,12 +126,14 @@ class Excitation:
         d = np.broadcast_to(d, diagonal.shape)
         C = M * d * d[:, None]
         eigenvalues, V = np.linalg.eigh(C)
-        value, slope = self._of_spectrum(np.maximum(eigenvalues, FLOOR * eigenvalues[-1]))
+        eigenvalues = np.maximum(eigenvalues, FLOOR * eigenvalues[-1])
+        value, slope = self._of_spectrum(eigenvalues)
+        exact = value if np.isinf(self.sharpness) else replace(self, sharpness=np.inf)._of_spectrum(eigenvalues)[0]
         by_c = (V * slope) @ V.T
         by_m = by_c * d * d[:, None]
         if normalised:
             by_m -= np.diag(np.einsum("ij,ji->i", C, by_c) / diagonal)
-        return value, by_m
+        return value, by_m, exact
 
     def _of_spectrum(self, eigenvalues: np.ndarray) -> tuple[float, np.ndarray]:
         """Return F and ∂F/∂λ; λ rising."""
@@ -145,7 +176,8 @@ class TorqueSlack:
         size = np.sqrt(ratio**2 + self.smoothing**2)
         by_torque = np.zeros(regressor.shape[:2])
         by_torque[:, chosen] = -ratio / size / self.limits[chosen] / ratio.size
-        return Value(1.0 - float((size - self.smoothing).mean()), by_torque[:, :, None] * self.parameters)
+        value = 1.0 - float((size - self.smoothing).mean())
+        return Value(value, by_torque[:, :, None] * self.parameters, exact=value)
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +212,7 @@ class FrictionCoverage:
                 missing = np.maximum(0.0, 1.0 - member.mean(axis=0) / self.wanted)
                 value += float((missing**2).sum()) / (4 * n)
                 slope[1] -= sign * 2 * missing / self.wanted / count / (4 * n) * by_v
-        return Value(value, None, slope)
+        return Value(value, None, slope, exact=value)
 
     def shares(self, motion: SampledMotion) -> np.ndarray:
         """Return the exact shares of time (4, n): fast forward, slow forward, fast backward, slow backward."""
@@ -197,7 +229,8 @@ class Duration:
     name: str = "duration"
 
     def evaluate(self, motion: SampledMotion, regressor: np.ndarray) -> Value:
-        return Value(float(len(motion) * (motion.times[1] - motion.times[0])), by_duration=1.0)
+        value = float(len(motion) * (motion.times[1] - motion.times[0]))
+        return Value(value, by_duration=1.0, exact=value)
 
 
 Objective = Excitation | TorqueSlack | FrictionCoverage | Duration

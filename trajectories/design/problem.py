@@ -13,7 +13,7 @@ import numpy as np
 
 from trajectories.basis import Basis, Family, SampledMotion, sample_times
 from trajectories.constraints import MotionConstraint, Product, Regressor, gathered
-from trajectories.design.objectives import Excitation, Objective
+from trajectories.design.objectives import Excitation, Objective, Observed, Value, observed
 from trajectories.errors import BadInput
 
 
@@ -88,7 +88,9 @@ class Evaluation:
     """A point: merit and objectives with gradients by the variables (x, the factor on the period).
 
     Attributes:
-        values: (k,) of the objectives or goals, smoothed; `slopes` (k, p).
+        values: (k,) of the objectives or goals, smoothed; `exact` (k,) not smoothed.
+        total: the weighted sum of the smoothed objectives; 0 where there are goals.
+        slopes: (k, p) of the goals, or (1, p) of the sum where there are none.
         constraints: (r,) smoothed, feasible where ≤ 0; `rows` (r, p).
         excess: largest constraint value at the samples, over its scale.
     """
@@ -96,6 +98,8 @@ class Evaluation:
     motion: SampledMotion
     regressor: np.ndarray
     values: np.ndarray
+    exact: np.ndarray
+    total: float
     slopes: np.ndarray
     constraints: np.ndarray
     rows: np.ndarray
@@ -112,23 +116,74 @@ def evaluate(problem: ExcitationProblem, basis: Basis, y: np.ndarray, sharpness:
     x, factor = (y[:-1], float(y[-1])) if problem.free_period else (y, problem.stretch[0])
     motion = stretched(basis.motion(x), factor)
     Y = problem.regressor(motion.q, motion.v, motion.a)
-    values, slopes, by_duration = list[float](), list[np.ndarray](), list[float]()
-    for objective in terms(problem):
-        found = _sharpened(objective, sharpness[0]).evaluate(motion, Y)
-        slope = np.zeros((4, *motion.q.shape)) if found.by_motion is None else found.by_motion
-        if found.by_regressor is not None:
-            slope[:3] += problem.product(motion.q, motion.v, motion.a, found.by_regressor)
-        values.append(found.value)
-        slopes.append(slope)
-        by_duration.append(found.by_duration)
+    seen: dict[tuple[int, int], Observed] = {}
+    found = [_value(_sharpened(one, sharpness[0]), motion, Y, seen) for one in terms(problem)]
+    if problem.goals:
+        total, shares = 0.0, np.eye(len(found))
+    else:
+        total, shares = _summed(problem, [one.value for one in found])
+    slopes = [_slope(problem, motion, Y, found, share, seen) for share in shares]
     parts = [gathered(c, motion, sharpness[1], problem.tightening) for c in problem.constraints]
     stacked = np.concatenate([np.array(slopes), *(part[1] for part in parts)])
-    gradient = _by_variables(problem, basis, motion, stacked, factor, np.array(by_duration))
-    k = len(values)
+    by_duration = shares @ np.array([one.by_duration for one in found])
+    gradient = _by_variables(problem, basis, motion, stacked, factor, by_duration)
+    k = len(slopes)
     return Evaluation(
-        motion, Y, np.array(values), gradient[:k], np.concatenate([np.zeros(0), *(part[0] for part in parts)]),
-        gradient[k:], max((part[2] for part in parts), default=-np.inf),
+        motion, Y, np.array([one.value for one in found]), np.array([one.exact for one in found]), total,
+        gradient[:k], np.concatenate([np.zeros(0), *(part[0] for part in parts)]), gradient[k:],
+        max((part[2] for part in parts), default=-np.inf),
     )  # fmt: skip
+
+
+def _value(one: Objective, motion: SampledMotion, Y: np.ndarray, seen: dict[tuple[int, int], Observed]) -> Value:
+    """Evaluate an objective; indices of one observation matrix share it."""
+    if not isinstance(one, Excitation):
+        return one.evaluate(motion, Y)
+    key = _matrix(one)
+    if key not in seen:
+        seen[key] = observed(Y, one.sigmas, one.existing)
+    return one.seen(seen[key])
+
+
+def _matrix(one: Excitation) -> tuple[int, int]:
+    return id(one.sigmas), id(one.existing)
+
+
+def _summed(problem: ExcitationProblem, values: list[float]) -> tuple[float, np.ndarray]:
+    """Return the weighted sum, condition numbers by their logarithm, and its slopes (1, k) by the values."""
+    logs = np.array([is_condition(one) for one, _ in problem.objectives])
+    weights, sizes = np.array([weight for _, weight in problem.objectives]), np.array(values)
+    sizes = np.where(logs, sizes, 1.0)
+    return float(weights @ np.where(logs, np.log(sizes), values)), (weights / sizes)[None]
+
+
+def _slope(
+    problem: ExcitationProblem,
+    motion: SampledMotion,
+    Y: np.ndarray,
+    found: list[Value],
+    shares: np.ndarray,
+    seen: dict[tuple[int, int], Observed],
+) -> np.ndarray:
+    """Return the slopes (4, N, n) of Σ shares · objectives by q, v, a, jerk: one derivative product for all."""
+    result, by_regressor = np.zeros((4, *motion.q.shape)), None
+    by_information: dict[tuple[int, int], np.ndarray] = {}
+    for one, objective, share in zip(found, terms(problem), shares):
+        if share == 0.0:
+            continue
+        if one.by_motion is not None:
+            result += share * one.by_motion
+        if isinstance(objective, Excitation):
+            key = _matrix(objective)
+            by_information[key] = by_information.get(key, 0.0) + share * one.by_information
+        elif one.by_regressor is not None:
+            by_regressor = share * one.by_regressor + (0.0 if by_regressor is None else by_regressor)
+    for key, S in by_information.items():
+        slope = seen[key].by_regressor(S)
+        by_regressor = slope if by_regressor is None else by_regressor + slope
+    if by_regressor is not None:
+        result[:3] += problem.product(motion.q, motion.v, motion.a, by_regressor)
+    return result
 
 
 def terms(problem: ExcitationProblem) -> list[Objective]:
@@ -153,10 +208,7 @@ def merit(problem: ExcitationProblem, values: np.ndarray) -> float:
     """Return what is minimised: γ, or the weighted sum with condition numbers by their logarithm."""
     if problem.goals:
         return max(goal.attainment(value) for goal, value in zip(problem.goals, values))
-    total = 0.0
-    for (objective, weight), value in zip(problem.objectives, values):
-        total += weight * (np.log(value) if is_condition(objective) else value)
-    return float(total)
+    return _summed(problem, list(values))[0]
 
 
 def unmet(problem: ExcitationProblem, values: np.ndarray) -> tuple[float, AttainmentGoal | None, float]:

@@ -17,7 +17,6 @@ from trajectories.design.problem import (
     Evaluation,
     ExcitationProblem,
     evaluate,
-    exact_values,
     is_condition,
     merit,
     unmet,
@@ -148,10 +147,9 @@ class StartSearch:
         if found.excess > 1e-7:
             return
         self.kept += 1
-        values = exact_values(self.problem, found.motion, found.regressor)
-        value = merit(self.problem, values)
+        value = merit(self.problem, found.exact)
         if value < self.merit:
-            self.best, self.merit, self.values = y, value, values
+            self.best, self.merit, self.values = y, value, found.exact
             self.history.append(value)
             self.times.append(time.process_time() - self.began)
 
@@ -219,14 +217,10 @@ class StartSearch:
         return start
 
     def _sum(self, y: np.ndarray, slope: np.ndarray) -> float:
-        found, total, gradient = self.at(y), 0.0, np.zeros(len(y))
-        for (objective, weight), value, row in zip(self.problem.objectives, found.values, found.slopes):
-            logarithm = is_condition(objective)
-            total += weight * float(np.log(value) if logarithm else value)
-            gradient += weight * (row / value if logarithm else row)
+        found = self.at(y)
         if slope.size:
-            slope[:] = gradient * self.scale
-        return total * self.scale
+            slope[:] = found.slopes[0] * self.scale
+        return found.total * self.scale
 
     def _last(self, y: np.ndarray, slope: np.ndarray) -> float:
         if slope.size:

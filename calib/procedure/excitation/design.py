@@ -217,7 +217,7 @@ def _constraints(
     torque = [
         TorqueLimit(
             one.regressor, one.regressor_gradient, dynamics.values, limits.torque, dynamics.covariance,
-            limits.deviations, margin,
+            limits.deviations, margin, one.torque_gradient,
         )
         for one in (dynamics.smooth, dynamics.exact)
     ]  # fmt: skip

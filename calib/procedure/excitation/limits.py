@@ -195,20 +195,22 @@ class Points:
     places: np.ndarray
 
     def __call__(self, q: np.ndarray) -> np.ndarray:
-        frames = joint_frames(self.chain, q)
-        tip = sweep(self.chain, q).poses()
-        carriers = [frames[j - 1] if j else tip for j in self.joints]
-        return np.stack([f[:, :3, :3] @ p + f[:, :3, 3] for f, p in zip(carriers, self.places)], axis=1)
+        return self._places(q, sweep(self.chain, q).poses())
 
     def product(self, q: np.ndarray, G: np.ndarray) -> np.ndarray:
         """Return the slopes (N, n) of Σ G · points."""
-        walked, points = sweep(self.chain, q), self(q)
-        result = np.zeros(q.shape)
+        walked = sweep(self.chain, q)
+        points, result = self._places(q, walked.poses()), np.zeros(q.shape)
         for k, joint in enumerate(self.joints):
             behind = int(self.chain.moving[joint - 1]) + 1 if joint else None
             slope = joint_jacobian(self.chain, walked, np.ascontiguousarray(points[:, k].T), behind)
             result += np.einsum("min,mi->mn", slope[:, :3], G[:, k])
         return result
+
+    def _places(self, q: np.ndarray, tip: np.ndarray) -> np.ndarray:
+        frames = joint_frames(self.chain, q) if any(self.joints) else tip[None]
+        carriers = [frames[j - 1] if j else tip for j in self.joints]
+        return np.stack([f[:, :3, :3] @ p + f[:, :3, 3] for f, p in zip(carriers, self.places)], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
