@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -119,7 +120,7 @@ class Capsules:
         return good
 
     @cached_property
-    def _compiled(self) -> tuple[np.ndarray | float, ...]:
+    def _compiled(self) -> tuple[Any, Any, float, Any, Any, Any, Any]:
         """What `calib.robot.capsule_kernels.clear` takes between the joint values and the margin."""
         form = [
             (AXES.index(e.axis), e.sign, e.value, e.ratio, -1.0 if e.joint is None else e.joint)
