@@ -41,7 +41,7 @@ def certify(session: Session, say: Say) -> list[str]:
     notes = [f"geometry {section.verdict}: {section.reason}"]
     if session.dynamic:
         dynamics = dynamics_section.read(session.identification.path)
-        exported = read_state(session)["steps"].get("export", {}).get("notes", [])
+        exported = read_state(session).notes("export")
         drawn = {}
         if session.plots:
             from calib.procedure.report.figures import draw_dynamics
@@ -81,7 +81,7 @@ def _arrival_notes(session: Session, place: str, unseen: str) -> list[str]:
     path = session.path(f"{place}/{CHECKED}")
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
     files_there = measured_files(session)[1] if place == "3-measured" else recordings(session)[1]
-    said = read_state(session)["steps"].get(unseen, {}).get("notes", [])
+    said = read_state(session).notes(unseen)
     names = tuple(f"{each.name}: " for each in files_there)
     return [line for line in (*lines, *(note for note in said if names and note.startswith(names))) if line.strip()]
 
@@ -187,7 +187,7 @@ def listed(session: Session) -> list[tuple[str, str, str, str]]:
         wanted += sorted(session.path("6-excitation").glob(f"*/{SAMPLES}"))
         wanted += [*session.identification.tables, session.identification.model]
     wanted += [*session.fit.tables, *exported[1:]]
-    made = {name: mark for step in read_state(session)["steps"].values() for name, mark in step["outputs"].items()}
+    made = {name: mark for step in read_state(session).steps.values() for name, mark in step.outputs.items()}
     rows = []
     for path in wanted:
         name = path.relative_to(session.folder)

@@ -29,7 +29,7 @@ import socket
 import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -56,19 +56,32 @@ POSES_CHECKED, MOTION_CHECKED = f"3-measured/{CHECKED}", f"7-recorded/{CHECKED}"
 
 @dataclass(frozen=True)
 class StepRecord:
-    """What ``state.json`` has to say of a step; it says more, which is for people."""
+    """What ``state.json`` has to say of a step: when and by what it was made, from which files (SHA-256), and which."""
 
     finished: Text
     inputs: Mapping[str, Text]
     outputs: Mapping[str, Text]
+    seconds: float = 0.0
+    command: Text = ""
+    seed: int = 0
+    toolkit: Text = ""
+    notes: tuple[Text, ...] = ()
 
 
 @dataclass(frozen=True)
 class StateFile:
     """``state.json``: the steps that were made, and the one that runs."""
 
-    steps: Mapping[str, StepRecord]
+    steps: Mapping[str, StepRecord] = field(default_factory=dict)
     running: Text = ""
+
+    def without(self, *names: str) -> StateFile:
+        """Return the state without these steps, and with none that runs."""
+        return StateFile({name: record for name, record in self.steps.items() if name not in names})
+
+    def notes(self, step: str) -> tuple[str, ...]:
+        """Return what was noted when a step was made; nothing where it was not."""
+        return self.steps[step].notes if step in self.steps else ()
 
 
 @dataclass(frozen=True)
@@ -207,7 +220,7 @@ def fingerprint(path: Path) -> str:
     return digest.hexdigest()
 
 
-def read_state(session: Session) -> dict[str, Any]:
+def read_state(session: Session) -> StateFile:
     """Return what ``state.json`` records; an empty record where there is none.
 
     Raises:
@@ -215,7 +228,7 @@ def read_state(session: Session) -> dict[str, Any]:
     """
     path = session.path("state.json")
     if not path.exists():
-        return {"schema": SCHEMA, "steps": {}}
+        return StateFile()
     advice = "delete it, and calib next makes the steps again"
     try:
         state = json.loads(path.read_text(encoding="utf-8"))
@@ -223,15 +236,16 @@ def read_state(session: Session) -> dict[str, Any]:
         raise SessionError(f"{path} is damaged ({error}); {advice}") from error
     check_schema(path, state.get("schema") if isinstance(state, dict) else None)
     try:
-        parse(StateFile, state, "what it records", SessionError)
+        return parse(StateFile, state, "what it records", SessionError)
     except SessionError as error:
         raise SessionError(f"{path} is damaged ({error}); {advice}") from None
-    return state
 
 
-def write_state(session: Session, state: Mapping[str, Any]) -> None:
+def write_state(session: Session, state: StateFile) -> None:
     """Record `state`, whole or not at all."""
-    files.write_json(session.path("state.json"), state)
+    running = {"running": state.running} if state.running else {}
+    steps = {name: asdict(record) for name, record in state.steps.items()}
+    files.write_json(session.path("state.json"), {"schema": SCHEMA, "steps": steps, **running})
 
 
 @contextmanager

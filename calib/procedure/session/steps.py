@@ -9,10 +9,9 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime
-from typing import Any
 
 from calib.errors import SessionError
 from calib.procedure.excitation import coefficients
@@ -25,6 +24,8 @@ from calib.procedure.session.folder import (
     SETTINGS,
     UNSEEN,
     Session,
+    StateFile,
+    StepRecord,
     fingerprint,
     read_state,
     write_state,
@@ -77,29 +78,29 @@ def states(session: Session) -> list[State]:
     return result
 
 
-def _behind(session: Session, step: SessionStep, recorded: dict[str, Any]) -> State:
-    words = "made before; an earlier step comes first" if step.name in recorded["steps"] else "comes later"
+def _behind(session: Session, step: SessionStep, recorded: StateFile) -> State:
+    words = "made before; an earlier step comes first" if step.name in recorded.steps else "comes later"
     return State(step, AFTER, words)
 
 
-def _state(session: Session, step: SessionStep, recorded: dict[str, Any]) -> State:
-    entry = recorded["steps"].get(step.name)
+def _state(session: Session, step: SessionStep, recorded: StateFile) -> State:
+    entry = recorded.steps.get(step.name)
     if missing := _missing(session, step):
         return State(step, WAITING, missing)
-    if recorded.get("running") == step.name:
+    if recorded.running == step.name:
         return State(step, READY, "was interrupted; will be made again")
     if entry is None:
         return State(step, READY, step.purpose)
-    if changes := _changes(entry["inputs"], _inputs(session, step)):
+    if changes := _changes(entry.inputs, _inputs(session, step)):
         if used := _used(session, step):
             return State(step, KEPT, f"{changes}; kept, since {used}")
         return State(step, STALE, changes)
-    gone = [name for name in entry["outputs"] if not session.path(name).exists()]
+    gone = [name for name in entry.outputs if not session.path(name).exists()]
     if gone:
         return State(step, STALE, f"{gone[0]} is gone")
-    replaced = [name for name, mark in entry["outputs"].items() if fingerprint(session.path(name)) != mark]
+    replaced = [name for name, mark in entry.outputs.items() if fingerprint(session.path(name)) != mark]
     by_hand = f"; replaced by hand: {', '.join(replaced)}" if replaced else ""
-    return State(step, DONE, f"{entry['finished'][:16].replace('T', ' ')}{by_hand}")
+    return State(step, DONE, f"{entry.finished[:16].replace('T', ' ')}{by_hand}")
 
 
 def _used(session: Session, step: SessionStep) -> str:
@@ -143,7 +144,7 @@ def _inputs(session: Session, step: SessionStep) -> dict[str, str]:
     return marks
 
 
-def _changes(before: dict[str, str], now: dict[str, str]) -> str:
+def _changes(before: Mapping[str, str], now: Mapping[str, str]) -> str:
     """Say what differs between two sets of fingerprints."""
     changed = [name for name in now if name in before and not _same(name, before[name], now[name])]
     added, gone = sorted(set(now) - set(before)), sorted(set(before) - set(now))
@@ -178,9 +179,8 @@ def run_next(session: Session, say: Say, progress: Say, command: str = "calib ne
 
 def _run(session: Session, step: SessionStep, say: Say, progress: Say, command: str) -> None:
     number = _steps_of(session).index(step) + 1
-    recorded = read_state(session)
-    recorded["steps"].pop(step.name, None)
-    write_state(session, recorded | {"running": step.name})
+    recorded = read_state(session).without(step.name)
+    write_state(session, replace(recorded, running=step.name))
     inputs, started = _inputs(session, step), time.perf_counter()
     progress(step.purpose)
     try:
@@ -189,18 +189,17 @@ def _run(session: Session, step: SessionStep, say: Say, progress: Say, command: 
         write_state(session, recorded)
         raise
     produced = sorted({path for name in step.outputs for path in session.folder.glob(name) if path.is_file()})
-    recorded["steps"][step.name] = {
-        "finished": datetime.now().astimezone().isoformat(timespec="seconds"),
-        "seconds": round(time.perf_counter() - started, 2),
-        "command": command,
-        "seed": session.settings.seed,
-        "toolkit": certificate.versions(),
-        "inputs": inputs,
-        "outputs": {str(path.relative_to(session.folder)): fingerprint(path) for path in produced},
-        "notes": notes,
-    }
-    recorded.pop("running", None)
-    write_state(session, recorded)
+    made = StepRecord(
+        finished=datetime.now().astimezone().isoformat(timespec="seconds"),
+        inputs=inputs,
+        outputs={str(path.relative_to(session.folder)): fingerprint(path) for path in produced},
+        seconds=round(time.perf_counter() - started, 2),
+        command=command,
+        seed=session.settings.seed,
+        toolkit=certificate.versions(),
+        notes=tuple(notes),
+    )
+    write_state(session, StateFile({**recorded.steps, step.name: made}))
     say(f"{number} {step.name}: {notes[0] if notes else 'done'}")
     for note in notes[1:]:
         say(f"    {note}")
@@ -208,11 +207,8 @@ def _run(session: Session, step: SessionStep, say: Say, progress: Say, command: 
 
 def forget(session: Session, step: SessionStep) -> None:
     """Let a step and all behind it be made again."""
-    recorded = read_state(session)
     own = _steps_of(session)
-    for later in own[own.index(step) :]:
-        recorded["steps"].pop(later.name, None)
-    write_state(session, recorded)
+    write_state(session, read_state(session).without(*(later.name for later in own[own.index(step) :])))
 
 
 def _move_export(session: Session) -> None:
@@ -224,7 +220,12 @@ def _move_export(session: Session) -> None:
     if now.is_dir():
         now.rmdir()
     os.replace(before, now)
-    for key in ("outputs", "inputs"):
-        for entry in recorded["steps"].values():
-            entry[key] = {name.replace(f"{before.name}/", f"{now.name}/", 1): mark for name, mark in entry[key].items()}
-    write_state(session, recorded)
+
+    def renamed(marks: Mapping[str, str]) -> dict[str, str]:
+        return {name.replace(f"{before.name}/", f"{now.name}/", 1): mark for name, mark in marks.items()}
+
+    made = {
+        name: replace(entry, inputs=renamed(entry.inputs), outputs=renamed(entry.outputs))
+        for name, entry in recorded.steps.items()
+    }
+    write_state(session, StateFile(made, recorded.running))

@@ -162,10 +162,10 @@ def test_a_failing_step_leaves_the_session_as_it_was(measured: Session) -> None:
     path.write_text(text.replace("[deg]", "[rad]"))
     with pytest.raises(MeasurementError, match=r"measured.csv, row 1, column 'joint\d'.*deg"):
         go_on(measured)
-    assert "running" not in read_state(measured) and not measured.path("session.lock").exists()
+    assert not read_state(measured).running and not measured.path("session.lock").exists()
     path.write_text(text)
     assert go_on(measured) is None
-    assert read_state(measured)["steps"].keys() == before["steps"].keys()
+    assert read_state(measured).steps.keys() == before.steps.keys()
 
 
 @pytest.mark.parametrize(
