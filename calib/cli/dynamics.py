@@ -18,9 +18,7 @@ def identify_dynamics(
     recordings: Annotated[list[str], typer.Argument(help="recordings of q and torque or current; log.npz@0:9.4 cuts")],
     out: Annotated[Path, typer.Option(help="folder for the identified model and its report")],
     validate: Annotated[list[str] | None, typer.Option(help="recording of other motion; may be repeated")] = None,
-    method: Annotated[
-        str | None, typer.Option(help="ols, wls, irls, tls, iv, didim, or pc-ols … under [constraints]")
-    ] = None,
+    method: Annotated[str | None, typer.Option(help="wls and others: calib study --list-methods")] = None,
     friction: Annotated[
         str | None, typer.Option(help="auto, standard, or one rung: load, presliding, stribeck, root, ...")
     ] = None,

@@ -12,7 +12,7 @@ import scipy.linalg
 from calib.dynamics.base import to_standard
 from calib.dynamics.idim import IdentificationModel, with_terms
 from calib.estimation.linear import LinearFit, ols, ridge, settled_std, wls
-from calib.estimation.samples import SampleFit, irls, stack
+from calib.estimation.samples import SampleFit, Samples, irls, stack
 from calib.estimation.total import tls
 from calib.estimation.triangles import Triangles, combine, retriangulate
 from calib.identification.friction.passivity import driving
@@ -68,7 +68,7 @@ class LeastSquares:
     def _estimate(self, problem: IdentificationProblem) -> MethodEstimate:
         prior = problem.prior if self.takes_prior else None
         if prior is None:
-            std, tau = _weighing(problem)
+            std, tau = weighed(problem)
             fit = self.solve(problem, std, tau)
             ridges = self.takes_prior and bool((problem.groups >= 0).any())
             fit, known = _drawn(problem, None, std, tau) if ridges else (fit, None)
@@ -95,7 +95,7 @@ def scaled_tls(pooled: Triangles, std: np.ndarray, exact: np.ndarray) -> LinearF
     return tls(pooled, noise, std)
 
 
-def _weighing(problem: IdentificationProblem) -> tuple[np.ndarray, np.ndarray]:
+def weighed(problem: IdentificationProblem) -> tuple[np.ndarray, np.ndarray]:
     """Return (rows,) standard deviations and inflation of a problem whose data determine every parameter."""
     pooled, noise = problem.pooled, problem.noise
     std = settled_std(pooled) if noise is None else noise * wls(pooled, noise).estimate.residual_std
@@ -199,7 +199,7 @@ class ConstrainedLeastSquares:
         return attempted(self.name, problem, lambda: self._estimate(problem, constraints))
 
     def _estimate(self, problem: IdentificationProblem, constraints: Constraints) -> MethodEstimate:
-        std, tau = _weighing(problem)
+        std, tau = weighed(problem)
         pooled, free = problem.pooled, self.free.solve(problem, std, tau)
         weights = std if self.free.weighted else np.ones(len(std))
         factor = combine(pooled, weights)
@@ -218,10 +218,14 @@ def _irls(problem: IdentificationProblem, std: np.ndarray, tau: np.ndarray) -> L
 def _reweighted(
     problem: IdentificationProblem, tau: np.ndarray, solve: Callable[[np.ndarray], np.ndarray] | None = None
 ) -> SampleFit:
+    return irls(samples_of(problem), inflation=float(np.median(tau)), solve=solve)
+
+
+def samples_of(problem: IdentificationProblem) -> Samples:
+    """Return the rows of all recordings, those of one instant together."""
     rows = problem.rows
     matrix, target, present = (np.concatenate([getattr(part, key) for part in rows]) for key in _STACKED)
-    samples = stack(matrix, target, present, rows[0].names, rows[0].units)
-    return irls(samples, inflation=float(np.median(tau)), solve=solve)
+    return stack(matrix, target, present, rows[0].names, rows[0].units)
 
 
 _STACKED = ("matrix", "target", "present")

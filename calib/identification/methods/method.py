@@ -24,7 +24,7 @@ from calib.errors import CannotSimulate, Diverged, NotConverged, Unidentifiable
 from calib.estimation import instrumental_variables
 from calib.estimation.estimate import Estimate
 from calib.estimation.linear import LinearFit
-from calib.estimation.triangles import Triangles, retriangulate
+from calib.estimation.triangles import Triangles, empty, retriangulate
 from calib.identification.cases import Case
 from calib.identification.loop.loop_recordings import ClosedLoops
 from calib.identification.loop.loop_settings import LoopSettings
@@ -134,6 +134,7 @@ class MethodEstimate:
         instrumental: what the simulated closed loop says besides, where the method simulates.
         loops: what was simulated.
         held: what constraints made of it, where the method takes them.
+        alone: whether values and covariance say all there is, since least squares of `pooled` is another estimate.
     """
 
     method: str
@@ -151,6 +152,7 @@ class MethodEstimate:
     instrumental: Instrumental | None = None
     loops: ClosedLoops | None = None
     held: Held | None = None
+    alone: bool = False
 
     @property
     def found(self) -> bool:
@@ -173,6 +175,8 @@ class MethodEstimate:
 
     def testable(self) -> tuple[Triangles, np.ndarray, np.ndarray]:
         """Return triangles on which least squares gives this estimate, (g,) std and (g,) inflation: to test with."""
+        if self.alone:
+            return _standing_for(self.estimate), np.ones(1), np.ones(1)
         if self.instrumental is None:
             if self.beforehand is None:
                 return self.pooled, self.std, self.inflation
@@ -185,6 +189,19 @@ class MethodEstimate:
         own = self.instrumental
         data = instrumental_variables.testable(own.problem, own.fit, own.std)
         return data, np.ones(1), np.array([own.inflation])
+
+
+def _standing_for(estimate: Estimate) -> Triangles:
+    """Return triangles of one group on which least squares gives an estimate, its covariance and degrees of freedom."""
+    p, sigma = len(estimate.values), np.where(estimate.sigma > 0.0, estimate.sigma, 1.0)
+    size, axes = np.linalg.eigh(estimate.covariance / np.outer(sigma, sigma))
+    root = (axes / np.sqrt(np.maximum(size, 1e-13 * size[-1]))).T / sigma
+    factor = np.zeros((1, p + 1, p + 1))
+    factor[0, :p] = retriangulate(np.column_stack([root, root @ estimate.values]))[:p]
+    factor[0, p, p] = np.sqrt(max(estimate.dof, 1))
+    return replace(
+        empty(estimate.names, estimate.units, 1), factors=frozen(factor), rows=frozen([max(estimate.dof, 1) + p], int)
+    )  # fmt: skip
 
 
 class Method(Protocol):

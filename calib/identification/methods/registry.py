@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 from calib.errors import UsageError, suggestion
 from calib.identification.methods.least_squares import IRLS, OLS, PC_IRLS, PC_OLS, PC_WLS, TLS, WLS
+from calib.identification.methods.maximum_likelihood import ML
 from calib.identification.methods.method import Method
+from calib.identification.methods.networks import ADALINE, HOPFIELD
 from calib.identification.methods.simulated import DIDIM, IV, PC_DIDIM, PC_IV
 
 
@@ -57,12 +59,24 @@ LISTING: tuple[MethodEntry, ...] = (
         ("ratio of the columns' noise to the torques'",),
     ),
     MethodEntry(
+        ML, "maximum likelihood: positions noisy too, noise levels estimated",
+        "Olsen, Swevers & Verdonck 2002; Leboutet et al. 2021", ("tolerance 0.01 sigma", "40 rounds"),
+    ),
+    MethodEntry(
         IV, "instrumental variables from the simulated closed loop", "Janot, Vandanjon & Gautier 2014",
         ("tolerance 2.5 %", "10 rounds"),
     ),
     MethodEntry(
         DIDIM, "least squares on the simulated motion alone (the slides' CLIE)", "Gautier, Janot & Vandanjon 2013",
         ("tolerance 2.5 %", "10 rounds"),
+    ),
+    MethodEntry(
+        ADALINE, "adaptive linear neuron, trained sample by sample", "Widrow & Hoff 1960; Widrow & Stearns 1985",
+        ("decay of the learning rate", "60 epochs"),
+    ),
+    MethodEntry(
+        HOPFIELD, "Hopfield-Tank network at rest", "Tank & Hopfield 1986; Atencia, Joya & Sandoval 2004",
+        ("bounds of its neurons", "200 steps"),
     ),
     MethodEntry(PC_OLS, "ols" + _CONSTRAINED, _SOUSA),
     MethodEntry(PC_WLS, "wls" + _CONSTRAINED, _SOUSA),

@@ -131,8 +131,10 @@ def _refuse(settings: IdentificationSettings, options: IdentifyOptions) -> None:
         raise UsageError(f"friction = '{settings.friction}': a parallel robot has standard friction only (Fv Fc off)")
     if settings.prior == "cad":
         raise UsageError('prior = "cad" is for serial arms yet, not for parallel robots')
-    if method_named(settings.method).needs_simulation:
-        raise UsageError(f"method '{settings.method}' simulates a serial arm; parallel robots take ols, wls, irls, tls")
+    method = method_named(settings.method)
+    if method.needs_simulation or method.name == "ml":
+        what = "simulates" if method.needs_simulation else "differentiates the torques of"
+        raise UsageError(f"method '{method.name}' {what} a serial arm; parallel robots take ols, wls, irls, tls")
 
 
 def _notes(model: ParallelModel, cases: Sequence[Case]) -> list[str]:

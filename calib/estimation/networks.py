@@ -1,0 +1,113 @@
+"""Least squares by two neural networks: Widrow's adaptive linear neuron, and Hopfield and Tank's recurrent one.
+
+Both come to rest at the minimum of ‖R⁻¹ (y - W x)‖²; what they add to it is that data are seen sample by sample, or
+that parameters stay within stated bounds. Their noise of training is in the covariance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from calib.errors import NotConverged
+from calib.estimation.linear import LinearFit, wls
+from calib.estimation.samples import Samples
+from calib.estimation.triangles import Triangles, combine, solve_triangle
+
+EPOCHS = 60  # at most
+RESTING = 0.1  # standard deviations from the minimum, rms over parameters, at which training may end
+BOX = 30.0  # times the parameter that explains all torques by one column: no estimate is near it
+SATURATED = 0.9  # of the box
+STEPS = 200
+AT_REST = 1e-3  # standard deviations from the equilibrium
+
+
+def adaline(
+    data: Samples, triangles: Triangles, std: np.ndarray, inflation: np.ndarray | None = None, seed: int = 0
+) -> tuple[LinearFit, int]:
+    """Train an adaptive linear neuron on samples in random order; return the estimate, and epochs.
+
+        w ← w + μ_k Z_kᵀ (y_k - Z_k w),    Z_k = R⁻¹ W_k T,    x = T w
+
+    with T such that the inputs are uncorrelated and of unit power, and μ_k = 1 / (epoch² mean ‖Z‖²), at most
+    1 / ‖Z_k‖²: LMS with Newton's direction (Widrow & Hoff 1960; Widrow & Stearns 1985, chapter 8). The estimate is the
+    mean of the last epoch's weights (Polyak & Juditsky 1992); how far it is from the minimum is added to the covariance.
+
+    Args:
+        data: samples.
+        triangles: of the same rows, one group per row of a sample.
+        std, inflation: (n,) of the rows, see `linear.wls`.
+
+    Raises:
+        NotConverged: with the last `LinearFit`.
+    """
+    fit, factor, p = wls(triangles, std, inflation), combine(triangles, std), triangles.parameters
+    rows, size = np.where(data.present, 1.0 / std, 0.0), np.sqrt(data.present.sum())
+    inverse = size * solve_triangle(factor, data.names)[1]
+    inputs, target = (rows[:, :, None] * data.matrix) @ inverse, rows * data.target
+    power = np.maximum(np.sum(inputs**2, axis=(1, 2)), 1e-300)
+    rng, weights = np.random.default_rng(seed), np.zeros(p)
+    for epoch in range(1, EPOCHS + 1):
+        mean, steps = np.zeros(p), np.minimum(1.0 / power, 1.0 / (epoch**2 * power.mean()))
+        for k in rng.permutation(len(target)):
+            own = inputs[k]
+            weights = weights + steps[k] * ((target[k] - own @ weights) @ own)
+            mean += weights
+        values = inverse @ mean / len(target)
+        away = float(np.sqrt(np.mean((factor[:p, :p] @ values - factor[:p, p]) ** 2)))
+        trained = replace(fit.estimate, values=values)
+        if away < RESTING:
+            excess = fit.estimate.covariance + (away / size) ** 2 * inverse @ inverse.T
+            return replace(fit, estimate=replace(trained, covariance=excess)), epoch
+    raise NotConverged(
+        f"the neuron is {away:.2g} standard deviations from rest after {EPOCHS} epochs: few samples for so many "
+        "parameters, or samples that do not fit",
+        replace(fit, estimate=trained),
+    )
+
+
+def hopfield(
+    triangles: Triangles, std: np.ndarray, inflation: np.ndarray | None = None, bound: np.ndarray | None = None
+) -> tuple[LinearFit, int]:
+    """Let a Hopfield-Tank network of p neurons come to rest; return the estimate, and steps.
+
+        u̇ = -∂E/∂x = -(Wᵀ R⁻¹ W x - Wᵀ R⁻¹ y),    x_i = α_i tanh(u_i / α_i),    E = ½ ‖R^(-½) (y - W x)‖²
+
+    (Tank & Hopfield 1986; Atencia, Joya & Sandoval 2004), E falling all the way. The equation is stiff by the square
+    of the condition number; it is integrated by the linearly implicit Euler form with steps that grow as E settles, in
+    units in which the columns have unit norm.
+
+    Args:
+        triangles: of the rows, one group per standard deviation.
+        std, inflation: (g,), see `linear.wls`.
+        bound: α (p,), what no parameter exceeds; None: `BOX` times what one column needs to explain all torques.
+
+    Raises:
+        NotConverged: where a neuron saturates, so that x is a bound and no estimate, or after `STEPS`.
+    """
+    fit = wls(triangles, std, inflation)
+    factor = combine(triangles, std)
+    p = triangles.parameters
+    norms = np.linalg.norm(factor[:p, :p], axis=0)
+    upper, target = factor[:p, :p] / norms, factor[:p, p]
+    reach = np.full(p, BOX * np.linalg.norm(target)) if bound is None else np.asarray(bound, dtype=float) * norms
+    inner, step = np.zeros(p), 1.0
+    for count in range(1, STEPS + 1):
+        outer = reach * np.tanh(inner / reach)
+        rest = upper @ outer - target
+        if np.linalg.norm(rest) < AT_REST:
+            return replace(fit, estimate=replace(fit.estimate, values=outer / norms)), count
+        while True:
+            gain = 1.0 - (outer / reach) ** 2
+            moved = inner - np.linalg.solve(np.eye(p) / step + (upper.T @ upper) * gain, upper.T @ rest)
+            energy = np.linalg.norm(upper @ (reach * np.tanh(moved / reach)) - target)
+            if energy < np.linalg.norm(rest) or step < 1e-12:
+                break
+            step *= 0.25
+        if step < 1e-12:
+            break
+        inner, step = moved, 4.0 * step
+    saturated = [name for name, x, most in zip(triangles.names, outer, reach) if abs(x) > SATURATED * most]
+    cause = f"neurons saturate: {', '.join(saturated[:5])}; widen their bounds" if saturated else "it is not at rest"
+    raise NotConverged(f"the network after {count} steps: {cause}", outer / norms)
