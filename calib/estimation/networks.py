@@ -32,7 +32,7 @@ def adaline(
 
     with T such that the inputs are uncorrelated and of unit power, and μ_k = 1 / (epoch² mean ‖Z‖²), at most
     1 / ‖Z_k‖²: LMS with Newton's direction (Widrow & Hoff 1960; Widrow & Stearns 1985, chapter 8). The estimate is the
-    mean of the last epoch's weights (Polyak & Juditsky 1992); how far it is from the minimum is added to the covariance.
+    mean of the last epoch's weights (Polyak & Juditsky 1992); its distance from the minimum is added to the covariance.
 
     Args:
         data: samples.
