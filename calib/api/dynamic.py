@@ -16,7 +16,7 @@ from calib.data.recordings.recording import Recording
 from calib.estimation.estimate import Estimate
 from calib.identification.identify_options import IdentifyOptions, read_options
 from calib.procedure.dynamic_stage import folder, identify, inputs
-from calib.procedure.kinematic_stage.verdict import Verdict
+from calib.procedure.findings import Verdict
 from calib.robot.calibrated import CalibratedChain
 
 if TYPE_CHECKING:

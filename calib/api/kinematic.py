@@ -18,9 +18,9 @@ from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.target_files import Targets, read_targets
 from calib.errors import UsageError, as_ours
 from calib.estimation.estimate import Estimate
+from calib.procedure.findings import Verdict
 from calib.procedure.kinematic_stage import compensation, compensation_file, fit, folder, inputs, selection
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSettings, SelectionSettings
-from calib.procedure.kinematic_stage.verdict import Verdict
 from calib.procedure.measuring.run import write_run
 from calib.procedure.report.fit_report import fit_metrics
 from calib.robot.calibrated import CalibratedChain

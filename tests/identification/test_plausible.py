@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -15,9 +16,7 @@ from calib.errors import MeasurementError
 from calib.identification.cases import Case, make_case
 from calib.identification.checks.recording_sizes import compare_sizes
 from calib.procedure.dynamic_stage.plausibility import findings
-from calib.procedure.kinematic_stage.metrics import Finding
-from calib.procedure.kinematic_stage.plausibility import held_by, told
-from calib.procedure.kinematic_stage.verdict import Verdict
+from calib.procedure.findings import Finding, Verdict, held_by, settled
 
 NAMES = ("joint1", "joint2", "joint3")
 ARM = replace(planted.arm(), joints=tuple(replace(joint, effort=60.0) for joint in planted.arm().joints))
@@ -81,11 +80,12 @@ def test_one_joint_that_prefers_a_lag_is_no_clock() -> None:
 
 def test_a_finding_holds_the_verdict_until_it_is_accepted() -> None:
     odd = [Finding("masses", "fail", "wrong way"), Finding("lag", "pass", "late")]
-    held = held_by(Verdict("pass", "5 %"), odd, ())
+    accepted = settled(odd, ("masses",))
+    held = held_by(Verdict("pass", "5 %"), odd)
     assert held == Verdict("fail", "wrong way; 5 %")
-    assert held_by(Verdict("pass", "5 %"), odd, ("masses",)) == Verdict("pass", "5 %")
-    assert told(odd, ()) == ['wrong way; if that is meant, accept = ["masses"] in the options', "late"]
-    assert told(odd, ("masses",))[0] == "wrong way (accepted by the options)"
+    assert held_by(Verdict("pass", "5 %"), accepted) == Verdict("pass", "5 %")
+    assert [one.told for one in odd] == ['wrong way; if that is meant, accept = ["masses"] in the options', "late"]
+    assert accepted[0].told == "wrong way (accepted by the options)"
 
 
 def test_torques_beyond_all_limits_are_another_unit() -> None:
@@ -103,9 +103,37 @@ def test_currents_without_gains_compare_with_no_masses() -> None:
     assert np.isnan(compare_sizes(one, ARM, newtons=False).masses).all()
 
 
-def test_an_encoder_that_jumps_is_named_with_its_rows() -> None:
-    assert not [note for note in check_recording(recorded()).notes if "jumps" in note]
+def test_an_encoder_that_jumps_is_named_with_its_rows_and_holds_the_verdict() -> None:
+    assert check_recording(recorded()).jumps == ()
     q = recorded().q.copy()
     q[2000:, 2] += 0.05
-    (note,) = [note for note in check_recording(replace(recorded(), q=q)).notes if "jumps" in note]
-    assert "joint3 jumps by 50" in note and "between rows 2000 and 2001" in note
+    jumping = check_recording(replace(recorded(), q=q))
+    assert "joint3 jumps by 50" in jumping.jumps[0] and "between rows 2000 and 2001" in jumping.jumps[0]
+    (one,) = [one for one in found(jumping) if one.name == "jump"]
+    assert one.level == "marginal" and one.words == f"log: {jumping.jumps[0]}"
+
+
+@pytest.mark.parametrize("clock, level", [(1.0, None), (1.2, None), (2.0, "fail"), (0.5, "fail"), (3.0, "fail")])
+def test_a_clock_is_told_without_velocities(clock: float, level: str | None) -> None:
+    """Of a robot whose masses are not known, too: lengths suffice."""
+    stamped = replace(recorded(clock=clock), v=None)
+    for arm in (ARM, replace(ARM, inertias=None)):
+        told = findings([compare_sizes(case_of(stamped), arm)], NAMES)
+        one = next((one for one in told if one.name == "clock"), None)
+        assert (one.level if one else None) == level
+        if one is not None:
+            times = re.search(r"stamps some ([0-9.]+) times too (large|small)", one.words)
+            assert times is not None and float(times[1]) == pytest.approx(max(clock, 1 / clock), rel=0.35)
+            assert times[2] == ("large" if clock > 1 else "small")
+
+
+def test_a_clock_is_told_once() -> None:
+    assert [one.name for one in found(recorded(clock=2.0))] == ["speed"]
+
+
+def test_exchanged_joints_are_named() -> None:
+    log = recorded()
+    order = [0, 2, 1]
+    one = replace(log, q=log.q[:, order], effort=log.effort[:, order], v=None)
+    (told,) = [one for one in found(one) if one.name == "order"]
+    assert told.level == "marginal" and "joint2 and joint3 exchanged" in told.words

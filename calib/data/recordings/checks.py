@@ -38,11 +38,10 @@ def check_recording(recording: Recording, joints: Joints | None = None) -> Recor
     _check_speed(recording)
     notes = (
         *_still(recording),
-        *_jumps(recording, joints),
         *_effort_notes(recording, joints),
         *_limit_notes(recording, joints),
     )
-    return _noted(recording, *notes, *_work_notes(recording))
+    return replace(_noted(recording, *notes, *_work_notes(recording)), jumps=tuple(_jumps(recording, joints)))
 
 
 def _check_count(recording: Recording) -> None:
@@ -142,7 +141,7 @@ def _check_speed(recording: Recording) -> None:
 
 
 def _jumps(recording: Recording, joints: Joints | None) -> list[str]:
-    """Note positions that jump from one row to the next, whatever the rows around do: an encoder, a clock, a join."""
+    """Return in words which positions jump, whatever the rows around do: an encoder, a clock, a join."""
     if len(recording) < 5:
         return []
     step = np.diff(recording.t)

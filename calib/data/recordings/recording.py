@@ -68,7 +68,7 @@ class Recording:
         effort_variance: (n,) mean variance of the effort's samples, from repeats [its unit²]; None where not known.
         file: where it came from.
         rows: (N,) number of each sample in the file, counted from 1.
-        notes: what is odd but was accepted, for the message.
+        notes: what is odd but was accepted, for the message; jumps: of positions, in words.
     """
 
     t: np.ndarray
@@ -87,6 +87,7 @@ class Recording:
     file: str = ""
     rows: np.ndarray = None  # type: ignore[assignment]  # set below
     notes: tuple[str, ...] = ()
+    jumps: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:

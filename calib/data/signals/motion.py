@@ -73,7 +73,7 @@ class Motion:
         joint_names, kind, file, drive_gain, effort_variance: the recording's.
         tau_link, tau_motor, q_link, q_ref, tau_ff, v_measured: (N, n) the recording's others on the grid, not
             filtered; or None.
-        sampling, cutoffs: what was found; notes: what a user should be told.
+        sampling, cutoffs: what was found; notes: what a user should be told; jumps: the recording's, in words.
     """
 
     t: np.ndarray
@@ -101,6 +101,7 @@ class Motion:
     v_measured: np.ndarray | None = None
     drive_gain: np.ndarray | None = None
     effort_variance: np.ndarray | None = None
+    jumps: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.t)
@@ -159,6 +160,7 @@ def make_motion(recording: Recording, options: FilterOptions | None = None, samp
         drive_gain=recording.drive_gain,
         effort_variance=recording.effort_variance,
         v_measured=v_measured,
+        jumps=recording.jumps,
         **others,
     )
 

@@ -20,7 +20,7 @@ from calib.procedure.dynamic_stage.verdict import (
     model_warnings,
     resting_parameters,
 )
-from calib.procedure.kinematic_stage.verdict import Verdict
+from calib.procedure.findings import Verdict
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,10 @@ masses   torques that pull against the robot's own masses, or `FAR` times as muc
 speed    measured velocities that are not the slope of the positions, by `SLIGHT`: marginal; by `WRONG` times: fail
 lag      torques that come later than the positions of their row, at most joints alike (``[recording] lag = …`` takes
          them earlier): a note; where that explains `HELPS` of what is left: marginal
+clock    inertias that are `INERT` times too large or small beside the masses that gravity tells, for the lengths of the
+         robot: marginal; beyond `FAR`: fail. Not said where measured velocities say so already
+order    two joints with which exchanged the robot's own masses leave less than `EXCHANGED` of the torques: marginal
+jump     a position that leaves the slope of the rows around it: marginal
 """
 
 from __future__ import annotations
@@ -17,20 +21,25 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from calib.identification.checks.recording_sizes import Lag, RecordingSizes
-from calib.procedure.kinematic_stage.metrics import Finding
-from calib.procedure.kinematic_stage.plausibility import LEVELS
+from calib.identification.checks.whole_robot import ClockRatio, Exchange
+from calib.procedure.findings import Finding
 
 FAR, OFF = 3.0, 2.2
 SLIGHT, WRONG = 0.05, 1.5
 HELPS = 0.3
+INERT = 2.0
+EXCHANGED = 0.98
 
 
 def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Finding]:
-    """Return what is odd with recordings, worst first."""
-    found = [
-        one for each in sizes for one in (*_masses(each, joints), *_speed(each, joints), *_lag(each.name, each.lag))
-    ]
-    return sorted(found, key=lambda one: -LEVELS.index(one.level))
+    """Return what is odd with recordings."""
+    found: list[Finding] = []
+    for each in sizes:
+        speed = list(_speed(each, joints))
+        found += [*_masses(each, joints), *speed, *([] if speed else _clock(each.name, each.clock))]
+        found += [*_lag(each.name, each.lag), *_order(each.name, each.exchange, joints)]
+        found += [Finding("jump", "marginal", f"{each.name}: {words}") for words in each.jumps]
+    return found
 
 
 def _masses(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
@@ -86,4 +95,29 @@ def _lag(name: str, lag: Lag | None) -> Iterator[Finding]:
         f"{name}: the torques come some {1e3 * abs(lag.seconds):.0f} ms {way} than the positions: [recording] lag = "
         f"{lag.seconds:.3f} in the options takes them back; with standard friction {100 * lag.after:.1f} % of the "
         f"joints' torques then stay unexplained, {100 * lag.before:.1f} % as recorded",
+    )  # fmt: skip
+
+
+def _clock(name: str, found: ClockRatio | None) -> Iterator[Finding]:
+    if found is None:
+        return
+    off = abs(np.log(found.ratio))
+    if off < np.log(INERT) + 2.0 * found.relative_sigma:
+        return
+    times = max(found.clock, 1.0 / found.clock)
+    yield Finding(
+        "clock", "fail" if off > np.log(FAR) else "marginal",
+        f"{name}: beside the masses that gravity tells, inertias are {found.ratio:.3g} times (± "
+        f"{100 * found.relative_sigma:.0f} %) those of a robot of these lengths: are the stamps some {times:.2g} times "
+        f"too {'large' if found.clock > 1.0 else 'small'}?",
+    )  # fmt: skip
+
+
+def _order(name: str, found: Exchange | None, joints: Sequence[str]) -> Iterator[Finding]:
+    if found is None or found.factor > EXCHANGED:
+        return
+    yield Finding(
+        "order", "marginal",
+        f"{name}: with {' and '.join(joints[j] for j in found.joints)} exchanged the robot's own masses leave "
+        f"{100 * found.factor:.0f} % of what they leave as recorded: are these columns exchanged?",
     )  # fmt: skip

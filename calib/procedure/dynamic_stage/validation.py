@@ -19,14 +19,8 @@ from calib.procedure.dynamic_stage import plausibility
 from calib.procedure.dynamic_stage.gains import relative_warnings
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, Progress
 from calib.procedure.dynamic_stage.tracking import Tracking, track
-from calib.procedure.dynamic_stage.verdict import (
-    Resting,
-    judge,
-    warnings,
-    with_prior,
-)
-from calib.procedure.kinematic_stage.plausibility import held_by, told
-from calib.procedure.kinematic_stage.verdict import Verdict
+from calib.procedure.dynamic_stage.verdict import Resting, judge, warnings, with_prior
+from calib.procedure.findings import Verdict, held_by, settled
 from calib.simulation.loop.controllers import Controller
 from calib.units import TORQUE
 
@@ -106,9 +100,9 @@ def assess(
     settings = inputs.options.settings
     labels = settings.torque_rows.numbered(inputs.chain.n)
     sizes = [compare_sizes(case, inputs.chain, settings.gravity, inputs.unit == TORQUE) for case in inputs.cases]
-    odd, accepted = plausibility.findings(sizes, inputs.chain.joint_names), inputs.options.accept
+    odd = settled(plausibility.findings(sizes, inputs.chain.joint_names), inputs.options.accept)
     verdict = with_prior(judge(fit, proofs, repeated, excitation, wrong, labels), findings.rests)
-    verdict = held_by(verdict, odd, accepted)
+    verdict = held_by(verdict, odd)
     say("tracking with the model fed forward")
     amperes = relative_warnings(inputs.unit)
     tracking = (
@@ -116,7 +110,7 @@ def assess(
         else track(inputs, dynamics, predictions, findings.controller)
     )  # fmt: skip
     said = (
-        *amperes, *told(odd, accepted),
+        *amperes, *(one.told for one in odd),
         *warnings(inputs.cases, inputs.unseen, validation, repeated, excitation, inputs.chain),
         *findings.notes,
     )  # fmt: skip

@@ -23,7 +23,7 @@ from calib.identification.identify import Identification
 from calib.identification.prior import resting
 from calib.identification.reweighted import standstill_shift
 from calib.identification.scores import Score
-from calib.procedure.kinematic_stage.verdict import Verdict
+from calib.procedure.findings import Verdict
 from calib.robot.chain import Chain
 
 TRANSFER = 2.0  # unseen errors this many times the fit's own: the model does not transfer

@@ -22,6 +22,7 @@ from calib.geometry.parameters import fixed_parameters, stated_prior
 from calib.geometry.result import GeometricFit, calibrated_chain
 from calib.geometry.uncertainty.error_model import ErrorModel, learn_errors
 from calib.geometry.weighing import Settings, combine
+from calib.procedure.findings import Verdict, settled
 from calib.procedure.kinematic_stage import plausibility
 from calib.procedure.kinematic_stage.comparison import (
     Comparison,
@@ -32,7 +33,6 @@ from calib.procedure.kinematic_stage.metrics import Findings
 from calib.procedure.kinematic_stage.remarks import Outlier, named_outliers, plateau, remains, remark
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import Arms, Assessment, assess
-from calib.procedure.kinematic_stage.verdict import Verdict
 from calib.procedure.measuring.image_findings import image_notes
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import stretched_length
@@ -190,7 +190,7 @@ def _found_of(
         reach=long,
         notes=(*((said,) if said else ()), *notes, *_blind_note(found.folds.blind)),
         blind=found.folds.blind,
-        odd=plausibility.settled(odd, accepted),
+        odd=settled(odd, accepted),
     )
 
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from calib.geometry.uncertainty.error_model import Discrepancy
+from calib.procedure.findings import Finding
 
 
 @dataclass(frozen=True)
@@ -132,15 +133,6 @@ class OutlierRow:
     sigmas: float
     size_mm: float | None = None
     size_deg: float | None = None
-
-
-@dataclass(frozen=True)
-class Finding:
-    """What is odd with measurements: its name in ``accept``, the best level it allows, and a sentence."""
-
-    name: str
-    level: str
-    words: str
 
 
 @dataclass(frozen=True)

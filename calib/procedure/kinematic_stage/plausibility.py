@@ -12,8 +12,7 @@ commanded     less than `TOO_GOOD` remains, which no instrument measures: a note
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -21,42 +20,12 @@ from calib.data.poses.measurements import PoseMeasurements
 from calib.geometry.accuracy import errors
 from calib.geometry.checks.plausible import Scale, mirrored_rms, scale_of
 from calib.geometry.installation import Installation
-from calib.procedure.kinematic_stage.metrics import Finding
-from calib.procedure.kinematic_stage.verdict import Verdict
+from calib.procedure.findings import Finding
 
 NO_ARM = 0.015
 BETTER = 3.0
 SHARE, LEAST, GROWN = 0.3, 1e-3, 5e-3
 TOO_GOOD = 2e-6  # [m]
-LEVELS = ("pass", "marginal", "fail")
-
-
-def held_by(verdict: Verdict, found: Sequence[Finding], accepted: Collection[str]) -> Verdict:
-    """Return the verdict, no better than the findings allow that were not accepted; they come first in its reason."""
-    for one in sorted(found, key=lambda one: -LEVELS.index(one.level)):
-        if one.level != "pass" and one.name not in accepted and LEVELS.index(one.level) >= LEVELS.index(verdict.level):
-            words = one.words.partition("; if that is meant, accept")[0]
-            return Verdict(one.level, f"{words}; {verdict.reason}")
-    return verdict
-
-
-def told(found: Sequence[Finding], accepted: Collection[str]) -> list[str]:
-    """Return what a user should know."""
-    return [f"{one.words}{_advice(one, accepted)}" for one in found]
-
-
-def _advice(one: Finding, accepted: Collection[str]) -> str:
-    if one.name in accepted:
-        return " (accepted by the options)"
-    return "" if one.level == "pass" else f'; if that is meant, accept = ["{one.name}"] in the options'
-
-
-def settled(found: Sequence[Finding], accepted: Collection[str]) -> tuple[Finding, ...]:
-    """Return findings as a fit's folder keeps them: those that were accepted allow a pass."""
-    words = told(found, accepted)
-    return tuple(
-        replace(one, words=said, level="pass" if one.name in accepted else one.level) for one, said in zip(found, words)
-    )
 
 
 def findings(
@@ -67,7 +36,7 @@ def findings(
     left: float | None,
     reach: float,
 ) -> list[Finding]:
-    """Return what is odd with the rows of a fit, worst first.
+    """Return what is odd with the rows of a fit, what explains most first.
 
     Args:
         nominal, calibrated: the arms, placed.
@@ -77,14 +46,14 @@ def findings(
     """
     before, after = (_rms(cell, blocks, torques) for cell in (nominal, calibrated))
     remains = after if left is None else left
-    found = []  # what explains most first
+    found = []
     if before > NO_ARM * reach:
         found += _reflection(before, mirrored_rms(nominal, blocks, torques))
     found += [*_unexplained(remains, reach), *_commanded(before, after)]
     scale = scale_of(nominal, blocks, torques)
     if scale is not None and before * np.sqrt(1.0 - scale.explained) < NO_ARM * reach:
         found += _scale(scale)
-    return sorted(found, key=lambda one: -LEVELS.index(one.level))
+    return found
 
 
 def _unexplained(remains: float, reach: float) -> Iterator[Finding]:

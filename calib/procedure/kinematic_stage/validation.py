@@ -21,6 +21,7 @@ from calib.geometry.installation import Installation
 from calib.geometry.observation import predict, prepare
 from calib.geometry.uncertainty.error_model import ErrorModel
 from calib.geometry.weighing import Settings
+from calib.procedure.findings import Verdict, held_by
 from calib.procedure.kinematic_stage.comparison import (
     Comparison,
     compare,
@@ -29,8 +30,7 @@ from calib.procedure.kinematic_stage.comparison import (
 )
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import Findings
-from calib.procedure.kinematic_stage.plausibility import held_by
-from calib.procedure.kinematic_stage.verdict import OWN_FRAMES, Verdict, judge
+from calib.procedure.kinematic_stage.verdict import OWN_FRAMES, judge
 from calib.robot.chain import Chain
 from calib.transforms import invert
 
@@ -117,12 +117,12 @@ def assess(
         outlier_share=findings.outlier_share, unexplained=findings.unexplained, tolerance=tolerance,
         nominal_cross_validated=findings.nominal_cross_validated, reach=findings.reach, blind=findings.blind,
     )  # fmt: skip
-    verdict = held_by(verdict, findings.odd, ())
+    verdict = held_by(verdict, findings.odd)
     clause, loud = urdf_alone(fitted, validation)
     verdict = verdict if not clause else replace(verdict, reason=f"{verdict.reason}; {clause}")
     blocks = (*inputs.fit, *(unseen.block for unseen in inputs.unseen.values()))
     warnings = (
-        *loud, *(one.words for one in findings.odd),
+        *loud, *(one.told for one in findings.odd),
         *inputs.notes, *(note for block in blocks for note in block.notes), *elsewhere(fitted, validation),
         *findings.notes, *_doubtful(validation), *_unsettled(validation), *interval_notes(validation),
     )  # fmt: skip

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib.procedure.findings import Verdict
 from calib.procedure.kinematic_stage.comparison import Comparison
 from calib.procedure.kinematic_stage.remarks import FLOOR
 
@@ -18,14 +19,6 @@ OUTLIERS = 0.05  # more rows than this share that do not fit: something is wrong
 TURNED = 5.0  # rms of the calibrated arm's orientations [deg] that no calibrated arm has
 ELSEWHERE = 0.10  # of the reach: errors of both arms that say where the instrument stood, and nothing of the arms
 OWN_FRAMES = 'refit their frames (--refit-frames; in a session: validation_frames = "own" in session.toml)'
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """``pass``, ``marginal`` or ``fail``, and why, in one sentence."""
-
-    level: str
-    reason: str
 
 
 @dataclass(frozen=True)

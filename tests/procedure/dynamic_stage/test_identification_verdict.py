@@ -12,7 +12,7 @@ from calib.data.signals.persistency import report_excitation
 from calib.identification.scores import PredictionErrors, Score
 from calib.procedure.dynamic_stage import verdict
 from calib.procedure.dynamic_stage.verdict import Resting, judge, with_prior
-from calib.procedure.kinematic_stage.verdict import Verdict
+from calib.procedure.findings import Verdict
 
 TORQUE = np.array([10.0, 100.0, 0.5])  # rms of each joint: the third does not matter
 

@@ -1,0 +1,115 @@
+"""Torques beside those of the whole robot: does its clock run right, and are its joints in order?
+
+A clock that runs s times too slow makes accelerations s² times too small, so that inertias come out s² times too large
+while masses, which gravity tells, stay as they are. How large inertias are beside masses, lengths alone say nearly: for
+rods between the joints their ratio is known up to 15 % on every recording at hand that tells it (Panda, LWR4+, TX40,
+14 of a UR10e), whatever the masses and the unit of the torques are. All thresholds are our choice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from calib.dynamics.bodies import bodies_of, standard_parameters
+from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.rigid_body import inverse_dynamics
+from calib.estimation.whiteness import inflation
+from calib.identification.checks.samples import Samples, basis, drive_columns, left_share
+from calib.identification.rods import rods
+from calib.robot.chain import Chain
+
+ROUNDS = 3  # of weighing joints by what is left of them
+SURE = 5.0  # sigmas from which on a factor is told
+ALIKE = 0.3  # least rms speed of exchanged joints, of the fastest one's: one that hardly moves may have any column
+KNOWN = 0.5  # largest share of their torques' variance that is left as recorded
+
+
+@dataclass(frozen=True)
+class ClockRatio:
+    """Inertias over masses, both beside those of rods between the joints, and the ratio's relative sigma."""
+
+    ratio: float
+    relative_sigma: float
+
+    @property
+    def clock(self) -> float:
+        """By how many times the stamps are too large."""
+        return float(np.sqrt(self.ratio))
+
+
+@dataclass(frozen=True)
+class Exchange:
+    """Two joints, from 0, with which exchanged the robot's own masses explain more, and the factor on what is left."""
+
+    joints: tuple[int, int]
+    factor: float
+
+
+def clock_ratio(samples: Samples, chain: Chain) -> ClockRatio | None:
+    """Return how large inertias are beside masses; None where the motion does not tell both factors.
+
+    Torques are τ = α τ_rods + free: α of the rods' torques of motion beside any torque of gravity, then α of their
+    gravity beside any torque of motion; drives free in both.
+    """
+    whole = np.asarray(rods(chain, IdentificationModel(bodies_of(chain), ()))).ravel()
+    still, moving = samples.at_rest, samples.inertial - samples.at_rest
+    inertia, own = _factor(samples.torque, moving @ whole, np.concatenate([still, samples.drives], axis=2))
+    mass, other = _factor(samples.torque, still @ whole, np.concatenate([moving, samples.drives], axis=2))
+    if inertia < SURE * own or mass < SURE * other:
+        return None
+    return ClockRatio(inertia / mass, float(np.hypot(own / inertia, other / mass)))
+
+
+def _factor(torque: np.ndarray, common: np.ndarray, free: np.ndarray) -> tuple[float, float]:
+    """Return α of τ = α common + free x and its sigma, joints weighed by what is left of them."""
+    m, n = torque.shape
+    weight, left, own = np.ones(n), torque, common
+    alpha = power = 0.0
+    for _ in range(ROUNDS):
+        scale = np.repeat(weight, m)
+        rows = free.transpose(1, 0, 2).reshape(m * n, -1) * scale[:, None]
+        spanned = basis(rows)
+        seen, part = (x - spanned @ (spanned.T @ x) for x in (torque.T.ravel() * scale, common.T.ravel() * scale))
+        power = float(part @ part)
+        if not power > 0.0:
+            return 0.0, np.inf
+        alpha = float(part @ seen) / power
+        left, own = ((x / scale).reshape(n, m) for x in (seen - alpha * part, part))
+        weight = 1.0 / np.maximum(left.std(axis=1), 1e-9 * max(float(torque.std()), 1e-300))
+    spread = [inflation(each) for each in left]
+    return alpha, float(np.sqrt(np.sum(weight[:, None] ** 2 * own**2 * np.array(spread)[:, None]))) / power
+
+
+def exchanged(samples: Samples, chain: Chain) -> Exchange | None:
+    """Return the two joints whose exchange lets the robot's own masses explain most more; None without such.
+
+    Each joint's torque is that of gravity and that of motion, by the robot's masses, each times a factor, and a drive.
+    """
+    masses = standard_parameters(chain)
+    before = np.array(list(_left(samples, masses, (0, 0))))
+    speed = samples.v.std(axis=0)
+    moves = (speed > ALIKE * speed.max()) & (before < KNOWN)
+    found = None
+    for pair in combinations(np.flatnonzero(moves).tolist(), 2):
+        after = np.array(list(_left(samples, masses, pair)))
+        factor = float(np.exp(0.5 * np.mean(np.log(np.maximum(after, 1e-9) / np.maximum(before, 1e-9)))))
+        if found is None or factor < found.factor:
+            found = Exchange(pair, factor)
+    return found
+
+
+def _left(samples: Samples, masses: np.ndarray, pair: tuple[int, int]) -> Iterator[float]:
+    """Yield what is left of each recorded joint's torque where the columns of two joints are exchanged."""
+    order = np.arange(samples.q.shape[1])
+    order[list(pair)] = order[list(pair)[::-1]]
+    q, v, a = (np.ascontiguousarray(x[:, order]) for x in (samples.q, samples.v, samples.a))
+    still = inverse_dynamics(samples.bodies, masses, q, np.zeros_like(v), np.zeros_like(a))
+    moving = inverse_dynamics(samples.bodies, masses, q, v, a) - still
+    drives, torque = drive_columns(v, a), samples.torque
+    for joint, recorded in sorted(enumerate(order), key=lambda one: one[1]):
+        columns = np.column_stack([still[:, joint], moving[:, joint], drives[:, joint]])
+        yield float(left_share(basis(columns), torque[None, :, recorded])[0])
