@@ -205,5 +205,5 @@ def _plain(array: np.ndarray) -> np.ndarray:
 
 def _placed(bodies: Bodies, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return each body's own motion and its cosine and sine, (N, B): numpy's are vectorised, the kernels' are not."""
-    amount = q[:, bodies.coordinates] * bodies.scales
+    amount = q.take(bodies.coordinates, axis=1) * bodies.scales  # q[:, …] is laid out by columns
     return amount, np.cos(amount), np.sin(amount)

@@ -75,10 +75,10 @@ def _links(leg: Leg, q: np.ndarray, pose: np.ndarray) -> LegLinks:
     shapes = ((6, n), (n, leg.held), (leg.held, 6), (leg.held,), (3,))
     full, inverse, carried, gap, lever = (np.zeros((count, *shape)) for shape in shapes)
     bodies, tail = compiled(leg)
+    q, pose = (np.require(x, requirements=["C", "W"]) for x in (q, pose))  # numba compiles per kind of array
     closure_kernels.legs(
-        bodies.links, bodies.constants, tail, leg.attachment, np.ascontiguousarray(q), np.ascontiguousarray(pose), full,
-        inverse, carried, gap, lever,
-    )  # fmt: skip
+        bodies.links, bodies.constants, tail, leg.attachment, q, pose, full, inverse, carried, gap, lever
+    )
     return LegLinks(full, full[:, : leg.held], inverse, carried, gap, lever)
 
 
