@@ -27,6 +27,7 @@ RETRIES = 4
 SPARE = 1.5  # measured numbers per unknown at least (our choice)
 WIDTHS = 3  # updates of a drawn fit's widths
 NARROWEST = 1e-6  # [m, rad]
+IMAGE_PASSES = 20  # at most, until the noise of images settles (our choice)
 CRAWLS = 60  # linearisations after which a placement that has not settled does not tell itself (our choice)
 HARDLY = 1e-3  # relative size of a column of a placement that a block hardly tells (our choice)
 
@@ -185,7 +186,7 @@ def fit_with_prior(
     weigher = Weigher(settings, nominal or cell, blocks, free, prior)
     state, solution = cell, None
     weigher.update(state, first=True)
-    for _ in range(settings.passes):
+    for _ in range(IMAGE_PASSES if any(weigher.noises) and settings.passes > 1 else settings.passes):
         solution = solve(
             weigher.linearise, lambda s, dx: step(s, free, dx), state,
             damping=settings.damping, limit=settings.limit,

@@ -18,6 +18,7 @@ from calib.geometry.pixel_residuals import PixelPart
 from calib.geometry.residuals import Part
 from calib.geometry.result import GeometricFit, Piece
 
+START_IMAGE = 1e-4  # displacement [m] and turn [rad] of an image that a fit begins with (our choice)
 START_SIGMA = dict.fromkeys(("position", "orientation", "consistency", "distance", "plane"), 1e-3) | {"pixel": 0.3}
 
 
@@ -33,7 +34,8 @@ class Settings:
         damping: first λ of Levenberg–Marquardt; 0 for the iterative linear least squares of eq. 11.
         tolerance: relative size of a column that counts as dependent.
         limit: linearisations at most, per pass.
-        passes: how often sigmas that are not stated (and robust weights) are estimated anew.
+        passes: how often sigmas that are not stated (and robust weights) are estimated anew; where there are images,
+            whose noise shrinks by little with each, until they settle.
     """
 
     loss: str = "none"
@@ -104,6 +106,8 @@ class Weigher:
             if isinstance(part, PixelPart):
                 unknowns = len(self.free) // len(found)
                 noise = estimate_noise(part.own_poses(self.sigmas[k]), unknowns, loss, self.settings.loss_scale)
+                if first and not robustly:
+                    noise = replace(noise, displacement=START_IMAGE, turn=START_IMAGE)
                 self.noises[k] = part.spread_over(noise)
                 self.shared[k] = replace(part, noise=self.noises[k]).shared_errors()
                 self.sigmas[k] = noise.factor * self.sigmas[k]

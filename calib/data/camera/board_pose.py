@@ -17,6 +17,7 @@ from calib.data.camera.lens import Lens, project_with_slopes, rays
 from calib.transforms import orthonormal, pose
 
 STEPS = 12  # of Gauss–Newton
+SETTLED = 1e-9  # relative change of the cost after which no image needs another
 FEWEST = 6
 
 
@@ -44,7 +45,8 @@ def board_poses(lens: Lens, board: Board, pixel: np.ndarray) -> BoardPoses:
         pixel: (m, K, 2) corners [px], NaN where not seen.
     """
     table = corners(board)
-    start = np.array([_from_homography(lens, table, each) for each in pixel])
+    sight = rays(lens, pixel.reshape(-1, 2)).reshape(pixel.shape)
+    start = np.array([_from_homography(table, each) for each in sight])
     one, two = (_refine(lens, table, pixel, guess) for guess in (start, _tilted_back(start, table)))
     worse = (two.rms < one.rms)[:, None, None]
     return BoardPoses(
@@ -53,10 +55,9 @@ def board_poses(lens: Lens, board: Board, pixel: np.ndarray) -> BoardPoses:
     )  # fmt: skip
 
 
-def _from_homography(lens: Lens, table: np.ndarray, pixel: np.ndarray) -> np.ndarray:
-    seen = np.flatnonzero(~np.isnan(pixel[:, 0]))
-    ray = rays(lens, pixel[seen])
-    seen, ray = seen[~np.isnan(ray[:, 0])], ray[~np.isnan(ray[:, 0])]
+def _from_homography(table: np.ndarray, sight: np.ndarray) -> np.ndarray:
+    seen = np.flatnonzero(~np.isnan(sight[:, 0]))
+    ray = sight[seen]
     if len(seen) < FEWEST:
         return pose(None, [0.0, 0.0, 1.0])
     middle, size = table[seen, :2].mean(axis=0), table[seen, :2].std() + 1e-9
@@ -64,7 +65,7 @@ def _from_homography(lens: Lens, table: np.ndarray, pixel: np.ndarray) -> np.nda
     rows = np.zeros((2 * len(seen), 9))
     rows[0::2, :3] = rows[1::2, 3:6] = flat
     rows[:, 6:] = -ray.reshape(-1, 1) * np.repeat(flat, 2, axis=0)
-    plane = np.linalg.svd(rows)[2][-1].reshape(3, 3) @ np.diag([1 / size, 1 / size, 1.0])
+    plane = np.linalg.svd(rows, full_matrices=False)[2][-1].reshape(3, 3) @ np.diag([1 / size, 1 / size, 1.0])
     plane[:, 2] -= plane[:, :2] @ middle
     plane = plane / np.sqrt(np.linalg.norm(plane[:, 0]) * np.linalg.norm(plane[:, 1]))
     plane = plane * np.sign((plane @ [*middle, 1.0])[2])
@@ -99,10 +100,13 @@ def _refine(lens: Lens, table: np.ndarray, pixel: np.ndarray, poses: np.ndarray)
         trial[:, 2, 3] = np.maximum(trial[:, 2, 3], 0.01)
         found = _normal(lens, table, pixel, seen, trial)
         better = found[0] < cost
+        settled = np.all(cost - found[0] <= SETTLED * cost)
         poses = np.where(better[:, None, None], trial, poses)
         cost, gradient = np.where(better, found[0], cost), np.where(better[:, None], found[1], gradient)
         information = np.where(better[:, None, None], found[2], information)
         damping = np.clip(np.where(better, damping / 10.0, damping * 30.0), 1e-9, 1e6)
+        if settled and better.any():
+            break
     count = seen.sum(axis=1)
     rms = np.sqrt(cost / np.maximum(2.0 * count - 6.0, 1.0))
     return BoardPoses(poses, np.where(count >= FEWEST, rms, np.nan), information)

@@ -1,20 +1,30 @@
-"""A lens from images of a board alone (Zhang 2000; OpenCV's calibrateCamera), and whether they tell it."""
+"""A lens from images of a board alone, and whether they tell it.
+
+Zhang's (2000) problem, min over lens and one pose per image of the reprojection error, by variable projection (Golub &
+Pereyra 1973; Kaufman 1975): for a lens every image has its own best pose, and what a QR of its rows leaves beyond those
+six columns is a least-squares problem in the lens alone. The focal length starts at the best of a few.
+"""
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
 
-import cv2
 import numpy as np
 
 from calib.data.camera.board import Board, corners
 from calib.data.camera.board_pose import board_poses
 from calib.data.camera.lens import Lens, project_with_slopes
-from calib.errors import MeasurementError
+from calib.errors import CalibError, MeasurementError
 
 MOST = 30  # images that a first lens is found from (our choice)
 FEWEST = 4
+STARTS = (0.25, 0.35, 0.5, 0.7, 1.0, 1.5, 2.2, 3.2)  # focal lengths tried first, in widths of the image (our choice)
+TRIED = 8  # images that they are tried on (our choice)
+FITTED = 8  # of a lens's values: focal lengths, principal point, four of distortion
+STEPS = 60
+BENT = 0.5  # reprojection error from which on the other model is tried [px], and share of it that makes it the better
+WRONG = 50.0  # reprojection error of no lens [px]
 LOOSE = 0.01  # relative sigma of the focal length above which images do not tell it (our choice)
 
 
@@ -48,9 +58,7 @@ def estimate_lens(
     Raises:
         MeasurementError: too few images, or all from one direction, so that the focal length cannot be told.
     """
-    table = corners(board)
-    seen = ~np.isnan(pixel[:, :, 0])
-    good = np.flatnonzero(seen.sum(axis=1) >= 8)
+    good = np.flatnonzero((~np.isnan(pixel[:, :, 0])).sum(axis=1) >= 8)
     if len(good) < FEWEST:
         raise MeasurementError(
             f"{len(good)} images with a board: a lens takes {FEWEST} at least, tilted differently, and a good one 15; "
@@ -58,17 +66,21 @@ def estimate_lens(
             file,
         )
     good = good[np.unique(np.linspace(0, len(good) - 1, MOST).astype(int))]
-    objects = [table[seen[k]].astype(np.float32) for k in good]
-    images = [pixel[k][seen[k]].astype(np.float32) for k in good]
-    try:
-        lens, rms = (_fisheye if model == "fisheye" else _pinhole)(objects, images, size)
-    except cv2.error as error:
+    own = pixel[good]
+    found, rms, matrix = _fitted(board, own, size, model)
+    if rms > BENT and model == "pinhole" and (other := _fitted(board, own, size, "fisheye")[1]) < BENT * rms:
         raise MeasurementError(
-            f"no lens explains these images ({str(error).splitlines()[0][:120]}): were they all taken with one camera, "
-            "at one focus, of this board?",
+            f"a fisheye lens explains these images to {other:.2f} px, a pinhole's to {rms:.2f} px only: state "
+            "[camera] model = 'fisheye' in the options, or give the lens (camera.yaml)",
             file,
-        ) from error
-    loose = _focal_sigma(lens, board, pixel[good], rms)
+        )
+    if not rms < WRONG:
+        raise MeasurementError(
+            f"no {model} lens explains these images: {rms:.1f} px remain with the best one. Were they all taken with "
+            "one camera, at one focus, of this board?",
+            file,
+        )
+    loose = _focal_sigma(found, matrix, rms)
     if not loose < LOOSE:
         told = f"to ±{100 * loose:.2g} % only" if loose < 0.5 else "not at all"
         raise MeasurementError(
@@ -77,44 +89,57 @@ def estimate_lens(
             "(camera.yaml)",
             file,
         )
-    return LensGuess(lens, rms, loose)
+    return LensGuess(found, rms, loose)
 
 
-def _pinhole(objects: list[np.ndarray], images: list[np.ndarray], size: tuple[int, int]) -> tuple[Lens, float]:
-    focal = 1.2 * max(size)
-    guess = np.array([[focal, 0, 0.5 * (size[0] - 1)], [0, focal, 0.5 * (size[1] - 1)], [0, 0, 1.0]])
-    flags = cv2.CALIB_FIX_K3
-    guessed = cv2.initCameraMatrix2D(objects, images, size, 1.0)
-    if not np.isfinite(guessed).all() or not 0.2 * max(size) < guessed[0, 0] < 20 * max(size):
-        guessed = guess
-    rms, matrix, bend, _, _ = cv2.calibrateCamera(objects, images, size, guessed, np.zeros(5), flags=flags)
-    values = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *bend.ravel()[:4], 0.0])
-    return Lens("pinhole", values, size), float(rms) / np.sqrt(2.0)
+def _fitted(board: Board, pixel: np.ndarray, size: tuple[int, int], model: str) -> tuple[Lens, float, np.ndarray]:
+    """Return the best lens, its reprojection error per coordinate [px], and ∂residual/∂values beside free poses."""
+    middle, zero = 0.5 * (np.array(size) - 1.0), np.zeros({"pinhole": 5, "fisheye": 4}[model])
+    starts = [Lens(model, np.array([f * max(size), f * max(size), *middle, *zero]), size) for f in STARTS]
+    lens = min(
+        starts, key=lambda each: float(np.nanmean(np.minimum(board_poses(each, board, pixel[:TRIED]).rms, WRONG)))
+    )
+    rows, damping = _beside_poses(lens, board, pixel), 1e-3
+    cost = _squares(rows)
+    for _ in range(STEPS):
+        matrix, residual = rows[:, :FITTED], rows[:, FITTED]
+        length = np.linalg.norm(matrix, axis=0) + 1e-300
+        padded = np.concatenate([matrix / length, np.sqrt(damping) * np.eye(FITTED)])
+        step = np.linalg.lstsq(padded, np.append(residual, np.zeros(FITTED)), rcond=None)[0] / length
+        trial = rows
+        with suppress(CalibError):  # a focal length below zero
+            moved = lens.with_values(lens.values + np.append(step, np.zeros(len(lens.values) - FITTED)))
+            trial = _beside_poses(moved, board, pixel)
+        after = _squares(trial)
+        if after < cost:
+            settled = cost - after < 1e-6 * cost
+            lens, rows, cost, damping = moved, trial, after, damping / 10.0
+            if settled:
+                break
+        elif (damping := 10.0 * damping) > 1e6:
+            break
+    return lens, float(np.sqrt(cost / (~np.isnan(pixel)).sum())), rows[:, :FITTED]
 
 
-def _fisheye(objects: list[np.ndarray], images: list[np.ndarray], size: tuple[int, int]) -> tuple[Lens, float]:
-    places: Any = cv2 if hasattr(cv2, "CALIB_RECOMPUTE_EXTRINSIC") else cv2.fisheye  # version 5, and before
-    flags = places.CALIB_RECOMPUTE_EXTRINSIC | places.CALIB_FIX_SKEW
-    shaped = [each.reshape(1, -1, 3).astype(np.float64) for each in objects]
-    seen = [each.reshape(1, -1, 2).astype(np.float64) for each in images]
-    rms, matrix, bend, _, _ = cv2.fisheye.calibrate(shaped, seen, size, np.eye(3), np.zeros(4), flags=flags)
-    values = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *bend.ravel()])
-    return Lens("fisheye", values, size), float(rms) / np.sqrt(2.0)
+def _squares(rows: np.ndarray) -> float:
+    """Return the sum of the squared residuals, the last column; infinite for a lens that projects nowhere."""
+    return float(np.nan_to_num(rows[:, FITTED] @ rows[:, FITTED], nan=np.inf))
 
 
-def _focal_sigma(lens: Lens, board: Board, pixel: np.ndarray, rms: float) -> float:
-    """Return the larger relative sigma of the focal lengths, every image's pose being unknown; infinite for none.
+def _beside_poses(lens: Lens, board: Board, pixel: np.ndarray) -> np.ndarray:
+    """Return [∂residual/∂values, residual] of all images, what each one's own six numbers of a pose take left out."""
+    table, rows = corners(board), []
+    for where, own in zip(board_poses(lens, board, pixel).poses, pixel):
+        seen = ~np.isnan(own[:, 0])
+        turned = table[seen] @ where[:3, :3].T
+        flat, by_point, by_lens = project_with_slopes(lens, turned + where[:3, 3])
+        parts = [by_point, np.cross(turned[:, None], by_point), by_lens[:, :, :FITTED], (own[seen] - flat)[:, :, None]]
+        rows.append(np.asarray(np.linalg.qr(np.concatenate(parts, axis=2).reshape(-1, 7 + FITTED), mode="r"))[6:, 6:])
+    return np.concatenate(rows)
 
-    OpenCV's own is a pseudo-inverse's, and tiny where nothing is told.
-    """
-    table, seen, rows = corners(board), ~np.isnan(pixel[:, :, 0]), []
-    places, fitted = board_poses(lens, board, pixel).poses, np.array([0, 1, 2, 3, 4, 5, 6, 7])
-    for where, own in zip(places, seen):
-        turned = table[own] @ where[:3, :3].T
-        _, by_point, by_lens = project_with_slopes(lens, turned + where[:3, 3])
-        slope = np.concatenate([by_point, np.cross(turned[:, None], by_point), by_lens[:, :, fitted]], axis=2)
-        rows.append(np.asarray(np.linalg.qr(slope.reshape(-1, 14), mode="r"))[6:, 6:])
-    matrix = np.concatenate(rows)
+
+def _focal_sigma(lens: Lens, matrix: np.ndarray, rms: float) -> float:
+    """Return the larger relative sigma of the focal lengths, every image's pose being unknown; infinite for none."""
     size = np.linalg.norm(matrix, axis=0) + 1e-300
     _, values, axes = np.linalg.svd(matrix / size, full_matrices=False)
     if values[-1] < 1e-9 * values[0]:

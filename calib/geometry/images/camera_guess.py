@@ -12,20 +12,29 @@ from itertools import product
 
 import numpy as np
 
+from calib.data.camera.board import corners
 from calib.data.camera.board_pose import board_poses
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.camera.lens import project
+from calib.data.poses.image_folders import listed
+from calib.data.poses.measurements import PoseMeasurements, take
 from calib.data.poses.pixels import IN_HAND, TO_HAND, Pixels
 from calib.errors import MeasurementError
-from calib.geometry.images.hand_eye import Placement, place_robustly
+from calib.geometry.images.hand_eye import Placement, misfit, place_robustly
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
-from calib.transforms import invert
+from calib.transforms import invert, pose
 
+ROUNDS = 4  # of leaving corners out
+MEDIAN = 1.1774  # of the length of a vector of two standard normals
 FEWEST = 3  # images that place a camera at all
 ENOUGH = 100  # images that it is placed by (our choice, as the next ones)
 UNLIKE = 3.0  # a mounting is found where the other one's misfit is so many times as large
 PAIRED = 0.25  # of the misfit is left with the rows shifted: they were
 SQUARE = 0.04  # relative error of the board's scale that is refused
+ODD = 8.0  # robust deviations from which on a corner does not fit into its image, and is left out
+AT_ONCE = 500  # images whose corners are looked at together
+NAMED = 3
+FEW = 0.3  # share of images that may contradict the others, and are left out; more are refused
 LOST = 0.2  # median misfit over the distance to the board beyond which nothing is placed
 
 
@@ -54,9 +63,12 @@ def complete_camera(chain: Chain, block: Pixels, others: Sequence[PoseMeasuremen
         block: of images.
         others: blocks fitted already; the lens of one with images of this size is taken over.
 
+    Corners that do not fit into their own image, and images that contradict all others, are left out and named.
+
     Raises:
         MeasurementError: where images and joints do not belong together, or the board is not of the stated size.
     """
+    given = block
     for other in others:
         if block.lens is None and isinstance(other, Pixels) and other.size == block.size and other.lens is not None:
             block = replace(block, lens=other.lens, mounting=block.mounting or other.mounting, free=())
@@ -70,7 +82,76 @@ def complete_camera(chain: Chain, block: Pixels, others: Sequence[PoseMeasuremen
     arm = forward(chain, block.q)
     found = place_camera(block, arm)
     _check_square(block, arm[found.rows], found)
-    return replace(block, mounting=found.mounting)
+    block = replace(block, mounting=found.mounting)
+    poses = _own_poses(block, np.arange(len(block)))
+    strange, words = _strangers(block, arm, found.placed, poses)
+    if len(strange):  # and once more without them, the lens too
+        kept = take(replace(given, notes=(*given.notes, words)), np.setdiff1d(np.arange(len(block)), strange))
+        return complete_camera(chain, kept, others)
+    return _without_gross_corners(block, poses)
+
+
+def _own_poses(block: Pixels, rows: np.ndarray) -> np.ndarray:
+    """Return the board's poses (k, 4, 4) in the camera at some rows, by each image alone."""
+    assert block.lens is not None
+    own = np.array_split(rows, len(rows) // AT_ONCE + 1)
+    return np.concatenate([board_poses(block.lens, block.board, block.pixel[each]).poses for each in own])
+
+
+def _without_gross_corners(block: Pixels, poses: np.ndarray) -> Pixels:
+    """Return the block without corners that lie far off all others of their image, which its notes name.
+
+    A gross corner moves the pose that the others are judged by: the worst go first, and poses (m, 4, 4) are found anew.
+    """
+    lens, table, before = block.lens, corners(block.board), block.seen
+    assert lens is not None
+    off, stale = np.full(before.shape, np.nan), np.arange(len(block))
+    for _ in range(ROUNDS):
+        point = np.einsum("mij,kj->mki", poses[:, :3, :3], table) + poses[:, None, :3, 3]
+        flat = project(lens, point.reshape(-1, 3)).reshape(*point.shape[:2], 2)
+        off[stale] = np.linalg.norm(block.pixel[stale] - flat, axis=2)
+        gross = off > ODD * np.nanmedian(off) / MEDIAN
+        gross &= off >= 0.5 * np.nanmax(off, axis=1, keepdims=True, initial=0.0)
+        if not gross.any():
+            break
+        block = replace(block, pixel=np.where(gross[:, :, None], np.nan, block.pixel))
+        stale = np.flatnonzero(gross.any(axis=1))
+        poses = _own_poses(block, stale)
+    gone = np.argwhere(before & ~block.seen)
+    if not len(gone):
+        return block
+    named = listed([f"corner {k} of {block.name(int(block.rows[row]))}" for row, k in gone], NAMED)
+    words = f"{len(gone)} of {before.sum()} corners do not fit into their image and are left out: {named}"
+    return replace(block, notes=(*block.notes, words))
+
+
+def _strangers(block: Pixels, arm: np.ndarray, placed: Placement, poses: np.ndarray) -> tuple[np.ndarray, str]:
+    """Return the rows of images that show the board elsewhere than all others do, and what is to be said of them.
+
+    Raises:
+        MeasurementError: where they are many.
+    """
+    lever = float(np.median(np.linalg.norm(poses[:, :3, 3], axis=1)))
+
+    def far(board: np.ndarray) -> np.ndarray:
+        return misfit(arm, seen_target(block.mounting, board), placed.station, placed.tool, lever)
+
+    own = far(poses)
+    most = max(LOST * lever, ODD * float(np.median(own)))
+    strange = np.flatnonzero(own > most)
+    if not len(strange):
+        return strange, ""
+    turned = far(pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3)) @ poses)[strange] <= most
+    cause = (
+        "they would fit turned by 180°: were they turned by a program?"
+        if turned.mean() > 0.5
+        else "are their joint values those of other images, or was camera or board moved?"
+    )
+    words = f"show the board {1e3 * float(np.median(own[strange])):.0f} mm from where all others do: {cause}"
+    words += f" ({listed([block.name(int(block.rows[row])) for row in strange])})"
+    if len(strange) > FEW * len(block):
+        raise MeasurementError(f"{len(strange)} of {len(block)} images {words}", block.file)
+    return strange, f"{len(strange)} image{'s are' if len(strange) > 1 else ' is'} left out, they {words}"
 
 
 def seen_target(mounting: str, poses: np.ndarray) -> np.ndarray:

@@ -66,7 +66,7 @@ def place_robustly(arm: np.ndarray, seen: np.ndarray, lever: float) -> Placement
                 station, tool = method(arm[keep], seen[keep])
             except np.linalg.LinAlgError:
                 break
-            found = Placement(name, station, tool, _misfit(arm, seen, station, tool, lever))
+            found = Placement(name, station, tool, misfit(arm, seen, station, tool, lever))
             if best is None or found.error < best.error:
                 best = found
             keep = found.misfit <= np.quantile(found.misfit, KEPT)
@@ -77,7 +77,8 @@ def place_robustly(arm: np.ndarray, seen: np.ndarray, lever: float) -> Placement
     return best
 
 
-def _misfit(arm: np.ndarray, seen: np.ndarray, station: np.ndarray, tool: np.ndarray, lever: float) -> np.ndarray:
+def misfit(arm: np.ndarray, seen: np.ndarray, station: np.ndarray, tool: np.ndarray, lever: float) -> np.ndarray:
+    """Return the distances (m,) [m] of B_i from S A_i X at the target, a turn counting with its lever [m]."""
     predicted = station @ arm @ tool
     turn = Rotation.from_matrix(np.swapaxes(predicted[:, :3, :3], 1, 2) @ seen[:, :3, :3]).magnitude()
     return np.hypot(np.linalg.norm(predicted[:, :3, 3] - seen[:, :3, 3], axis=1), lever * turn)
@@ -135,7 +136,7 @@ def place_pose(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarra
         station (4, 4) and tool (4, 4).
     """
     placed = [_by_orientations(arm, seen), _by_ways(arm, seen)]
-    return min(placed, key=lambda each: float(np.median(_misfit(arm, seen, *each, LEVER))))
+    return min(placed, key=lambda each: float(np.median(misfit(arm, seen, *each, LEVER))))
 
 
 def _by_orientations(arm: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -20,6 +20,7 @@ from calib.estimation import robust
 
 CLIP = 25.0  # squared residuals beyond so many times their median are taken for it (our choice)
 STEPS = 20
+ALIKE, LEAST = 0.05, 2e-6  # change of a noise that repeats no fit, as a share, and of its [m, rad] (our choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +50,7 @@ class ImageNoise:
     def near(self, other: ImageNoise) -> bool:
         """Say whether two estimates are alike, so that the fit need not be repeated."""
         pairs = ((self.factor, other.factor), (self.displacement, other.displacement), (self.turn, other.turn))
-        alike = all(abs(a - b) <= 0.05 * max(a, b, 1e-9) for a, b in pairs)
+        alike = all(abs(a - b) <= ALIKE * max(a, b) + LEAST for a, b in pairs)
         return alike and np.abs(self.weight - other.weight).max(initial=0.0) < 0.05
 
 

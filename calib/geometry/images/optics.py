@@ -80,10 +80,12 @@ class Optics:
         return sum(len(lens.values) for lens in self.lenses) + len(SHAPE) * len(self.boards)
 
     def with_values(self, values: np.ndarray) -> Optics:
-        """Return the same with other values."""
+        """Return the same with other values; a focal length changes by half at most, however wild the step."""
         lenses, start = [], 0
         for lens in self.lenses:
-            lenses.append(lens.with_values(values[start : start + len(lens.values)]))
+            own = np.array(values[start : start + len(lens.values)])
+            own[:2] = np.clip(own[:2], 0.5 * lens.values[:2], 1.5 * lens.values[:2])
+            lenses.append(lens.with_values(own))
             start += len(lens.values)
         shapes = np.asarray(values[start:]).reshape(-1, len(SHAPE))
         return replace(self, lenses=tuple(lenses), boards=tuple(BoardShape(*map(float, row)) for row in shapes))
