@@ -90,7 +90,7 @@ def fit(
 def select(
     robot: Robot,
     out: Annotated[Path, typer.Option(help="CSV file of the chosen joint values, rad")],
-    m: Annotated[int, typer.Option("-m", help="how many poses")] = 30,
+    m: Annotated[int, typer.Option("-m", "--poses", help="how many poses")] = 30,
     kind: Annotated[str, typer.Option(help="what will be measured: pose or position")] = "pose",
     tool: Annotated[
         list[str] | None, typer.Option(help="x,y,z of a target in the tip's frame [m]; may be repeated")
