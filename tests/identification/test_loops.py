@@ -176,7 +176,7 @@ REFUSED = [
     ({"form": ""}, GAINS, "holds no reference"),
     ({"factor": 180.0 / np.pi}, GAINS, "looks like deg"),
     ({"factor": 3.0}, GAINS, "is this the reference of this recording"),
-    ({}, GAINS.replace("1000", "1100"), "no whole multiple"),
+    ({}, GAINS.replace("rate = 1000", "rate = 100"), "is below 250 Hz"),
     ({}, 'controller = "pd"\nkp = [1, 2]\nkd = [1]\n', "2 values for 3 joints"),
     ({}, 'controller = "pd"\nkp = [1]\n', "needs kp and kd"),
     ({}, 'controller = "pid"\n', "one of pd, cascade, identify"),

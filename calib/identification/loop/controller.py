@@ -72,20 +72,24 @@ def identify_controller(
 
 
 def _error(reference: Reference, measured: np.ndarray, rate: float) -> np.ndarray:
-    every = round(1.0 / (rate * reference.period))
-    aim = reference.q[::every] if every >= 1 else reference.q
-    if every < 1 or abs(every * rate * reference.period - 1.0) > 1e-3 or len(aim) < len(measured):
+    tick = _ticks(reference, rate, len(measured))
+    if rate * reference.period > 1.0 + 1e-3 or tick[-1] > len(reference.t) - 1:
         raise MeasurementError(
             f"a log of {len(measured)} samples at {rate:g} Hz does not fit a reference of {len(reference.t)} instants "
             f"at {1 / reference.period:g} Hz"
         )
-    return aim[: len(measured)] - shaped(measured, (None, reference.q.shape[1]), "measured positions")
+    return reference.at(tick)[0] - shaped(measured, (None, reference.q.shape[1]), "measured positions")
+
+
+def _ticks(reference: Reference, rate: float, count: int) -> np.ndarray:
+    """Return the control periods (count,) of a log's samples, whole where they are to a thousandth."""
+    every = 1.0 / (rate * reference.period)
+    return np.arange(count) * (round(every) if abs(every / max(round(every), 1) - 1.0) < 1e-3 else every)
 
 
 def _instruments(reference: Reference, count: int, rate: float, band: float) -> np.ndarray:
     """Return functions of the reference that errors depend on (count, k): friction, inertia, gravity, low-passed."""
-    every = round(1.0 / (rate * reference.period))
-    q, v, a = (x[::every][:count] for x in (reference.q, reference.v, reference.a))
+    q, v, a = reference.at(_ticks(reference, rate, count))
     jerk = np.gradient(a, 1.0 / rate, axis=0)
     slow = np.tanh(v / (0.01 * np.abs(v).max(axis=0, initial=1e-9)))
     parts = [v, a, jerk, slow, np.gradient(slow, 1.0 / rate, axis=0), np.sin(q), np.cos(q)]

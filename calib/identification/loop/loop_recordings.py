@@ -31,7 +31,7 @@ from calib.simulation.loop.tracking import feed_forward
 LEAST_RATE = 1000.0  # of a controller whose rate is not stated [Hz] (our choice)
 SETTLE = 0.2  # [s] our choice
 SMOOTH = 4.0  # times f_q: low-pass of the logged reference, against the rounding of its digits (our choice)
-WHOLE = 0.01  # periods by which a control rate may miss a multiple of the log's
+WHOLE = 0.001  # of a control rate that is near a multiple of the log's, by which it is that: clocks are not exact
 FAR = 0.3  # of a joint's motion: a reference that is further off is another one (our choice)
 DEGREES = 180.0 / np.pi
 
@@ -44,14 +44,14 @@ class Loop:
         controller: given, identified from the log (`calib.identification.loop.controller`) or guessed: a third of the
             bandwidth still serves.
         reference: at the controller's rate, in the recording's time, and spanning it.
-        every: control periods per recorded sample.
+        every: control periods per recorded sample, whole or not.
         design: (n,) inertia for which the gains are what they say [kg m²]; the simulated robot then gets gains times
             J(x_k) / design, so that its bandwidth stays (Gautier & Janot). None: gains as they are.
     """
 
     controller: Controller
     reference: Reference
-    every: int = 1
+    every: float = 1
     design: np.ndarray | None = None
 
 
@@ -156,39 +156,38 @@ def _compare(motion: Motion, joint: int) -> None:
     )
 
 
-def _make_reference(motion: Motion, rate: float | None = None) -> tuple[Reference, int]:
+def _make_reference(motion: Motion, rate: float | None = None) -> tuple[Reference, float]:
     """Return the reference of a motion without gaps at the control rate, and control periods per sample.
 
     The logged positions are low-passed at `SMOOTH` f_q and joined by a cubic spline, whose slopes are v and a.
 
     Raises:
-        UsageError: where the control rate is no whole multiple of the motion's.
+        UsageError: where the control rate is below the motion's.
     """
     every = periods_per_sample(motion, rate)
     cutoff = min(SMOOTH * float(motion.cutoff.max()), USABLE * motion.rate / 2)
     smooth = low_pass(np.asarray(motion.q_ref), motion.rate, cutoff)
     spline = CubicSpline(np.arange(len(smooth)), smooth)
-    place = np.arange((len(smooth) - 1) * every + 1) / every
+    place = np.arange(int((len(smooth) - 1) * every + 1e-9) + 1) / every
     v, a = (spline(place, order) * motion.rate**order for order in (1, 2))
     return Reference(motion.t[0] + place / motion.rate, spline(place), v, a), every
 
 
-def periods_per_sample(motion: Motion, rate: float | None = None) -> int:
-    """Return how many control periods a sample lasts; without a rate, as few as make `LEAST_RATE`.
+def periods_per_sample(motion: Motion, rate: float | None = None) -> float:
+    """Return how many control periods a sample lasts, whole or not; without a rate, as few as make `LEAST_RATE`.
 
     Raises:
-        UsageError: where the control rate is no whole multiple of the motion's.
+        UsageError: where the control rate is below the motion's.
     """
     if rate is None:
         return max(1, int(np.ceil(LEAST_RATE / motion.rate - 1e-6)))
     every = round(rate / motion.rate)
-    if every < 1 or abs(rate / motion.rate - every) > WHOLE * every:
-        least = max(1, int(rate / motion.rate))
+    if rate < (1.0 - WHOLE) * motion.rate:
         raise UsageError(
-            f"[loop] rate: {rate:g} Hz is no whole multiple of {motion.rate:.6g} Hz, the rate of {motion.file}; "
-            f"near it are {least * motion.rate:.6g} and {(least + 1) * motion.rate:.6g} Hz"
+            f"[loop] rate: {rate:g} Hz is below {motion.rate:.6g} Hz, the rate of {motion.file}: a controller that is "
+            "slower than its log? Is it in Hz?"
         )
-    return every
+    return every if abs(rate / motion.rate - every) <= WHOLE * every else rate / motion.rate
 
 
 def _inside(motion: Motion) -> slice:
@@ -225,7 +224,7 @@ def _controller(
 
 def _fed_forward(
     controller: Controller, loop: LoopSettings, cad: np.ndarray | None, bodies: Bodies, motion: Motion,
-    reference: Reference, every: int,
+    reference: Reference, every: float,
 ) -> Controller:  # fmt: skip
     """Return the controller with the torques it adds along the reference."""
     if loop.feedforward == "none":

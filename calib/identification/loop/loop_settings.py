@@ -11,8 +11,8 @@ whether least squares is biased. Gains are what the joints feel, torque per posi
     velocity = [90.0, 28.0]
     reset = 0.05
     share = 1.0                      # of the reference's velocity that the velocity loop sees
-    rate = 5000.0                    # of the controller [Hz], a whole multiple of the log's; default: the log's, or the
-                                     # least multiple of it that is 1 kHz or more
+    rate = 5000.0                    # of the controller [Hz], whole multiple of the log's or not; default: the log's,
+                                     # or the least multiple of it that is 1 kHz or more
     delay = 1                        # control periods from measurement to torque
     limit = [130.0, 60.0]            # saturation [N m]
     windup = 0.1                     # largest integral of the error [rad s]

@@ -38,7 +38,7 @@ from calib.identification.loop.loop_recordings import periods_per_sample, take
 from calib.identification.prediction import Dynamics
 from calib.identification.rows import segments
 from calib.robot.chain import Chain
-from calib.simulation.loop.closed_loop import SIMULATED, Plant, inertia_diagonal
+from calib.simulation.loop.closed_loop import Plant, inertia_diagonal
 from calib.simulation.loop.controllers import Controller, pd
 from calib.simulation.loop.references import Reference
 from calib.simulation.loop.tracking import feed_forward, replayed_error
@@ -47,6 +47,7 @@ FREQUENCY, DAMPING = 5.0, 0.7  # [Hz] and 1, of a controller that is not stated
 LONGEST = 20.0  # [s] of a recording that are replayed
 MARGIN = 0.05  # least eigenvalue of a possible robot's inertia, scaled by its diagonal
 SOFT = 0.25  # least smoothing of a sign, in Fc h / inertia: Runge and Kutta's bound in 64 steps at `MARGIN` is 0.11
+REPLAYED = ("acceleration", "velocity", "one", "sign", "speed", "cubic", "stribeck")  # the rest is in the disturbance
 LEAST = 1e-3  # [kg m² or kg] least inertia of a joint
 FEEDBACK, CAD, IDENTIFIED, FLOOR = (
     "feedback alone",
@@ -138,19 +139,19 @@ def _robot(dynamics: Dynamics, case: Case) -> tuple[Plant, tuple[str, ...]]:
     """Return the model as a robot, with what the case carries, and the names of terms that cannot be simulated."""
     model = dynamics.model
     bodies = model.inertial
-    kept = [k for k, one in enumerate(model.columns) if one.shape in SIMULATED]
+    kept = [k for k, one in enumerate(model.columns) if one.shape in REPLAYED]
     terms = tuple(replace(model.columns[k], side="motor") for k in kept)
     values = dynamics.values[:bodies] * model.carried_columns(case.carried)
-    left_out = tuple(one.name for one in model.columns if one.shape not in SIMULATED)
+    left_out = tuple(one.name for one in model.columns if one.shape not in REPLAYED)
     return Plant(model.bodies, terms, np.concatenate([values, dynamics.values[bodies:][kept]])), left_out
 
 
-def _reference(part: Case, rate: float | None) -> tuple[Reference, int]:
+def _reference(part: Case, rate: float | None) -> tuple[Reference, float]:
     """Return the recorded motion at the control rate, and control periods per sample."""
     motion = part.motion
     every = periods_per_sample(motion, rate)
     samples = np.arange(len(motion))
-    place = np.arange((len(motion) - 1) * every + 1) / every
+    place = np.arange(int((len(motion) - 1) * every + 1e-9) + 1) / every
     series = [CubicSpline(samples, x)(place) for x in (motion.q, motion.v, motion.a)]
     return Reference(place / motion.rate, *series), every
 

@@ -22,9 +22,14 @@ from calib.simulation.loop.controllers import Controller
 from calib.simulation.loop.references import Reference
 
 _TURNS = ((1, 2, 0), (2, 0, 1), (0, 1, 2))  # which old axes are the new x, y, z, by moving axis
-_CODES = {"sign": 0, "speed": 1, "cubic": 2, "stribeck": 3}  # as in `kernels`
+_ACTS = (
+    "sign", "speed", "cubic", "stribeck", "root", "position", "sine", "cosine", "dead", "sine_band", "cosine_band",
+    "stop", "presliding", "load", "load_velocity",
+)  # fmt: skip
+_CODES = {name: code for code, name in enumerate(_ACTS)}  # as in `loop_kernels`
+_SMOOTHED = ("sign", "stribeck", "root", "dead", "presliding", "load")  # whose last setting must be above zero
 Packed = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-SIMULATED = ("acceleration", "velocity", "one", *_CODES)
+SIMULATED = ("acceleration", "velocity", "one", *_ACTS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +53,7 @@ class Plant:
         for one in self.terms:
             if one.shape not in SIMULATED:
                 raise CalibError(f"term '{one.name}': the simulator knows {', '.join(SIMULATED)}, not '{one.shape}'")
-            if one.shape in ("sign", "stribeck") and not one.settings[-1] > 0.0:
+            if one.shape in _SMOOTHED and not one.settings[-1] > 0.0:
                 raise CalibError(
                     f"term '{one.name}': an exact sign cannot be integrated; give a smoothing v0 of some 0.01 rad/s"
                 )
@@ -69,7 +74,7 @@ class Sensing:
         sigma_tau: (n,) white noise of the recorded torque [N m or N]; it does not act.
         push: (n,) torque that acts and is not recorded: ripple, cables, all that no model holds [N m or N].
         push_band: cut-off of the first-order low-pass that colours it, σ kept [Hz]; None: white.
-        every: control periods per recorded sample.
+        every: control periods per recorded sample, whole or not (5 kHz and 140 Hz: 35.7).
     """
 
     sigma_q: np.ndarray | float = 0.0
@@ -77,7 +82,7 @@ class Sensing:
     sigma_tau: np.ndarray | float = 0.0
     push: np.ndarray | float = 0.0
     push_band: float | None = None
-    every: int = 1
+    every: float = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,28 +140,48 @@ def simulate(
         own = shaped(push, reference.q.shape, "push")
         drawn["push"] = np.ascontiguousarray(own + drawn["push"] if len(drawn["push"]) else own)
     q, v = (np.array(x, dtype=float) for x in (start if start is not None else (reference.q[0], reference.v[0])))
-    out = np.empty((5, -(-count // sensing.every), n))
+    tick = sample_ticks(count, sensing.every)
+    out = np.empty((5, len(tick), n))
     model = np.empty((0, 0)) if controller.model is None else _body(plant.bodies, controller.model)
     status, reached = loop_kernels.closed_loop(
-        *_packed(plant), model, controller.rows, controller.sampled(reference), drawn["sigma_q"],
+        *packed(plant), model, controller.rows, controller.sampled(reference), drawn["sigma_q"],
         np.ascontiguousarray(np.broadcast_to(sensing.quantum, (n,)), dtype=float), drawn["push"], reference.period,
-        controller.smoothing(reference.period), controller.delay, sensing.every, q, v, out,
+        controller.smoothing(reference.period), controller.delay, float(sensing.every), q, v, out,
     )  # fmt: skip
     if status != loop_kernels.FINE:
         raise _failure(status, reached * reference.period)
-    heard = drawn["sigma_tau"][:: sensing.every] if len(drawn["sigma_tau"]) else 0.0
-    t = reference.t[:: sensing.every]
+    heard = drawn["sigma_tau"][tick.astype(int)] if len(drawn["sigma_tau"]) else 0.0
+    whole = np.all(tick == tick.astype(int))
+    t = reference.t[tick.astype(int)] if whole else reference.t[0] + tick * reference.period
     motion = [frozen(x) for x in out]
     return SimulatedRun(t, motion[0], motion[1], motion[2], motion[3], frozen(out[4] + heard), motion[4])
 
 
-def forward_dynamics(plant: Plant, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> np.ndarray:
-    """Return the accelerations (N, n) under torques (N, n) of the drives, friction and motor inertia included."""
+def sample_ticks(count: int, every: float) -> np.ndarray:
+    """Return the control periods, whole or not, at which samples of `count` periods are recorded."""
+    return np.arange(int((count - 1) / every + 1e-9) + 1) * every
+
+
+def forward_dynamics(
+    plant: Plant, q: np.ndarray, v: np.ndarray, tau: np.ndarray, parameters: np.ndarray | None = None
+) -> np.ndarray:
+    """Return the accelerations (N, n) under torques (N, n) of the drives, friction and motor inertia included.
+
+    Friction that depends on the past is taken at rest.
+
+    Args:
+        parameters: (N, p) of each sample; None: the plant's.
+
+    Raises:
+        CalibError: where the inertia is not positive definite.
+    """
     from calib.simulation.loop import loop_kernels
 
     q, v, tau = (np.ascontiguousarray(shaped(x, (len(q), plant.bodies.n), "states")) for x in (q, v, tau))
-    out = np.empty_like(q)
-    failed = loop_kernels.forward_dynamics(*_packed(plant), q, v, tau, out)
+    out, count = np.empty_like(q), len(plant.parameters)
+    values = np.empty((0, count)) if parameters is None else shaped(parameters, (len(q), count), "parameters")
+    layout = layout_of(plant)
+    failed = loop_kernels.forward_dynamics(*packed(plant), *layout, np.ascontiguousarray(values), q, v, tau, out)
     if failed >= 0:
         raise CalibError(f"sample {failed}: the inertia matrix is not positive definite")
     return out
@@ -193,7 +218,26 @@ def _coloured(white: np.ndarray, step: float) -> np.ndarray:
     return np.ascontiguousarray(lfilter([np.sqrt(1.0 - pole**2)], [1.0, -pole], white, axis=0))
 
 
-def _packed(plant: Plant) -> Packed:
+def layout_of(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return where each parameter goes in what `packed` returns: order, entries, shares, owners of `loop_kernels`."""
+    n, first = plant.bodies.n, plant.inertial
+    order = np.ascontiguousarray(np.broadcast_to(plant.bodies.order, (plant.bodies.count, 10)), dtype=np.int64)
+    entries: list[tuple[int, int, int]] = []
+    shares: list[float] = []
+    owners: list[int] = []
+    for k, one in enumerate(plant.terms):
+        for row, motion in one.acts:
+            if one.shape in _CODES:
+                owners.append(first + k)
+                continue
+            seen = ((2 * n, 1.0),) if one.shape == "one" else motion
+            start = n if one.shape == "velocity" else 0
+            entries += [(row, start + place, first + k) for place, _ in seen]
+            shares += [weight for _, weight in seen]
+    return order, np.array(entries, dtype=np.int64).reshape(-1, 3), np.array(shares), np.array(owners, dtype=np.int64)
+
+
+def packed(plant: Plant) -> Packed:
     """Return tree, body, linear, kinds and acts as the kernels lay them out."""
     bodies, n = plant.bodies.count, plant.bodies.n
     parents = np.where(plant.bodies.parents < 0, bodies, plant.bodies.parents)
@@ -202,7 +246,7 @@ def _packed(plant: Plant) -> Packed:
     kinds = np.array([[row, code] for row, code, *_ in acts], dtype=np.int64).reshape(-1, 2)
     values = np.array([[amount, *settings, *weights] for _, _, amount, settings, weights in acts])
     body = _body(plant.bodies, plant.parameters[: 10 * bodies])
-    return np.ascontiguousarray(links), body, linear, kinds, values.reshape(-1, 4 + n)
+    return np.ascontiguousarray(links), body, linear, kinds, values.reshape(-1, 8 + n)
 
 
 def _body(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
@@ -220,7 +264,7 @@ def _body(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
 
 
 def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int) -> tuple[np.ndarray, list]:
-    """Return linear (n, 2 n + 1) and the acts: row, code, amount, three settings, weights (n,)."""
+    """Return linear (n, 2 n + 1) and the acts: row, code, amount, seven settings, weights (n,)."""
     linear, acts = np.zeros((n, 2 * n + 1)), []
     for one, value in zip(terms, values, strict=True):
         for row, motion in one.acts:
@@ -231,7 +275,7 @@ def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int) -> tuple[np.
             for joint, weight in motion:
                 weights[joint] += weight
             if one.shape in _CODES:
-                settings = [0.0] * (3 - len(one.settings)) + list(one.settings)
+                settings = [0.0] * (7 - len(one.settings)) + list(one.settings)
                 acts.append((row, _CODES[one.shape], value, settings, weights))
             else:
                 first = 0 if one.shape == "acceleration" else n

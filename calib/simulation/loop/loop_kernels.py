@@ -14,13 +14,16 @@ passes on: half of the time otherwise. B bodies, n joints, T acts of friction th
     body    (B + 1, 23): placement (rotation by rows, origin) with each joint about or along z, ten standard parameters
             in such a frame, scale; row B, columns 0 to 2: the base's acceleration against gravity
     linear  (n, 2 n + 1): added inertia, viscous friction, offset
-    kinds   (T, 2) torque row and code; acts (T, 4 + n): amount, three settings, weights of the joints' velocities
+    kinds   (T, 2) torque row and code; acts (T, 8 + n): amount, seven settings (the last ones used), weights of the
+            joints' motions
+    memory  (T, 2) of friction that depends on the past: state of the stop operator, and where it was there
+    loads   (n,) torques that the gears transmit, of the last call, where friction depends on them
     work    (B + 1, 46): pose, velocity 12, acceleration 18, twist 24, force 30, inertia about the origin 36 …
 """
 
 from __future__ import annotations
 
-from math import cos, exp, sin, tanh
+from math import cos, exp, isinf, pi, sin, sqrt, tanh
 
 import numpy as np
 from numba import njit
@@ -28,7 +31,10 @@ from numba import njit
 OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
 JOINED = {**OPTIONS, "forceinline": True}
 FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
-SIGN, SPEED, CUBIC, STRIBECK = 0, 1, 2, 3
+SIGN, SPEED, CUBIC, STRIBECK, ROOT, POSITION, SINE, COSINE, DEAD = 0, 1, 2, 3, 4, 5, 6, 7, 8
+SINE_BAND, COSINE_BAND, STOP, PRESLIDING, LOAD, LOAD_VELOCITY = 9, 10, 11, 12, 13, 14
+EDGE = 0.1  # of its dead zone: over so much speed a dead-zone sign is smoothed, since no jump can be integrated
+BEYOND = 0.1  # [rad] over which ripple of a band fades outside the positions it was learnt at
 MOST = 64  # steps that friction may ask for in one period
 REACH = 6.0  # smoothing widths from standstill within which the sign counts as stiff: one period away at most 6 v0
 FINE, SINGULAR, STIFF, DIVERGED = -1, 1, 2, 3
@@ -198,83 +204,231 @@ def _substitute(matrix, vector):
 
 
 @njit(**JOINED)
-def friction(linear, kinds, acts, v, out):
-    """Take off out (n,) what the drives' friction and offsets need."""
-    n = v.shape[0]
+def smooth_sign(scaled):
+    """Return tanh, cut where it is one to rounding."""
+    return 1.0 if scaled > 20.0 else -1.0 if scaled < -20.0 else tanh(scaled)
+
+
+@njit(**JOINED)
+def seen(acts, t, motion):
+    """Return what act t sees of a motion (n,): the weighted sum over joints."""
+    total = 0.0
+    for k in range(motion.shape[0]):
+        total += acts[t, 8 + k] * motion[k]
+    return total
+
+
+@njit(**JOINED)
+def stop(memory, t, place, width):
+    """Return the stop operator's state at a place, from its last state and place."""
+    return min(1.0, max(-1.0, memory[t, 0] + (place - memory[t, 1]) / width))
+
+
+@njit(**OPTIONS)
+def shape(code, acts, t, memory, q, v):
+    """Return what act t is per unit of its parameter, as `calib.dynamics.shapes` says; loads are another's business."""
+    rate, last = seen(acts, t, v), acts[t, 7]
+    if code == SPEED:
+        return abs(rate)
+    if code == CUBIC:
+        return rate * rate * rate
+    if code == ROOT:
+        return rate / sqrt(abs(rate) + last)
+    if code == DEAD:
+        wide = EDGE * last
+        return 0.5 * (smooth_sign((rate - last) / wide) + smooth_sign((rate + last) / wide))
+    if code == LOAD_VELOCITY:
+        return rate
+    if code in (SIGN, LOAD):
+        return smooth_sign(rate / last)
+    if code == STRIBECK:
+        return smooth_sign(rate / last) * exp(-((abs(rate) / acts[t, 5]) ** acts[t, 6]))
+    place = seen(acts, t, q)
+    if code == POSITION:
+        return place
+    if code == STOP:
+        return stop(memory, t, place, last)
+    if code == PRESLIDING:
+        return stop(memory, t, place, acts[t, 6]) - smooth_sign(rate / last)
+    if code in (SINE, COSINE):
+        gain = 1.0 / (1.0 + (rate / last) ** 2)
+        return gain * (sin(acts[t, 6] * place) if code == SINE else cos(acts[t, 6] * place))
+    order, left, middle, right = acts[t, 1], acts[t, 2], acts[t, 3], acts[t, 4]
+    frequency = abs(rate) * order / (2.0 * pi)
+    falls = 1.0 if isinf(right) else (right - frequency) / (right - middle)
+    gain = min(1.0, max(0.0, min((frequency - left) / (middle - left), falls)))
+    if not acts[t, 5] * rate > 0.0 or gain == 0.0:
+        return 0.0
+    outside = max(max(acts[t, 6] - place, place - last), 0.0)
+    gain *= min(1.0, max(0.0, 1.0 - outside / BEYOND))
+    return gain * (sin(order * place) if code == SINE_BAND else cos(order * place))
+
+
+@njit(**JOINED)
+def friction(linear, kinds, acts, memory, q, v, out):
+    """Take off out (n,) what the drives' friction and offsets need, but for what depends on loads; True: some does."""
+    n, loaded = v.shape[0], False
     for j in range(n):
         total = linear[j, 2 * n]
         for k in range(n):
             total += linear[j, n + k] * v[k]
         out[j] -= total
     for t in range(kinds.shape[0]):
-        rate = 0.0
-        for k in range(n):
-            rate += acts[t, 4 + k] * v[k]
         code = kinds[t, 1]
-        if code == SPEED:
-            shape = abs(rate)
-        elif code == CUBIC:
-            shape = rate * rate * rate
+        if code in (LOAD, LOAD_VELOCITY):
+            loaded = True
+        elif code == SIGN:
+            out[kinds[t, 0]] -= acts[t, 0] * smooth_sign(seen(acts, t, v) / acts[t, 7])
         else:
-            scaled = rate / acts[t, 3]
-            shape = 1.0 if scaled > 20.0 else -1.0 if scaled < -20.0 else tanh(scaled)
-            if code == STRIBECK:
-                shape *= exp(-((abs(rate) / acts[t, 1]) ** acts[t, 2]))
-        out[kinds[t, 0]] -= acts[t, 0] * shape
+            out[kinds[t, 0]] -= acts[t, 0] * shape(code, acts, t, memory, q, v)
+    return loaded
 
 
 @njit(**OPTIONS)
-def stiffness(kinds, acts, v, matrix, unit):
+def _under_load(linear, kinds, acts, memory, q, v, tau, matrix, loads, out):
+    """Replace out (n,), accelerations without it, by those with friction that grows with the transmitted torque.
+
+    load = torque left after friction - added inertia · a, and friction hangs on the load: repeated until both agree,
+    which they do where the coefficients are below one. M is factorised. False: they do not.
+    """
+    n = out.shape[0]
+    plain, extra, change = out.copy(), np.zeros(n), np.empty(n)
+    left = tau.copy()
+    friction(linear, kinds, acts, memory, q, v, left)
+    for _ in range(200):
+        size, moved = 0.0, 0.0
+        for j in range(n):
+            load = left[j] - extra[j]
+            for k in range(n):
+                load -= linear[j, k] * out[k]
+            size, moved = max(size, abs(load)), max(moved, abs(load - loads[j]))
+            loads[j] = load
+        if moved <= 1e-13 * size:
+            return True
+        for j in range(n):
+            extra[j] = 0.0
+        for t in range(kinds.shape[0]):
+            if kinds[t, 1] == LOAD or kinds[t, 1] == LOAD_VELOCITY:
+                size = abs(seen(acts, t, loads))
+                extra[kinds[t, 0]] += acts[t, 0] * size * shape(kinds[t, 1], acts, t, memory, q, v)
+        for j in range(n):
+            change[j] = -extra[j]
+        _substitute(matrix, change)
+        for j in range(n):
+            out[j] = plain[j] + change[j]
+    return moved <= 1e-6 * size
+
+
+@njit(**OPTIONS)
+def stiffness(kinds, acts, loads, v, matrix, unit):
     """Return a bound [1/s] of the fastest decay that smoothed signs bring in near standstill, M factorised.
 
     The trace of M⁻¹ D, D the steepest slopes of the signs in reach (not the local ones: a step that enters the band
-    must not overshoot it): never below the largest eigenvalue.
+    must not overshoot it): never below the largest eigenvalue. Springs of friction with memory count by four times
+    their natural frequency, so that no step is longer than half a radian of it.
     """
-    total, n = 0.0, unit.shape[0]
+    total, springs, n = 0.0, 0.0, unit.shape[0]
     for t in range(kinds.shape[0]):
-        if kinds[t, 1] != SIGN and kinds[t, 1] != STRIBECK:
+        code, last, amount, spring = kinds[t, 1], acts[t, 7], acts[t, 0], 0.0
+        if code in (SIGN, STRIBECK):
+            slope, middle = amount / last, 0.0
+        elif code == LOAD:
+            slope, middle = amount * abs(seen(acts, t, loads)) / last, 0.0
+        elif code == ROOT:
+            slope, middle = amount / sqrt(last), 0.0
+        elif code == DEAD:
+            slope, middle, last = 0.5 * amount / (EDGE * last), last, EDGE * last
+        elif code == STOP:
+            slope, middle, spring = 0.0, 0.0, amount / last
+        elif code == PRESLIDING:
+            slope, middle, spring = amount / last, 0.0, amount / acts[t, 6]
+        else:
             continue
-        rate = 0.0
-        for k in range(n):
-            rate += acts[t, 4 + k] * v[k]
-        if abs(rate) > REACH * acts[t, 3]:
+        if abs(abs(seen(acts, t, v)) - middle) > REACH * last:
+            slope = 0.0
+        if slope == 0.0 and spring == 0.0:
             continue
         for j in range(n):
             unit[j] = 0.0
         unit[kinds[t, 0]] = 1.0
         _substitute(matrix, unit)
-        slope = acts[t, 0] / acts[t, 3]
         for k in range(n):
-            total += abs(slope * acts[t, 4 + k] * unit[k])
-    return total
+            total += abs(slope * acts[t, 8 + k] * unit[k])
+            springs += abs(spring * acts[t, 8 + k] * unit[k])
+    return total + 4.0 * sqrt(springs)
 
 
 @njit(**OPTIONS)
-def _accelerate(tree, body, linear, kinds, acts, q, v, tau, work, matrix, out):
+def accelerate(tree, body, linear, kinds, acts, memory, loads, q, v, tau, work, matrix, out):
     """Write the accelerations (n,) under the torques of the drives; M is left factorised. False: M not definite."""
     for j in range(q.shape[0]):
         out[j] = tau[j]
     dynamics(tree, body, linear, q, v, work, matrix, out)
-    friction(linear, kinds, acts, v, out)
+    loaded = friction(linear, kinds, acts, memory, q, v, out)
     if not _factorise(matrix):
         return False
     _substitute(matrix, out)
+    if loaded:
+        return _under_load(linear, kinds, acts, memory, q, v, tau, matrix, loads, out)
     return True
 
 
 @njit(**OPTIONS)
-def forward_dynamics(tree, body, linear, kinds, acts, q, v, tau, out):
-    """Fill out (N, n); return the first sample whose inertia is not positive definite, or -1."""
-    work, matrix = np.empty((tree.shape[0] + 1, 46)), np.empty((q.shape[1], q.shape[1]))
+def unstressed(kinds, acts, q, memory):
+    """Set the friction that depends on the past to rest at q (n,)."""
+    for t in range(kinds.shape[0]):
+        memory[t, 0], memory[t, 1] = 0.0, seen(acts, t, q)
+
+
+@njit(**JOINED)
+def remember(kinds, acts, q, memory):
+    """Move the friction that depends on the past to q (n,)."""
+    for t in range(kinds.shape[0]):
+        if kinds[t, 1] == STOP or kinds[t, 1] == PRESLIDING:
+            place = seen(acts, t, q)
+            width = acts[t, 7] if kinds[t, 1] == STOP else acts[t, 6]
+            memory[t, 0], memory[t, 1] = stop(memory, t, place, width), place
+
+
+@njit(**OPTIONS)
+def set_parameters(values, order, entries, shares, owners, body, linear, acts):
+    """Write parameters (p,) into body, linear and acts, which hold everything else.
+
+    order (B, 10): the standard parameter behind each of a body; entries (E, 3): row and column of `linear`, parameter;
+    shares (E,): their weights; owners (T,): the parameter of each act.
+    """
+    for i in range(order.shape[0]):
+        for k in range(10):
+            body[i, 12 + k] = values[10 * i + order[i, k]]
+    linear[:] = 0.0
+    for e in range(entries.shape[0]):
+        linear[entries[e, 0], entries[e, 1]] += shares[e] * values[entries[e, 2]]
+    for t in range(owners.shape[0]):
+        acts[t, 0] = values[owners[t]]
+
+
+@njit(**OPTIONS)
+def forward_dynamics(tree, body, linear, kinds, acts, order, entries, shares, owners, values, q, v, tau, out):
+    """Fill out (N, n); return the first sample whose inertia is not positive definite, or -1.
+
+    values (N, p): parameters of each sample; (0, p): those that body, linear and acts hold.
+    """
+    n, count = q.shape[1], kinds.shape[0]
+    work, matrix = np.empty((tree.shape[0] + 1, 46)), np.empty((n, n))
+    memory, loads = np.zeros((count, 2)), np.zeros(n)
     for sample in range(q.shape[0]):
-        args = (q[sample], v[sample], tau[sample], work, matrix, out[sample])
-        if not _accelerate(tree, body, linear, kinds, acts, *args):
+        if values.shape[0]:
+            set_parameters(values[sample], order, entries, shares, owners, body, linear, acts)
+        args = (memory, loads, q[sample], v[sample], tau[sample], work, matrix, out[sample])
+        if not accelerate(tree, body, linear, kinds, acts, *args):
             return sample
     return FINE
 
 
 @njit(**OPTIONS)
-def _advance(tree, body, linear, kinds, acts, q, v, tau, period, slopes, work, matrix, at, rate):
+def advance(
+    tree, body, linear, kinds, acts, memory, loads, q, v, tau, period, slopes, work, matrix, at, rate
+):  # fmt: skip
     """Advance q, v (n,) by one control period under constant torques (Runge & Kutta's classical form).
 
     In as many steps as friction near standstill asks for. On the negative axis the form's stability function
@@ -282,7 +436,7 @@ def _advance(tree, body, linear, kinds, acts, q, v, tau, period, slopes, work, m
     sign and does not change sides from step to step, which would be chatter; abs(z) <= 2 here. slopes[0] is known.
     """
     n = q.shape[0]
-    pieces = int(0.5 * period * stiffness(kinds, acts, v, matrix, at)) + 1
+    pieces = int(0.5 * period * stiffness(kinds, acts, loads, v, matrix, at)) + 1
     if pieces > MOST:
         return STIFF
     span = period / pieces
@@ -299,17 +453,19 @@ def _advance(tree, body, linear, kinds, acts, q, v, tau, period, slopes, work, m
                     before = slopes[stage - 2, j] if stage > 1 else 0.0
                     at[j] = q[j] + part * (v[j] + half * before)
                     rate[j] = v[j] + part * slopes[stage - 1, j]
-            if not _accelerate(tree, body, linear, kinds, acts, at, rate, tau, work, matrix, slopes[stage]):
+            state = (at, rate, tau, work, matrix, slopes[stage])
+            if not accelerate(tree, body, linear, kinds, acts, memory, loads, *state):
                 return SINGULAR
         for j in range(n):
             first, inner, last = slopes[0, j], slopes[1, j] + slopes[2, j], slopes[3, j]
             q[j] += span * (v[j] + span / 6.0 * (first + inner))
             v[j] += span / 6.0 * (first + 2.0 * inner + last)
+        remember(kinds, acts, q, memory)
     return FINE
 
 
 @njit(**OPTIONS)
-def _command(gains, aim, speed, seen, rate, integral, period, wish):
+def command(gains, aim, speed, seen, rate, integral, period, wish):
     """Write what feedback asks for (n,) from reference and measurement; rows of `gains` as in `closed_loop`."""
     for j in range(wish.shape[0]):
         error = aim[j] - seen[j]
@@ -342,46 +498,68 @@ def closed_loop(
     gains (6, n): kp, kd, ki, share of the reference's velocity, torque limit, limit of the integral. reference
     (4, N, n): position, velocity, torque ahead, acceleration ahead (for the controller's `model`, with 0 rows for
     none). encoder, push (N, n) or (0, n): noise of the measured position, torque no model knows.
-    q, v (n,): the state, overwritten. `out` (5, M, n): true q, v, a, measured q, torque applied, every `every` periods.
+    q, v (n,): the state, overwritten. `out` (5, M, n): true q, v, a, measured q, torque applied, every `every` periods,
+    of which a part is integrated by itself: sample m is at period m · every, whole or not.
     """
     count, n = reference.shape[1], q.shape[0]
     work, matrix, slopes = np.empty((tree.shape[0] + 1, 46)), np.empty((n, n)), np.zeros((4, n))
-    at, rate, speed, seen, before = np.empty(n), np.empty(n), np.zeros(n), np.empty(n), np.empty(n)
+    at, rate, speed, read, before = np.empty(n), np.empty(n), np.zeros(n), np.empty(n), np.empty(n)
     integral, wish, tau, waiting = np.zeros(n), np.empty(n), np.empty(n), np.zeros((late + 1, n))
+    memory, loads = np.zeros((kinds.shape[0], 2)), np.zeros(n)
+    unstressed(kinds, acts, q, memory)
+    sample = 0
     for k in range(count):
         for j in range(n):
-            seen[j] = q[j] + (encoder[k, j] if encoder.shape[0] else 0.0)
+            read[j] = q[j] + (encoder[k, j] if encoder.shape[0] else 0.0)
             if quantum[j] > 0.0:
-                seen[j] = quantum[j] * np.floor(seen[j] / quantum[j] + 0.5)
+                read[j] = quantum[j] * np.floor(read[j] / quantum[j] + 0.5)
             if k == 0:
                 speed[j] = v[j]
             else:
-                speed[j] += smoothing * ((seen[j] - before[j]) / period - speed[j])
-            before[j] = seen[j]
-        _command(gains, reference[0, k], reference[1, k], seen, speed, integral, period, wish)
+                speed[j] += smoothing * ((read[j] - before[j]) / period - speed[j])
+            before[j] = read[j]
+        command(gains, reference[0, k], reference[1, k], read, speed, integral, period, wish)
         if model.shape[0]:
-            _linearise(tree, model, linear, reference[3, k], seen, speed, work, matrix, wish)
+            _linearise(tree, model, linear, reference[3, k], read, speed, work, matrix, wish)
         for j in range(n):
             wish[j] += reference[2, k, j]
             held = min(max(wish[j], -gains[4, j]), gains[4, j])
-            if held != wish[j] and (reference[0, k, j] - seen[j]) * wish[j] > 0.0:
-                integral[j] -= period * (reference[0, k, j] - seen[j])  # no winding up against the limit
+            if held != wish[j] and (reference[0, k, j] - read[j]) * wish[j] > 0.0:
+                integral[j] -= period * (reference[0, k, j] - read[j])  # no winding up against the limit
             waiting[k % (late + 1), j] = held
             tau[j] = waiting[(k + 1) % (late + 1) if k >= late else 0, j]
             if push.shape[0]:
                 at[j] = tau[j] + push[k, j]
             else:
                 at[j] = tau[j]
-        if not _accelerate(tree, body, linear, kinds, acts, q, v, at, work, matrix, slopes[0]):
+        if not accelerate(tree, body, linear, kinds, acts, memory, loads, q, v, at, work, matrix, slopes[0]):
             return SINGULAR, k
-        if k % every == 0:
-            m = k // every
-            for j in range(n):
-                out[0, m, j], out[1, m, j], out[2, m, j] = q[j], v[j], slopes[0, j]
-                out[3, m, j], out[4, m, j] = seen[j], tau[j]
+        wish[:] = at
+        while sample < out.shape[1] and sample * every < k + 1 - 1e-9:
+            part = sample * every - k
+            if part < 1e-9:
+                for j in range(n):
+                    out[0, sample, j], out[1, sample, j], out[2, sample, j] = q[j], v[j], slopes[0, j]
+                    out[3, sample, j], out[4, sample, j] = read[j], tau[j]
+            else:
+                here, fast, first, past = q.copy(), v.copy(), slopes.copy(), memory.copy()
+                args = (tree, body, linear, kinds, acts, past, loads)
+                status = advance(*args, here, fast, wish, part * period, first, work, matrix, at, rate)
+                if status != FINE:
+                    return status, k
+                if not accelerate(*args, here, fast, wish, work, matrix, first[0]):
+                    return SINGULAR, k
+                for j in range(n):
+                    out[0, sample, j], out[1, sample, j], out[2, sample, j] = here[j], fast[j], first[0, j]
+                    seen_now = here[j] + (encoder[k, j] if encoder.shape[0] else 0.0)
+                    if quantum[j] > 0.0:
+                        seen_now = quantum[j] * np.floor(seen_now / quantum[j] + 0.5)
+                    out[3, sample, j], out[4, sample, j] = seen_now, tau[j]
+                accelerate(tree, body, linear, kinds, acts, memory, loads, q, v, wish, work, matrix, slopes[0])
+            sample += 1
         if k + 1 < count:
-            wish[:] = at
-            status = _advance(tree, body, linear, kinds, acts, q, v, wish, period, slopes, work, matrix, at, rate)
+            args = (tree, body, linear, kinds, acts, memory, loads)
+            status = advance(*args, q, v, wish, period, slopes, work, matrix, at, rate)
             if status != FINE:
                 return status, k
         for j in range(n):

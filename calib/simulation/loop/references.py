@@ -39,6 +39,16 @@ class Reference:
         """The control period [s]."""
         return float(self.t[-1] - self.t[0]) / (len(self.t) - 1)
 
+    def at(self, tick: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return q, v, a (M, n) at control periods `tick` (M,), by cubic splines where they are not whole."""
+        whole = tick.astype(int)
+        if np.all(tick == whole):
+            return self.q[whole], self.v[whole], self.a[whole]
+        from scipy.interpolate import CubicSpline
+
+        q, v, a = (CubicSpline(np.arange(len(self.t)), x)(tick) for x in (self.q, self.v, self.a))
+        return q, v, a
+
 
 def fourier(
     centre: np.ndarray, sines: np.ndarray, cosines: np.ndarray, base: float, duration: float, rate: float

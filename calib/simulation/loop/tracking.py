@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib.dynamics.idim import IdentificationModel
-from calib.simulation.loop.closed_loop import Plant, Sensing, simulate
+from calib.simulation.loop.closed_loop import Plant, Sensing, sample_ticks, simulate
 from calib.simulation.loop.controllers import Controller, with_feedforward
 from calib.simulation.loop.references import Reference
 
@@ -49,5 +49,5 @@ def tracking_error(
     """
     ahead = controller if believed is None else with_feedforward(controller, feed_forward(believed, reference))
     run = simulate(robot, ahead, reference, sensing, seed)
-    every = 1 if sensing is None else sensing.every
-    return np.sqrt(np.mean((run.q - reference.q[::every]) ** 2, axis=0))
+    tick = sample_ticks(len(reference.t), 1 if sensing is None else sensing.every)
+    return np.sqrt(np.mean((run.q - reference.at(tick)[0]) ** 2, axis=0))

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from arms import physical
+from scipy.interpolate import CubicSpline
 
 from calib.dynamics import drives, rigid_body
 from calib.dynamics.bodies import bodies_of, standard_parameters, with_payload
@@ -199,8 +200,61 @@ def test_what_cannot_be_simulated_is_refused():
         simulate(stiff, controller, reference)
     with pytest.raises(CalibError, match="exact sign"):
         replace(plant, terms=drives.standard(["Ia Fv Fc"] * 6, 0.0))
-    with pytest.raises(CalibError, match="'position'"):
-        Plant(plant.bodies, (drives.term("k1", "position", 0),), np.zeros(61))
+
+
+EVERYTHING = {
+    "position": (), "speed": (), "cubic": (), "root": (0.05,), "stribeck": (0.3, 2.0, 0.05), "dead": (0.3,),
+    "sine": (5.0, 2.0), "cosine": (3.0, np.inf), "sine_band": (6.0, 0.1, 0.5, 1.0, 1.0, -1.5, 1.5),
+    "cosine_band": (6.0, 0.0, 0.4, np.inf, -1.0, -0.5, 0.5), "load": (0.05,), "load_velocity": (), "stop": (0.05,),
+    "presliding": (0.05, 0.05),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("shape", EVERYTHING)
+def test_all_friction_that_identification_knows_can_be_simulated(shape):
+    """What is recorded obeys the identification model.
+
+    Within what a sampled record tells of turning points, where friction depends on them; and but for the edge of a dead
+    zone, which is a ramp, since no jump can be integrated.
+    """
+    chain = description.read(library.path("tx40"))
+    terms = (*drives.standard(["Ia Fv Fc"] * 6, 0.05), drives.term("extra", shape, 1, *EVERYTHING[shape]))
+    plain = known_robots.plant("tx40").parameters
+    amount = 0.15 if shape.startswith("load") else 2.0
+    plant = Plant(bodies_of(chain), terms, np.append(plain, amount))
+    run = simulate(plant, known_robots.controller("tx40"), motion(duration=2.0, rate=2000.0))
+    model = known_robots.model(plant)
+    load = model.transmitted(plant.parameters, run.q, run.v, run.a)
+    columns = model.regressor(run.q, run.v, run.a, load)
+    away = np.abs(np.einsum("kij,j->ki", columns, plant.parameters) - run.torque)[:, 1]
+    assert np.ptp(columns[:, 1, -1]) > 0.2
+    edge = np.abs(np.abs(run.v[:, 1]) - 0.3) < 0.15 if shape == "dead" else np.zeros(len(away), dtype=bool)
+    close = 1e-4 if shape in ("stop", "presliding", "dead") else 1e-8
+    assert away[~edge].max() < close * np.abs(run.torque).max() and edge.mean() < 0.5
+
+
+def test_samples_may_fall_between_control_periods():
+    """5 kHz and 140 Hz: 35.7 periods; half periods agree with whole ones, others with the motion in between."""
+    plant, controller, reference = known_robots.plant("tx40"), known_robots.controller("tx40"), motion(duration=0.5)
+    whole, between = (simulate(plant, controller, reference, Sensing(every=x)) for x in (5, 2.5))
+    assert np.array_equal(between.q[::2], whole.q) and np.array_equal(between.a[::2], whole.a)
+    slow = simulate(plant, controller, reference, Sensing(every=5000.0 / 140.0))
+    assert len(slow.t) == 71 and np.allclose(np.diff(slow.t), 1.0 / 140.0)
+    fine = simulate(plant, controller, reference)
+    assert np.abs(CubicSpline(fine.t, fine.q)(slow.t) - slow.q).max() < 1e-7
+    tau = np.einsum("kij,j->ki", known_robots.model(plant).regressor(slow.q, slow.v, slow.a), plant.parameters)
+    assert np.abs(tau - slow.torque).max() < 1e-10 * np.abs(slow.torque).max()
+
+
+def test_every_sample_may_have_parameters_of_its_own():
+    plant = known_robots.plant("tx40", coupled=True, offset=np.full(6, 0.2))
+    rng = np.random.default_rng(0)
+    q, v, tau = rng.normal(size=(3, 4, 6))
+    values = plant.parameters * rng.uniform(0.95, 1.05, (4, len(plant.parameters)))
+    alone = [
+        forward_dynamics(replace(plant, parameters=one), q[[k]], v[[k]], tau[[k]])[0] for k, one in enumerate(values)
+    ]
+    assert np.array_equal(forward_dynamics(plant, q, v, tau, values), np.array(alone))
 
 
 def test_references_are_their_own_derivatives_and_keep_the_limits():
