@@ -17,6 +17,7 @@ from calib.estimation.estimate import Estimate
 from calib.identification.identify_options import IdentifyOptions, read_options
 from calib.procedure.dynamic_stage import folder, identify, inputs
 from calib.procedure.findings import Verdict
+from calib.procedure.parallel_stage.robots import FoundRobot, recognised, refuse_links
 from calib.robot.calibrated import CalibratedChain
 
 if TYPE_CHECKING:
@@ -95,7 +96,7 @@ class DynamicsModel:
 
 @checked
 def identify_dynamics(
-    robot: str | Path | CalibratedChain,
+    robot: str | Path | CalibratedChain | FoundRobot,
     recordings: Recorded | Sequence[Recorded],
     *,
     validate: Recorded | Sequence[Recorded] = (),
@@ -114,7 +115,8 @@ def identify_dynamics(
     estimate: Σ = Σ_torque + S Σ_geometry Sᵀ.
 
     Args:
-        robot, base, tip: as of `calib.load`; or what it returned; or ``fit.robot``.
+        robot, base, tip: as of `calib.load`; or what it returned; or ``fit.robot``. Of a parallel robot the result is a
+            `calib.api.parallel.ParallelDynamics`, with the same members and an outcome of its own.
         recordings: logs of q and torque (or current): files, ``log.npz@0:9.4`` cut, or what `read_recording` returned.
         validate: the same of other motion.
         method, friction: in place of the options'; see ``calib identify --help``.
@@ -128,6 +130,10 @@ def identify_dynamics(
         Unidentifiable: where the motion tells no parameter.
     """
     chosen = options if isinstance(options, IdentifyOptions) else read_options(optional(options))
+    robot = recognised(robot)
+    if isinstance(robot, FoundRobot):
+        refuse_links(base, tip)
+        return _of_parallel(robot, listed(recordings), listed(validate), chosen, method, friction, seed, progress)
     given = inputs.gather(
         robot, listed(recordings), listed(validate), options=chosen, method=method, friction=friction, base=base,
         tip=tip, seed=seed, progress=progress,
@@ -135,3 +141,17 @@ def identify_dynamics(
     if on_read is not None:
         on_read(given)
     return DynamicsModel(identify.run(given, progress))
+
+
+def _of_parallel(
+    robot: FoundRobot, recordings: Sequence[Recorded], validate: Sequence[Recorded], options: IdentifyOptions,
+    method: str | None, friction: str | None, seed: int, progress: Callable[[str], None] | None,
+) -> Any:  # fmt: skip
+    from calib.api.parallel import ParallelDynamics
+    from calib.procedure.parallel_stage.identify import identify_parallel
+
+    return ParallelDynamics(
+        identify_parallel(
+            robot, recordings, validate, options=options, method=method, friction=friction, seed=seed, progress=progress
+        )
+    )

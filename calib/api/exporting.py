@@ -6,17 +6,22 @@ from pathlib import Path
 
 from calib.api.dynamic import DynamicsModel
 from calib.api.kinematic import GeometryFit
+from calib.api.parallel import ParallelDynamics, ParallelGeometry
 from calib.api.reading import optional, saved
 from calib.arguments import checked
 from calib.errors import RobotError, UsageError
 from calib.procedure.export import delivery, dynamics, geometry
 from calib.procedure.export.identified import is_identified
+from calib.procedure.parallel_stage.robots import refuse_parallel
 from calib.robot.load import resolve
 
 
 @checked
 def export(
-    result: GeometryFit | DynamicsModel | str | Path, into: str | Path, *, urdf: str | Path | None = None
+    result: GeometryFit | DynamicsModel | ParallelGeometry | ParallelDynamics | str | Path,
+    into: str | Path,
+    *,
+    urdf: str | Path | None = None,
 ) -> tuple[str, ...]:
     """Write a calibrated robot, with its dynamics where they were identified, for other programs.
 
@@ -37,6 +42,7 @@ def export(
     """
     into = Path(into)
     with saved(result) as place:
+        refuse_parallel(place, "export", "a URDF holds no closed loops: take its robot.toml and dynamics.json")
         identified = is_identified(place)
         delivery.check_into(into, place, optional(urdf), dynamics.WRITTEN if identified else delivery.WRITTEN)
         if identified:

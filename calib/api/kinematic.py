@@ -22,6 +22,7 @@ from calib.procedure.findings import Verdict
 from calib.procedure.kinematic_stage import compensation, compensation_file, fit, folder, inputs, selection
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSettings, SelectionSettings
 from calib.procedure.measuring.run import write_run
+from calib.procedure.parallel_stage.robots import FoundRobot, recognised, refuse_links, refuse_parallel
 from calib.procedure.report.fit_report import fit_metrics
 from calib.robot.calibrated import CalibratedChain
 
@@ -225,6 +226,7 @@ def select_poses(
     """
     from calib.workers import workers as opened
 
+    refuse_parallel(robot, "choosing poses", "spread them over its workspace by hand")
     say, lost = progress or (lambda words: None), []
     with as_ours(), opened(workers) as crew:
         chosen = selection.choose(
@@ -236,7 +238,7 @@ def select_poses(
 
 @checked
 def fit_geometry(
-    robot: str | Path | CalibratedChain,
+    robot: str | Path | CalibratedChain | FoundRobot,
     measured: Measured | Sequence[Measured],
     settings: FitSettings | None = None,
     *,
@@ -250,7 +252,9 @@ def fit_geometry(
     """Fit a robot's geometry to measured poses, and judge it on poses it has not seen.
 
     Args:
-        robot, base, tip: the nominal robot, as of `calib.load`; or what it returned.
+        robot, base, tip: the nominal robot, as of `calib.load`; or what it returned. Of a parallel robot the result is
+            a `calib.api.parallel.ParallelGeometry`, with the same members and an outcome of its own; its measurements
+            are files.
         measured: CSV files, or what `read_poses` returned.
         settings: model, loss, folds, stations, tools, rows to hold out, tolerance, seed.
         validate: unseen poses, like `measured`.
@@ -264,6 +268,10 @@ def fit_geometry(
         NotConverged: where the fit did not come to an end.
     """
     chosen = options if isinstance(options, FitOptions) else read_options(optional(options))
+    robot = recognised(robot)
+    if isinstance(robot, FoundRobot):
+        refuse_links(base, tip)
+        return _of_parallel(robot, listed(measured), listed(validate), settings, chosen, progress)
     given = inputs.gather(
         robot, listed(measured), listed(validate), options=chosen, settings=settings, base=base, tip=tip
     )
@@ -303,6 +311,7 @@ def compensate(
         found = fitted
     else:
         with saved(fitted) as place:
+            refuse_parallel(place, "compensation", "its controller takes the calibrated robot.toml")
             found = compensation.read(place)
     chain = found.nominal.chain
     if not isinstance(targets, Targets):
@@ -312,3 +321,20 @@ def compensate(
         found, targets, frame=frame, tool=tool, dof=dof, start=start, tolerance=tolerance, seed=seed, progress=progress
     )
     return JointCommands(commands, targets, found)
+
+
+def _of_parallel(
+    robot: FoundRobot, measured: Sequence[Measured], validate: Sequence[Measured], settings: FitSettings | None,
+    options: FitOptions, progress: Progress | None,
+) -> Any:  # fmt: skip
+    from calib.api.parallel import ParallelGeometry
+    from calib.procedure.parallel_stage.fit import fit_parallel
+
+    files, unseen = ([_file(one) for one in part] for part in (measured, validate))
+    return ParallelGeometry(fit_parallel(robot, files, unseen, settings=settings, options=options, progress=progress))
+
+
+def _file(measured: Measured) -> Path:
+    if isinstance(measured, PoseMeasurements):
+        raise UsageError("a parallel robot's measurements are CSV files (calib formats parallel), not values in memory")
+    return Path(measured)

@@ -6,14 +6,16 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from calib.api.dynamic import DynamicsModel
+from calib.api.parallel import ParallelDynamics
 from calib.api.reading import optional, saved
 from calib.arguments import checked
 from calib.errors import as_ours
 from calib.procedure.excitation import design, folder, planning
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, DEFAULT_PLAN, ExcitationSettings, PlanSettings
+from calib.procedure.parallel_stage.robots import FoundRobot, recognised, refuse_links
 from calib.robot.calibrated import CalibratedChain
 
 if TYPE_CHECKING:
@@ -95,10 +97,10 @@ class MotionPlan:
 
 @checked
 def design_excitation(
-    robot: str | Path | CalibratedChain,
+    robot: str | Path | CalibratedChain | FoundRobot,
     settings: ExcitationSettings = DEFAULT_DESIGN,
     *,
-    model: DynamicsModel | str | Path | None = None,
+    model: DynamicsModel | ParallelDynamics | str | Path | None = None,
     limits: str | Path | None = None,
     base: str | None = None,
     tip: str | None = None,
@@ -108,7 +110,8 @@ def design_excitation(
     """Design a motion that excites a robot's dynamics within its limits.
 
     Args:
-        robot, base, tip: as of `calib.load`; or what it returned; or ``fit.robot``.
+        robot, base, tip: as of `calib.load`; or what it returned; or ``fit.robot``. Of a parallel robot the result is a
+            `calib.api.parallel.ParallelExcitation`, with the same members but ``plot``.
         settings: period, harmonics, goals, effort of the search, playback, seed.
         model: identified dynamics, in memory or in a folder: they predict the torques.
         limits: TOML file of speeds, torques, workspace, collision (``calib formats limits``).
@@ -121,10 +124,19 @@ def design_excitation(
     """
     from calib.workers import workers as opened
 
-    lost = []
+    lost, robot = [], recognised(robot)
     with as_ours(), ExitStack() as stack:
         place = None if model is None else stack.enter_context(saved(model))
         crew = stack.enter_context(opened(workers))
+        if isinstance(robot, FoundRobot):
+            from calib.api.parallel import ParallelExcitation
+            from calib.procedure.parallel_stage.excite import excite_parallel
+
+            refuse_links(base, tip)
+            made = excite_parallel(
+                robot, settings, model=place, limits=optional(limits), map=crew.map, progress=progress
+            )
+            return cast(Any, ParallelExcitation(robot, made, settings.rate))
         designed = design.excite(
             robot, settings, model=place, limits=optional(limits), base=base, tip=tip, map=crew.map_without(lost),
             progress=progress,
@@ -134,11 +146,11 @@ def design_excitation(
 
 @checked
 def plan_motion(
-    robot: str | Path | CalibratedChain,
+    robot: str | Path | CalibratedChain | FoundRobot,
     waypoints: str | Path,
     settings: PlanSettings = DEFAULT_PLAN,
     *,
-    model: DynamicsModel | str | Path | None = None,
+    model: DynamicsModel | ParallelDynamics | str | Path | None = None,
     limits: str | Path | None = None,
     drives: str | Path | None = None,
     base: str | None = None,
@@ -148,8 +160,9 @@ def plan_motion(
     """Plan the fastest motion through waypoints, within a robot's speeds and torques.
 
     Args:
-        robot, base, tip: as of `calib.load`; or what it returned; or ``fit.robot``.
-        waypoints: CSV of joint values, or of places of the tip.
+        robot, base, tip: as of `calib.load`; or what it returned; or ``fit.robot``. Of a parallel robot the result is a
+            `calib.api.parallel.ParallelMotionPlan`, with the same members but ``plot``.
+        waypoints: CSV of joint values, or of places of the tip (of the platform's coordinates).
         settings: payloads, straight lines, rate, shaping, approach.
         model: identified dynamics, in memory or in a folder, to plan with.
         limits: TOML file (``calib formats limits``); drives: TOML file of Ia, Fv, Fc, off, where there is no model.
@@ -158,8 +171,19 @@ def plan_motion(
     Raises:
         UsageError: for waypoints that cannot be reached, and limits that cannot be kept.
     """
+    robot = recognised(robot)
     with as_ours(), ExitStack() as stack:
         place = None if model is None else stack.enter_context(saved(model))
+        if isinstance(robot, FoundRobot):
+            from calib.api.parallel import ParallelMotionPlan
+            from calib.procedure.parallel_stage.plan import plan_parallel
+
+            refuse_links(base, tip)
+            made = plan_parallel(
+                robot, Path(waypoints), settings, model=place, limits=optional(limits), drives=optional(drives),
+                progress=progress,
+            )  # fmt: skip
+            return cast(Any, ParallelMotionPlan(made))
         planned = planning.plan(
             robot, Path(waypoints), settings, model=place, limits=optional(limits), drives=optional(drives), base=base,
             tip=tip, progress=progress,

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, overload
 
 from calib.api.dynamic import DynamicsModel, Recorded
 from calib.api.kinematic import GeometryFit, Measured
+from calib.api.parallel import ParallelDynamics, ParallelGeometry
 from calib.api.reading import listed
 from calib.arguments import checked
-from calib.procedure.dynamic_stage import identify
+from calib.procedure.dynamic_stage import identify as arm_identify
 from calib.procedure.dynamic_stage import inputs as recorded
-from calib.procedure.kinematic_stage import fit
+from calib.procedure.kinematic_stage import fit as arm_fit
 from calib.procedure.kinematic_stage import inputs as measured
 
 
@@ -20,8 +22,15 @@ from calib.procedure.kinematic_stage import inputs as measured
 def validate(result: GeometryFit, unseen: Measured | Sequence[Measured]) -> GeometryFit: ...
 @overload
 def validate(result: DynamicsModel, unseen: Recorded | Sequence[Recorded]) -> DynamicsModel: ...
+@overload
+def validate(result: ParallelGeometry, unseen: Measured | Sequence[Measured]) -> ParallelGeometry: ...
+@overload
+def validate(result: ParallelDynamics, unseen: Recorded | Sequence[Recorded]) -> ParallelDynamics: ...
 @checked
-def validate(result: GeometryFit | DynamicsModel, unseen: Measured | Recorded | Sequence[Measured | Recorded]) -> Any:
+def validate(
+    result: GeometryFit | DynamicsModel | ParallelGeometry | ParallelDynamics,
+    unseen: Measured | Recorded | Sequence[Measured | Recorded],
+) -> Any:
     """Hold a result against poses or motion it has not seen, and judge it anew.
 
     Args:
@@ -34,8 +43,18 @@ def validate(result: GeometryFit | DynamicsModel, unseen: Measured | Recorded | 
     Raises:
         MeasurementError: for files that cannot be right, naming row and column.
     """
+    if isinstance(result, (ParallelGeometry, ParallelDynamics)):
+        return _of_parallel(result, listed(unseen))
     if isinstance(result, GeometryFit):
         given = measured.with_unseen(result.outcome.inputs, listed(unseen), result.options, result.settings)
-        return replace(result, outcome=fit.assessed(result.outcome, given, result.options, result.settings))
+        return replace(result, outcome=arm_fit.assessed(result.outcome, given, result.options, result.settings))
     more = recorded.with_unseen(result.outcome.inputs, listed(unseen))
-    return replace(result, outcome=identify.assessed(result.outcome, more))
+    return replace(result, outcome=arm_identify.assessed(result.outcome, more))
+
+
+def _of_parallel(result: ParallelGeometry | ParallelDynamics, unseen: Sequence[Any]) -> Any:
+    from calib.procedure.parallel_stage import fit, identify
+
+    if isinstance(result, ParallelGeometry):
+        return ParallelGeometry(fit.with_unseen(result.outcome, [Path(one) for one in unseen]))
+    return ParallelDynamics(identify.with_unseen(result.outcome, unseen))

@@ -31,17 +31,15 @@ def identify_dynamics(
     plots: Plots = True,
 ) -> None:
     """Identify the dynamics of ROBOT from recordings, and say how well it predicts other motion."""
-    from calib.procedure.parallel_stage import robots
-
-    if (parallel := robots.find(robot)) is not None:
-        _identify_parallel(parallel, recordings, out, validate or [], method, friction, options, seed, plots)
-        return
     from calib.api.dynamic import identify_dynamics as identified
     from calib.procedure.dynamic_stage import folder
+    from calib.procedure.parallel_stage import folder as parallel_folder
+    from calib.procedure.parallel_stage.robots import path_of
     from calib.procedure.report import console as shown
     from calib.procedure.report import dynamics_section
 
-    folder.check_identification_target(out, [options, *recordings, *(validate or [])])
+    check = parallel_folder.check_identified if path_of(robot) else folder.check_identification_target
+    check(out, [options, *recordings, *(validate or [])])
 
     def read(given: Any) -> None:
         folder.check_identification_target(out, [given.source, given.source.parent])
@@ -55,24 +53,3 @@ def identify_dynamics(
         show("writing")
         found.save(out, plots=plots)
     say_written(found.renderables(), out, found.verdict.level)
-
-
-def _identify_parallel(
-    robot: Any, recordings: list[str], out: Path, validate: list[str], method: str | None, friction: str | None,
-    options: Path | None, seed: int, plots: bool,
-) -> None:  # fmt: skip
-    from dataclasses import replace
-
-    from calib.identification.identify_options import read_options
-    from calib.procedure.parallel_stage import folder
-    from calib.procedure.parallel_stage.identify import identify_parallel
-
-    chosen = read_options(options)
-    if friction is not None:
-        chosen = replace(chosen, settings=replace(chosen.settings, friction=friction))
-    with progress() as show:
-        found = identify_parallel(
-            robot, recordings, validate, options=chosen, method=method, seed=seed, progress=show
-        )  # fmt: skip
-        folder.write_identified(found, out, plots)
-    say_written(folder.identified_lines(found), out)

@@ -55,14 +55,11 @@ def fit(
     Pass means that on poses it has not seen the calibrated arm is better than the nominal one, or that there is nothing
     to gain; that it is good enough is said only with --tolerance.
     """
-    from calib.procedure.parallel_stage import robots
-
-    if (parallel := robots.find(robot)) is not None:
-        _fit_parallel(parallel, measured, out, validate or [])
-        return
     from calib.api.kinematic import fit_geometry
     from calib.procedure.kinematic_stage import folder
     from calib.procedure.kinematic_stage.settings import FitSettings
+    from calib.procedure.parallel_stage import folder as parallel_folder
+    from calib.procedure.parallel_stage.robots import path_of
     from calib.procedure.report import console as shown
     from calib.procedure.report import geometry_section
 
@@ -70,7 +67,8 @@ def fit(
         model, loss, folds, stations, tools, holdout, refit_frames,
         None if tolerance is None else 1e-3 * tolerance, seed,
     )  # fmt: skip
-    folder.check_fit_target(out, [options, *measured, *(validate or [])])
+    check = parallel_folder.check_fitted if path_of(robot) else folder.check_fit_target
+    check(out, [options, *measured, *(validate or [])])
 
     def read(given: Any) -> None:
         folder.check_fit_target(out, [given.source])
@@ -129,9 +127,6 @@ def select(
 ) -> None:
     """Choose the poses at which the geometry of ROBOT shows best."""
     from calib.api.kinematic import select_poses
-    from calib.procedure.parallel_stage.robots import refuse_parallel
-
-    refuse_parallel(robot, "select")
     from calib.files import check_target
     from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
     from calib.procedure.measuring.run import RunSettings
@@ -178,7 +173,9 @@ def export(
     """Write the calibrated geometry, with --into in all forms and with identified dynamics, for other programs."""
     from calib.errors import UsageError
     from calib.procedure.export import geometry
+    from calib.procedure.parallel_stage.robots import refuse_parallel
 
+    refuse_parallel(folder, "export", "a URDF holds no closed loops: take its robot.toml and dynamics.json")
     if into:
         from calib.api.exporting import export as export_all
 
@@ -244,8 +241,10 @@ def compensate(
     from calib.files import check_target
     from calib.procedure.export.geometry import results
     from calib.procedure.kinematic_stage import compensation
+    from calib.procedure.parallel_stage.robots import refuse_parallel
 
     may = numbers(tolerance, 2, "--tolerance")
+    refuse_parallel(folder, "compensation", "its controller takes the calibrated robot.toml")
     fitted = compensation.read(folder)
     check_target(out, [targets, *results(fitted.folder)])
     with progress() as show:
@@ -256,13 +255,3 @@ def compensate(
     found.save(out, partial=partial)
     say(str(found))
     say(f"{int(found.commands.reached.sum())} of {len(found.q)} commands written to {out}")
-
-
-def _fit_parallel(robot: Any, measured: list[Path], out: Path, validate: list[Path]) -> None:
-    from calib.procedure.parallel_stage import folder
-    from calib.procedure.parallel_stage.fit import fit_parallel
-
-    with progress():
-        found = fit_parallel(robot, measured, validate)
-        folder.write_fitted(found, out)
-    say_written(found.lines(), out)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -56,17 +56,16 @@ def excite(
     """Design a motion that excites the dynamics of ROBOT within its limits."""
     from calib.api.motions import design_excitation
     from calib.procedure.excitation import folder
-    from calib.procedure.parallel_stage import robots
+    from calib.procedure.parallel_stage import folder as parallel_folder
+    from calib.procedure.parallel_stage.robots import path_of
 
     settings = ExcitationSettings(
         goals=tuple(goal or ()), hard=tuple(hard or ()), period=period, harmonics=harmonics, family=family,
         drives=drives, rate=rate, starts=starts, evaluations=evaluations, seed=seed, front=front,
         start=_stands(start), repeat=repeat, slower=slower, existing=tuple(existing or ()), lock=tuple(lock or ()),
     )  # fmt: skip
-    if (parallel := robots.find(robot)) is not None:
-        _excite_parallel(parallel, settings, out, model, limits, workers)
-        return
-    folder.check_design_target(out, [robot, model, limits, *settings.existing])
+    check = parallel_folder.check_moved if path_of(robot) else folder.check_design_target
+    check(out, [robot, model, limits, *settings.existing])
     with progress() as say:
         designed = design_excitation(
             robot, settings, model=model, limits=limits, base=base, tip=tip, workers=workers, progress=say
@@ -116,15 +115,15 @@ def plan(
     """Plan the fastest motion of ROBOT through waypoints, within its speeds and torques."""
     from calib.api.motions import plan_motion
     from calib.procedure.excitation import folder
-    from calib.procedure.parallel_stage.robots import refuse_parallel
-
-    refuse_parallel(robot, "plan")
+    from calib.procedure.parallel_stage import folder as parallel_folder
+    from calib.procedure.parallel_stage.robots import path_of
 
     settings = PlanSettings(
         payloads=tuple(payload or ()), lines=line, rate=rate, shorten=shorten, stray=stray, start=_stands(start),
         slower=slower,
     )  # fmt: skip
-    folder.check_plan_target(out, [robot, waypoints, model, limits, drives])
+    check = parallel_folder.check_moved if path_of(robot) else folder.check_plan_target
+    check(out, [robot, waypoints, model, limits, drives])
     with progress() as say:
         planned = plan_motion(
             robot, waypoints, settings, model=model, limits=limits, drives=drives, base=base, tip=tip, progress=say
@@ -132,19 +131,6 @@ def plan(
         say("writing")
         planned.save(out, plots=plots)
     say_written(str(planned).splitlines(), out)
-
-
-def _excite_parallel(
-    robot: Any, settings: ExcitationSettings, out: Path, model: Path | None, limits: Path | None, workers: str
-) -> None:
-    from calib.procedure.parallel_stage import folder
-    from calib.procedure.parallel_stage.excite import excite_parallel
-    from calib.workers import workers as pool
-
-    with progress() as say, pool(workers) as spread:
-        designed = excite_parallel(robot, settings, model=model, limits=limits, map=spread.map, progress=say)
-        folder.write_designed(robot, designed, settings.rate, out)
-    say_written(folder.designed_lines(robot, designed), out)
 
 
 def _stands(start: str | None) -> tuple[float, ...] | None:

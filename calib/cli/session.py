@@ -69,7 +69,7 @@ def new(
     from calib.procedure.parallel_stage.robots import refuse_parallel
     from calib.procedure.session.questions import Answers, checked
 
-    refuse_parallel(robot, "new")
+    refuse_parallel(robot, "calib new")
     told = tuple(obstacle) if obstacle else None
     given = Answers(
         robot, instrument, tool, limits, dynamics, tuple(payload or ()), torques, instrument_at, cone, facing, box, told
@@ -240,8 +240,10 @@ def view(
     """Show in Rerun: the robot, pose errors, poses as they were chosen, motions with their limits, torques."""
     from calib.errors import UsageError, command_line
     from calib.files import check_target
+    from calib.procedure.parallel_stage.robots import refuse_parallel
     from calib.procedure.report import viewer
 
+    refuse_parallel(folder, "calib view")
     if save is None and spawn is False:
         raise UsageError("nothing to do: give --save FILE.rrd, or leave --no-spawn out")
     if save:

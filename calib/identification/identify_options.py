@@ -11,6 +11,7 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
                                      # the periods that `calib recall` averaged, relative between joints
     drives = "Ia Fv Fc off"          # a text for all joints, or one per joint; default by rows: motor as here, link
                                      # Fvl Fcl offl, drive Ia Fvm Fcm offm, both all seven
+    passive = "Fv Fc"                # friction of a parallel robot's passive joints; default none
     v0 = 0.01                        # smoothing of the Coulomb sign [rad/s or m/s], or one per joint
     rows = "motor"                   # which torques are explained: motor; with joint torque sensors (columns tau_l and
                                      # tau_m or tau) also link (Model 1), both (Model 2), drive (Model 3: tau_m - tau_l)
@@ -93,6 +94,7 @@ from calib.config import (
     Positive,
     Real,
     Spread,
+    Text,
     Whole,
     check_keys,
     inherited,
@@ -169,6 +171,7 @@ class OptionsFile:
     method: Annotated[str, OneOf(tuple(METHODS))] | None = None
     weights: Annotated[str, OneOf(WEIGHTS)] | None = None
     drives: Texts | None = None
+    passive: Text | None = None
     v0: Annotated[tuple[Positive, ...], Spread()] | None = None
     rows: Annotated[str, OneOf(tuple(ROWS))] | None = None
     gravity: Annotated[tuple[float, float, float], Expect("three numbers [m/s²]")] | None = None

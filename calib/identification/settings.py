@@ -50,6 +50,7 @@ class IdentificationSettings:
 
     Attributes:
         sets: names of the standard drive terms, one text per joint, or one for all; none: those of the rows.
+        passive: names of the drive terms of a parallel robot's passive joints, one text for all.
         v0: smoothing of the Coulomb sign [rad/s or m/s], one per joint, or one for all.
         torque_rows: which torques are explained.
         couplings, terms: what a joint-by-joint model lacks.
@@ -72,6 +73,7 @@ class IdentificationSettings:
     """
 
     sets: tuple[str, ...] = ()
+    passive: str = ""
     v0: tuple[float, ...] = (V0,)
     torque_rows: TorqueRows = MOTOR
     couplings: tuple[Coupling, ...] = ()
@@ -97,6 +99,8 @@ class IdentificationSettings:
 
 def make_model(chain: Chain, settings: IdentificationSettings) -> IdentificationModel:
     """Return the model of a chain: its bodies, payloads at its tip, and the drives' standard terms."""
+    if settings.passive:
+        raise UsageError(f"passive = '{settings.passive}': a serial arm has no passive joints")
     bodies = bodies_of(chain)
     if settings.gravity is not None:
         bodies = with_gravity(bodies, np.array(settings.gravity))

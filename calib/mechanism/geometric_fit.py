@@ -151,6 +151,13 @@ def platform_errors(known: ClosedRobot, readings: np.ndarray, coordinates: np.nd
     return coordinates - coordinates_of(known, locate(known, readings))
 
 
+def contradictions(known: ClosedRobot, readings: np.ndarray) -> np.ndarray:
+    """Return what redundant encoder readings (m, n) contradict each other by, Nᵀ (q - q(x̂)) (m, n - r) [rad or m]."""
+    posture = locate(known, readings)
+    across = preload_directions(known, loop_jacobians(known, posture)).transpose(0, 2, 1)
+    return times(across, readings - posture.q[:, known.robot.actuated])
+
+
 def _observed(
     known: ClosedRobot, readings: np.ndarray, coordinates: np.ndarray | None, parameters: Sequence[LoopParameter]
 ) -> tuple[np.ndarray, np.ndarray]:

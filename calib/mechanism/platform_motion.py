@@ -39,8 +39,8 @@ def twist_of(known: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray) ->
     full = np.zeros((3, len(x), 6))
     full[:, :, selected] = x, v, a
     angles, rates, changes = full[:, :, 3:]
-    Rz = Rotation.from_euler("z", angles[:, 2]).as_matrix()
-    Rzy = Rz @ Rotation.from_euler("y", angles[:, 1]).as_matrix()
+    Rz = Rotation.from_euler("z", angles[:, 2:]).as_matrix()
+    Rzy = Rz @ Rotation.from_euler("y", angles[:, 1:2]).as_matrix()
     axes = np.stack([Rzy[:, :, 0], Rz[:, :, 1], np.broadcast_to([0.0, 0.0, 1.0], (len(x), 3))], axis=2)
     yaw = rates[:, 2:] * axes[:, :, 2]
     pitch = rates[:, 1:2] * axes[:, :, 1]

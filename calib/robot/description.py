@@ -67,7 +67,7 @@ def read(path: str | Path, propose_beta: bool = True) -> Chain:
     if "leg" in table or table.get("kind") == "parallel":
         raise RobotError(
             f"{path} is a parallel robot (legs and a platform), and this is for serial arms yet; calib "
-            "identify, excite and fit take it"
+            "fit, excite, identify and plan take it"
         )
     robot = {key: value for key, value in table.items() if key not in EXTRA}
     if "element" not in robot:

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+import calib as api
 from calib.cli import run
 from calib.mechanism import library as parallel
 from calib.mechanism import parallel_files
@@ -54,6 +55,8 @@ def folder(tmp_path_factory):
     table = np.column_stack([np.degrees(q), 1e3 * x[:, :2], np.degrees(x[:, 2])])
     np.savetxt(path / "poses.csv", table, delimiter=",", header=motors + ",x [mm],y [mm],rz [deg]", comments="")
     np.savetxt(path / "readings.csv", table[:, :4], delimiter=",", header=motors, comments="")
+    (path / "way.csv").write_text("x [mm],y [mm],rz [deg]\n0,0,0\n50,40,15\n-60,20,-20\n0,0,0\n")
+    (path / "outside.csv").write_text("x [mm],y [mm],rz [deg]\n0,0,0\n300,0,0\n")
     np.savetxt(path / "passive.csv", table[:, :5], delimiter=",", header=motors + ",elbow1 [deg]", comments="")
     return path
 
@@ -72,6 +75,7 @@ def test_identify_finds_the_payload_and_predicts_other_motion(folder, tmp_path, 
     assert abs(table["values"]["M5"] / 5.37 - 1.0) < 0.02
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["validation"]["other.csv"]["filtered"]["relative_error_percent"]["total"] < 5.0
+    assert metrics["verdict"]["level"] == "pass"
     assert metrics["rows"] == (["power"] if options == "power" else ["x", "y", "rz"])
     assert (
         calib("identify", out, *files, "--options", folder / "options.toml", "--out", tmp_path / "again", "--no-plots")
@@ -99,6 +103,61 @@ def test_excite_writes_a_motion_within_the_limits(tmp_path):
     assert max(metrics["peak_torque"]) < 127.0 and min(one["margin"] for one in metrics["margins"]) > -1e-9
     rows = np.loadtxt(out / "motion.csv", delimiter=",", skiprows=1)
     assert rows.shape == (1001, 1 + 3 + 3 * 4) and np.abs(rows[:, 1:3]).max() <= 0.08
+    log = np.vstack([rows[:-1], rows[:-1], rows])[:, [0, *range(4, 8), *range(12, 16)]]
+    log[:, 0] = np.arange(len(log)) / 1000.0
+    np.savetxt(tmp_path / "log.csv", log, delimiter=",", header=HEAD, comments="")
+    assert calib("recall", out, tmp_path / "log.csv", "--out", tmp_path / "mean.csv") == 0
+    mean = np.loadtxt(tmp_path / "mean.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(mean[:, 1:5], rows[:-1, 4:8], atol=1e-6)
+
+
+def test_plan_keeps_the_limits_and_passes_the_waypoints(folder, tmp_path, capsys):
+    for line in (False, True):
+        out = tmp_path / f"plan{line}"
+        assert calib("plan", "dualv", "--waypoints", folder / "way.csv", "--out", out, *(["--line"] * line)) == 0
+        metrics = json.loads((out / "metrics.json").read_text())
+        assert max(metrics["peak_torque"]) <= 127.0 and min(metrics["margins"]["torque"]) < 0.02
+        rows = np.loadtxt(out / "motion.csv", delimiter=",", skiprows=1)
+        for point in ([0.05, 0.04, np.radians(15)], [-0.06, 0.02, np.radians(-20)], [0.0, 0.0, 0.0]):
+            assert np.abs(rows[:, 1:4] - point).max(axis=1).min() < 2e-3
+
+
+def test_the_api_takes_what_the_commands_take(folder, tmp_path):
+    robot = api.load("dualv")
+    fitted = api.fit_geometry(robot, folder / "poses.csv", api.FitSettings(holdout=0.3))
+    assert fitted.verdict.level == "pass" and "held out" in fitted.verdict.reason
+    files = [folder / "empty.csv", folder / "load.csv"]
+    model = api.identify_dynamics("dualv", files, options=folder / "options.toml")
+    assert model.verdict.level == "marginal" and "no unseen motion" in str(model)
+    judged = api.validate(model, folder / "other.csv")
+    assert judged.verdict.level == "pass" and judged.estimate is not None
+    metrics = json.loads((judged.save(tmp_path / "api", plots=False) / "metrics.json").read_text())
+    assert metrics == judged.to_dict() and list(metrics["validation"]) == ["other.csv"]
+    still = model.robot.known.home.q[:, robot.known.robot.actuated]
+    assert np.abs(judged.torques(still, 0 * still, 0 * still)).max() < 1.0
+    assert api.plan_motion(fitted.robot, folder / "way.csv", model=judged).duration > 0.1
+    for refused in (lambda: api.export(judged, tmp_path / "no"), lambda: api.select_poses(robot)):
+        with pytest.raises(api.CalibError):
+            refused()
+
+
+def test_verdicts_fail_where_they_should(folder, tmp_path, capsys):
+    log = np.loadtxt(folder / "empty.csv", delimiter=",", skiprows=1)
+    log[:, 5] *= -1.0
+    np.savetxt(tmp_path / "reversed.csv", log, delimiter=",", header=HEAD, comments="")
+    words = ("--validate", folder / "other.csv", "--no-plots", "--out", tmp_path / "id")
+    assert calib("identify", "dualv", tmp_path / "reversed.csv", *words) == 1
+    assert "above 30 % fails" in capsys.readouterr().out
+    words = ("--options", folder / "options.toml", "--out", tmp_path / "none", "--no-plots")
+    (tmp_path / "load.csv").write_text((folder / "empty.csv").read_text())
+    assert calib("identify", "dualv", folder / "other.csv", tmp_path / "load.csv", *words) == 1
+    table = np.loadtxt(folder / "poses.csv", delimiter=",", skiprows=1)
+    table[:30, 4] += 20.0
+    motors = "motor1 [deg],motor2 [deg],motor3 [deg],motor4 [deg],x [mm],y [mm],rz [deg]"
+    np.savetxt(tmp_path / "wrong.csv", table[:40], delimiter=",", header=motors, comments="")
+    words = ("fit", "dualv", tmp_path / "wrong.csv", "--validate", folder / "poses.csv", "--out", tmp_path / "fit")
+    assert calib(*words) == 1
+    assert "worse than the nominal" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -110,14 +169,19 @@ def test_excite_writes_a_motion_within_the_limits(tmp_path):
         (("identify", "dualv", "load.csv", "--friction", "stribeck"), "standard friction only"),
         (("fit", "dualv", "passive.csv"), "passive joint"),
         (("fit", "dualv", "three.csv"), "'motor1' is missing"),
-        (("excite", "dualv", "--lock", "motor1"), "--lock is for serial arms"),
-        (("plan", "dualv", "--waypoints", "poses.csv"), "calib plan is for serial arms"),
-        (("select", "dualv"), "calib select is for serial arms"),
+        (("excite", "dualv", "--lock", "motor1"), "lock is for serial arms"),
+        (("plan", "dualv", "--waypoints", "empty.csv"), "neither the platform's coordinates (x, y, rz)"),
+        (("plan", "dualv", "--waypoints", "outside.csv"), "waypoint 2: joint 1 at 0.3"),
+        (("plan", "dualv", "--waypoints", "way.csv", "--shorten", 5), "shorten is for serial arms"),
+        (("fit", "dualv", "poses.csv", "--model", "stiffness"), "model 'stiffness' is for serial arms"),
+        (("fit", "dualv", "readings.csv", "--tolerance", 0.1), "a tolerance is of the platform's position"),
+        (("identify", "dualv", "load.csv", "--base", "link0"), "base 'link0'"),
+        (("select", "dualv"), "choosing poses is for serial arms"),
         (("new", "--robot", "dualv", "--instrument", "cmm"), "calib new is for serial arms"),
     ],
 )
 def test_what_is_wrong_is_said(folder, tmp_path, capsys, words, said):
-    command, *rest = [folder / word if word.endswith(".csv") else word for word in words]
+    command, *rest = [folder / word if str(word).endswith(".csv") else word for word in words]
     out = tmp_path / "out"
     given = [out, *rest] if command == "new" else [*rest, "--out", out]
     assert calib(command, *given) == 2

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -61,6 +62,7 @@ def judge(
     excitation: Mapping[str, ExcitationReport],
     driven: Sequence[int] = (),
     rows: Sequence[str] = (),
+    coordinate: str = "joint",
 ) -> Verdict:
     """Judge an identification by motion it has not seen; the first rule that holds.
 
@@ -81,6 +83,7 @@ def judge(
         excitation: of the training files.
         driven: joints, from 0, see `calib.identification.friction.passivity`.
         rows: what the torque rows are called, see `calib.dynamics.torque_rows.TorqueRows.numbered`; default 1, 2, ...
+        coordinate: what such a row belongs to, in a word.
     """
     if driven:
         named = ", ".join(str(joint + 1) for joint in driven)
@@ -88,7 +91,7 @@ def judge(
         return Verdict("fail", f"friction drives joint {named} instead of braking it, as in no robot: {why}")
     moves = {name: scored for name, scored in validation.items() if scored.motion_share >= MOVES}
     verdict = _judge_totals(fit, moves, len(moves) < len(validation), repeated, excitation)
-    return _held_by_joint(verdict, moves or fit, rows)
+    return _held_by_joint(verdict, moves or fit, rows, coordinate)
 
 
 def _judge_totals(
@@ -121,7 +124,7 @@ def _judge_totals(
     return Verdict("pass", told)
 
 
-def _held_by_joint(verdict: Verdict, scores: Mapping[str, Score], rows: Sequence[str]) -> Verdict:
+def _held_by_joint(verdict: Verdict, scores: Mapping[str, Score], rows: Sequence[str], coordinate: str) -> Verdict:
     """Return the verdict with the joints named that the model does not explain, and no better than they allow.
 
     Taken in the band, since noise is no fault of the model, and moving, since friction at rest takes any value.
@@ -136,7 +139,7 @@ def _held_by_joint(verdict: Verdict, scores: Mapping[str, Score], rows: Sequence
         lost |= {int(k): max(lost.get(int(k), 0.0), float(share[k])) for k in np.flatnonzero(share >= LOST)}
     if not lost:
         return verdict
-    named = ", ".join(f"joint {rows[k] if rows else k + 1} ({lost[k]:.0f} % unexplained)" for k in sorted(lost))
+    named = ", ".join(f"{coordinate} {rows[k] if rows else k + 1} ({lost[k]:.0f} % unexplained)" for k in sorted(lost))
     level = "fail" if failed or verdict.level == "fail" else "marginal"
     return Verdict(
         level, f"{verdict.reason}; the model does not hold for {named}: is this the robot, are the columns in order?"
@@ -162,7 +165,14 @@ def warnings(
 ) -> list[str]:
     """Return what a user should know of the recordings, whatever model was identified, worst first."""
     told = [line for case in (*cases, *unseen) for line in beyond(case, chain)]
-    told += [
+    return told + motion_warnings(validation, repeated, excitation)
+
+
+def motion_warnings(
+    validation: Mapping[str, Score], repeated: Mapping[str, float], excitation: Mapping[str, ExcitationReport]
+) -> list[str]:
+    """Return what a user should know of the recordings' motion, whatever the robot."""
+    told = [
         f"{name}: {100 * share:.0f} % of its states were met in training: a repeat proves nothing, it is no evidence"
         for name, share in repeated.items()
     ]
@@ -179,6 +189,15 @@ def model_warnings(
     cases: Sequence[Case], found: Identification, excitation: Mapping[str, ExcitationReport]
 ) -> tuple[str, ...]:
     """Return what a user should know of the model and the motion it was identified from, whatever is unseen."""
+    told = parameter_warnings(found)
+    told += found.bias.lines(found.fitted.instrumental is not None)
+    told += _elastic(cases)
+    told += _slow_bias(cases, found)
+    return tuple(told)
+
+
+def parameter_warnings(found: Identification[Any]) -> list[str]:
+    """Return what a user should know of the parameters, whatever the robot: condition, bounds, prior."""
     told, normalised = [], found.condition[1]
     if normalised > CONDITION:
         told.append(
@@ -187,11 +206,7 @@ def model_warnings(
         )
     if found.fitted.held is not None:
         told += found.fitted.held.lines()
-    told += found.bias.lines(found.fitted.instrumental is not None)
-    told += _rests(found)
-    told += _elastic(cases)
-    told += _slow_bias(cases, found)
-    return tuple(told)
+    return told + _rests(found)
 
 
 def beyond(case: Case, chain: Chain) -> list[str]:
@@ -207,7 +222,7 @@ def beyond(case: Case, chain: Chain) -> list[str]:
     return [f"{case.name}: far beyond the robot's limits ({named}): is this the robot, are the columns in its order?"]
 
 
-def resting_parameters(found: Identification) -> Resting:
+def resting_parameters(found: Identification[Any]) -> Resting:
     """Return the base parameters that the motion does not tell."""
     if found.prior is None:
         return Resting(of=found.base.b)
@@ -216,7 +231,7 @@ def resting_parameters(found: Identification) -> Resting:
     return Resting(names, found.base.b, found.prior.source)
 
 
-def _rests(found: Identification) -> list[str]:
+def _rests(found: Identification[Any]) -> list[str]:
     """Say which parameters the motion does not tell."""
     names = resting_parameters(found).names
     if found.prior is None or not names:

@@ -3,14 +3,15 @@
 identify: ``dynamics.json`` (values of all parameters, base expressions), ``estimate.csv``, ``covariance.csv``,
 ``metrics.json`` (errors by recording, parameters, elimination, notes), ``torques_1.csv`` and figures. fit:
 ``estimate.csv`` (changes of the loops' constants), ``covariance.csv``, ``metrics.json``. excite: ``motion.csv`` (time,
-platform coordinates, and position, speed, torque of each actuator) and ``metrics.json``.
+platform coordinates, and position, speed, torque of each actuator), ``trajectory.toml`` (the actuators' positions as
+Fourier series, for `calib recall`) and ``metrics.json``. plan: the same without series.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,22 +25,29 @@ from calib.identification.model_file import MODEL
 from calib.identification.prediction import predict
 from calib.identification.scores import Score
 from calib.mechanism import parallel_files
+from calib.procedure.excitation import coefficients
 from calib.procedure.excitation.coefficients import PLANNED
 from calib.procedure.excitation.parallel import ParallelDesign
 from calib.procedure.parallel_stage.fit import ParallelFit
 from calib.procedure.parallel_stage.identify import ParallelOutcome
+from calib.procedure.parallel_stage.plan import ParallelPlan, plan_metrics
 from calib.procedure.parallel_stage.robots import FoundRobot
 from calib.robot.calibrated import ROBOT
+from calib.robot.tables import dumps
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 IDENTIFIED = (ROBOT, MODEL, ESTIMATE, COVARIANCE, METRICS, "torques_1.csv", "plot_*.png")
 FITTED = (ROBOT, ESTIMATE, COVARIANCE, METRICS)
-DESIGNED = (ROBOT, PLANNED, METRICS)
+MOVED = (ROBOT, PLANNED, coefficients.NAME, METRICS)
+EXACT = 1e-8  # by which the series of the actuators may leave the motion [rad or m]
 RATE = 100.0  # of torques_1.csv [Hz]
 
 
 def write_identified(outcome: ParallelOutcome, out: Path, plots: bool = True) -> Path:
     """Write the folder of an identification, all files or none."""
-    check_target(out, IDENTIFIED, (METRICS, MODEL), "identification", [outcome.robot.source])
+    check_identified(out, [outcome.robot.source])
 
     def write(folder: Path) -> None:
         _write_robot(outcome.robot, folder)
@@ -53,20 +61,22 @@ def write_identified(outcome: ParallelOutcome, out: Path, plots: bool = True) ->
         write_covariance(folder / COVARIANCE, found.names, estimate.covariance)
         values = dict(zip(outcome.model.names, map(float, found.dynamics.values)))
         table = {"robot": ROBOT, "kind": outcome.model.torque_rows.name, "payloads": list(outcome.model.payloads)}
+        table["v0"] = outcome.found.settings.v0[0]
         base = dict(zip(found.names, words))
         files.write_json(folder / MODEL, table | {"values": values, "base": base, "covariance": COVARIANCE})
         files.write_json(folder / METRICS, metrics(outcome))
         case = (*outcome.unseen, *outcome.cases)[0]
         _write_torques(case, predict(found.dynamics, case), folder / "torques_1.csv")
         if plots:
-            _draw(outcome, folder)
+            for name, figure in figures(outcome).items():
+                figure.savefig(folder / f"plot_{name}.png", dpi=110)
 
     return write_staged(out, IDENTIFIED, write)
 
 
 def write_fitted(fitted: ParallelFit, out: Path) -> Path:
     """Write the folder of a geometric calibration, all files or none."""
-    check_target(out, FITTED, (METRICS, ROBOT), "fit", [fitted.nominal.source, *fitted.files])
+    check_fitted(out, [fitted.nominal.source, *fitted.files])
 
     def write(folder: Path) -> None:
         found, estimate = fitted.found, fitted.found.estimate
@@ -82,7 +92,7 @@ def write_fitted(fitted: ParallelFit, out: Path) -> Path:
 
 def write_designed(robot: FoundRobot, design: ParallelDesign, rate: float, out: Path) -> Path:
     """Write the folder of an exciting motion, one period at the controller's rate, all files or none."""
-    check_target(out, DESIGNED, (METRICS, PLANNED), "excitation", [robot.source])
+    check_moved(out, [robot.source])
     known = robot.known.robot
     t = np.arange(round(design.family.period * rate) + 1) / rate
     x, v, a = design.orders(t)
@@ -96,9 +106,44 @@ def write_designed(robot: FoundRobot, design: ParallelDesign, rate: float, out: 
     def write(folder: Path) -> None:
         _write_robot(robot, folder)
         files.write_table(folder / PLANNED, header, np.hstack(parts).tolist())
+        series = coefficients.table(_actuators_series(design, rate), ROBOT)
+        files.write(folder / coefficients.NAME, dumps(series))
         files.write_json(folder / METRICS, design_metrics(robot, design))
 
-    return write_staged(out, DESIGNED, write)
+    return write_staged(out, MOVED, write)
+
+
+def write_planned(planned: ParallelPlan, out: Path) -> Path:
+    """Write the folder of a planned motion at the controller's rate, all files or none."""
+    check_moved(out, [planned.robot.source])
+    robot, track = planned.robot.known.robot, planned.track
+    parts = [track.times[:, None], planned.coordinates, track.q, track.v]
+    header = ["t [s]", *robot.freedom, *(f"q_{n}" for n in robot.joint_names), *(f"v_{n}" for n in robot.joint_names)]
+    if track.tau is not None:
+        parts.append(track.tau)
+        header += [f"tau_{n}" for n in robot.joint_names]
+
+    def write(folder: Path) -> None:
+        _write_robot(planned.robot, folder)
+        files.write_table(folder / PLANNED, header, np.hstack(parts).tolist())
+        files.write_json(folder / METRICS, plan_metrics(planned))
+
+    return write_staged(out, MOVED, write)
+
+
+def check_identified(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
+    """Refuse, before any work is done, a folder that an identification cannot go into."""
+    check_target(out, IDENTIFIED, (METRICS, MODEL), "identification", inputs)
+
+
+def check_fitted(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
+    """Refuse, before any work is done, a folder that a fit cannot go into."""
+    check_target(out, FITTED, (METRICS, ROBOT), "fit", inputs)
+
+
+def check_moved(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
+    """Refuse, before any work is done, a folder that a motion cannot go into."""
+    check_target(out, MOVED, (METRICS, PLANNED), "motion", inputs)
 
 
 def design_metrics(robot: FoundRobot, design: ParallelDesign) -> dict[str, Any]:
@@ -125,6 +170,7 @@ def metrics(outcome: ParallelOutcome) -> dict[str, Any]:
         "robot": outcome.robot.known.robot.name,
         "rows": list(outcome.model.torque_rows.numbered(outcome.model.n)),
         "method": found.fitted.method,
+        "verdict": {"level": outcome.verdict.level, "reason": outcome.verdict.reason},
         "identification": {name: _errors(one) for name, one in outcome.fit.items()},
         "validation": {name: _errors(one) for name, one in outcome.validation.items()},
         "parameters": {
@@ -181,6 +227,21 @@ def _write_robot(robot: FoundRobot, folder: Path) -> None:
     parallel_files.write(folder / ROBOT, robot.known.robot, f"from {robot.source}")
 
 
+def _actuators_series(design: ParallelDesign, rate: float) -> coefficients.Periodic:
+    """Return the periodic motion of the actuators as Fourier series, long enough to be exact within `EXACT`."""
+    known, period = design.robot.model.known, design.family.period
+    count = 2048
+    q = design.along(period / count * np.arange(count)).posture.q[:, known.robot.actuated]
+    lines = np.fft.rfft(q, axis=0) / count
+    above = np.cumsum(2.0 * np.abs(lines[::-1]), axis=0)[::-1].max(axis=1)
+    harmonics = max(1, int((above[1:] > EXACT).sum()))
+    own = tuple(
+        np.concatenate([[c[0].real], -2.0 * c[1 : harmonics + 1].imag, 2.0 * c[1 : harmonics + 1].real])
+        for c in lines.T
+    )
+    return coefficients.Periodic(known.robot.joint_names, period, rate, 1, "fourier", own)
+
+
 def _essential(outcome: ParallelOutcome) -> dict[str, float]:
     """Return the essential parameters' values by their names; empty where none were asked for."""
     gone = outcome.found.elimination
@@ -205,13 +266,13 @@ def _write_torques(case: Case, predicted: np.ndarray, path: Path) -> None:
     files.write_table(path, header, np.column_stack([case.motion.t, case.target, predicted])[::step].tolist())
 
 
-def _draw(outcome: ParallelOutcome, folder: Path) -> None:
-    """Draw measured and predicted rows of every recording, below the identification band."""
+def figures(outcome: ParallelOutcome) -> dict[str, Figure]:
+    """Return measured and predicted rows of every recording, below the identification band, by name."""
     import matplotlib.pyplot as plt
 
+    drawn = {}
     for number, case in enumerate((*outcome.cases, *outcome.unseen), 1):
-        predicted: Callable[[np.ndarray], np.ndarray] = lambda x, own=case: in_band(own.motion, x)  # noqa: E731
-        y, model = predicted(case.target), predicted(predict(outcome.found.dynamics, case))
+        y, model = (in_band(case.motion, x) for x in (case.target, predict(outcome.found.dynamics, case)))
         labels = [f"{a} [{b}]" for a, b in zip(case.torque_rows.numbered(case.motion.n), _units(outcome, case))]
         figure, axes = plt.subplots(len(labels), 1, figsize=(8, 1.9 * len(labels) + 0.6), sharex=True, squeeze=False)
         for axis, label, one, two in zip(axes[:, 0], labels, y.T, model.T):
@@ -223,8 +284,9 @@ def _draw(outcome: ParallelOutcome, folder: Path) -> None:
         axes[0, 0].legend(loc="upper right", ncols=3, fontsize=7)
         axes[-1, 0].set_xlabel("time [s]")
         figure.tight_layout()
-        figure.savefig(folder / f"plot_torque_{number}.png", dpi=110)
         plt.close(figure)
+        drawn[f"torque_{number}"] = figure
+    return drawn
 
 
 def _units(outcome: ParallelOutcome, case: Case) -> tuple[str, ...]:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from calib.data.recordings.recording import Joints, Recording
+from calib.data.signals.persistency import ExcitationReport, repeats, report_excitation
 from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import MeasurementError, UsageError
 from calib.identification.cases import Case, case_names, make_case
@@ -18,16 +20,30 @@ from calib.identification.methods.registry import method_named
 from calib.identification.prediction import predict
 from calib.identification.scores import Score, score
 from calib.identification.settings import IdentificationSettings, per_joint
-from calib.mechanism.closure import NoPosture
-from calib.mechanism.parallel_model import ParallelModel, make_parallel_model, rows_named
+from calib.mechanism.closure import NoPosture, locate
+from calib.mechanism.parallel_model import PLATFORM, ParallelModel, make_parallel_model, rows_named
 from calib.mechanism.parallel_robot import ParallelRobot
 from calib.procedure.dynamic_stage.inputs import read_motion
+from calib.procedure.dynamic_stage.validation import REPEAT
+from calib.procedure.dynamic_stage.verdict import (
+    judge,
+    motion_warnings,
+    parameter_warnings,
+    resting_parameters,
+    with_prior,
+)
+from calib.procedure.findings import Verdict
 from calib.procedure.parallel_stage.robots import FoundRobot
 
 _NOT_YET = {
     "couplings": "[[coupling]]", "terms": "[[term]]", "loop": "[loop]", "gravity": "gravity",
     "payload_values": "known payloads",
 }  # fmt: skip
+APART = 1e-3  # rms by which redundant encoders contradict each other from which it is said [rad or m] (our choice)
+FEW = 200  # samples of a recording at which they are asked
+DRIVEN = -0.01  # of the energy that the actuators move, as `calib.identification.friction.passivity.LEAST`
+
+Recorded = str | Path | Recording
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,19 +53,23 @@ class ParallelOutcome:
     Attributes:
         robot: with its file.
         model: what was identified.
+        options: how recordings were read.
         found: the model with numbers, estimate and elimination.
         cases, unseen: recordings learnt from, and others.
         fit, validation: case name → score.
+        verdict: pass, marginal or fail, by the rules of serial arms (`calib.procedure.dynamic_stage.verdict`).
         notes: what a user should know.
     """
 
     robot: FoundRobot
     model: ParallelModel
+    options: IdentifyOptions
     found: Identification[RegressorModel]
     cases: tuple[Case, ...]
     unseen: tuple[Case, ...]
     fit: Mapping[str, Score]
     validation: Mapping[str, Score]
+    verdict: Verdict
     notes: tuple[str, ...]
 
 
@@ -64,59 +84,138 @@ def joints_of(robot: ParallelRobot) -> Joints:
 
 def identify_parallel(
     robot: FoundRobot,
-    recordings: Sequence[str | Path | Recording],
-    validate: Sequence[str | Path | Recording] = (),
+    recordings: Sequence[Recorded],
+    validate: Sequence[Recorded] = (),
     *,
     options: IdentifyOptions | None = None,
     method: str | None = None,
+    friction: str | None = None,
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> ParallelOutcome:
-    """Identify the dynamics of a parallel robot from recordings of its actuated joints.
+    """Identify the dynamics of a parallel robot from recordings of its actuated joints, and judge it.
 
     Args:
         recordings, validate: files with a cut if wanted, or recordings in memory.
         options: filters, payloads, drives, method; ``rows``: motor (on the platform's coordinates where actuators are
-            redundant) or power.
-        method: in place of the options'.
+            redundant) or power; ``passive``: friction of the passive joints.
+        method, friction: in place of the options'.
 
     Raises:
         UsageError: for options that only serial arms know.
         MeasurementError: for recordings that cannot be right.
     """
     say, options = progress or (lambda words: None), options or IdentifyOptions()
-    settings = replace(options.settings, seed=seed, **({} if method is None else {"method": method}))
+    chosen = {"method": method, "friction": friction}
+    settings = replace(
+        options.settings, seed=seed, **{key: value for key, value in chosen.items() if value is not None}
+    )
     _refuse(settings, options)
     known = robot.known
     wanted = settings.torque_rows.name
     rows = rows_named(known, "" if wanted == "motor" else wanted)
     model = make_parallel_model(
-        known, settings.sets, per_joint(settings.v0, 1, "v0")[0], rows, tuple(settings.payloads)
+        known, settings.sets, per_joint(settings.v0, 1, "v0")[0], rows, tuple(settings.payloads), settings.passive
     )
-    given = [*recordings, *validate]
-    names = case_names([str(each.file if isinstance(each, Recording) else each) for each in given])
-    cases: list[Case] = []
-    for name, each in zip(names, given):
+    learnt = _cases(model, options, recordings, (), say)
+    unseen = _cases(model, options, validate, learnt, say)
+    settings = replace(settings, torque_rows=rows)
+    found = identify_model(model, learnt, settings, cad=model.known_parameters(), progress=progress)
+    return _assessed(robot, model, options, found, learnt, unseen)
+
+
+def with_unseen(outcome: ParallelOutcome, validate: Sequence[Recorded]) -> ParallelOutcome:
+    """Return an outcome judged anew on more unseen recordings; nothing is identified."""
+    known = (*outcome.cases, *outcome.unseen)
+    more = _cases(outcome.model, outcome.options, validate, known, lambda words: None)
+    return _assessed(
+        outcome.robot, outcome.model, outcome.options, outcome.found, outcome.cases, (*outcome.unseen, *more)
+    )
+
+
+def _cases(
+    model: ParallelModel, options: IdentifyOptions, given: Sequence[Recorded], before: Sequence[Case],
+    say: Callable[[str], None],
+) -> tuple[Case, ...]:  # fmt: skip
+    """Return the cases of recordings; the band of those `before` serves where the options state none."""
+    paths = [str(each.file if isinstance(each, Recording) else each) for each in given]
+    names = case_names([*(case.name for case in before), *paths])[len(before) :]
+    cases = []
+    for name, path, each in zip(names, paths, given):
         say(f"reading {name}")
-        own = file_settings(options, str(each.file if isinstance(each, Recording) else each))
-        like = cases[0].motion if len(cases) >= len(recordings) else None
-        motion = read_motion(each, joints_of(known.robot), own, like)
+        own = file_settings(options, path)
+        motion = read_motion(each, joints_of(model.known.robot), own, before[0].motion if before else None)
         gains = None if own.gains is None else np.array(per_joint(own.gains, model.n, "gains"))
         if motion.kind == "current" and gains is None and motion.drive_gain is None:
             raise UsageError(f"{name}: currents without drive gains; state gains = [...] (N m/A) in the options file")
         gains = motion.drive_gain if gains is None and motion.kind == "current" else gains
         try:
-            cases.append(make_case(name, motion, rows, gains=gains, carried=own.payload))
+            cases.append(make_case(name, motion, model.torque_rows, gains=gains, carried=own.payload))
         except NoPosture as error:
             raise MeasurementError(f"{error}", name) from error
-    learnt, unseen = tuple(cases[: len(recordings)]), tuple(cases[len(recordings) :])
-    settings = replace(settings, torque_rows=rows, prior="none")
-    found = identify_model(model, learnt, settings, progress=progress)
-    scores = {case.name: score(case, predict(found.dynamics, case)) for case in cases}
-    return ParallelOutcome(
-        robot, model, found, learnt, unseen, {case.name: scores[case.name] for case in learnt},
-        {case.name: scores[case.name] for case in unseen}, tuple(_notes(model, learnt)),
+    return tuple(cases)
+
+
+def _assessed(
+    robot: FoundRobot, model: ParallelModel, options: IdentifyOptions, found: Identification[RegressorModel],
+    cases: tuple[Case, ...], unseen: tuple[Case, ...],
+) -> ParallelOutcome:  # fmt: skip
+    """Return the outcome: every recording predicted, and the verdict that follows."""
+    scores = {case.name: score(case, predict(found.dynamics, case)) for case in (*cases, *unseen)}
+    fit, validation = ({case.name: scores[case.name] for case in part} for part in (cases, unseen))
+    shares = {case.name: max(repeats(own.motion, case.motion) for own in cases) for case in unseen}
+    repeated = {name: share for name, share in shares.items() if share >= REPEAT}
+    excitation = {case.name: report_excitation(case.motion) for case in cases}
+    proofs = {name: one for name, one in validation.items() if name not in repeated}
+    notes = (
+        *_contradictions(model, (*cases, *unseen)), *motion_warnings(validation, repeated, excitation),
+        *parameter_warnings(found), *_payload_notes(model, found, cases), *_redundancy_notes(model),
+        *_recording_notes(model, (*cases, *unseen)),
     )  # fmt: skip
+    verdict = _judged(model, found, cases, fit, proofs, repeated, excitation)
+    return ParallelOutcome(robot, model, options, found, cases, unseen, fit, validation, verdict, notes)
+
+
+def _judged(
+    model: ParallelModel, found: Identification[RegressorModel], cases: Sequence[Case], fit: Mapping[str, Score],
+    proofs: Mapping[str, Score], repeated: Mapping[str, float], excitation: Mapping[str, ExcitationReport],
+) -> Verdict:  # fmt: skip
+    if driven := _driven_joints(model, found, cases):
+        return Verdict(
+            "fail",
+            f"friction drives joint {', '.join(driven)} instead of braking it, as in no robot: is a torque's sign "
+            "reversed, are columns swapped, is a payload on board that the options do not name?",
+        )
+    labels = found.settings.torque_rows.titles(model.known.robot.joint_names)
+    kind = "platform" if model.torque_rows.name == PLATFORM else "joint"
+    verdict = judge(fit, proofs, repeated, excitation, (), labels, kind)
+    return with_prior(verdict, resting_parameters(found))
+
+
+def _driven_joints(
+    model: ParallelModel, found: Identification[RegressorModel], cases: Sequence[Case]
+) -> tuple[str, ...]:
+    """Return names of joints whose friction gives energy, as a share of all that the actuators move."""
+    joints = [joint.name for leg in model.known.robot.legs for joint in leg.chain.joints]
+    rubbing = [
+        (one, value) for one, value in zip(model.terms, found.dynamics.values[model.inertial :])
+        if one.form.dissipative and value != 0.0 and one.joint is not None
+    ]  # fmt: skip
+    taken, moved = np.zeros(len(joints)), 0.0
+    for case in cases:
+        every = max(1, len(case.motion) // (10 * FEW))
+        q, v, a = (getattr(case.motion, key)[::every] for key in "qva")
+        motion, target = model.moved(q, v, a), case.target[::every]
+        if case.torque_rows.name == PLATFORM:
+            target = target * motion.rate
+        elif target.shape[1] == model.n:
+            target = target * v
+        moved += np.abs(target.sum(axis=1)).sum()
+        for one, value in rubbing:
+            speed = motion.v[:, one.joint]
+            size = one.settings[0] if one.shape == "sign" else 0.0
+            taken[one.joint] += value * np.sum(speed * (np.tanh(speed / max(size, 1e-9)) if size else speed))
+    return tuple(name for name, own in zip(joints, taken) if own < DRIVEN * moved)
 
 
 def _refuse(settings: IdentificationSettings, options: IdentifyOptions) -> None:
@@ -137,9 +236,38 @@ def _refuse(settings: IdentificationSettings, options: IdentifyOptions) -> None:
         raise UsageError(f"method '{method.name}' {what} a serial arm; parallel robots take ols, wls, irls, tls")
 
 
-def _notes(model: ParallelModel, cases: Sequence[Case]) -> list[str]:
-    """Return what payloads and redundancy ask to be said."""
+def _recording_notes(model: ParallelModel, cases: Sequence[Case]) -> list[str]:
+    """Return how the files were understood, and what they hold that takes no part."""
     robot, notes = model.known.robot, []
+    passive = [joint.name for leg in robot.legs for joint in leg.chain.joints if joint.name not in robot.joint_names]
+    for case in cases:
+        notes += [f"{case.name}: {note}" for note in case.motion.notes]
+        unread = " ".join(note for note in case.motion.notes if note.startswith("not read: "))
+        if named := [name for name in passive if name in unread]:
+            notes.append(
+                f"{case.name}: {', '.join(named)} are passive joints: their encoders and torques take no part, the "
+                "loops say how they move"
+            )
+    return notes
+
+
+def _contradictions(model: ParallelModel, cases: Sequence[Case]) -> list[str]:
+    """Return whether redundant encoders agree."""
+    robot, notes = model.known.robot, []
+    for case in cases if robot.redundant else ():
+        q = case.motion.q[:: max(1, len(case.motion) // FEW)]
+        apart = float(np.sqrt(np.mean((q - locate(model.known, q).q[:, robot.actuated]) ** 2)))
+        if apart > APART:
+            notes.append(
+                f"{case.name}: the {robot.n} encoders contradict each other by {1e3 * apart:.3g} mrad (or mm) rms: "
+                "zeros or geometry are off; fit them first: calib fit on the same readings"
+            )
+    return notes
+
+
+def _payload_notes(model: ParallelModel, found: Identification[Any], cases: Sequence[Case]) -> list[str]:
+    """Return what recordings with and without them tell of the payloads."""
+    notes, estimate = [], found.fitted.estimate
     for label in model.payloads:
         on = sum(label in case.carried for case in cases)
         if on == 0:
@@ -149,9 +277,22 @@ def _notes(model: ParallelModel, cases: Sequence[Case]) -> list[str]:
                 f"payload '{label}' is on board of every recording: its parameters are regrouped with the platform's; "
                 "a run without it tells them apart"
             )
-    if robot.redundant:
-        notes.append(
-            f"{robot.n} actuators for {robot.r} freedoms: torques were projected on the platform's coordinates, the "
-            "overconstraint takes no part"
-        )
+        elif f"M{label}" in found.base.names:
+            k = found.base.names.index(f"M{label}")
+            mass, sigma = estimate.values[k], estimate.sigma[k]
+            if mass < 3.0 * sigma:
+                notes.append(
+                    f"payload '{label}': {mass:.3g} ± {sigma:.2g} kg: the recordings said to carry it move as if it "
+                    "were not there"
+                )
     return notes
+
+
+def _redundancy_notes(model: ParallelModel) -> list[str]:
+    robot = model.known.robot
+    if not robot.redundant:
+        return []
+    return [
+        f"{robot.n} actuators for {robot.r} freedoms: torques were projected on the platform's coordinates, the "
+        "overconstraint takes no part"
+    ]
