@@ -150,7 +150,8 @@ def test_verdicts_fail_where_they_should(folder, tmp_path, capsys):
     assert "above 30 % fails" in capsys.readouterr().out
     words = ("--options", folder / "options.toml", "--out", tmp_path / "none", "--no-plots")
     (tmp_path / "load.csv").write_text((folder / "empty.csv").read_text())
-    assert calib("identify", "dualv", folder / "other.csv", tmp_path / "load.csv", *words) == 1
+    assert calib("identify", "dualv", folder / "empty.csv", tmp_path / "load.csv", *words) == 0
+    assert "move as if it were not there" in capsys.readouterr().out
     table = np.loadtxt(folder / "poses.csv", delimiter=",", skiprows=1)
     table[:30, 4] += 20.0
     motors = "motor1 [deg],motor2 [deg],motor3 [deg],motor4 [deg],x [mm],y [mm],rz [deg]"
