@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 from typer.main import get_command
 
-from calib.cli import camera, dynamics, geometry, motion, session
+from calib.cli import camera, dynamics, geometry, motion, session, study
 
 # many small matrices: BLAS threads only get in each other's way (a fit on two busy cores: 9 s against 19 s)
 for _pool in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -24,7 +24,7 @@ EXIT_CODES = (
     "or not converged, 4 an error that nobody foresaw: calib-bug-….txt says where."
 )
 INTERRUPTED = "interrupted; nothing was left half-written"
-RESUMED = ("next", "redo", "demo")  # keep what they have done; every other command starts over
+RESUMED = ("next", "redo", "demo", "study")  # keep what they have done; every other command starts over
 
 app = typer.Typer(
     add_completion=False,
@@ -38,7 +38,7 @@ app = typer.Typer(
 _FLAGS = ("--debug", "--help", "--line", "--plots", "--no-plots", "--refit-frames", "--no-refit-frames")
 _USAGE: Any = typer.BadParameter.__mro__[2]  # ClickException, of the click that this typer uses (or brings)
 
-for _group in (geometry, camera, dynamics, motion, session):
+for _group in (geometry, camera, dynamics, study, motion, session):
     app.add_typer(_group.app)
 
 

@@ -109,7 +109,7 @@ def formats(
         str | None,
         typer.Argument(
             help="measurements, images, targets, options, identify-options, identified, exports, constraints, mdh, "
-            "parallel, robot, session, limits, waypoints, excitation or recordings"
+            "parallel, robot, session, limits, waypoints, excitation, study or recordings"
         ),
     ] = None,
     schema: Annotated[

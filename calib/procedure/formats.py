@@ -69,6 +69,7 @@ TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
         "trajectory.toml of calib excite, and what calib recall writes",
         ("calib.procedure.excitation.coefficients", "calib.procedure.excitation.recall"),
     ),
+    "study": ("the TOML file of calib study", ("calib.studies.conditions",)),
     "recordings": (
         "recordings of motion, for calib identify",
         (
@@ -86,6 +87,7 @@ SCHEMAS: Mapping[str, tuple[str, str]] = {
     "constraints": ("calib.procedure.kinematic_stage.pose_limits", "ConstraintsFile"),
     "limits": ("calib.procedure.excitation.limits", "LimitsFile"),
     "session": ("calib.procedure.session.settings", "SessionSettings"),
+    "study": ("calib.studies.conditions", "StudyFile"),
 }
 """Topic → module and dataclass of the TOML files that people write."""
 

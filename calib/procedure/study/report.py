@@ -1,0 +1,164 @@
+"""The report of a study: tables, box plots, and the decision rule, as one HTML file; the same tables for a console."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Sequence
+from datetime import datetime
+from importlib import metadata, resources
+
+from calib.procedure.report.page import Pictures, Section, Table, Text
+from calib.procedure.study import figures
+from calib.studies.conditions import Condition, Study
+from calib.studies.summary import FIGURES, LEVEL, RELIABLE, SLACK, ConditionSummary, MethodSummary, Spread
+from calib.studies.trial import Row
+
+RULE = (
+    f"Of the methods that give an estimate in at least {RELIABLE:.0%} of the trials, those are as good as the best "
+    "whose torque error on unseen motion, noise-free, is not told from the best one's on the same data sets (sign "
+    f"test, {LEVEL:.0%}), or whose median is larger by at most {SLACK:.0%}.",
+    "The cheapest of these, by processor time, is the one to take.",
+    "A trial without an estimate counts as an infinite error, in medians and in comparisons.",
+)
+MEANING = (
+    "torque: 100 ‖τ̂ - τ‖ / ‖τ‖ along a motion that no method saw, against the noise-free torques of the true robot.",
+    "β: 100 ‖β̂ - β‖ / ‖β‖ of the base parameters; in σ: rms of their errors in stated standard deviations (1 where "
+    "these tell the error); covered: share within 1.96 σ (95 % where they do).",
+    "d_τ, d_q: the survey's figures, on the data set itself. d_τ compares with noisy torque, and has a floor that no "
+    "method goes below: it cannot rank.",
+    "All are medians over trials; runs are simulations of the robot; CPU is processor time of the method alone; p is "
+    "the sign test's against the best.",
+)
+HEADER = (
+    "method", "trials", "failed", "torque [%]", "quartiles", "worst joint [%]", "β [%]", "in σ", "covered [%]",
+    "d_τ [%]", "d_q [%]", "rounds", "runs", "CPU [s]", "p", "",
+)  # fmt: skip
+
+
+def overview(conditions: Sequence[ConditionSummary]) -> Table:
+    """Return what to take on each condition."""
+    lines = []
+    for one in conditions:
+        if not one.methods:
+            lines.append((one.condition.name, described(one.condition), "no rows yet", "", "", "", ""))
+            continue
+        best, chosen = one.methods[0], one.chosen
+        failed = ", ".join(f"{m.method} {sum(m.failures.values())}/{m.trials}" for m in one.methods if m.failures)
+        lines.append(
+            (
+                one.condition.name, described(one.condition), chosen.method if chosen else "none",
+                _short(chosen.figures["torque_error"].median) if chosen else "",
+                f"{best.method} {_short(best.figures['torque_error'].median)}",
+                ", ".join(m.method for m in one.methods if m.as_good and m is not chosen), failed,
+            )
+        )  # fmt: skip
+    header = ("condition", "", "take", "torque [%]", "best [%]", "as good", "without an estimate")
+    return Table("What to take", header, lines, numbers=(3,))
+
+
+def described(one: Condition) -> str:
+    """Return a condition in a line."""
+    filtered = f"{one.cutoff:g} Hz" if one.cutoff else "unfiltered"
+    wrong = "" if one.mismatch == "none" else f", {one.mismatch}"
+    degrees = math.degrees(one.sigma_q)
+    return f"{one.robot}, {degrees:.3g}°, {one.sigma_tau:g} N·m, r = {one.decimation}, {filtered}{wrong}"
+
+
+def condition_table(one: ConditionSummary) -> Table:
+    """Return all methods of a condition, best first."""
+    rows = [_line(method) for method in one.methods]
+    strong = frozenset(k for k, method in enumerate(one.methods) if method.chosen)
+    return Table(
+        f"Methods on {one.condition.name}", HEADER, rows, described(one.condition), strong, range(1, len(HEADER) - 1)
+    )
+
+
+def _line(one: MethodSummary) -> tuple[str, ...]:
+    found = one.figures
+    failed = ", ".join(f"{count} {status}" for status, count in one.failures.items())
+    mark = "take" if one.chosen else "as good" if one.as_good else ""
+    return (
+        one.method, str(one.trials), failed or "0", _short(found["torque_error"].median),
+        _quartiles(found["torque_error"]), _short(found["torque_worst"].median), _short(found["beta_error"].median),
+        _short(found["beta_sigma"].median), _short(found["coverage"].median),
+        _short(found["survey_tau"].median), _short(found["survey_q"].median), _short(found["iterations"].median),
+        _short(found["simulations"].median), _short(found["cpu"].median), _short(one.p), mark,
+    )  # fmt: skip
+
+
+def _short(value: float) -> str:
+    if math.isnan(value):
+        return "–"
+    if math.isinf(value):
+        return "∞"
+    return f"{value:.3g}" if abs(value) < 1e5 else f"{value:.1e}"
+
+
+def _quartiles(found: Spread) -> str:
+    return f"{_short(found.lower)}–{_short(found.upper)}"
+
+
+def summary_table(conditions: Sequence[ConditionSummary]) -> tuple[list[str], list[list[object]]]:
+    """Return header and rows of ``summary.csv``."""
+    header = ["condition", "method", "trials", "failed", "rank", "as_good", "take", "p"]
+    header += [f"{name}_{part}" for name in FIGURES for part in ("median", "lower", "upper")]
+    lines: list[list[object]] = []
+    for one in conditions:
+        for method in one.methods:
+            spreads = [value for name in FIGURES for value in _parts(method.figures[name])]
+            flags = ["yes" if flag else "no" for flag in (method.as_good, method.chosen)]
+            head = [one.condition.name, method.method, method.trials, sum(method.failures.values()), method.rank]
+            lines.append([*head, *flags, "" if math.isnan(method.p) else method.p, *spreads])
+    return header, lines
+
+
+def _parts(found: Spread) -> list[object]:
+    return ["" if math.isnan(value) else value for value in (found.median, found.lower, found.upper)]
+
+
+def make_page(
+    study: Study, conditions: Sequence[ConditionSummary], rows: Sequence[Row], notes: Sequence[str], plots: bool = True
+) -> str:
+    """Return the report as HTML.
+
+    Args:
+        rows: of these conditions.
+        plots: with box plots.
+    """
+    import jinja2  # slow to load
+
+    sections = [
+        Section("", [overview(conditions), Text("How that was decided", RULE), Text("Figures", MEANING)]),
+    ]  # fmt: skip
+    for one in conditions:
+        if not one.methods:
+            continue
+        own = [row for row in rows if row.digest == one.condition.digest]
+        blocks = [condition_table(one)]
+        drawn = [Pictures("", [figures.boxes(one, own)])] if plots else []
+        said = _failures(own)
+        blocks = [*blocks, *drawn, *([Text("Without an estimate", said)] if said else [])]
+        sections.append(Section(one.condition.name, blocks))
+    here, style = resources.files("calib.procedure.study"), resources.files("calib.procedure.report")
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    environment.filters["data_uri"] = lambda png: f"data:image/png;base64,{base64.b64encode(png).decode()}"
+    source = here.joinpath("study.html").read_text(encoding="utf-8")
+    when = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z").strip()
+    return environment.from_string(source).render(
+        title=study.name, about=study.about, sections=sections, notes=notes,
+        issued=f"{when}, armature-calib {metadata.version('armature-calib')}, {len(rows)} trials",
+        style=style.joinpath("certificate.css").read_text(encoding="utf-8"),
+    )  # fmt: skip
+
+
+def _failures(rows: Sequence[Row]) -> list[str]:
+    """Return the first message of each way in which a method failed, with how often."""
+    found: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        if not row.found:
+            found.setdefault((row.method, row.status), []).append(row)
+    return [
+        f"{method}: {len(own)} {status}, e.g. data set {own[0].seed}: {own[0].message}"
+        for (method, status), own in sorted(found.items())
+    ]  # fmt: skip

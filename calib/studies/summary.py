@@ -1,0 +1,154 @@
+"""What rows say: figures of merit of each method on each condition, and which methods can be told apart.
+
+Failures count: a trial without an estimate has an infinite error, in medians and in comparisons. Methods are compared
+on the same data sets, pair by pair, by the sign test (Conover 1999, section 3.4), since errors of two methods on one
+data set go together and their distributions have long tails.
+
+The rule: of the methods that give an estimate in at least `RELIABLE` of the trials, those whose torque error on unseen
+motion is not told from the best one's (`LEVEL`), or larger by no more than `SLACK` in the median, are as good as the
+best; of these the cheapest is the one to take.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import comb
+
+import numpy as np
+
+from calib.studies.conditions import Condition, Study
+from calib.studies.trial import Row
+
+RELIABLE, LEVEL, SLACK = 0.95, 0.05, 0.05  # our choices
+LEAST = 6  # common data sets below which the sign test cannot tell at 5 %
+FIGURES = (
+    "torque_error", "torque_worst", "beta_error", "beta_distance", "beta_sigma", "coverage", "survey_tau", "survey_q",
+    "iterations", "simulations", "cpu", "seconds",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Median and quartiles of a figure over runs; failures are infinite in errors, and left out elsewhere."""
+
+    median: float
+    lower: float
+    upper: float
+    count: int
+
+
+@dataclass(frozen=True)
+class MethodSummary:
+    """One method on one condition.
+
+    Attributes:
+        trials: number of its rows; failures: status → how many of them gave no estimate.
+        figures: name of a figure (`FIGURES`) → its spread.
+        rank: by the median torque error, from 1.
+        as_good: not told from the best, or within `SLACK` of it, and reliable.
+        chosen: the cheapest of those.
+        p: of the sign test against the best; NaN for the best itself.
+    """
+
+    method: str
+    trials: int
+    failures: Mapping[str, int]
+    figures: Mapping[str, Spread]
+    rank: int = 0
+    as_good: bool = False
+    chosen: bool = False
+    p: float = float("nan")
+
+    @property
+    def reliable(self) -> bool:
+        return sum(self.failures.values()) <= (1.0 - RELIABLE) * self.trials
+
+
+@dataclass(frozen=True)
+class ConditionSummary:
+    """All methods on one condition, best first."""
+
+    condition: Condition
+    methods: tuple[MethodSummary, ...]
+
+    @property
+    def chosen(self) -> MethodSummary | None:
+        """The method to take; None where none is reliable."""
+        return next((one for one in self.methods if one.chosen), None)
+
+
+def summarise(study: Study, rows: Iterable[Row]) -> list[ConditionSummary]:
+    """Return what rows say of a study's conditions; rows of others, and of methods not asked for, do not count."""
+    kept: dict[str, dict[str, list[Row]]] = {}
+    for row in rows:
+        kept.setdefault(row.digest, {}).setdefault(row.method, []).append(row)
+    result = []
+    for condition, runs in zip(study.conditions, study.runs):
+        own = {name: kept.get(condition.digest, {}).get(name, []) for name in runs}
+        result.append(_ranked(condition, {name: found for name, found in own.items() if found}))
+    return result
+
+
+def _ranked(condition: Condition, rows: Mapping[str, Sequence[Row]]) -> ConditionSummary:
+    errors = {name: {row.seed: _error(row) for row in own} for name, own in rows.items()}
+    plain = [_summary(name, own) for name, own in rows.items()]
+    plain.sort(key=lambda one: (not one.reliable, one.figures["torque_error"].median))
+    if not plain:
+        return ConditionSummary(condition, ())
+    best = plain[0]
+    size = best.figures["torque_error"].median
+    judged = []
+    for rank, one in enumerate(plain, 1):
+        p = float("nan") if one is best else sign_test(errors[one.method], errors[best.method])
+        near = one.figures["torque_error"].median <= (1.0 + SLACK) * size
+        good = one.reliable and np.isfinite(size) and (one is best or near or p > LEVEL)
+        judged.append(replace(one, rank=rank, as_good=bool(good), p=p))
+    good = [one for one in judged if one.as_good]
+    cheapest = min(good, key=lambda one: one.figures["cpu"].median, default=None)
+    return ConditionSummary(condition, tuple(replace(one, chosen=one is cheapest) for one in judged))
+
+
+def _error(row: Row) -> float:
+    return row.torque_error if row.found else float("inf")
+
+
+def _summary(name: str, rows: Sequence[Row]) -> MethodSummary:
+    failures: dict[str, int] = {}
+    for row in rows:
+        if not row.found:
+            failures[row.status] = failures.get(row.status, 0) + 1
+    figures = {}
+    for figure in FIGURES:
+        bad = figure in ("torque_error", "torque_worst", "beta_error", "beta_distance")
+        values = [float(getattr(row, figure)) for row in rows if row.found]
+        values += [float("inf")] * (len(rows) - len(values)) if bad else []
+        figures[figure] = spread(values)
+    return MethodSummary(name, len(rows), failures, figures)
+
+
+def spread(values: Sequence[float]) -> Spread:
+    """Return median and quartiles of what is not NaN; of nothing, NaN."""
+    found = np.sort([value for value in values if value == value])
+    if not len(found):
+        return Spread(float("nan"), float("nan"), float("nan"), 0)
+    with np.errstate(invalid="ignore"):
+        lower, median, upper = (float(x) for x in np.quantile(found, [0.25, 0.5, 0.75], method="nearest"))
+    return Spread(median, lower, upper, len(found))
+
+
+def sign_test(one: Mapping[int, float], other: Mapping[int, float]) -> float:
+    """Return the two-sided p of the sign test that one method's error exceeds the other's as often as not.
+
+    Args:
+        one, other: seed → error; seeds in both count, ties do not.
+
+    Returns:
+        1 where fewer than `LEAST` data sets tell them apart.
+    """
+    both = [(one[seed], other[seed]) for seed in one.keys() & other.keys()]
+    larger, smaller = sum(a > b for a, b in both), sum(a < b for a, b in both)
+    count, few = larger + smaller, min(larger, smaller)
+    if count < LEAST:
+        return 1.0
+    return min(1.0, 2.0 * sum(comb(count, k) for k in range(few + 1)) / 2.0**count)

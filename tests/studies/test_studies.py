@@ -1,0 +1,143 @@
+"""Studies: what a file may say, trials that are pure, summaries that count failures."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from study_rows import ROW
+
+from calib.errors import UsageError
+from calib.studies.conditions import Condition, read_study, shipped
+from calib.studies.experiment import make_experiment
+from calib.studies.summary import sign_test, summarise
+from calib.studies.trial import FOUND, NOT_RECORDED, run_trial
+
+FILE = """
+name = "small"
+robot = "rv2sq"
+methods = ["wls", "iv"]
+runs = 3
+runs_loop = 2
+duration = 4.0
+[[noise]]
+name = "1"
+sigma_q = "1e-4 deg"
+sigma_tau = 0.05
+"""
+SHORT = Condition("short", "rv2sq", np.deg2rad(1e-4), 0.05, duration=4.0, resimulated=0)
+
+
+def written(folder: Path, text: str = FILE) -> Path:
+    path = folder / "small.toml"
+    path.write_text(text)
+    return path
+
+
+def test_the_surveys_conditions_are_there():
+    study = read_study(["MCS-*"])
+    names = {one.name for one in study.conditions}
+    assert names == {f"MCS-{robot}-{n}" for robot in ("TX40-1", "TX40-4", "RV2SQ-1") for n in range(1, 6)}
+    assert all(runs["wls"] == 100 and runs["iv"] == 30 for runs in study.runs)
+    assert len({one.digest for one in study.conditions}) == 15
+    fifth = next(one for one in study.conditions if one.name == "MCS-TX40-4-5")
+    assert (fifth.decimation, fifth.sigma_tau) == (4, 0.1)
+    assert fifth.sigma_q == pytest.approx(np.deg2rad(1e-2))
+
+
+def test_every_shipped_study_is_named_as_its_file():
+    assert all(read_study([name]).name == name for name in shipped())
+
+
+def test_combinations_are_named_by_what_varies(tmp_path: Path):
+    text = FILE.replace('"rv2sq"', '["tx40", "rv2sq"]').replace("runs = 3", 'runs = 3\nmismatch = ["none", "clock"]')
+    names = [one.name for one in read_study([written(tmp_path, text)]).conditions]
+    assert names == ["small-tx40-none", "small-tx40-clock", "small-rv2sq-none", "small-rv2sq-clock"]
+
+
+def test_what_a_condition_is_called_is_no_part_of_what_it_is():
+    assert SHORT.digest == replace(SHORT, name="other", resimulated=5).digest
+    assert SHORT.digest != replace(SHORT, sigma_tau=0.06).digest
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('"iv"]', '"ivv"]', "there is no method 'ivv' .did you mean 'iv'"),
+        ("runs_loop", "runs_lop", "no key 'runs_lop' .did you mean 'runs_loop'"),
+        ("[[noise]]", "[noise]", "noise"),
+        ('"1e-4 deg"', "30.0", "at most 0.1"),
+        ('"rv2sq"', '"rv2"', "did you mean 'rv2sq'"),
+    ],
+)
+def test_a_file_that_is_no_study_is_told_why(tmp_path: Path, old: str, new: str, said: str):
+    with pytest.raises(UsageError, match=said):
+        read_study([written(tmp_path, FILE.replace(old, new))])
+
+
+def test_a_study_that_does_not_ship_is_told_its_neighbour():
+    with pytest.raises(UsageError, match="did you mean 'MCS-TX40-1-1'"):
+        read_study(["MCS-TX40-11"])
+
+
+def test_a_trial_is_pure():
+    """Same condition, method and seed: the same row but for the times, whatever ran before; another seed: another."""
+    first = run_trial(SHORT, "wls", 3)
+    other = run_trial(SHORT, "wls", 4)
+    make_experiment.cache_clear()
+    again = run_trial(SHORT, "wls", 3)
+    timeless = [{k: v for k, v in asdict(row).items() if k not in ("seconds", "cpu")} for row in (first, again)]
+    assert str(timeless[0]) == str(timeless[1])
+    assert first.status == FOUND
+    assert first.torque_error != other.torque_error
+    assert first.torque_error < 2.0
+
+
+def test_a_loop_that_cannot_be_recorded_is_a_row(monkeypatch: pytest.MonkeyPatch):
+    """An unstable controller is counted, and ends nothing."""
+    from calib.simulation.cells import known_robots
+    from calib.simulation.loop.controllers import scaled
+
+    stiff = scaled(known_robots.controller("rv2sq"), 100.0)
+    monkeypatch.setattr(known_robots, "controller", lambda name: replace(stiff, limit=np.full(6, np.inf)))
+    make_experiment.cache_clear()
+    row = run_trial(SHORT, "wls", 0)
+    make_experiment.cache_clear()
+    assert row.status == NOT_RECORDED
+    assert row.message
+
+
+def test_failures_count_against_a_method(tmp_path: Path):
+    study = read_study([written(tmp_path)])
+    digest = study.conditions[0].digest
+    good = [replace(ROW, digest=digest, method="wls", seed=k, torque_error=1.0, cpu=9.0) for k in range(20)]
+    risky = [replace(ROW, digest=digest, method="iv", seed=k, torque_error=0.1, cpu=1.0) for k in range(18)]
+    lost = [replace(ROW, digest=digest, method="iv", seed=k, status="diverged") for k in (18, 19)]
+    (one,) = summarise(study, [*good, *risky, *lost])
+    assert [method.method for method in one.methods] == ["wls", "iv"]
+    assert one.chosen is not None and one.chosen.method == "wls"
+    assert one.methods[1].failures == {"diverged": 2}
+
+
+def test_of_methods_as_good_as_each_other_the_cheap_one_is_taken(tmp_path: Path):
+    study = read_study([written(tmp_path)])
+    digest, rng = study.conditions[0].digest, np.random.default_rng(0)
+    found = []
+    for seed in range(30):
+        own = float(rng.lognormal())
+        found.append(replace(ROW, digest=digest, method="iv", seed=seed, torque_error=own, cpu=5.0))
+        found.append(replace(ROW, digest=digest, method="wls", seed=seed, torque_error=1.01 * own, cpu=1.0))
+    (one,) = summarise(study, found)
+    assert one.chosen is not None and one.chosen.method == "wls"
+    found = [replace(row, torque_error=1.2 * row.torque_error) if row.method == "wls" else row for row in found]
+    (one,) = summarise(study, found)
+    assert one.chosen is not None and one.chosen.method == "iv"  # always larger by a fifth: told apart
+
+
+def test_the_sign_test_is_the_binomial_one():
+    one = dict.fromkeys(range(10), 2.0)
+    other = {seed: 1.0 if seed < 9 else 3.0 for seed in range(10)}
+    assert sign_test(one, other) == pytest.approx(2 * (1 + 10) / 2**10)
+    assert sign_test(dict.fromkeys(range(5), 2.0), other) == 1.0  # too few to tell

@@ -1,0 +1,15 @@
+"""Rows of a study, made up."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from calib.studies.trial import Row
+
+ROW = Row(
+    "c", "d1", "wls", 0, "found", "", "tx40", 1e-6, 0.05, 1, 50.0, "none", 10.0, 0.15, torque_error=0.3, version="1"
+)  # fmt: skip
+
+
+def rows(count: int) -> list[Row]:
+    return [replace(ROW, seed=seed, message=f"odd, with a comma {seed}") for seed in range(count)]
