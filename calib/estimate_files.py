@@ -15,6 +15,7 @@ import numpy as np
 
 from calib import files
 from calib.errors import RobotError
+from calib.records import plain_text
 
 ESTIMATE, COVARIANCE = "estimate.csv", "covariance.csv"
 AGAIN = "fit, or identify, again"
@@ -54,7 +55,7 @@ def read_estimate(folder: Path) -> StoredEstimate:
         with path.open(encoding="utf-8", newline="") as file:
             rows = tuple(csv.DictReader(file))
         values, sigma = (np.array([float(row.get(key) or "nan") for row in rows]) for key in ("value", "sigma"))
-        names, units = (tuple(row[key] for row in rows) for key in ("name", "unit"))
+        names, units = (tuple(plain_text(row[key]) for row in rows) for key in ("name", "unit"))
     except (OSError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
         raise RobotError(f"{path} cannot be read ({error}); {AGAIN}") from error
     return StoredEstimate(names, units, values, sigma, rows)
@@ -81,8 +82,8 @@ def read_covariance(path: Path) -> tuple[tuple[str, ...], np.ndarray]:
         matrix = np.array([row[1:] for row in rows], dtype=float)
     except (OSError, UnicodeDecodeError, ValueError) as error:
         raise RobotError(f"{path} cannot be read ({error}); {AGAIN}") from error
-    names = tuple(header[1:])
-    if tuple(row[0] for row in rows if row) != names or matrix.shape != (len(names), len(names)):
+    names = tuple(map(plain_text, header[1:]))
+    if tuple(plain_text(row[0]) for row in rows if row) != names or matrix.shape != (len(names), len(names)):
         raise RobotError(f"{path}: rows and columns do not name the same parameters; {AGAIN}")
     if not np.isfinite(matrix).all():
         raise RobotError(f"{path}: not a table of finite numbers; {AGAIN}")

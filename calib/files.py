@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calib.errors import CalibError, UsageError
+from calib.records import shielded
 
 if TYPE_CHECKING:  # the commands' help is written without loading it
     import numpy as np
@@ -184,11 +185,12 @@ def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence
     """Write a CSV table; floats with 12 significant digits, so that a table read back serves as the value.
 
     Cells with commas, quotes or line breaks are quoted, those of the header too: names come from people's files. So is
-    a whole header that would be taken for one with other separators, or for a comment.
+    a whole header that would be taken for one with other separators, or for a comment. A text that a spreadsheet would
+    take for a formula (``=1+1``) gets an apostrophe before it (`calib.records.shielded`).
     """
     text = _headed(header)
     lines = csv.writer(text, lineterminator="\n")
-    lines.writerows([f"{cell:.12g}" if isinstance(cell, float) else cell for cell in row] for row in rows)
+    lines.writerows([_cell(cell) for cell in row] for row in rows)
     return write(path, text.getvalue())
 
 
@@ -200,11 +202,15 @@ def write_numbers(path: str | Path, header: Sequence[str], values: np.ndarray) -
     return write(path, text.getvalue())
 
 
+def _cell(value: Any) -> Any:
+    return f"{value:.12g}" if isinstance(value, float) else shielded(value) if isinstance(value, str) else value
+
+
 def _headed(header: Sequence[str]) -> io.StringIO:
     text = io.StringIO()
     misread = header[0].startswith("#") or any(mark in name for name in header for mark in ";\t")
     quoting = csv.QUOTE_ALL if misread else csv.QUOTE_MINIMAL
-    csv.writer(text, lineterminator="\n", quoting=quoting).writerow(header)
+    csv.writer(text, lineterminator="\n", quoting=quoting).writerow(map(_cell, header))
     return text
 
 

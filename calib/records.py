@@ -12,6 +12,26 @@ from pathlib import Path
 from typing import Any, SupportsIndex, TypeVar, Union, get_args, get_origin, get_type_hints
 
 T = TypeVar("T")
+_FORMULA = ("=", "+", "-", "@", "\t", "\r", "'")  # what a spreadsheet's formula begins with, and our own mark
+
+
+def shielded(text: str) -> str:
+    """Return a text as a cell of a table holds it: with an apostrophe where a spreadsheet would take it for a formula.
+
+    Numbers stay as they are.
+    """
+    if text[:1] not in _FORMULA:
+        return text
+    try:
+        float(text)
+    except ValueError:
+        return f"'{text}"
+    return text
+
+
+def plain_text(cell: str) -> str:
+    """Return the text that `shielded` made this cell of."""
+    return cell[1:] if cell[:1] == "'" and cell[1:2] in _FORMULA else cell
 
 
 def read_rows(kind: type[T], path: Path) -> tuple[T, ...]:
@@ -39,7 +59,7 @@ def _cell(hint: Any, row: Mapping[str, str], name: str, place: str) -> Any:
     if not text and wanted[0] is not str and len(get_args(hint)) > len(wanted):
         return None
     try:
-        return wanted[0](text)
+        return wanted[0](plain_text(text))
     except ValueError as error:
         raise ValueError(f"{place}: {name}: {error}") from error
 

@@ -31,6 +31,7 @@ from worker_tasks import (
 
 from calib.errors import CalibError, MeasurementError, TaskLost, UsageError
 from calib.workers import Workers, workers
+from calib.workers.interrupts import finishing
 
 
 @pytest.fixture(scope="module")
@@ -279,3 +280,16 @@ def test_a_script_that_starts_itself_again_is_told(tmp_path: Path) -> None:
     running = script(tmp_path, guard="True")
     _, err = running.communicate(timeout=SECONDS)
     assert "CalibError: worker processes end as they start" in err and "lacks if __name__" in err
+
+
+def test_what_is_nearly_done_survives_one_interrupt_and_not_two() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    with finishing():
+        os.kill(os.getpid(), signal.SIGINT)
+        done = sum(range(1000))
+    assert done == 499500 and signal.getsignal(signal.SIGINT) is before
+    with pytest.raises(KeyboardInterrupt), finishing():
+        for _ in range(2):
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.01)
+    assert signal.getsignal(signal.SIGINT) is before

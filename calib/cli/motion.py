@@ -58,6 +58,7 @@ def excite(
     from calib.procedure.excitation import folder
     from calib.procedure.parallel_stage import folder as parallel_folder
     from calib.procedure.parallel_stage.robots import path_of
+    from calib.workers.interrupts import finishing
 
     settings = ExcitationSettings(
         goals=tuple(goal or ()), hard=tuple(hard or ()), period=period, harmonics=harmonics, family=family,
@@ -71,7 +72,8 @@ def excite(
             robot, settings, model=model, limits=limits, base=base, tip=tip, workers=workers, progress=say
         )
         say("writing")
-        designed.save(out, plots=plots)
+        with finishing():
+            designed.save(out, plots=plots)
     say_written(str(designed).splitlines(), out)
 
 

@@ -21,6 +21,7 @@ import numpy as np
 
 from calib.arrays import frozen
 from calib.errors import MeasurementError, suggestion
+from calib.records import plain_text
 from calib.units import ANGLES, LENGTHS, plain_number
 
 _HEADING = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
@@ -65,7 +66,7 @@ class Table:
     def texts(self, name: str) -> list[str]:
         """Return a column (m,) as texts; numbers in their shortest form (``0``, not ``0.0``)."""
         cells = self.cells[self.index(name)]
-        return [f"{cell:.12g}" for cell in cells] if cells.dtype == float else [str(cell) for cell in cells]
+        return [f"{cell:.12g}" for cell in cells] if cells.dtype == float else [plain_text(str(cell)) for cell in cells]
 
     def numbers(self, name: str, dimension: str = "", unit: str = "", gaps: bool = False) -> np.ndarray:
         """Return a column (m,) as floats in SI.
@@ -214,7 +215,7 @@ def _comment_header(comment: str, separator: str, width: int, path: str | Path) 
 
 def _split_units(cells: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     names, units = [], []
-    for i, cell in enumerate(cells):
+    for i, cell in enumerate(map(plain_text, cells)):
         match = _HEADING.match(cell)
         names.append((match["name"] if match else cell) or f"column {i + 1}")
         units.append(match["unit"].strip() if match else "")

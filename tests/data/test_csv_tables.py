@@ -175,3 +175,15 @@ def test_numbers_are_written_as_rows_are(tmp_path):
     header = ["# t", 'a, "b"', "c;d"]
     plain = files.write_table(tmp_path / "rows.csv", header, values.tolist()).read_bytes()
     assert files.write_numbers(tmp_path / "numbers.csv", header, values).read_bytes() == plain
+
+
+def test_a_name_that_is_a_formula_is_text_in_a_spreadsheet_and_itself_when_read_back(tmp_path):
+    names = ["=1+1", "+a", "-b", "@c", "'=d", "'", "e", "-1.5"]
+    path = files.write_table(
+        tmp_path / "t.csv", ["=x [mm]", "name"], [[float(k), name] for k, name in enumerate(names)]
+    )
+    cells = [line.split(",") for line in path.read_text().splitlines()]
+    assert cells[0][0] == "'=x [mm]"
+    assert [row[1] for row in cells[1:]] == ["'=1+1", "'+a", "'-b", "'@c", "''=d", "''", "e", "-1.5"]
+    table = read_table(path)
+    assert table.header == ("=x", "name") and table.units == ("mm", "") and table.texts("name") == names

@@ -198,6 +198,14 @@ def test_what_cannot_be_simulated_is_refused(robot, tmp_path, capsys, log_as, lo
     assert code == 2 and message in " ".join(capsys.readouterr().err.split()) and not out.exists()
 
 
+def test_gains_of_another_length_are_refused_whatever_the_method(robot, tmp_path, capsys):
+    code, _ = identify(
+        robot, tmp_path, log(tmp_path, "train.csv", 1), 'controller = "pd"\nkp = [1, 2]\nkd = [1]\n', "ols"
+    )
+    assert code == 2
+    assert "[loop] kp: 2 values for 3 joints" in " ".join(capsys.readouterr().err.split())
+
+
 def test_every_key_of_the_loop_is_documented_and_read():
     for key in (field.name for field in fields(loop_settings.LoopSettings)):
         assert f"{key} =" in loop_settings.__doc__ or f" {key} " in loop_settings.__doc__, key

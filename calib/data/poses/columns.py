@@ -70,6 +70,16 @@ def find_layout(table: Table, options: FileOptions, joints: Sequence[str]) -> La
         MeasurementError: where a column is missing, or the header allows several kinds and the options name none.
     """
     check_names(table, options, joints)
+    found = _layout(table, options, joints)
+    numbers = (*found.joints, *(name for names in found.positions for name in names), *found.orientation)
+    twice = sorted({name for name in numbers if numbers.count(name) > 1})
+    if twice:
+        message = "is read twice, as two different columns: is one of them mapped to it by mistake? See [columns]"
+        raise MeasurementError(message, table.file, column=twice[0])
+    return found
+
+
+def _layout(table: Table, options: FileOptions, joints: Sequence[str]) -> Layout:
     columns = find_joints(table, options, joints)
     kind = _find_kind(table, options)
     if kind in LABEL_OF:

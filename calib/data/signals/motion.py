@@ -134,7 +134,7 @@ def make_motion(recording: Recording, options: FilterOptions | None = None, samp
     cutoff = _per_joint(cutoffs.position if options.cutoff is None else options.cutoff, recording)
     for value in cutoff:
         check_cutoff(float(value), sampled.rate, recording.file)
-    decimator = _decimator(cutoffs, options, sampled.rate, recording.file)
+    decimator = _decimator(cutoffs, options, sampled, recording.file)
     q, v, a, mask = _derive(sampled, cutoff, options)
     while options.band is None and decimator.factor > 1 and not len(kept(sampled.segment[mask], decimator)):
         decimator = design_decimator(sampled.rate, decimator.factor // 2, options.decimator)  # whose window fits
@@ -248,12 +248,16 @@ def _span(mask: np.ndarray) -> np.ndarray | slice:
     return slice(first, stop) if mask[first:stop].all() else mask
 
 
-def _decimator(cutoffs: Cutoffs, options: FilterOptions, rate: float, file: str) -> Decimator:
+def _decimator(cutoffs: Cutoffs, options: FilterOptions, sampled: Resampled, file: str) -> Decimator:
+    rate = sampled.rate
     if options.band is None:
         return design_decimator(rate, cutoffs.factor, options.decimator)
     if not 0 < options.band < rate / 2:
         message = f"an identification band of {options.band:g} Hz is not below the Nyquist frequency {rate / 2:g} Hz"
         raise MeasurementError(message, file)
+    if (factor := factor_for(rate, options.band)) > len(sampled.t):
+        message = f"an identification band of {options.band:g} Hz keeps one sample of {factor}, of {len(sampled.t)}"
+        raise MeasurementError(f"{message} there are: raise the band, or leave it to the data", file)
     return design_decimator(rate, factor_for(rate, options.band), options.decimator)
 
 

@@ -19,7 +19,10 @@ from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation
 from calib.geometry.observation import observe, prepare
 from calib.geometry.parameters import layout
+from calib.geometry.result import GeometricFit
+from calib.robot.chain import element_length
 
+SHORT = 0.01  # [m]: lengths below say nothing of a factor
 FLIP = np.array([1.0, -1.0, 1.0])
 Torques = Sequence[np.ndarray | None] | None
 
@@ -76,6 +79,32 @@ def _scale(value: np.ndarray, matrix: np.ndarray, size: float) -> Scale | None:
     return Scale(
         1.0 / (1.0 - slope / size), float(np.sqrt(rest / count / power)) / size, 1.0 - rest / max(squares, 1e-300)
     )
+
+
+def length_factor(fit: GeometricFit) -> Scale | None:
+    """Return the factor by which all lengths of a fitted arm grew together; None where fewer than two were fitted.
+
+    Its sigma is that of the measurements; how much of the lengths' change it explains says whether it is one factor.
+    """
+    chain, split, candidates = fit.start.chain, fit.split, fit.candidates
+    if split is None or candidates is None:
+        return None
+    arm = len(chain.elements)
+    own = np.array([element_length(chain, int(k)) if k < arm else 0.0 for k in candidates])
+    total = own[split.kept] + split.coefficients @ own[split.dropped]  # with those that are merged into them
+    place = {int(k): number for number, k in enumerate(fit.free)}
+    used = [(place[int(k)], int(k), size) for k, size in zip(candidates[split.kept], total) if int(k) in place]
+    used = [one for one in used if one[1] < arm and chain.elements[one[1]].axis[0] == "t" and abs(one[2]) > SHORT]
+    if len(used) < 2:
+        return None
+    index, elements, lengths = (np.array(each) for each in zip(*used))
+    grown = fit.cell.chain.values[elements] - chain.values[elements]
+    weight = np.linalg.pinv(fit.estimate.covariance[np.ix_(index, index)], hermitian=True)
+    power, common = float(lengths @ weight @ lengths), float(lengths @ weight @ grown)
+    if not power > 0.0:
+        return None
+    share = common**2 / power / max(float(grown @ weight @ grown), 1e-300)
+    return Scale(1.0 + common / power, power**-0.5, share)
 
 
 def mirrored_rms(nominal: Installation, blocks: Sequence[PoseMeasurements], torques: Torques = None) -> float:

@@ -34,7 +34,7 @@ recording, relative to the options file.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Annotated, Any
 
 import numpy as np
@@ -128,6 +128,17 @@ def completed(loop: LoopSettings, controller: Controller, n: int) -> Controller:
         controller.kp, controller.kd, controller.ki, np.full(n, loop.share), per_joint(loop, "limit", n),
         per_joint(loop, "windup", n), delay=loop.delay, cutoff=loop.velocity_cutoff,
     )  # fmt: skip
+
+
+def check_lengths(loop: LoopSettings, n: int) -> None:
+    """Refuse a list that has another length than the n joints.
+
+    Raises:
+        UsageError: with the key.
+    """
+    for key in (one.name for one in fields(loop) if isinstance(getattr(loop, one.name), tuple)):
+        if key != "positive" and getattr(loop, key):
+            per_joint(loop, key, n)
 
 
 def per_joint(loop: LoopSettings, key: str, n: int) -> np.ndarray:

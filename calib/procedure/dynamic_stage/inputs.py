@@ -19,6 +19,7 @@ from calib.errors import UsageError, suggestion
 from calib.identification.cases import Case, case_names, make_case
 from calib.identification.gains import DriveGains
 from calib.identification.identify_options import FileSettings, IdentifyOptions, file_settings
+from calib.identification.loop.loop_settings import check_lengths
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.gains import FoundGains, find_gains
 from calib.procedure.kinematic_stage.inputs import joint_kinds
@@ -104,6 +105,8 @@ def gather(
     known = robot if isinstance(robot, CalibratedChain) else load_calibrated(robot, base, tip)
     source = Path(known.source or known.chain.name) if isinstance(robot, CalibratedChain) else resolve(robot)
     chain = known.chain
+    if options.settings.loop is not None:
+        check_lengths(options.settings.loop, chain.n)
     names = case_names(paths)
     motions: list[Motion] = []
     for name, path, each in zip(names, paths, given):

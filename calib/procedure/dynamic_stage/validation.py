@@ -109,6 +109,7 @@ def assess(
         Tracking(unseen=bool(inputs.unseen), failure=amperes[0]) if amperes
         else track(inputs, dynamics, predictions, findings.controller)
     )  # fmt: skip
+    verdict = _with_replays(verdict, tracking)
     said = (
         *amperes, *(one.told for one in odd),
         *warnings(inputs.cases, inputs.unseen, validation, repeated, excitation, inputs.chain),
@@ -118,6 +119,14 @@ def assess(
         fit, validation, predictions, repeated, excitation, _tolerated(verdict, proofs, tolerance),
         tuple(dict.fromkeys(said)), tracking,
     )  # fmt: skip
+
+
+def _with_replays(verdict: Verdict, tracking: Tracking) -> Verdict:
+    """Return the verdict with it said where the model is one to predict torques with, not to simulate."""
+    if not any(one.added.any() for one in tracking.replays):
+        return verdict
+    words = "its inertias are those of no possible robot: predict torques with it, simulate the exported one"
+    return replace(verdict, reason=f"{verdict.reason}; {words}")
 
 
 def _tolerated(verdict: Verdict, proofs: Mapping[str, Score], tolerance: float) -> Verdict:

@@ -37,6 +37,7 @@ BEYOND = 0.05  # of a joint's range by which a recording may leave it: encoders 
 CONDITION = 200.0  # of the observation matrix with columns of unit norm
 MOVES = 0.1  # share of moving rows below which a recording is no motion
 BEND = 1e-4  # rms of link minus motor position that shows elasticity [rad or m]
+SURELY = 2.0  # sigmas below zero from which on a drive's inertia or friction is called negative
 SLOW_SHARE = 0.1  # share of samples near standstill from which on Coulomb friction is drawn down
 
 
@@ -206,7 +207,7 @@ def parameter_warnings(found: Identification[Any]) -> list[str]:
         )
     if found.fitted.held is not None:
         told += found.fitted.held.lines()
-    return told + _rests(found)
+    return [*told, *_negative(found), *_rests(found)]
 
 
 def beyond(case: Case, chain: Chain) -> list[str]:
@@ -229,6 +230,22 @@ def resting_parameters(found: Identification[Any]) -> Resting:
     on = resting(found.prior, found.fitted.estimate.covariance)
     names = tuple(name for name, rests in zip(found.base.names, on) if rests)
     return Resting(names, found.base.b, found.prior.source)
+
+
+def _negative(found: Identification[Any]) -> list[str]:
+    """Say which inertia or friction of drives came out below zero, by more than `SURELY` sigmas, as of no drive."""
+    estimate = found.fitted.estimate
+    wrong = [
+        f"{name} = {value:.3g} ± {sigma:.2g}"
+        for name, one, value, sigma in zip(found.names, found.terms, estimate.values, estimate.sigma)
+        if one is not None and one.nonnegative and value < -SURELY * sigma
+    ]
+    if not wrong:
+        return []
+    return [
+        f"below zero, as of no drive: {', '.join(wrong)}; the motion or the friction's form lets others stand for it: "
+        "trust the sum on such motion, not the parts (a method with the prior keeps them at zero)"
+    ]
 
 
 def _rests(found: Identification[Any]) -> list[str]:

@@ -18,6 +18,7 @@ from calib.procedure.excitation.metrics import DesignCondition
 from calib.procedure.excitation.playback import Playback, check_playback, play
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, ExcitationSettings
 from calib.robot.calibrated import CalibratedChain
+from calib.workers.interrupts import finishing
 from trajectories.basis import Family
 from trajectories.bspline import bspline_family
 from trajectories.constraints import MotionConstraint, TorqueLimit
@@ -114,15 +115,18 @@ def excite(
     search = partial(design, evaluations=settings.evaluations, seed=settings.seed, map=map, report=report)
     found, problem = _searched(problem, wanted, settings.starts, search, say)
     say("verifying")
-    found, proof = ensured(problem, found, checked)
+    with finishing():
+        found, proof = ensured(problem, found, checked)
     front = None
     if settings.front and not found.interrupted:
         with suppress(KeyboardInterrupt):  # the motion is there: what comes besides may be cut short
             front = _front(problem, given, found, wanted, settings.front, report)
-    played = play(problem.family, found, given, settings)
+    with finishing():
+        played = play(problem.family, found, given, settings)
+        condition_found = _condition_of(given, problem.family, found, settings.repeat)
     cut = ("interrupted before any motion met the goals",) if wanted and not problem.goals else ()
     return Designed(
-        given, settings, problem, found, proof, _condition_of(given, problem.family, found, settings.repeat),
+        given, settings, problem, found, proof, condition_found,
         _reached(problem, found), front, played,
         (*given.limits.notes, *given.model.notes, *notes, *given.columns.notes, *cut, *played.notes),
     )  # fmt: skip

@@ -179,7 +179,7 @@ def _found_of(
     long = stretched_length(inputs.chain)
     said = plateau(found, long)
     left = cross_validated(found)
-    odd = plausibility.findings(found.nominal.cell, found.fit.cell, inputs.fit, torques, left, long)
+    odd = plausibility.findings(found.nominal.cell, found.fit, inputs.fit, torques, left, long)
     return Findings(
         model=found.chosen,
         loss=found.loss,

@@ -6,7 +6,7 @@ marginal, until the options' ``accept`` says that it is meant. Findings of poses
 unexplained   on rows left out even the chosen model leaves more than `NO_ARM` of the reach: fail
 reflection    with the instrument's y turned the nominal arm fits `BETTER` times as well: its axes are left-handed: fail
 scale         one factor on all measured lengths takes away `SHARE` of the squares of the nominal arm's errors; off one
-              by more than `GROWN`: marginal, else a note
+              by more than `GROWN`: marginal, else a note; a note where the fitted lengths grew together
 commanded     less than `TOO_GOOD` remains, which no instrument measures: a note
 """
 
@@ -18,8 +18,9 @@ import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements
 from calib.geometry.accuracy import errors
-from calib.geometry.checks.plausible import Scale, mirrored_rms, scale_of
+from calib.geometry.checks.plausible import Scale, length_factor, mirrored_rms, scale_of
 from calib.geometry.installation import Installation
+from calib.geometry.result import GeometricFit
 from calib.procedure.findings import Finding
 
 NO_ARM = 0.015
@@ -30,7 +31,7 @@ TOO_GOOD = 2e-6  # [m]
 
 def findings(
     nominal: Installation,
-    calibrated: Installation,
+    fit: GeometricFit,
     blocks: Sequence[PoseMeasurements],
     torques: Sequence[np.ndarray | None],
     left: float | None,
@@ -39,12 +40,13 @@ def findings(
     """Return what is odd with the rows of a fit, what explains most first.
 
     Args:
-        nominal, calibrated: the arms, placed.
+        nominal: the arm as it was, placed.
+        fit: of the calibrated one.
         blocks: the rows; torques: gravity torques (m, n) per block [N m].
         left: error of the chosen model on rows left out [m]; None where it was not computed.
         reach: of the arm [m].
     """
-    before, after = (_rms(cell, blocks, torques) for cell in (nominal, calibrated))
+    before, after = (_rms(cell, blocks, torques) for cell in (nominal, fit.cell))
     remains = after if left is None else left
     found = []
     if before > NO_ARM * reach:
@@ -52,7 +54,7 @@ def findings(
     found += [*_unexplained(remains, reach), *_commanded(before, after)]
     scale = scale_of(nominal, blocks, torques)
     if scale is not None and before * np.sqrt(1.0 - scale.explained) < NO_ARM * reach:
-        found += _scale(scale)
+        found += _scale(scale) or _lengths(length_factor(fit))
     return found
 
 
@@ -74,16 +76,30 @@ def _reflection(before: float, mirrored: float) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def _scale(found: Scale) -> Iterator[Finding]:
+def _scale(found: Scale) -> list[Finding]:
     if found.explained < SHARE or abs(found.factor - 1.0) < LEAST:
-        return
+        return []
     grown = 100.0 * (found.factor - 1.0)
-    yield Finding(
+    one = Finding(
         "scale", "marginal" if abs(found.factor - 1.0) > GROWN else "pass",
         f"all measured lengths are {abs(grown):.2g} % {'larger' if grown > 0 else 'smaller'} than the arm's, by one "
         f"factor, {found.factor:.4f} ± {found.sigma:.1g}, which explains {100 * found.explained:.0f} % of what the "
         "nominal arm leaves: is the instrument's (or a camera's target's) scale right? The fit takes it for the arm's",
     )  # fmt: skip
+    return [one]
+
+
+def _lengths(found: Scale | None) -> list[Finding]:
+    """Tell that the fitted lengths grew together, whatever else of the nominal arm was wrong."""
+    if found is None or abs(found.factor - 1.0) < max(LEAST, 3.0 * found.sigma):
+        return []
+    one = Finding(
+        "scale", "pass",
+        f"the fitted lengths are together {found.factor:.4f} ± {found.sigma:.1g} times the nominal ones, and that one "
+        f"factor is {100 * found.explained:.0f} % of their change: an arm may be so, an instrument's scale may be so, "
+        "and these measurements do not tell which",
+    )  # fmt: skip
+    return [one]
 
 
 def _commanded(before: float, after: float) -> Iterator[Finding]:

@@ -24,6 +24,7 @@ from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.excitation import coefficients
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.measuring.run import is_run, rehearsed_samples
+from calib.records import shielded
 from calib.robot import calibrated, library
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward, joint_frames
@@ -202,8 +203,9 @@ def _measured(place: Path) -> Measured:
     """Return the rows of ``residuals.csv`` whose position was measured, as both arms see them."""
     after, before = installation_file.read(place), installation_file.nominal(place)
     with FitFolder(place).residuals.open(encoding="utf-8", newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["dx [mm]"] and row["station"] in after.station_names]
-    joints = [f"{joint.name} [{joint.unit}]" for joint in after.chain.joints]
+        known = set(map(shielded, after.station_names))
+        rows = [row for row in csv.DictReader(file) if row["dx [mm]"] and row["station"] in known]
+    joints = [shielded(f"{joint.name} [{joint.unit}]") for joint in after.chain.joints]
     q = np.array([[float(row[name]) for name in joints] for row in rows]).reshape(-1, after.chain.n)
     miss = 1e-3 * np.array([[float(row[f"d{axis} [mm]"]) for axis in "xyz"] for row in rows]).reshape(-1, 3)
     seen, nominal, modelled = (np.zeros((len(rows), 3)) for _ in range(3))

@@ -61,6 +61,12 @@ def test_a_column_doubled(write, good):
     refused(write(POSE.replace("q3", "q2"), good), "more than once .columns 2 and 3", None, "q2")
 
 
+@pytest.mark.parametrize("columns", [{"x": "y"}, {"x": "y", "y": "y"}, {"qx": "qy"}])
+def test_a_column_read_twice(write, good, columns):
+    twice = next(iter(columns.values()))
+    refused(write(POSE, good), "read twice", None, twice, FileOptions(columns=columns))
+
+
 def test_a_column_too_many(write, good):
     refused(
         write(POSE + ",q4", [[*row, 0.1] for row in good]), "the robot has 3 joints, and this is one more", None, "q4"

@@ -136,6 +136,7 @@ def test_crumbs_between_gaps_are_left_out():
         (FilterOptions(cutoff=(10.0, 400.0)), "cut-off of 400 Hz"),
         (FilterOptions(band=300.0), "identification band of 300 Hz"),
         (FilterOptions(band=0.2), r"needs .* s without a gap"),
+        (FilterOptions(band=1e-6), "1e-06 Hz keeps one sample of 200000000, of .* raise the band"),
     ],
 )
 def test_filters_that_cannot_be(options, pattern):

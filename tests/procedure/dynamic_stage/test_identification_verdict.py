@@ -9,7 +9,9 @@ import planted_motion as planted
 import pytest
 
 from calib.data.signals.persistency import report_excitation
+from calib.identification.identify import identify
 from calib.identification.scores import PredictionErrors, Score
+from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage import verdict
 from calib.procedure.dynamic_stage.verdict import Resting, judge, with_prior
 from calib.procedure.findings import Verdict
@@ -82,3 +84,16 @@ def test_most_parameters_from_the_cad_are_told_in_the_reason(drawn, told):
     reason = with_prior(Verdict("marginal", "why"), rests).reason
     assert (reason == f"why; {drawn} of 10 parameters are the CAD's: this motion does not tell them") == told
     assert told or reason == "why"
+
+
+def test_drives_below_zero_are_told_with_their_sigma() -> None:
+    """Without the prior nothing keeps friction above zero; the log is made to push joint 2 along."""
+    own = planted.case("train", 0)
+    robot, settings = planted.arm(), IdentificationSettings(friction="standard", prior="none")
+    target = own.target.copy()
+    target[:, 1] -= 6.0 * own.motion.v[:, 1]
+    found = identify(robot, [replace(own, target=target)], settings)
+    told = [line for line in verdict.model_warnings([own], found, {}) if line.startswith("below zero")]
+    assert len(told) == 1 and "Fv2 = -" in told[0] and "Fv1" not in told[0]
+    sound = identify(robot, [own], settings)
+    assert not [line for line in verdict.model_warnings([own], sound, {}) if line.startswith("below zero")]
