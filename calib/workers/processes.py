@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -162,6 +163,7 @@ def _serve(pipe: connection.Connection) -> None:
     """Run in a process: answer calls until the other end is closed. Only while a task runs, Ctrl-C is heard."""
     hear = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
     Thread(target=_end_with_parent, daemon=True).start()
+    sys.unraisablehook = _unheard
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
     with suppress(EOFError, OSError):
@@ -172,6 +174,12 @@ def _serve(pipe: connection.Connection) -> None:
             finally:
                 signal.signal(signal.SIGINT, signal.SIG_IGN)
             pipe.send_bytes(answer)
+
+
+def _unheard(unraisable: Any) -> None:
+    """Say nothing of a Ctrl-C that came within a library's callback, which cannot pass it on: one more will."""
+    if not isinstance(unraisable.exc_value, KeyboardInterrupt):
+        sys.__unraisablehook__(unraisable)
 
 
 def _end_with_parent() -> None:
