@@ -73,7 +73,7 @@ def _checked(function: Callable[..., Any], name: str, annotated: Any, method: bo
     def call(*args: Any, **kwargs: Any) -> Any:
         if not (len(args) > method or kwargs):  # nothing is given beside the defaults
             return function(*args)
-        from calib.config import shown
+        from calib.config_types import shown
         from calib.errors import UsageError
 
         wanted, hints = expected()

@@ -20,7 +20,8 @@ from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
 
 from calib.cli import run
-from calib.config import located, number, parse, read_toml, schema, shown
+from calib.config import located, parse, read_toml, schema
+from calib.config_types import number, shown
 from calib.data.poses import fit_options
 from calib.errors import CalibError, UsageError
 from calib.identification import identify_options

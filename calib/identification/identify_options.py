@@ -82,7 +82,8 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from calib.config import (
+from calib.config import check_keys, inherited, own_table, parse, read_toml, strict
+from calib.config_types import (  # fmt: skip
     Checked,
     Expect,
     Flag,
@@ -96,14 +97,8 @@ from calib.config import (
     Spread,
     Text,
     Whole,
-    check_keys,
-    inherited,
-    own_table,
-    parse,
-    read_toml,
     shown,
-    strict,
-)  # fmt: skip
+)
 from calib.data.recordings.recording import parse_cut
 from calib.data.recordings.recording_options import RecordingOptions
 from calib.data.signals.motion import FilterOptions

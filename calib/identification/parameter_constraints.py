@@ -15,7 +15,8 @@ from typing import Annotated, Any
 import numpy as np
 
 from calib.arrays import frozen
-from calib.config import Checked, Expect, Flag, Real, Text, Whole, strict
+from calib.config import strict
+from calib.config_types import Checked, Expect, Flag, Real, Text, Whole
 from calib.dynamics import base as bases
 from calib.dynamics.base import Base
 from calib.dynamics.drives import DriveTerm

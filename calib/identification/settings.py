@@ -8,7 +8,8 @@ from typing import Annotated, TypeVar
 
 import numpy as np
 
-from calib.config import Expect, JointNumber, Real, Text, strict
+from calib.config import strict
+from calib.config_types import Expect, JointNumber, Real, Text
 from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of, with_gravity, with_payload
 from calib.dynamics.drives import DriveTerm

@@ -36,7 +36,7 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.config import shown
+from calib.config_types import shown
 from calib.errors import RobotError, suggestion
 from calib.mechanism.parallel_robot import COORDINATES, Leg, ParallelRobot
 from calib.robot import mdh

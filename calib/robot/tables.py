@@ -1,7 +1,7 @@
 """Robot tables in TOML: names and placements with clear complaints, exact writing.
 
 A number may be a TOML number or a text: an expression of numbers, ``pi`` and ``+ - * / ( )``, with an optional unit
-behind it: ``"-pi/2"``, ``"90 deg"``, ``"110 deg/s"``, ``"-313 mm"`` (`calib.config.number`, `calib.units`).
+behind it: ``"-pi/2"``, ``"90 deg"``, ``"110 deg/s"``, ``"-313 mm"`` (`calib.config_types.number`, `calib.units`).
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import tomlkit
 
-from calib import config
-from calib.config import shown
+from calib import config, config_types
+from calib.config_types import shown
 from calib.errors import RobotError
 from calib.transforms import from_xyz_rpy, to_xyz_rpy
 
@@ -23,7 +23,7 @@ _PI = {math.pi: "pi", -math.pi: "-pi", math.pi / 2: "pi/2", -math.pi / 2: "-pi/2
 
 load = partial(config.read_toml, error=RobotError)
 check_keys = partial(config.check_keys, error=RobotError)
-number = partial(config.number, error=RobotError)
+number = partial(config_types.number, error=RobotError)
 
 
 def word(table: Mapping[str, Any], key: str, where: str, default: str | None = None) -> str:
@@ -42,7 +42,7 @@ def word(table: Mapping[str, Any], key: str, where: str, default: str | None = N
 
 def vector(value: Any, count: int, where: str, quantity: str = "") -> np.ndarray:
     """Return (count,) numbers in SI units from a TOML list."""
-    return np.array(config.numbers(value, count, where, quantity, RobotError))
+    return np.array(config_types.numbers(value, count, where, quantity, RobotError))
 
 
 def placement(table: Any, where: str) -> np.ndarray:

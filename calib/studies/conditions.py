@@ -43,7 +43,8 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
-from calib.config import Filled, Name, NotNegative, OneOf, Real, Spread, Text, Whole, parse, read_toml, strict
+from calib.config import parse, read_toml, strict
+from calib.config_types import Filled, Name, NotNegative, OneOf, Real, Spread, Text, Whole
 from calib.errors import UsageError, suggestion
 from calib.identification.methods.registry import METHODS, method_named
 

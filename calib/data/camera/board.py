@@ -22,7 +22,8 @@ from typing import Annotated
 import numpy as np
 
 from calib import files
-from calib.config import OneOf, Real, Whole, parse, read_toml, strict
+from calib.config import parse, read_toml, strict
+from calib.config_types import OneOf, Real, Whole
 from calib.errors import UsageError
 
 KINDS = ("charuco", "chessboard", "apriltag")

@@ -48,23 +48,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from calib.config import (
-    Expect,
-    Flag,
-    Hidden,
-    Label,
-    Name,
-    Names,
-    OneOf,
-    Positive,
-    Real,
-    Spread,
-    inherited,
-    own_table,
-    parse,
-    read_toml,
-    strict,
-)  # fmt: skip
+from calib.config import inherited, own_table, parse, read_toml, strict
+from calib.config_types import Expect, Flag, Hidden, Label, Name, Names, OneOf, Positive, Real, Spread  # fmt: skip
 from calib.data.poses.measurements import KINDS
 from calib.errors import UsageError, suggestion
 from calib.units import ANGLES, LENGTHS

@@ -28,7 +28,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from calib.config import Checked, Flag, Hidden, Name, OneOf, Positive, Real, Text, shown, strict
+from calib.config import strict
+from calib.config_types import Checked, Flag, Hidden, Name, OneOf, Positive, Real, Text, shown
 from calib.data.recordings.recording import Joints, named
 from calib.errors import MeasurementError, UsageError, suggestion
 from calib.units import CURRENTS, EFFORTS, POSITIONS, TIMES, VELOCITIES

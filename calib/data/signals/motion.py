@@ -14,7 +14,8 @@ from typing import Annotated
 import numpy as np
 
 from calib.arrays import frozen
-from calib.config import OneOf, OneOrMany, Positive, Real, Whole, strict
+from calib.config import strict
+from calib.config_types import OneOf, OneOrMany, Positive, Real, Whole
 from calib.data.recordings.clock import CLOCKS
 from calib.data.recordings.recording import Recording, read_only
 from calib.data.signals.bandwidth import USABLE, Cutoffs, check_cutoff, propose_cutoffs

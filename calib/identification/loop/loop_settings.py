@@ -39,7 +39,8 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from calib.config import Flag, Name, Names, OneOf, Positive, Real, Spread, Whole, strict
+from calib.config import strict
+from calib.config_types import Flag, Name, Names, OneOf, Positive, Real, Spread, Whole
 from calib.errors import UsageError
 from calib.simulation.loop.controllers import Controller, cascade, pd
 

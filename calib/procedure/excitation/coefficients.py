@@ -24,7 +24,8 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from calib.config import Expect, Filled, Name, OneOf, Positive, Real, Whole, parse, read_toml
+from calib.config import parse, read_toml
+from calib.config_types import Expect, Filled, Name, OneOf, Positive, Real, Whole
 from calib.errors import UsageError
 from trajectories.bspline import bspline_family
 from trajectories.errors import BadInput

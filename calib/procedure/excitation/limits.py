@@ -36,19 +36,8 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from calib.config import (
-    Name,
-    NotNegative,
-    Numeric,
-    Real,
-    Spread,
-    Whole,
-    check_keys,
-    number,
-    parse,
-    read_toml,
-    strict,
-)  # fmt: skip
+from calib.config import check_keys, parse, read_toml, strict
+from calib.config_types import Name, NotNegative, Numeric, Real, Spread, Whole, number  # fmt: skip
 from calib.errors import UsageError
 from calib.geometry.observability import targets_of
 from calib.procedure.kinematic_stage.pose_limits import DEFAULTS, ConstraintsFile, Limits, Point, limits_of

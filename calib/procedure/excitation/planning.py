@@ -10,7 +10,8 @@ from typing import Annotated
 
 import numpy as np
 
-from calib.config import Expect, numbers, parse, read_toml, strict
+from calib.config import parse, read_toml, strict
+from calib.config_types import Expect, numbers
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.drives import standard
 from calib.dynamics.idim import IdentificationModel

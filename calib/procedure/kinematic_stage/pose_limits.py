@@ -55,21 +55,8 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from calib.config import (
-    Checked,
-    Expect,
-    Name,
-    Numeric,
-    OneOf,
-    OneOrMany,
-    Real,
-    check_keys,
-    number,
-    parse,
-    read_toml,
-    shown,
-    strict,
-)  # fmt: skip
+from calib.config import check_keys, parse, read_toml, strict
+from calib.config_types import Checked, Expect, Name, Numeric, OneOf, OneOrMany, Real, number, shown  # fmt: skip
 from calib.data.poses.pixels import IN_HAND
 from calib.errors import RobotError, UsageError
 from calib.geometry.installation import Installation

@@ -13,7 +13,8 @@ from typing import Annotated, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.config import Expect, Name, OneOf, Real, strict
+from calib.config import strict
+from calib.config_types import Expect, Name, OneOf, Real
 from calib.data.camera.board import Board, corners, read_board
 from calib.data.camera.camera_info import read_lens
 from calib.data.camera.lens import Lens, project

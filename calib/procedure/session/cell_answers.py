@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.config import number
+from calib.config_types import number
 from calib.errors import UsageError
 
 UNKNOWN = ("", "unknown", "not known", "?", "-")

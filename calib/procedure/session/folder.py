@@ -35,7 +35,8 @@ from pathlib import Path
 from typing import Any
 
 from calib import files
-from calib.config import Text, parse
+from calib.config import parse
+from calib.config_types import Text
 from calib.errors import CalibError, SessionError, command_line
 from calib.folders import CERTIFICATE, METRICS
 from calib.procedure.dynamic_stage.folder import IdentificationFolder

@@ -15,7 +15,8 @@ from typing import Annotated, Any, get_args, get_type_hints
 import tomlkit
 from tomlkit.items import Comment, Trivia
 
-from calib.config import (
+from calib.config import parse, read_toml, strict
+from calib.config_types import (  # fmt: skip
     About,
     Checked,
     Expect,
@@ -27,11 +28,8 @@ from calib.config import (
     Real,
     Text,
     Whole,
-    parse,
-    read_toml,
     shown,
-    strict,
-)  # fmt: skip
+)
 from calib.data.poses.fit_options import LOSSES, MODELS
 from calib.errors import SessionError
 from calib.identification.friction.friction_ladder import NAMES as FRICTION
