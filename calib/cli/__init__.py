@@ -31,7 +31,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # a unit in brackets is a unit, not a style
-    help="Calibrate a robot: choose poses, fit the geometry, validate on unseen poses, export.",
+    help="Calibrate a robot's geometry, then its dynamics on it: choose poses and motions, fit, validate, export.",
     epilog=EXIT_CODES,
 )
 

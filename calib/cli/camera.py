@@ -26,7 +26,7 @@ def board(
     dictionary: Annotated[str | None, typer.Option(help="of the markers: 4x4_50 to 7x7_1000, apriltag_36h11")] = None,
     paper: Annotated[str | None, typer.Option(help="a4, a3, a2, a1 or a0; by default the smallest that fits")] = None,
 ) -> None:
-    """Make a board to print, at true scale, with a ruler to check the print by.
+    """Make a board to print at true scale; a ruler checks the print.
 
     ChArUco is the one to take: seen in part it still counts, and its corners are found to hundredths of a pixel; the
     corners of tags ten times worse. Print at 100 %, glue it onto something flat, measure a square, correct board.toml.
@@ -45,7 +45,7 @@ def images(
     image_topic: Annotated[str | None, typer.Option(help="of a bag with several cameras")] = None,
     joint_topic: Annotated[str | None, typer.Option(help="of a bag with several robots")] = None,
 ) -> None:
-    """Look for the board in images, and say which are of no use and why; make a folder of a bag's images.
+    """Find the board in images or a bag; say which are useless. A bag's images become a folder.
 
     A folder that was looked at holds corners.csv, and goes where a CSV file of measured poses goes: calib fit ROBOT
     FOLDER. See calib formats images.

@@ -30,7 +30,7 @@ def identify_dynamics(
     seed: Seed = 0,
     plots: Plots = True,
 ) -> None:
-    """Identify the dynamics of ROBOT from recordings, and say how well it predicts other motion."""
+    """Identify ROBOT's dynamics from recordings, and judge them. What counts is how well other motion is predicted."""
     from calib.api.dynamic import identify_dynamics as identified
     from calib.procedure.dynamic_stage import folder
     from calib.procedure.parallel_stage import folder as parallel_folder

@@ -48,7 +48,7 @@ def fit(
     seed: Seed = 0,
     plots: Plots = True,
 ) -> None:
-    """Fit the geometry of ROBOT to measured poses, and say how far to trust it.
+    """Fit the geometry of ROBOT to measured poses, and judge it.
 
     Exit codes: 0 the verdict is pass or marginal, 1 fail, 2 input or usage, 3 not identifiable or not converged, 4 an
     error that nobody foresaw.
@@ -170,7 +170,7 @@ def export(
         bool, typer.Option("--for-corrections", help="the URDF that joint_corrections.csv belongs to, worse without it")
     ] = False,
 ) -> None:
-    """Write the calibrated geometry, with --into in all forms and with identified dynamics, for other programs."""
+    """Write the calibrated robot for other programs. With --into: in all forms, identified dynamics included."""
     from calib.errors import UsageError
     from calib.procedure.export import geometry
     from calib.procedure.parallel_stage.robots import refuse_parallel
@@ -236,7 +236,7 @@ def compensate(
     ] = False,
     seed: Seed = 0,
 ) -> None:
-    """Turn nominal targets into the joint commands that put the real tool there."""
+    """Turn targets into joint commands that put the real tool there."""
     from calib.api import kinematic
     from calib.files import check_target
     from calib.procedure.export.geometry import results

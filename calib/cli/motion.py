@@ -53,7 +53,7 @@ def excite(
     seed: Seed = DESIGN.seed,
     plots: Plots = True,
 ) -> None:
-    """Design a motion that excites the dynamics of ROBOT within its limits."""
+    """Design a motion that excites ROBOT's dynamics, within limits."""
     from calib.api.motions import design_excitation
     from calib.procedure.excitation import folder
     from calib.procedure.parallel_stage import folder as parallel_folder
@@ -84,7 +84,7 @@ def recall(
     out: Annotated[Path, typer.Option(help="the averaged period: .npz with its variance, or .csv")],
     skip: Annotated[int, typer.Option(help="whole periods to leave out at the beginning")] = 0,
 ) -> None:
-    """Find a designed motion in a log, and average its periods to a recording for calib identify."""
+    """Find a designed motion in a log, and average its periods. What comes out is a recording for calib identify."""
     from calib.procedure.excitation import recall as excitation_recall
 
     excitation_recall.check_target(out, folder, log)
@@ -114,7 +114,7 @@ def plan(
     tip: Tip = None,
     plots: Plots = True,
 ) -> None:
-    """Plan the fastest motion of ROBOT through waypoints, within its speeds and torques."""
+    """Plan the fastest motion of ROBOT through waypoints. Speeds and torques stay within its limits."""
     from calib.api.motions import plan_motion
     from calib.procedure.excitation import folder
     from calib.procedure.parallel_stage import folder as parallel_folder

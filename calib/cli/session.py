@@ -57,7 +57,7 @@ def new(
     tip: Tip = "",
     seed: Seed = 0,
 ) -> None:
-    """Make a session FOLDER: calibrate a robot step by step, with a certificate at the end.
+    """Make a session FOLDER: calibrate a robot step by step. A certificate comes at the end.
 
     What is to be measured goes into FOLDER/3-measured as CSV (calib formats measurements), what is to be recorded into
     FOLDER/7-recorded (calib formats recordings); how the session goes on is said in FOLDER/session.toml (calib formats
@@ -116,7 +116,7 @@ def formats(
         bool, typer.Option("--schema", help="the JSON schema of a TOML file, for editors that complete its keys")
     ] = False,
 ) -> None:
-    """Print what the files of this toolkit hold: columns, keys, units."""
+    """Print what files hold: columns, keys, units."""
     from calib.procedure import formats as documents
 
     if schema:
@@ -127,7 +127,7 @@ def formats(
 
 @app.command("next")
 def next_step(folder: Folder, plots: Plots = True) -> None:
-    """Do what can be done in a session, then say what to do at the robot."""
+    """Go on in a session, then say what to do at the robot."""
     _go_on(folder, "next", plots=plots)
 
 
@@ -143,7 +143,7 @@ def redo(
 
 @app.command()
 def status(folder: Folder) -> None:
-    """Show how far a session is, and what is stale because something changed."""
+    """Show how far a session is, and what is stale."""
     from calib.procedure.session import commands
 
     console = make_console()
@@ -162,7 +162,7 @@ def demo(
     seed: Seed = 0,
     plots: Plots = True,
 ) -> None:
-    """Calibrate a simulated robot with simulated instruments, and compare with the hidden truth."""
+    """Calibrate a simulated robot; compare with the hidden truth."""
     from calib.errors import command_line
     from calib.procedure.session import demo as demonstration
 
@@ -190,7 +190,7 @@ def run(
     workers: Annotated[str, typer.Option(help="local processes, or the address of a Dask scheduler")] = "1",
     plots: Plots = True,
 ) -> None:
-    """Run many SESSIONS, one folder per robot, each as far as it goes; a table at the end says how they stand.
+    """Run many SESSIONS, one folder per robot, as far as they go. A table at the end says how they stand.
 
     A robot that fails does not stop the others; its folder's run.log says why. The exit code is the worst of all.
     """
@@ -237,7 +237,7 @@ def view(
     ] = None,
     robot: Annotated[str | None, typer.Option(help="the arm to draw, where the folder does not say")] = None,
 ) -> None:
-    """Show in Rerun: the robot, pose errors, poses as they were chosen, motions with their limits, torques."""
+    """Show robot, errors, poses, motions or torques in Rerun."""
     from calib.errors import UsageError, command_line
     from calib.files import check_target
     from calib.procedure.parallel_stage.robots import refuse_parallel

@@ -27,7 +27,7 @@ def study(
     list_studies: Annotated[bool, typer.Option("--list", help="the studies that come with the toolkit")] = False,
     plots: Plots = True,
 ) -> None:
-    """Compare identification methods by Monte Carlo where the truth is known: run STUDY, or what of it is missing.
+    """Compare identification methods where the truth is known. Runs STUDY, or what of it is missing (Monte Carlo).
 
     Rows go to the disk as they come: a study that was stopped, or lost workers, goes on from there when the same
     command is given again; asked for more runs, it adds them. What a study file holds: calib formats study.

@@ -58,3 +58,8 @@ def test_help_keeps_units_in_brackets(calib, command):
         said = " ".join(out.split())
         assert "frames, offsets, geometry, stiffness, bending, coupling, harmonics or wobble" in said
         assert "calib formats measurements" in said and "Exit codes" in said
+
+
+def test_no_commands_summary_is_cut_off(calib, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    assert "..." not in calib("--help")[1].partition("Commands:")[2]
