@@ -16,7 +16,7 @@ app = typer.Typer()
 def board(
     out: Annotated[Path, typer.Option(help="folder for board.toml, board.pdf and board.svg")],
     kind: Annotated[str, typer.Option(help="charuco, chessboard or apriltag (a grid)")] = "charuco",
-    columns: Annotated[int, typer.Option(help="squares (tags) across")] = 9,
+    columns: Annotated[int | None, typer.Option(help="squares (tags) across; by default 9, of a chessboard 10")] = None,
     rows: Annotated[int, typer.Option(help="squares (tags) down")] = 7,
     square: Annotated[float, typer.Option(metavar="MM", help="side of a square (tag), in mm")] = 30.0,
     marker: Annotated[
@@ -56,6 +56,8 @@ def images(
     with progress() as show:
         if source.is_dir() and (source / "board.toml").exists():
             lines = boards.look(source, show)
+        elif not source.exists():
+            raise UsageError(f"{source}: no such file or folder")
         elif board is None or out is None:
             raise UsageError(f"{source} has no board.toml; of a bag --board and --out are needed")
         else:

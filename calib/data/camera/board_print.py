@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from calib.data.camera.board import Board
+from calib.data.camera.images import quiet
 
 PAPERS = {"a4": (0.210, 0.297), "a3": (0.297, 0.420), "a2": (0.420, 0.594), "a1": (0.594, 0.841), "a0": (0.841, 1.189)}
 EDGE = 0.008  # printers leave this free [m]
@@ -16,7 +17,8 @@ POINT = 0.0254 / 72.0  # PDF's unit [m]
 def charuco(board: Board) -> cv2.aruco.CharucoBoard:
     """Return OpenCV's own of a ChArUco board; lengths in metres."""
     size = board.columns, board.rows
-    return cv2.aruco.CharucoBoard(size, board.square, board.marker, dictionary(board.dictionary))
+    with quiet():
+        return cv2.aruco.CharucoBoard(size, board.square, board.marker, dictionary(board.dictionary))
 
 
 def dictionary(name: str) -> cv2.aruco.Dictionary:

@@ -15,9 +15,11 @@ import numpy as np
 from calib.data.camera.board import DICTIONARIES, Board, corners
 from calib.data.camera.board_print import charuco, dictionary
 from calib.data.camera.corner_file import Detection
+from calib.data.camera.images import quiet
 
 COARSE = 1.5e6  # pixels of the image that markers are sought in (our choice, as the next ones)
 FEWEST = 8  # corners that make an image useful
+MANY = 4  # markers that tell a dictionary
 FLOOR = {"charuco": 0.02, "chessboard": 0.02, "apriltag": 0.2}  # of a corner's sigma [px]; tags' wander with blur
 BLURRED = 7.0  # width of an edge from which on an image is refused [px]
 MOVED = 1.8  # ratio of the widths of edges across and along from which on blur is motion
@@ -69,7 +71,8 @@ def _coarse(image: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray]:
             return nothing
         return np.arange(inner[0] * inner[1]), _upright(image, found.reshape(-1, 2), board)
     if board.kind == "charuco":
-        found, ids, _, _ = cv2.aruco.CharucoDetector(charuco(board)).detectBoard(image)
+        with quiet():
+            found, ids, _, _ = cv2.aruco.CharucoDetector(charuco(board)).detectBoard(image)
         return nothing if ids is None else (ids.ravel(), np.asarray(found).reshape(-1, 2))
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
@@ -168,8 +171,14 @@ def _absent(image: np.ndarray, coarse: np.ndarray, board: Board, count: int, tho
     if thorough:
         if len(_coarse(np.ascontiguousarray(coarse[:, ::-1]), board)[0]) >= FEWEST:
             return "the board is seen mirrored: is the image flipped, or seen in a mirror? Save it unflipped"
-        if board.kind != "chessboard" and (other := _other_dictionary(coarse, board)):
-            return f"no markers of {board.dictionary}, but some of {other}: state it in board.toml"
+        if board.kind != "chessboard":
+            if (seen := _markers(coarse, board.dictionary)) >= MANY:
+                return (
+                    f"{seen} markers of {board.dictionary} are seen, but not where board.toml has them: are kind, "
+                    "columns and rows (squares, not inner corners) those of the print?"
+                )
+            if other := _other_dictionary(coarse, board):
+                return f"no markers of {board.dictionary}, but some of {other}: state it in board.toml"
     width = _sharpest(coarse)
     if width > 3.5:
         return f"no board found; the image's sharpest edges are {width:.0f} px wide: out of focus, or still moving"
@@ -178,13 +187,17 @@ def _absent(image: np.ndarray, coarse: np.ndarray, board: Board, count: int, tho
 
 def _other_dictionary(image: np.ndarray, board: Board) -> str:
     """Return the dictionary of which the most markers are found; empty where hardly any are."""
-    best, name, own = 3, "", board.dictionary.split("_")[0]
-    for each in DICTIONARIES:
-        if each.endswith("_100") or each.startswith("apriltag_36h11"):
-            ids = cv2.aruco.ArucoDetector(dictionary(each)).detectMarkers(image)[1]
-            if ids is not None and len(ids) > best and each.split("_")[0] != own:
-                best, name = len(ids), each
-    return name
+    own = board.dictionary.split("_")[0]
+    others = [each for each in DICTIONARIES if each.endswith("_100") or each.startswith("apriltag_36h11")]
+    counts = {each: _markers(image, each) for each in others if each.split("_")[0] != own}
+    best = max(counts, key=lambda each: counts[each])
+    return best if counts[best] >= MANY else ""
+
+
+def _markers(image: np.ndarray, name: str) -> int:
+    """Return how many markers of a dictionary an image shows."""
+    ids = cv2.aruco.ArucoDetector(dictionary(name)).detectMarkers(image)[1]
+    return 0 if ids is None else len(ids)
 
 
 def _sharpest(image: np.ndarray) -> float:

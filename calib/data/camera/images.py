@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -9,6 +11,7 @@ import numpy as np
 
 from calib.errors import MeasurementError
 
+PNG = b"\x89PNG\r\n\x1a\n"
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".webp")
 
 
@@ -26,6 +29,16 @@ def read_image(path: Path) -> np.ndarray:
         raise MeasurementError(f"cannot be read as an image ({error}): was it copied whole?", path) from error
 
 
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keep OpenCV from writing to the terminal: what is wrong is said in our own words."""
+    before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(before)
+
+
 def decode(content: bytes) -> np.ndarray:
     """Return a compressed image's grey levels (height, width), 8 bits; see `read_image`.
 
@@ -34,14 +47,14 @@ def decode(content: bytes) -> np.ndarray:
     """
     if not content:
         raise ValueError("the file is empty")
+    if content.startswith(PNG) and b"IEND" not in content[-64:]:  # libpng would complain on its own
+        raise ValueError("no image format that is known, or cut short")
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        found = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+        with quiet():
+            found = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     except cv2.error as error:
         raise ValueError(str(error)) from error
-    finally:
-        cv2.utils.logging.setLogLevel(before)
     if found is None:
         raise ValueError("no image format that is known, or cut short")
     return to_grey(found)

@@ -61,8 +61,8 @@ def estimate_lens(
     good = np.flatnonzero((~np.isnan(pixel[:, :, 0])).sum(axis=1) >= 8)
     if len(good) < FEWEST:
         raise MeasurementError(
-            f"{len(good)} images with a board: a lens takes {FEWEST} at least, tilted differently, and a good one 15; "
-            "take more, or give the lens (camera.yaml)",
+            f"{len(good)} image{'s' if len(good) != 1 else ''} with a board: a lens takes {FEWEST} at least, tilted "
+            "differently, and a good one 15; take more, or give the lens (camera.yaml)",
             file,
         )
     good = good[np.unique(np.linspace(0, len(good) - 1, MOST).astype(int))]

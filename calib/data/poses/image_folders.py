@@ -16,6 +16,7 @@ every length of the robot with it: measure the print.
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -37,9 +38,10 @@ from calib.data.poses.plausible import Limits
 from calib.errors import CalibError, MeasurementError
 
 JOINTS = "joints.csv"
-LOOKED_INTO = 3  # useless images that are looked into for the reason
+LOOKED_INTO = 3  # useless images that are looked into for the reason, unless it is found
 LEAST = 3  # usable images below which a folder is refused
 
+MEASURED = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?![\w.]*_)")  # a number, no part of a name
 Progress = Callable[[int, int, str], None]
 
 
@@ -164,7 +166,7 @@ def detected(
             continue
         sizes[name] = image.shape[1], image.shape[0]
         result[name] = detect(image, board, thorough=useless < LOOKED_INTO)
-        useless += bool(result[name].problem)
+        useless += result[name].problem.startswith("no board found")
     if not sizes:
         return Found(result)
     usual = Counter(sizes.values()).most_common(1)[0][0]
@@ -198,15 +200,18 @@ def _usable(names: Sequence[str], found: Found, path: Path) -> tuple[np.ndarray,
 
 
 def problem_words(problems: Mapping[str, str]) -> list[str]:
-    """Return why images are of no use, one sentence per reason, with their names."""
+    """Return why images are of no use, one sentence per reason, with their names; of its numbers the range is told."""
     reasons: dict[str, list[str]] = {}
     for name, problem in problems.items():
         if problem:
-            reasons.setdefault(problem, []).append(name)
-    return [
-        f"{len(own)} image{'s are' if len(own) > 1 else ' is'} of no use ({reason}): {listed(own)}"
-        for reason, own in reasons.items()
-    ]
+            reasons.setdefault(MEASURED.sub("#", problem), []).append(name)
+    result = []
+    for reason, own in reasons.items():
+        for each in zip(*(MEASURED.findall(problems[name]) for name in own)):
+            low, high = min(each, key=float), max(each, key=float)
+            reason = reason.replace("#", low if low == high else f"{low} to {high}", 1)
+        result.append(f"{len(own)} image{'s are' if len(own) > 1 else ' is'} of no use ({reason}): {listed(own)}")
+    return result
 
 
 def listed(names: Sequence[str], most: int = 5) -> str:

@@ -52,7 +52,7 @@ def diagnose(found: GeometricFit) -> list[Diagnosis]:
     """Return findings on each block: rows that look like another set-up, and residuals that are not noise."""
     result = []
     for block, part in lengths(found):
-        if len(block.measured) >= FEWEST:
+        if part.value.shape[1] >= FEWEST:  # pairs of rows count once
             result += [*_setup_change(block, part), *_systematic(block, part)]
     return result
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.data.poses.fit_options import FitOptions, check_files
+from calib.data.poses.fit_options import FileOptions, FitOptions, check_files
 from calib.data.poses.image_folders import JOINTS, is_image_folder, read_images
 from calib.data.poses.measurements import PoseMeasurements, take
-from calib.data.poses.pixels import Pixels
+from calib.data.poses.pixels import IN_HAND, Pixels
 from calib.data.poses.pose_files import joint_columns, read_measurements
 from calib.errors import CalibError, MeasurementError, UsageError
 from calib.geometry.checks.copied_rows import repeated
@@ -296,9 +296,15 @@ def pose_count(blocks: Sequence[PoseMeasurements]) -> int:
 def _named(
     read: Sequence[tuple[Path, PoseMeasurements]], options: FitOptions, stations: str, tools: str
 ) -> list[PoseMeasurements]:
-    """Name the stations and tools of the fit files as --stations and --tools say; no two things share a name."""
+    """Name the stations and tools of the fit files as --stations and --tools say; no two things share a name.
+
+    Where an arm carried a camera and something else, or two cameras, these are several tools whatever --tools says.
+    """
     result, count, names = [], dict[str, int](), dict[Path, str]()
+    carried = list(dict.fromkeys(_carried(block) for _, block in read))
     for path, block in read:
+        if tools == "one" and len(carried) > 1 and block.tool_names == (FileOptions().tool,):
+            block = replace(block, tool_names=(_carried_name(_carried(block), carried),))
         if tools == "each":
             block = replace(block, tool_names=tuple(f"{path.stem} {name}" for name in block.tool_names))
         if path not in names:
@@ -312,6 +318,19 @@ def _named(
     return [replace(b, station=f"{b.station} station") if b.station in targets else b for b in result]
 
 
+def _carried(block: PoseMeasurements) -> tuple[str, object]:
+    """Return what the arm carries, as far as it tells two tools apart: a target, a camera by its images, a board."""
+    if not isinstance(block, Pixels):
+        return FileOptions().tool, None
+    return ("camera", block.size) if block.mounting == IN_HAND else ("board", block.board)
+
+
+def _carried_name(own: tuple[str, object], carried: Sequence[tuple[str, object]]) -> str:
+    """Return what an arm carries by name, with a number from the second of its sort on."""
+    number = [each for each in carried if each[0] == own[0]].index(own) + 1
+    return f"{own[0]} {number}" if number > 1 else own[0]
+
+
 def _free_name(taken: Mapping[str, Unseen], file: str) -> str:
     """Return a file's name, or its path where a file of that name is there already."""
     name = Path(file).name
@@ -323,6 +342,7 @@ def _free_name(taken: Mapping[str, Unseen], file: str) -> str:
 
 def _shared(block: PoseMeasurements, fit: Sequence[PoseMeasurements], notes: list[str]) -> PoseMeasurements:
     """Return a validation block seen from a station of the fit, with the fit's tools."""
+    fit = [other for other in fit if _carried(other) == _carried(block)] or fit
     first = fit[0]
     if block.has_instrument:
         stations = [other.station for other in fit if other.has_instrument]

@@ -15,37 +15,41 @@ from calib.data.poses.image_folders import JOINTS, find_corners, joint_table, pr
 from calib.errors import UsageError
 
 Show = Callable[[str], None]
-USUAL = {"charuco": ("5x5_100", 0.7), "chessboard": ("5x5_100", 0.7), "apriltag": ("apriltag_36h11", 0.3)}
+USUAL = {"charuco": ("5x5_100", 0.7, 9), "chessboard": ("5x5_100", 0.7, 10), "apriltag": ("apriltag_36h11", 0.3, 9)}
+SMALLEST = 1.0  # side of a square [mm]
 GRID = (12, 9)  # cells of the image that coverage counts (our choice)
 
 
 def make(
-    out: Path, kind: str, columns: int, rows: int, square: float, marker: float | None, words: str | None,
+    out: Path, kind: str, columns: int | None, rows: int, square: float, marker: float | None, words: str | None,
     paper: str | None,
 ) -> list[str]:  # fmt: skip
     """Write ``board.toml``, ``board.pdf`` and ``board.svg``; return what to do with them.
 
     Args:
         out: folder.
-        kind, columns, rows, words, paper: see `calib.data.camera.board`; a dictionary, and the paper's name.
+        kind, columns, rows, words, paper: see `calib.data.camera.board`; a dictionary, and the paper's name. None: the
+            usual ones.
         square, marker: [mm].
 
     Raises:
         UsageError: for a board that cannot be, or does not fit onto its paper.
     """
     from calib.data.camera import board_print
+    from calib.data.camera.detection import FEWEST
 
     if kind not in KINDS:
         raise UsageError(f"--kind {kind}: expected one of {', '.join(KINDS)}")
     if paper is not None and paper.lower() not in board_print.PAPERS:
         raise UsageError(f"--paper {paper}: expected one of {', '.join(board_print.PAPERS)}")
-    usual, share = USUAL[kind]
+    if square < SMALLEST:
+        raise UsageError(f"--square {square:g}: a square of {square:g} mm cannot be printed; --square counts in mm")
+    usual, share, across = USUAL[kind]
     try:
-        made = boards.checked(
-            Board(
-                kind, columns, rows, square / 1e3, (share * square if marker is None else marker) / 1e3, words or usual
-            )
-        )
+        side, between = square / 1e3, (share * square if marker is None else marker) / 1e3
+        made = boards.checked(Board(kind, columns or across, rows, side, between, words or usual))
+        if (count := len(boards.corners(made))) < FEWEST:
+            raise UsageError(f"a {made.words} has {count} corners; an image counts from {FEWEST} on: more squares")
         size = board_print.page_size(made, (paper or "").lower())
     except ValueError as error:
         raise UsageError(f"this board cannot be: {error}") from None
@@ -95,10 +99,10 @@ def summary(found: Found, board: Board, names: Iterable[str]) -> list[str]:
     return [*lines, *problem_words({name: one.problem for name, one in found.images.items()})]
 
 
-def coverage(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Return how many corners (N, 2) [px] lie in each cell of an image, (rows, columns) of `GRID`."""
+def coverage(pixels: np.ndarray, size: tuple[int, int], weights: np.ndarray | None = None) -> np.ndarray:
+    """Return how many corners (N, 2) [px] lie in each cell of an image, (rows, columns) of `GRID`; or their weight."""
     bins = [np.linspace(0, length, count + 1) for length, count in zip(size, GRID)]
-    return np.histogram2d(pixels[:, 0], pixels[:, 1], bins)[0].T
+    return np.histogram2d(pixels[:, 0], pixels[:, 1], bins, weights=weights)[0].T
 
 
 def coverage_words(pixels: np.ndarray, size: tuple[int, int]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +15,42 @@ from calib.geometry.installation import Installation
 from calib.geometry.observation import observe, prepare
 from calib.geometry.pixel_residuals import PixelPart
 from calib.geometry.result import GeometricFit
-from calib.procedure.measuring.boards import coverage_words
+from calib.procedure.measuring.boards import coverage, coverage_words
 
-ODD = 8.0  # sigmas from which on a corner is named (our choice)
-NAMED = 3
 LOOSE = 4.0  # times their stated sigmas that corners lie off within an image, from which on it is worth a word
+
+
+@dataclass(frozen=True)
+class ImageCoverage:
+    """Where in its images a camera saw corners, and how well they are predicted there.
+
+    Attributes:
+        file: the images' folder.
+        size: width and height of the images [px].
+        count: corners per cell of the image, row by row (`calib.procedure.measuring.boards.GRID`).
+        rms: distance of corners seen from corners predicted [px], per cell; 0 where none was seen.
+    """
+
+    file: str
+    size: tuple[int, int]
+    count: tuple[tuple[int, ...], ...]
+    rms: tuple[tuple[float, ...], ...]
+
+
+def image_coverage(found: GeometricFit) -> tuple[ImageCoverage, ...]:
+    """Return where the images of a fit show corners; nothing where there are none."""
+    result = []
+    for piece in found.pieces:
+        block, part = found.blocks[piece.block].measured, piece.part
+        if not isinstance(block, Pixels) or not isinstance(part, PixelPart):
+            continue
+        pixels = block.pixel[part.index, part.corner]
+        count = coverage(pixels, block.size)
+        square = coverage(pixels, block.size, np.sum(part.value**2, axis=0))
+        rms = np.round(np.sqrt(square / np.maximum(count, 1.0)), 4)
+        cells = tuple(map(tuple, count.astype(int).tolist())), tuple(map(tuple, rms.tolist()))
+        result.append(ImageCoverage(Path(block.file).name, block.size, *cells))
+    return tuple(result)
 
 
 def reprojection(cell: Installation, blocks: Sequence[PoseMeasurements], torques: Torques = None) -> float | None:
@@ -64,7 +96,6 @@ def image_notes(found: GeometricFit) -> list[str]:
             )
         pixels = block.pixel[block.seen]
         lines.append(f"{name}: {coverage_words(pixels, block.size)}")
-        lines += _odd_corners(name, block, part, piece.sigma)
         if "scale" not in block.free:
             lines.append(
                 f"{name}: the board gives the scale ({1e3 * block.board.square:g} mm a square): an error of 0.1 % "
@@ -72,21 +103,3 @@ def image_notes(found: GeometricFit) -> list[str]:
                 + (", against which the other instruments' measurements stand" if others else "")
             )
     return lines
-
-
-def _odd_corners(name: str, block: Pixels, part: PixelPart, sigma: np.ndarray) -> list[str]:
-    """Name corners that do not fit into their own image."""
-    off = part.within(sigma)
-    size = np.sqrt(np.mean((off / sigma) ** 2, axis=0))
-    odd = np.flatnonzero(size > ODD)
-    if not len(odd):
-        return []
-    worst = odd[np.argsort(-size[odd])[:NAMED]]
-    told = ", ".join(
-        f"corner {part.corner[k]} of {block.name(int(block.rows[part.index[k]]))} "
-        f"({float(np.linalg.norm(off[:, k])):.1f} px)"
-        for k in worst
-    )
-    return [
-        f"{name}: {len(odd)} of {len(size)} corners do not fit into their image: {told}; loss = 'cauchy' bears them"
-    ]

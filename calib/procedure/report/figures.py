@@ -58,6 +58,10 @@ def captioned(report: Report) -> dict[str, Captioned]:
         result["singular_values"] = Captioned(make, words)
     if proof.q:
         result |= _over_workspace(report, proof, label)
+    for number, seen in enumerate(report.images, 1):
+        make = partial(geometry_figures.image_coverage, seen.size, np.array(seen.count), np.array(seen.rms))
+        words = f"Where in the image corners were seen, and how well they are predicted there ({seen.file})."
+        result["coverage" if number == 1 else f"coverage_{number}"] = Captioned(make, words, True)
     arm = [row for row in report.parameters if row.group == "arm"]
     if arm:
         change = np.array([row.value - row.nominal for row in arm])

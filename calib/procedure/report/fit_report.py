@@ -22,6 +22,7 @@ from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.folder import metrics
 from calib.procedure.kinematic_stage.metrics import FitMetrics, ValidationMetrics
 from calib.procedure.kinematic_stage.tables import estimate_table
+from calib.procedure.measuring.image_findings import ImageCoverage, image_coverage
 from calib.records import read_record
 from calib.transforms import invert
 
@@ -96,6 +97,7 @@ class Report:
         singular_values: of the scaled observation matrix; `rank` of them are kept.
         sets: errors per set of rows.
         noise: what the stated sigmas alone give, rms by nature [m, rad]; None where none were stated.
+        images: what each camera's images show of it; empty without any.
     """
 
     schema: int
@@ -113,6 +115,7 @@ class Report:
     rank: int
     sets: tuple[RowErrors, ...]
     noise: Mapping[str, float | None]
+    images: tuple[ImageCoverage, ...] = ()
 
 
 def fit_metrics(outcome: Outcome) -> FitMetrics:
@@ -145,6 +148,7 @@ def collect(outcome: Outcome) -> Report:
         rank=len(values) if fit.split is None else fit.split.rank,
         sets=tuple(sets),
         noise=_noise(outcome.fit.blocks),
+        images=image_coverage(fit),
     )
 
 

@@ -175,6 +175,32 @@ def error_map(
     return figure
 
 
+def image_coverage(size: tuple[int, int], count: np.ndarray, rms: np.ndarray) -> Figure:
+    """Draw where in its images a camera saw corners, and their reprojection error; where none was seen stays white.
+
+    Args:
+        size: width and height of the images [px].
+        count: (rows, columns) corners per cell of the image.
+        rms: (rows, columns) reprojection error there [px].
+    """
+    wide, high = size
+    share = float(np.mean(count > 0))
+    inch = 0.5 * (WIDE - 2.0) * high / wide
+    with styled():
+        figure, axes = sheet(1, 2, WIDE, 0.9 + inch, across=0.75, right=0.75)
+        corners = count.astype(float), "", f"corners seen, in {share:.0%} of the image"
+        drawn = corners, (rms, "[px]", "reprojection error, rms")
+        for plot, (values, unit, title) in zip(axes, drawn):
+            shown = np.where(count > 0, values, np.nan)
+            mesh = plot.imshow(shown, extent=(0, wide, high, 0), cmap=HEAT, vmin=0.0, interpolation="nearest")
+            plot.set(xlabel="u [px]", title=title)
+            plot.locator_params(nbins=5)
+            plot.tick_params(labelleft=plot is axes[0])
+            colour_scale(figure, plot, mesh, unit)
+        axes[0].set_ylabel("v [px]")
+    return figure
+
+
 def parameter_changes(
     names: Sequence[str], units: Sequence[str], changes: np.ndarray, sigmas: np.ndarray, most: int = 48
 ) -> Figure:

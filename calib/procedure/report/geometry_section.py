@@ -71,6 +71,7 @@ def certificate_section(report: Report, drawn: Mapping[str, Picture]) -> Section
     blocks: list[Block] = [_error_table(metrics), *iso9283_tables(metrics)]
     blocks.append(_pictures("Before and after", drawn, ("position", "orientation", "distance")))
     blocks.append(_pictures("What remains", drawn, ("joints", "map")))
+    blocks.append(_pictures("What the camera saw", drawn, [name for name in drawn if name.startswith("coverage")]))
     if any(step.cross_validated_mm is not None for step in metrics.ladder):
         blocks += [_ladder_table(metrics), _pictures("", drawn, ("ladder",))]
     blocks.append(Text("What the poses can tell", identifiability(report)))

@@ -83,6 +83,11 @@ def test_another_dictionary_is_named():
     assert "no markers of 6x6_50, but some of 4x4_100" in found.problem
 
 
+def test_another_layout_is_told_from_no_board():
+    found = detect(image("charuco"), replace(BOARDS["charuco"], columns=6))
+    assert re.search(r"\d+ markers of 4x4_50 are seen, but not where board.toml has them", found.problem)
+
+
 @pytest.mark.slow
 def test_motion_is_told_from_defocus():
     way = np.array([placed(right=shift) for shift in np.linspace(-0.0025, 0.0025, 7)])

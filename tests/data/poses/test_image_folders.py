@@ -13,7 +13,7 @@ from calib.data.camera.camera_info import write_lens
 from calib.data.camera.lens import Lens
 from calib.data.poses.fit_options import parse_options
 from calib.data.poses.image_bags import read_image_bag, write_image_folder
-from calib.data.poses.image_folders import is_image_folder, read_images
+from calib.data.poses.image_folders import is_image_folder, problem_words, read_images
 from calib.errors import MeasurementError
 from calib.simulation.cells import camera_cell as camera
 from calib.simulation.cells.cell import SimulatedInstrument
@@ -159,3 +159,14 @@ def test_images_of_a_bag_take_the_joints_of_their_stamps(compressed, folder, tmp
     assert np.nanmax(np.abs(block.pixel - np.delete(direct.pixel, 2, axis=0))) < 1e-6
     with pytest.raises(MeasurementError, match="has no images on '/camera'"):
         read_image_bag(tmp_path / "bag", board, "/camera")
+
+
+def test_one_sentence_per_reason_tells_the_range_of_its_numbers():
+    blurred = {
+        f"{k}.png": f"no board found; the image's sharpest edges are {width} px wide" for k, width in ((1, 9), (2, 12))
+    }
+    other = {"3.png": "no markers of 4x4_50, but some of 5x5_100: state it"}
+    assert problem_words({**blurred, "4.png": "", **other}) == [
+        "2 images are of no use (no board found; the image's sharpest edges are 9 to 12 px wide): 1.png, 2.png",
+        "1 image is of no use (no markers of 4x4_50, but some of 5x5_100: state it): 3.png",
+    ]

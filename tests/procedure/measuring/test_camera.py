@@ -13,6 +13,7 @@ from calib.cli import run
 from calib.data.camera.board import read_board
 from calib.data.camera.corner_file import Detection, Found
 from calib.data.poses.image_bags import ImageBag, write_image_folder
+from calib.data.poses.measurements import Distances
 from calib.data.poses.plans import read_poses
 from calib.errors import UsageError
 from calib.geometry.observability import targets_of
@@ -29,6 +30,7 @@ from calib.simulation.cells import camera_cell as camera
 from calib.simulation.cells import camera_files
 from calib.simulation.cells.cell import SimulatedInstrument
 from calib.simulation.cells.virtual_cells import rigid, virtual_cell
+from calib.transforms import pose
 from poses.space import is_feasible
 
 SILENT = partial(lambda *words: None)
@@ -90,10 +92,12 @@ def test_boards_are_made_and_impossible_ones_refused(tmp_path, capsys):
         (["--paper", "a4"], "squares of 25 mm would fit"),
         (["--paper", "b5"], "--paper b5: expected one of a4"),
         (["--dictionary", "5x5"], "dictionary: expected one of"),
-        (["--square", "0"], "square: expected"),
+        (["--square", "0.03"], "--square counts in mm"),
+        (["--columns", "3", "--rows", "3"], "has 4 corners; an image counts from 8 on"),
     ):
         assert run(["board", "--out", str(tmp_path), *wrong]) == 2
         assert words in capsys.readouterr().err
+    assert make(tmp_path, "chessboard", None, 7, 30.0, None, None, None)[0].startswith("chessboard 10 x 7, 30 mm")
     assert make(tmp_path, "apriltag", 4, 3, 30.0, None, None, None)[0].startswith(
         "AprilTag grid 4 x 3, 30 mm, 48 corners"
     )
@@ -155,3 +159,36 @@ def test_the_prediction_is_what_a_fit_then_states(cell):
     stated = pose_sigmas(found.cell, everywhere, found.free, found.estimate.covariance, station=-1)[:, 0]
     assert 0.4 < np.median(stated / predicted.sigma) < 2.5  # the noise of the arm is our choice there
     assert np.corrcoef(np.log(stated), np.log(predicted.sigma))[0, 1] > 0.5
+
+
+def test_images_beside_another_instrument_are_another_tool_and_their_coverage_is_drawn(cell, tmp_path):
+    """A tracker's reflector in the same hand, and distances of pairs of it; no option names the tools."""
+    from calib.geometry.images.camera_guess import complete_camera
+    from calib.procedure.kinematic_stage.fit import run as fitted
+    from calib.procedure.kinematic_stage.inputs import gather
+    from calib.procedure.kinematic_stage.settings import FitSettings
+    from calib.procedure.report import figures, fit_report
+    from calib.robot.chain import random_joints
+    from calib.simulation.cells.cell import measure, true_poses
+
+    arm, reflector = cell.cell.nominal, pose(None, [0.1, 0.0, 0.1])
+    images = replace(camera.photograph(cell, camera.views(cell, 30, 5), 0.05, 5), tool_names=("tool",))
+    truth = replace(
+        cell.cell.truth, stations=pose(None, [2.0, 1.0, 0.5])[None], tools=reflector[None], tool_names=("tool",)
+    )
+    tracker = replace(cell.cell, truth=truth, instrument=SimulatedInstrument("tracker", 20e-6, None))
+    points = measure(tracker, random_joints(arm, 30, 6), 6)
+    q = random_joints(arm, 40, 7)
+    place = true_poses(tracker, q)[:, :3, 3].reshape(20, 2, 3)
+    rng = np.random.default_rng(7)
+    length = np.linalg.norm(place[:, 0] - place[:, 1], axis=1) + rng.normal(0.0, 2e-5, 20)
+    pairs = Distances(q, arm.joint_names, np.repeat(length, 2), group=np.repeat(np.arange(20), 2))
+    given = gather("lwr4plus", [images, points, pairs], settings=FitSettings(model="geometry"))
+    assert [block.tool_names for block in given.fit] == [("camera",), ("tool",), ("tool",)]
+    found = fitted(given, wanted=FitSettings(model="geometry"))
+    assert found.verdict.level == "pass"
+    block = complete_camera(arm, images)
+    (seen,) = fit_report.collect(found).images
+    assert np.sum(seen.count) == block.seen.sum() and seen.size == cell.lens.size
+    assert 0.03 < np.sqrt(np.sum(np.square(seen.rms) * seen.count) / np.sum(seen.count)) < 0.15
+    assert "coverage" in figures.captioned(fit_report.collect(found))
