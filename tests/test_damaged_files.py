@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import io
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import planted_motion as planted
 import pytest
@@ -14,15 +16,38 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from strategies import damaged
 
+from calib.data.camera.board import Board, read_board, write_board
+from calib.data.camera.board_print import raster
+from calib.data.camera.camera_info import read_lens, write_lens
+from calib.data.camera.corner_file import Found, read_corners, write_corners
+from calib.data.camera.detection import detect
+from calib.data.camera.images import decode as read_image_of
+from calib.data.camera.images import read_image
+from calib.data.camera.lens import pinhole
 from calib.data.poses.fit_options import read_options
 from calib.data.poses.plans import read_poses
 from calib.data.poses.pose_files import read_measurements
+from calib.data.poses.target_files import read_targets
 from calib.data.recordings.recording import Joints
 from calib.data.recordings.recording_files import read_recording
 from calib.errors import CalibError
+from calib.geometry.observability import targets_of
 from calib.identification import identify_options
 from calib.procedure.excitation import coefficients
+from calib.procedure.excitation.limits import read_motion_limits
 from calib.procedure.excitation.waypoints import read_waypoints
+from calib.procedure.kinematic_stage.pose_limits import read_limits
+from calib.procedure.session.folder import Session, read_state
+from calib.procedure.session.settings import (
+    DynamicsSection,
+    FitSection,
+    InstrumentSection,
+    PosesSection,
+    RobotSection,
+    SessionSettings,
+    read_settings,
+    written,
+)
 from calib.robot import description
 from calib.robot.formats import urdf_write
 from calib.robot.load import load
@@ -71,11 +96,70 @@ def robot_toml(tmp: Path) -> bytes:
     return description.write(tmp / "made.toml", planted.arm()).read_bytes()
 
 
+def bag(tmp: Path) -> bytes:
+    """Return a bag of joint states, one file of MCAP."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    place = tmp / f"bag{len(list(tmp.glob('bag*')))}"
+    store, series = get_typestore(Stores.ROS2_HUMBLE), planted.series(0)
+    state, header, stamp = (
+        store.types[name]
+        for name in ("sensor_msgs/msg/JointState", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+    )
+    with Writer(place, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        topic = writer.add_connection("/joint_states", state.__msgtype__, typestore=store)
+        for k in range(150):
+            time = header(stamp=stamp(sec=k // 100, nanosec=k % 100 * 10_000_000), frame_id="")
+            q, tau = (series[key][2 * k].copy() for key in ("q", "tau"))
+            message = state(header=time, name=list(JOINTS), position=q, velocity=q, effort=tau)
+            writer.write(topic, k * 10_000_000, store.serialize_cdr(message, state.__msgtype__))
+    return next(place.glob("*.mcap")).read_bytes()
+
+
+def picture(tmp: Path) -> bytes:
+    image = raster(BOARD, 600.0, 0.01)
+    return bytes(cv2.imencode(".png", image)[1].tobytes())
+
+
+def corner_table(tmp: Path) -> bytes:
+    found = detect(read_image_of(picture(tmp)), BOARD)
+    return write_corners(tmp / "made_corners.csv", Found({"a.png": found}, (200, 200))).read_bytes()
+
+
+def look(path: Path) -> None:
+    detect(read_image(path), BOARD)
+
+
+TURNED = b"q1,q2,q3,x,y,z,qx,qy,qz,qw\n" + b"0.1,0.2,0.3,0.4,0.5,0.6,0,0,0,1\n0.2,0.1,0.3,0.4,0.5,0.6,0,0,0,1\n" * 4
+SESSION = SessionSettings(
+    "a", "2026-11-22", 0, RobotSection("r.toml"), InstrumentSection("tracker", "position"), PosesSection(),
+    FitSection(), DynamicsSection(),
+)  # fmt: skip
+
+
+STATE = json.dumps(
+    {
+        "schema": 2, "running": "fit",
+        "steps": {"poses": {
+            "finished": "2026-11-22", "inputs": {"robot.toml": "ab"}, "outputs": {"2-poses/poses.csv": "cd"},
+            "seconds": 1.5, "command": "calib select", "seed": 3, "notes": ["said"],
+        }},
+    }
+).encode()  # fmt: skip
+LIMITS = (
+    b'[joints]\nmargin = 0.02\n[[obstacle]]\nname = "wall"\nkind = "box"\nsize = [0.1, 1, 1]\nxyz = [1, 0, 0]\n'
+    b'[instrument]\nxyz = [3, 0, 1]\nsight = "40 deg"\n[target]\nfacing = [0, 0, 1]\nheight = [0.2, 1.5]\n'
+)
+MOTION_LIMITS = (
+    b"[velocity]\nall = 1.0\n[acceleration]\nall = 8.0\n[torque]\nmargin = 0.1\n[frequency]\nresonance = 5.0\n"
+)
+BOARD = Board(columns=5, rows=4, marker=0.02)
 ARM = load("ur5")
 KINDS: dict[str, tuple[str, Callable[[Path], bytes], Callable[[Path], Any]]] = {
     "positions": ("m.csv", lambda tmp: poses("q1,q2,q3,x,y,z"), lambda path: read_measurements(path, JOINTS)),
     "poses": (
-        "m.csv", lambda tmp: b"q1,q2,q3,x,y,z,qx,qy,qz,qw\n" + b"0.1,0.2,0.3,0.4,0.5,0.6,0,0,0,1\n" * 4,
+        "m.csv", lambda tmp: TURNED,
         lambda path: read_measurements(path, JOINTS),
     ),
     "sockets": (
@@ -93,13 +177,34 @@ KINDS: dict[str, tuple[str, Callable[[Path], bytes], Callable[[Path], Any]]] = {
     "waypoints": (
         "w.csv", lambda tmp: poses("q1,q2,q3,q4,q5,q6"), lambda path: read_waypoints(path, ARM, ARM.lower, ARM.upper),
     ),
+    "targets": ("t.csv", lambda tmp: poses("x,y,z,q1,q2,q3"), lambda path: read_targets(path, JOINTS)),
+    "session.toml": ("session.toml", lambda tmp: written(SESSION).encode(), read_settings),
+    "state.json": ("state.json", lambda tmp: STATE, lambda path: read_state(Session(path.parent, SESSION))),
+    "constraints": ("c.toml", lambda tmp: LIMITS, lambda path: read_limits(path, targets_of(ARM))),
+    "motion limits": ("l.toml", lambda tmp: MOTION_LIMITS, lambda path: read_motion_limits(path, ARM)),
+    "image": ("i.png", picture, look),
+    "corners": ("corners.csv", corner_table, lambda path: read_corners(path, BOARD)),
+    "board": ("board.toml", lambda tmp: write_board(BOARD, tmp / "made_board.toml").read_bytes(), read_board),
+    "camera": (
+        "camera.yaml", lambda tmp: write_lens(pinhole(900.0, (640, 480)), tmp / "made.yaml").read_bytes(), read_lens,
+    ),
+    "bag": ("b.mcap", bag, lambda path: read_recording(path, Joints(JOINTS))),
 }  # fmt: skip
+
+
+_CONTENT: dict[str, bytes] = {}
+
+
+def _made(kind: str, make: Callable[[Path], bytes], tmp_path: Path) -> bytes:
+    if kind not in _CONTENT:
+        _CONTENT[kind] = make(tmp_path)
+    return _CONTENT[kind]
 
 
 def read_damaged(kind: str, data: st.DataObject, tmp_path: Path) -> None:
     """Read a damaged file: nothing but an error of the toolkit may come of it."""
     name, make, read = KINDS[kind]
-    content = data.draw(damaged(make(tmp_path)))
+    content = data.draw(damaged(_made(kind, make, tmp_path)))
     path = tmp_path / "here" / name
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(content)
@@ -115,6 +220,14 @@ def read_damaged(kind: str, data: st.DataObject, tmp_path: Path) -> None:
 @given(data=st.data())
 def test_a_damaged_file_is_read_or_refused(kind: str, data: st.DataObject, tmp_path: Path) -> None:
     read_damaged(kind, data, tmp_path)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_file_itself_is_read(kind: str, tmp_path: Path) -> None:
+    name, make, read = KINDS[kind]
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here" / name).write_bytes(_made(kind, make, tmp_path))
+    read(tmp_path / "here" / name)
 
 
 @pytest.mark.slow

@@ -74,9 +74,14 @@ def read_corners(path: Path, board: Board) -> Found:
     import csv
 
     count, images, size = len(corners(board)), dict[str, Detection](), (0, 0)
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        rows = list(csv.DictReader(file))
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            rows = list(csv.DictReader(file, restkey="further cells", restval=""))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise MeasurementError(f"cannot be read as a table ({error})", path) from error
     for number, row in enumerate(rows, 1):
+        if "further cells" in row:
+            raise MeasurementError("has more cells than the header names columns", path, number)
         cells = {(key or "").split("[")[0].strip(): (value or "").strip() for key, value in row.items()}
         name, problem = cells.get("image", ""), cells.get("problem", "")
         try:
@@ -90,7 +95,7 @@ def read_corners(path: Path, board: Board) -> Found:
             if problem or not cells.get("corner"):
                 continue
             k, place = int(cells["corner"]), (float(cells["u"]), float(cells["v"]))
-        except (KeyError, ValueError) as error:
+        except (KeyError, ValueError, OverflowError) as error:
             raise MeasurementError(f"expected image, corner, u, v ({error})", path, number) from error
         if not 0 <= k < count:
             raise MeasurementError(f"corner {k}: the board ({board.words}) has {count}", path, number, "corner")
