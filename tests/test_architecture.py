@@ -21,6 +21,7 @@ HOMES = {
         "calib.mechanism.closure_kernels",
         "calib.robot.capsule_kernels",
         "calib.simulation.loop.loop_kernels",
+        "calib.simulation.loop.tangent_kernels",
     ],
     "yourdfpy": ["calib.robot.formats.readback"],
     "cv2": [

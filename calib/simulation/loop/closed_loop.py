@@ -157,6 +157,67 @@ def simulate(
     return SimulatedRun(t, motion[0], motion[1], motion[2], motion[3], frozen(out[4] + heard), motion[4])
 
 
+@dataclass(frozen=True, eq=False)
+class Sensitivities:
+    """A simulated motion without noise, and its slopes by parameters; M samples, c parameters.
+
+    Attributes:
+        t: (M,) [s].
+        q, v, torque: (M, n) [rad or m, per s, N m or N].
+        by_q, by_v, by_torque: (M, n, c) their slopes, per unit of each parameter.
+    """
+
+    t: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    torque: np.ndarray
+    by_q: np.ndarray
+    by_v: np.ndarray
+    by_torque: np.ndarray
+
+
+def simulate_tangents(
+    plant: Plant, controller: Controller, reference: Reference, columns: np.ndarray, every: float = 1,
+    relative: np.ndarray | None = None,
+) -> Sensitivities:  # fmt: skip
+    """Let the robot follow a reference without noise, and say what each parameter changes: exactly, in one pass.
+
+    Args:
+        plant: whose friction hangs on position and velocity alone.
+        columns: (c,) indices of the parameters.
+        every: control periods per sample.
+        relative: (n, c) slopes of the logarithm of all gains of a joint by the parameters, where the gains follow them
+            (`calib.identification.loop.loop_recordings.Loop.design`); None: they stay.
+
+    Raises:
+        CalibError: where the inertia is not positive definite, friction too stiff, or of a kind without slopes.
+        NotConverged: where the loop is unstable.
+    """
+    from calib.simulation.loop import loop_kernels, tangent_kernels
+
+    for one in plant.terms:
+        if one.shape in _CODES and one.form.slopes is None and one.shape != "dead":
+            raise CalibError(
+                f"term '{one.name}' ({one.shape}): no tangents of friction that hangs on loads or the past"
+            )
+    n, count, c = plant.bodies.n, len(reference.t), len(columns)
+    find = np.full(len(plant.parameters), -1)
+    find[np.asarray(columns, dtype=int)] = np.arange(c)
+    tick = sample_ticks(count, every)
+    out, slopes = np.empty((3, len(tick), n)), np.empty((3, len(tick), n, c))
+    model = np.empty((0, 0)) if controller.model is None else _body(plant.bodies, controller.model)
+    scale = np.zeros((n, c)) if relative is None else np.ascontiguousarray(shaped(relative, (n, c), "relative"))
+    status, reached = tangent_kernels.closed_loop_tangent(
+        packed(plant), (*layout_of(plant), find), model, controller.rows, scale, controller.sampled(reference),
+        np.empty((0, n)), reference.period, controller.smoothing(reference.period), controller.delay, float(every),
+        np.array(reference.q[0]), np.array(reference.v[0]), count, out, slopes,
+    )  # fmt: skip
+    if status != loop_kernels.FINE:
+        raise _failure(status, reached * reference.period)
+    t = reference.t[0] + tick * reference.period
+    return Sensitivities(t, *(frozen(x) for x in out), *(frozen(x) for x in slopes))
+
+
 def sample_ticks(count: int, every: float) -> np.ndarray:
     """Return the control periods, whole or not, at which samples of `count` periods are recorded."""
     return np.arange(int((count - 1) / every + 1e-9) + 1) * every

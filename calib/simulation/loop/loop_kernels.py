@@ -168,7 +168,7 @@ def dynamics(tree, body, linear, q, v, work, matrix, out):
 
 
 @njit(**JOINED)
-def _factorise(matrix):
+def factorise(matrix):
     """Overwrite the lower triangle with L, the diagonal with 1 / D, M = L D Lᵀ; False where M is not definite."""
     for i in range(matrix.shape[0]):
         for j in range(i):
@@ -188,7 +188,7 @@ def _factorise(matrix):
 
 
 @njit(**JOINED)
-def _substitute(matrix, vector):
+def substitute(matrix, vector):
     """Overwrite vector (n,) with M⁻¹ vector, M factorised."""
     n = vector.shape[0]
     for i in range(n):
@@ -313,7 +313,7 @@ def _under_load(linear, kinds, acts, memory, q, v, tau, matrix, loads, out):
                 extra[kinds[t, 0]] += acts[t, 0] * size * shape(kinds[t, 1], acts, t, memory, q, v)
         for j in range(n):
             change[j] = -extra[j]
-        _substitute(matrix, change)
+        substitute(matrix, change)
         for j in range(n):
             out[j] = plain[j] + change[j]
     return moved <= 1e-6 * size
@@ -351,7 +351,7 @@ def stiffness(kinds, acts, loads, v, matrix, unit):
         for j in range(n):
             unit[j] = 0.0
         unit[kinds[t, 0]] = 1.0
-        _substitute(matrix, unit)
+        substitute(matrix, unit)
         for k in range(n):
             total += abs(slope * acts[t, 8 + k] * unit[k])
             springs += abs(spring * acts[t, 8 + k] * unit[k])
@@ -365,9 +365,9 @@ def accelerate(tree, body, linear, kinds, acts, memory, loads, q, v, tau, work, 
         out[j] = tau[j]
     dynamics(tree, body, linear, q, v, work, matrix, out)
     loaded = friction(linear, kinds, acts, memory, q, v, out)
-    if not _factorise(matrix):
+    if not factorise(matrix):
         return False
-    _substitute(matrix, out)
+    substitute(matrix, out)
     if loaded:
         return _under_load(linear, kinds, acts, memory, q, v, tau, matrix, loads, out)
     return True
@@ -474,7 +474,7 @@ def command(gains, aim, speed, seen, rate, integral, period, wish):
 
 
 @njit(**OPTIONS)
-def _linearise(tree, model, linear, ahead, seen, rate, work, matrix, wish):
+def linearise_command(tree, model, linear, ahead, seen, rate, work, matrix, wish):
     """Replace wish (n,), with ahead an acceleration, by M(q) wish + c(q, v) + g(q) of the controller's model."""
     n = wish.shape[0]
     wanted = wish + ahead
@@ -520,7 +520,7 @@ def closed_loop(
             before[j] = read[j]
         command(gains, reference[0, k], reference[1, k], read, speed, integral, period, wish)
         if model.shape[0]:
-            _linearise(tree, model, linear, reference[3, k], read, speed, work, matrix, wish)
+            linearise_command(tree, model, linear, reference[3, k], read, speed, work, matrix, wish)
         for j in range(n):
             wish[j] += reference[2, k, j]
             held = min(max(wish[j], -gains[4, j]), gains[4, j])

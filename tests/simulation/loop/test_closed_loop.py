@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from arms import physical
+from arms import motley_with_follower, physical
 from scipy.interpolate import CubicSpline
 
 from calib.dynamics import drives, rigid_body
 from calib.dynamics.bodies import bodies_of, standard_parameters, with_payload
 from calib.errors import CalibError, NotConverged
 from calib.robot import description, library
-from calib.robot.chain import Chain, Element, Joint
+from calib.robot.chain import Chain
 from calib.simulation.cells import known_robots
 from calib.simulation.loop import controllers, references
 from calib.simulation.loop.closed_loop import Plant, Sensing, forward_dynamics, inertia_diagonal, simulate
@@ -21,20 +21,6 @@ from calib.simulation.loop.references import Reference
 from calib.transforms import displace
 
 HIGH = np.array([2.0, 1.2, 1.2, 2.0, 1.5, 2.0])
-
-
-def motley() -> Chain:
-    """Return an arm with prismatic joints, axes x, y, z, signs, a mimic follower, gravity askew."""
-    rng = np.random.default_rng(3)
-    elements = []
-    for j, axis in enumerate(("rx", "tz", "ry", "rz", "tx")):
-        sign = -1.0 if j in (1, 3) else 1.0
-        placement = displace(np.eye(4), rng.normal(size=6) * 0.5)
-        elements.append(Element(f"moving{j}", axis, 0.3, j, j, sign=sign, placement=placement))
-    elements.append(Element("follower", "ry", 0.1, 3, 2, ratio=0.5))
-    kinds = ("revolute", "prismatic", "revolute", "revolute", "prismatic")
-    joints = tuple(Joint(f"joint{j + 1}", kind, -2.0, 2.0) for j, kind in enumerate(kinds))
-    return Chain("motley", joints, tuple(elements), gravity=np.array([1.0, -2.0, -9.0]))
 
 
 def bare(chain: Chain) -> Plant:
@@ -54,7 +40,8 @@ def free(n: int) -> controllers.Controller:
     return controllers.pd(np.zeros(n), np.zeros(n))
 
 
-@pytest.mark.parametrize("chain", [description.read(library.path(x)) for x in ("tx40", "lwr4plus")] + [motley()],
+@pytest.mark.parametrize("chain", [description.read(library.path(x)) for x in ("tx40", "lwr4plus")]
+                         + [motley_with_follower()],
                          ids=lambda chain: chain.name)  # fmt: skip
 def test_forward_dynamics_are_those_of_the_dynamics_room(chain):
     bodies = bodies_of(chain)
