@@ -1,9 +1,10 @@
 """One data set of a condition: a robot with known parameters in its closed loop, and the problem a method is given.
 
-The robot follows a motion in its controller's loop at 5 kHz; the encoders' noise enters the loop, the torque's is that
-of the log. Positions are low-passed and differentiated, rows decimated, as `calib identify` does it. What is believed
-of the robot may differ from what it is (`Condition.mismatch`). All data sets of a condition share the motion: the best
-by condition number of `DRAWN` random Fourier series within the limits (self-collisions are not looked at).
+The robot follows a motion in its controller's loop at 5 kHz, logged at 1 kHz (TX40) or 140 Hz (RV-2SQ); the encoders'
+noise enters the loop, the torque's is that of the log. Positions are low-passed and differentiated, rows decimated, as
+`calib identify` does it. What is believed of the robot may differ from what it is (`Condition.mismatch`). All data sets
+of a condition share the motion: the best by condition number of `DRAWN` random Fourier series within the limits
+(self-collisions are not looked at).
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from calib.data.recordings.recording import Recording
 from calib.data.signals.bandwidth import USABLE
@@ -34,7 +36,7 @@ from calib.robot.load import load
 from calib.simulation.cells import known_robots
 from calib.simulation.cells.cell import SimulatedInstrument, measure
 from calib.simulation.cells.virtual_cells import perturbed_cell, rigid
-from calib.simulation.loop.closed_loop import Plant, Sensing, simulate
+from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, simulate
 from calib.simulation.loop.controllers import Controller
 from calib.simulation.loop.references import Reference, random_fourier
 from calib.simulation.loop.tracking import feed_forward
@@ -61,14 +63,14 @@ class Setup:
         plant: the robot as its maker describes it.
         reference: the motion, at the control rate.
         other: the motion that validates.
-        every: control periods per sample.
+        every: control periods per sample, whole or not.
     """
 
     chain: Chain
     plant: Plant
     reference: Reference
     other: Reference
-    every: int
+    every: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,20 +91,13 @@ class Experiment:
     torque: np.ndarray
 
 
-def control_rate(robot: str) -> tuple[float, int]:
-    """Return the control rate [Hz] and the periods per logged sample.
-
-    The TX40's 5 kHz and 1 kHz are the survey's; the RV-2SQ's 140 Hz go 36 times into 5040 Hz, in place of its 5 kHz.
-    """
-    return (5000.0, 5) if robot == "tx40" else (5040.0, 36)
-
-
 @lru_cache(maxsize=4)
 def set_up(robot: str, duration: float) -> Setup:
     """Return what the data sets of a robot share."""
     chain = load(robot)
     plant = known_robots.plant(robot)
-    rate, every = control_rate(robot)
+    known = known_robots.truth(robot)["control"]
+    rate, every = float(known["rate"]), float(known["rate"]) / float(known["sampling"])
     model = known_robots.model(plant)
     kept = _nominal_base(robot).kept
 
@@ -184,15 +179,19 @@ def _robots(condition: Condition, setup: Setup, seed: int) -> tuple[Plant, Ident
 
 def _recorded(condition: Condition, setup: Setup, true: Plant, controller: Controller, seed: int) -> Case:
     """Return the case of one noisy run of the true robot."""
-    late = round(LATE / setup.reference.period) if condition.mismatch == "clock" else 0
-    every = 1 if late else setup.every
-    sensing = Sensing(condition.sigma_q, 0.0, condition.sigma_tau, every=every)
-    run = simulate(true, controller, setup.reference, sensing, np.random.default_rng([seed, 20_211]))
-    picked = np.arange(0, len(setup.reference.t), setup.every) // every
-    rate = 1.0 / (setup.reference.period * setup.every)
+    sensing = Sensing(condition.sigma_q, 0.0, condition.sigma_tau, every=setup.every)
+
+    def run(every: float) -> SimulatedRun:
+        own = replace(sensing, every=every)
+        return simulate(true, controller, setup.reference, own, np.random.default_rng([seed, 20_211]))
+
+    log, period = run(setup.every), setup.reference.period
+    rate, torque = 1.0 / (period * setup.every), log.tau
+    if condition.mismatch == "clock":
+        torque = run(1).tau[np.maximum(np.rint((log.t - log.t[0] - LATE) / period).astype(int), 0)]
+    asked = CubicSpline(setup.reference.t, setup.reference.q)(log.t)
     recording = Recording(
-        setup.reference.t[:: setup.every], run.measured[picked], run.tau[np.maximum(picked - late, 0)], "torque",
-        setup.chain.joint_names, q_ref=setup.reference.q[:: setup.every], file=condition.name,
+        log.t, log.measured, torque, "torque", setup.chain.joint_names, q_ref=asked, file=condition.name
     )  # fmt: skip
     cutoff = condition.cutoff or USABLE * rate / 2
     decimator = design_decimator(rate, condition.decimation, "chebyshev")
@@ -203,10 +202,10 @@ def _recorded(condition: Condition, setup: Setup, true: Plant, controller: Contr
 def _loop(condition: Condition, controller: Controller) -> LoopSettings:
     """Return the loop as it is believed to be."""
     kp, kd = BELIEVED if condition.mismatch == "controller" else (1.0, 1.0)
-    drive = known_robots.truth(condition.robot)["drives"]
+    known = known_robots.truth(condition.robot)
     return LoopSettings(
         "pd", kp=tuple(kp * controller.kp), kd=tuple(kd * controller.kd), limit=tuple(controller.limit),
-        rate=control_rate(condition.robot)[0], inertia=tuple(drive["Ia"]),
+        rate=float(known["control"]["rate"]), inertia=tuple(known["drives"]["Ia"]),
     )  # fmt: skip
 
 
