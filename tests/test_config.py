@@ -28,7 +28,8 @@ from calib.identification import identify_options
 from calib.procedure.excitation import limits
 from calib.procedure.excitation.coefficients import TrajectoryFile
 from calib.procedure.formats import SCHEMAS
-from calib.procedure.kinematic_stage import pose_limits
+from calib.procedure.measuring import constraints_file
+from calib.procedure.measuring.constraints_file import ConstraintsFile
 from calib.procedure.session.folder import StateFile
 from calib.procedure.session.settings import SessionSettings, example
 
@@ -51,7 +52,10 @@ STEP = {"finished": "2026-01-01T00:00:00", "inputs": {"a.csv": "12"}, "outputs":
 FILES: dict[str, tuple[dict[str, Any], Callable[[dict[str, Any]], object]]] = {
     "options": (documented(fit_options), fit_options.parse_options),
     "identify-options": (documented(identify_options), identify_options.parse_options),
-    "constraints": (documented(pose_limits), lambda table: parse(pose_limits.ConstraintsFile, table, "c.toml")),
+    "constraints": (
+        documented(constraints_file),
+        lambda table: parse(ConstraintsFile, table, "c.toml"),
+    ),
     "limits": (LIMITS, lambda table: parse(limits.LimitsFile, table, "l.toml")),
     "session": (
         tomllib.loads(example().replace('file = ""', 'file = "robot.urdf"')),
@@ -191,7 +195,7 @@ def test_places_are_named_as_toml_names_them() -> None:
 )
 def test_constraints_that_cannot_be(table: dict[str, Any], words: str) -> None:
     with pytest.raises(UsageError, match=words):
-        parse(pose_limits.ConstraintsFile, table, "c.toml")
+        parse(ConstraintsFile, table, "c.toml")
 
 
 @pytest.mark.parametrize(

@@ -45,7 +45,7 @@ TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
         "what calib export --into writes of an identified robot",
         ("calib.procedure.export.dynamics", "calib.identification.possible.solve"),
     ),
-    "constraints": ("the TOML file of calib select --constraints", ("calib.procedure.kinematic_stage.pose_limits",)),
+    "constraints": ("the TOML file of calib select --constraints", ("calib.procedure.measuring.constraints_file",)),
     "mdh": ("a robot as a table of modified Denavit-Hartenberg rows", ("calib.robot.mdh", "calib.robot.tables")),
     "parallel": (
         "a parallel robot as legs and a platform, and what commands write of one",
@@ -84,7 +84,7 @@ TOPICS: Mapping[str, tuple[str, tuple[str, ...]]] = {
 SCHEMAS: Mapping[str, tuple[str, str]] = {
     "options": ("calib.data.poses.fit_options", "FitOptions"),
     "identify-options": ("calib.identification.identify_options", "OptionsFile"),
-    "constraints": ("calib.procedure.kinematic_stage.pose_limits", "ConstraintsFile"),
+    "constraints": ("calib.procedure.measuring.constraints_file", "ConstraintsFile"),
     "limits": ("calib.procedure.excitation.limits", "LimitsFile"),
     "session": ("calib.procedure.session.settings", "SessionSettings"),
     "study": ("calib.studies.conditions", "StudyFile"),

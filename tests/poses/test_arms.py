@@ -12,7 +12,7 @@ from arms import motley
 from differences import check
 
 from calib.geometry.observability import observation, targets_of
-from calib.procedure.kinematic_stage.pose_limits import read_limits
+from calib.procedure.measuring.pose_limits import read_limits
 from calib.robot.chain import Chain
 from calib.robot.load import load
 from poses.candidates import draw_candidates

@@ -1,7 +1,7 @@
 """The limits file of excitation: where the arm may go, how fast, and with which torques.
 
 TOML; every table is optional. ``without``, ``[joints]``, ``[target]`` (height, axis_distance, reach, of the tip),
-``[collision]`` and ``[[obstacle]]`` are those of pose selection (`calib.procedure.kinematic_stage.pose_limits`), and so
+``[collision]`` and ``[[obstacle]]`` are those of pose selection (`calib.procedure.measuring.constraints_file`), and so
 is what is kept where nothing is stated: self-collision, the floor, a margin to the joint limits. A plan through stated
 waypoints keeps what is stated only. Besides, per joint or ``all``::
 
@@ -40,7 +40,8 @@ from calib.config import check_keys, parse, read_toml, strict
 from calib.config_types import Name, NotNegative, Numeric, Real, Spread, Whole, number  # fmt: skip
 from calib.errors import UsageError
 from calib.geometry.observability import targets_of
-from calib.procedure.kinematic_stage.pose_limits import DEFAULTS, ConstraintsFile, Limits, Point, limits_of
+from calib.procedure.measuring.constraints_file import DEFAULTS, ConstraintsFile, Point
+from calib.procedure.measuring.pose_limits import Limits, limits_of
 from calib.robot.chain import Chain
 from calib.robot.kinematics import joint_frames, joint_jacobian, sweep
 from poses.space import PoseConstraint

@@ -15,9 +15,9 @@ from calib.data.poses.plans import read_poses, write_poses
 from calib.errors import UsageError
 from calib.geometry.observability import Observation, observation, targets_of
 from calib.procedure.kinematic_stage.inputs import joint_kinds, load_robot
-from calib.procedure.kinematic_stage.pose_limits import Limits, read_limits
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
 from calib.procedure.measuring.camera_view import ImageObservation, Predicted, image_observation, predict
+from calib.procedure.measuring.pose_limits import Limits, read_limits
 from calib.procedure.measuring.prediction import Prediction, by_count
 from calib.procedure.measuring.prediction import predicted as foretold
 from calib.procedure.measuring.prediction import table as outlook_table
@@ -102,7 +102,7 @@ def choose(
         robot: see `calib.robot.load`.
         m: how many.
         settings: what is measured, index, method, seed.
-        constraints: see `calib.procedure.kinematic_stage.pose_limits`.
+        constraints: see `calib.procedure.measuring.constraints_file`.
         existing: CSV of poses measured before, which count.
         base, tip: links of a URDF.
         map: where parallel work runs (`calib.workers`).

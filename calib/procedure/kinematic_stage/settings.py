@@ -81,7 +81,7 @@ class SelectionSettings:
         seconds: of processor time for the search; None lets it end by itself.
         climbs: searches for feasible poses beyond the bound; 0 bounds the candidates and the chosen poses only.
         without: defaults that poses need not keep, and what the cell does not have
-            (`calib.procedure.kinematic_stage.pose_limits`).
+            (`calib.procedure.measuring.constraints_file`).
         run: how fast the poses are driven, and how long each is measured.
     """
 

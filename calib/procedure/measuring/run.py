@@ -101,7 +101,7 @@ def plan_run(
 
     Args:
         chain: the arm, for its speeds.
-        limits: with lower, upper, collision and clearance (`calib.procedure.kinematic_stage.pose_limits.Limits`).
+        limits: with lower, upper, collision and clearance (`calib.procedure.measuring.pose_limits.Limits`).
         settings: speed and dwell.
         seed: of the search for ways around.
         progress: called with a few words now and then.

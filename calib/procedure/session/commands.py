@@ -18,7 +18,8 @@ from calib.folders import CERTIFICATE
 from calib.geometry.observability import targets_of
 from calib.procedure.excitation.limits import read_motion_limits
 from calib.procedure.kinematic_stage.folder import URDF
-from calib.procedure.kinematic_stage.pose_limits import ConstraintsFile, beside, limits_of, read_limits
+from calib.procedure.measuring.constraints_file import ConstraintsFile, beside
+from calib.procedure.measuring.pose_limits import limits_of, read_limits
 from calib.procedure.session import instructions, steps
 from calib.procedure.session.folder import Session, create, locked, open_session, verdict_of
 from calib.procedure.session.questions import instrument_named

@@ -16,8 +16,8 @@ from calib.dynamics.gravity import gravity_torques
 from calib.geometry.observability import SIGMA_ORIENTATION, observation, targets_of
 from calib.geometry.uncertainty.spread import pose_sigmas
 from calib.procedure.kinematic_stage import compensation, selection
-from calib.procedure.kinematic_stage.pose_limits import read_limits
 from calib.procedure.kinematic_stage.settings import SelectionSettings
+from calib.procedure.measuring.pose_limits import read_limits
 from calib.procedure.measuring.run import Run
 from calib.procedure.session.folder import PREDICTED, SELECTION, Session
 from calib.robot.chain import Chain

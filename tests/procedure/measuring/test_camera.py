@@ -18,10 +18,10 @@ from calib.data.poses.plans import read_poses
 from calib.errors import UsageError
 from calib.geometry.observability import targets_of
 from calib.procedure.kinematic_stage import selection
-from calib.procedure.kinematic_stage.pose_limits import read_limits
 from calib.procedure.kinematic_stage.settings import SelectionSettings
 from calib.procedure.measuring.boards import make
 from calib.procedure.measuring.camera_view import image_observation
+from calib.procedure.measuring.pose_limits import read_limits
 from calib.procedure.session.commands import NewSession, begin, go_on
 from calib.procedure.session.folder import open_session
 from calib.robot.deflection import Deflection

@@ -11,7 +11,8 @@ from differences import check
 
 import calib
 from calib.geometry.observability import observation, targets_of
-from calib.procedure.kinematic_stage.pose_limits import ConstraintsFile, Limits, limits_of, read_limits
+from calib.procedure.measuring.constraints_file import ConstraintsFile
+from calib.procedure.measuring.pose_limits import Limits, limits_of, read_limits
 from calib.procedure.measuring.prediction import predicted
 from calib.procedure.measuring.run import RunSettings, is_run, plan_run, rehearsed_samples, write_run
 from calib.procedure.session.cell_answers import cell_tables

@@ -1,0 +1,199 @@
+"""The constraints file of pose selection: where the arm may go while it is measured.
+
+With no file, and wherever a file says nothing else, poses keep a share of each joint's range to its limits, distance
+between the arm's own links, and the floor that the arm stands on.
+
+TOML; every table is optional, a key that is none of these is refused. Lengths in m, angles in rad, or with a unit
+(``"30 deg"``); all places in the arm's base frame::
+
+    without = ["instrument"]         # what the cell does not have (instrument, box, obstacles), and defaults that are
+                                     # not to be kept (self-collision, floor, joint-margin, view)
+    [joints]                         # narrower limits: lower and upper
+    q1 = ["-90 deg", "90 deg"]
+    margin = 0.01                    # share of each joint's own range that stays free at either end
+    [target]                         # the first target's position
+    height = [0.2, 1.5]              # z; a single number is the least
+    axis_distance = 0.3              # least distance from the base's z axis
+    reach = 1.2                      # largest distance from the base's origin
+    facing = [0, 0, 1]               # the direction it faces, in its own frame (default z); a list of them for several
+    [instrument]                     # camera or tracker
+    xyz = [2.0, 0.0, 1.0]            # where it stands, and how: rpy (or matrix)
+    rpy = [0, 0, "180 deg"]
+    roll = ["-20 deg", "20 deg"]     # of the target, seen from the instrument's frame: R = Rz(yaw) Ry(pitch) Rx(roll)
+    pitch = ["-20 deg", "20 deg"]
+    sight = "40 deg"                 # half angle of the cone, around facing, in which the target sees the instrument
+    range = [0.5, 20.0]              # least and largest distance of the target
+    [camera]                         # in place of an instrument; places may be rough, a centimetre and some degrees do
+    mounting = "in hand"             # the arm carries the camera; to hand: the board
+    lens = "camera.yaml"             # beside the file; ROS camera_info
+    board = "board.toml"
+    carried = {xyz = [0.04, 0.0, 0.06], rpy = [0, 0, 0]}       # what the arm carries, in the tip's frame
+    stands = {xyz = [0.5, 0.1, 0.0], rpy = ["180 deg", 0, 0]}  # the other, in the base; cameras look along z
+    tilt = "50 deg"                  # largest angle between the line of sight and the board's normal
+    range = [0.3, 1.2]               # least and largest distance of the board's middle
+    margin = 10                      # pixels that the board keeps to the image's edge
+    [collision]                      # by the URDF's collision shapes, or capsules where there are none
+    margin = 0.01                    # least distance between parts
+    radius = 0.06                    # of the capsules; by default 5 % of the stretched arm, 0.05 or more
+    floor = 0.0                      # height of the floor; by default of what the arm stands on
+    box = [[-1, 1], [-1, 1], [0, 2]] # x, y and z that no part of the arm leaves
+    [[obstacle]]                     # box (size: 3), sphere (1: radius) or cylinder (2: radius, length)
+    name = "table"
+    kind = "box"
+    size = [1.0, 1.0, 0.1]
+    xyz = [0.8, 0.0, -0.05]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+
+from calib.config import parse, read_toml, strict
+from calib.config_types import Checked, Expect, Name, Numeric, OneOf, OneOrMany, Real, shown
+from calib.procedure.measuring.camera_view import CameraTable
+
+MOTION = ("velocity", "acceleration", "jerk", "torque", "friction", "point", "frequency")  # `motion_limits` reads them
+MARGIN, JOINT_MARGIN = 0.01, 0.01  # [m], share of a joint's range: where the file does not tell (our choice)
+DEFAULTS = ("self-collision", "floor", "joint-margin", "view")
+CELL = ("instrument", "box", "obstacles")
+
+Metres = Annotated[float, Real(quantity="length")]
+Distance = Annotated[float, Real(least=0, quantity="length")]
+Angle = Annotated[float, Real(quantity="angle")]
+Point = Annotated[tuple[Metres, Metres, Metres], Expect("a list of 3 lengths")]
+Turns = Annotated[tuple[Angle, Angle, Angle], Expect("a list of 3 angles")]
+Rows = Annotated[tuple[tuple[float, float, float, float], ...], Expect("three or four rows of 4 numbers")]
+Span = Annotated[tuple[Numeric, Numeric], Expect("a list of 2 numbers, lower and upper")]
+Box = Annotated[tuple[Span, Span, Span], Expect("three lists of 2 numbers, x, y and z")]
+Size = Annotated[tuple[Annotated[float, Real(above=0, quantity="length")], ...], Expect("lengths above 0")]
+
+
+_ONE = {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3}
+_PAIR = {"type": "array", "minItems": 2, "maxItems": 2, "items": {"type": ["number", "string"]}}
+
+
+def _directions(value: Any) -> Any:
+    """Make a single direction a list of one."""
+    single = isinstance(value, list | tuple) and len(value) > 0 and not isinstance(value[0], list | tuple)
+    return [value] if single else value
+
+
+@strict
+@dataclass(frozen=True)
+class TargetTable:
+    """[target], see the module."""
+
+    height: Annotated[float | tuple[float, ...], OneOrMany(Real(quantity="length"))] | None = None
+    axis_distance: Distance | None = None
+    reach: Annotated[float, Real(above=0, quantity="length")] | None = None
+    facing: Annotated[
+        tuple[Annotated[tuple[float, float, float], Expect("a list of 3 numbers")], ...],
+        Checked(_directions, {"anyOf": [_ONE, {"type": "array", "items": _ONE, "minItems": 1}]}),
+    ] = ((0.0, 0.0, 1.0),)
+
+    def __post_init__(self) -> None:
+        if not self.facing or not all(map(np.any, self.facing)):
+            raise ValueError("facing: [0, 0, 0] is no direction")
+        if isinstance(self.height, tuple):
+            rising(self.height, "height")
+
+    @property
+    def heights(self) -> tuple[float | None, float | None]:
+        """The least and the largest height of the target [m]."""
+        return (self.height[0], self.height[1]) if isinstance(self.height, tuple) else (self.height, None)
+
+
+@strict
+@dataclass(frozen=True)
+class PlacedTable:
+    """What stands somewhere: xyz and rpy, or a matrix."""
+
+    xyz: Point | None = None
+    rpy: Turns | None = None
+    matrix: Rows | None = None
+
+    @property
+    def stated(self) -> dict[str, Any]:
+        """The keys that were stated."""
+        return {key: value for key in ("xyz", "rpy", "matrix") if (value := getattr(self, key)) is not None}
+
+
+@strict
+@dataclass(frozen=True)
+class InstrumentTable(PlacedTable):
+    """[instrument], see the module."""
+
+    roll: Span | None = None
+    pitch: Span | None = None
+    sight: Annotated[float, Real(above=0, quantity="angle")] | None = None
+    range: Span | None = None
+
+    def __post_init__(self) -> None:
+        for key in ("sight", "range"):
+            if getattr(self, key) is not None and self.xyz is None and self.matrix is None:
+                raise ValueError(f"{key} needs the place of the instrument, xyz")
+
+
+@strict
+@dataclass(frozen=True)
+class CollisionTable:
+    """[collision], see the module."""
+
+    margin: Distance = MARGIN
+    radius: Annotated[float, Real(above=0, quantity="length")] | None = None
+    floor: Metres | None = None
+    box: Box | None = None
+
+
+@strict
+@dataclass(frozen=True, kw_only=True)
+class ObstacleTable(PlacedTable):
+    """[[obstacle]], see the module."""
+
+    kind: Annotated[str, OneOf(("box", "sphere", "cylinder"))]
+    size: Size
+    name: Name = "obstacle"
+
+
+def _span_or_margin(value: Any) -> Any:
+    """Take a list of two numbers or texts with units, or one (the margin)."""
+    pair = isinstance(value, list | tuple) and len(value) == 2
+    parts = value if pair else (value,)
+    if not all(isinstance(part, str | int | float) and not isinstance(part, bool) for part in parts):
+        raise ValueError(f"expected a list of 2 numbers, lower and upper, found {shown(value)}")
+    return tuple(parts) if pair else value
+
+
+@strict
+@dataclass(frozen=True)
+class ConstraintsFile:
+    """The constraints file."""
+
+    joints: Mapping[
+        str, Annotated[Any, Checked(_span_or_margin, {"anyOf": [_PAIR, {"type": ["number", "string"]}]})]
+    ] = field(default_factory=dict)
+    target: TargetTable = field(default_factory=TargetTable)
+    instrument: InstrumentTable | None = None
+    camera: CameraTable | None = None
+    collision: CollisionTable | None = None
+    obstacle: tuple[ObstacleTable, ...] = ()
+    without: tuple[Annotated[str, OneOf((*CELL, *DEFAULTS))], ...] = ()
+
+
+def beside(path: Path) -> dict[str, Path]:
+    """Return the files that a constraints file names, by name: a camera's lens and its board."""
+    table = {key: value for key, value in read_toml(path).items() if key not in MOTION}
+    camera = parse(ConstraintsFile, table, str(path)).camera
+    return {} if camera is None else {name: path.parent / name for name in (camera.lens, camera.board)}
+
+
+def rising(span: tuple[float, ...], where: str) -> None:
+    if len(span) != 2:
+        raise ValueError(f"{where}: expected a list of 2 numbers, lower and upper, found {len(span)}")
+    if not span[0] < span[1]:
+        raise ValueError(f"{where}: {span[0]:g} is not below {span[1]:g}")
