@@ -1,0 +1,97 @@
+"""A study that loses a worker, its process, or its patience: no trial is lost, none counts twice."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+import dask_cluster
+import pytest
+
+from calib.procedure.study.outcome import run_study
+from calib.studies.rows import JOURNAL, read_rows
+from calib.studies.trial import Row
+
+FILE = """
+name = "small"
+robot = "rv2sq"
+methods = ["ols", "wls"]
+runs = 12
+duration = 4.0
+resimulated = 0
+[[noise]]
+name = "1"
+sigma_q = "1e-4 deg"
+sigma_tau = 0.05
+"""
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Path:
+    path = tmp_path / "small.toml"
+    path.write_text(FILE)
+    return path
+
+
+def timeless(rows: list[Row]) -> list[str]:
+    return sorted(str({k: v for k, v in asdict(row).items() if k not in ("seconds", "cpu")}) for row in rows)
+
+
+def test_rows_that_are_there_are_not_run_again(study: Path, tmp_path: Path):
+    """More runs are added; a file edited half-way keeps what its new conditions share with the old."""
+    first = run_study([study], tmp_path / "out", runs=1, plots=False)
+    second = run_study([study], tmp_path / "out", runs=2, plots=False)
+    assert (first.progress.done, second.progress.done) == (2, 2)
+    study.write_text(FILE.replace("0.05", "0.06"))
+    third = run_study([study], tmp_path / "out", runs=1, plots=False)
+    assert third.progress.done == 2
+    assert "4 rows are of conditions that are not of this study" in " ".join(third.notes)
+    assert third.conditions[0].methods[0].trials == 1
+    study.write_text(FILE)
+    assert run_study([study], tmp_path / "out", runs=2, plots=False).progress.done == 0
+
+
+@pytest.mark.slow
+def test_a_cluster_that_loses_a_worker_loses_no_trial(study: Path, tmp_path: Path):
+    with dask_cluster.running(tmp_path, workers=2) as cluster:
+        killed = []
+
+        def say(words: str) -> None:
+            if " of 24 trials" in words and not killed:
+                killed.append(words)
+                cluster.workers[0].kill()
+
+        found = run_study([study], tmp_path / "out", where=cluster.address, plots=False, say=say)
+    assert killed and not killed[0].startswith("24 of")
+    assert (found.progress.done, found.progress.lost) == (24, 0)
+    run_study([study], tmp_path / "here", plots=False)
+    rows = read_rows(tmp_path / "out")
+    assert len({row.key for row in rows}) == len(rows) == 24
+    assert timeless(rows) == timeless(read_rows(tmp_path / "here"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("how", "code"), [(signal.SIGKILL, -9), (signal.SIGINT, 130)])
+def test_a_study_that_was_stopped_goes_on(study: Path, tmp_path: Path, how: int, code: int):
+    out = tmp_path / "out"
+    words = [sys.executable, "-m", "calib.cli", "study", str(study), "--out", str(out), "--no-plots"]
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    journal = out / JOURNAL
+    for _ in range(1200):
+        if journal.exists() and len(journal.read_text().splitlines()) > 4:
+            break
+        time.sleep(0.05)
+    os.kill(process.pid, how)
+    _, said = process.communicate()
+    assert process.returncode == code
+    assert code != 130 or "the same command goes on from here" in said
+    kept = read_rows(out)
+    assert 4 <= len(kept) < 24
+    found = run_study([study], out, plots=False)
+    assert found.progress.done == 24 - len(kept)
+    assert len({row.key for row in read_rows(out)}) == len(read_rows(out)) == 24
