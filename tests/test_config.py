@@ -32,6 +32,8 @@ from calib.procedure.measuring import constraints_file
 from calib.procedure.measuring.constraints_file import ConstraintsFile
 from calib.procedure.session.folder import StateFile
 from calib.procedure.session.settings import SessionSettings, example
+from calib.studies import conditions
+from calib.studies.conditions import StudyFile
 
 FEW = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
@@ -52,16 +54,14 @@ STEP = {"finished": "2026-01-01T00:00:00", "inputs": {"a.csv": "12"}, "outputs":
 FILES: dict[str, tuple[dict[str, Any], Callable[[dict[str, Any]], object]]] = {
     "options": (documented(fit_options), fit_options.parse_options),
     "identify-options": (documented(identify_options), identify_options.parse_options),
-    "constraints": (
-        documented(constraints_file),
-        lambda table: parse(ConstraintsFile, table, "c.toml"),
-    ),
+    "constraints": (documented(constraints_file), lambda table: parse(ConstraintsFile, table, "c.toml")),
     "limits": (LIMITS, lambda table: parse(limits.LimitsFile, table, "l.toml")),
     "session": (
         tomllib.loads(example().replace('file = ""', 'file = "robot.urdf"')),
         lambda table: parse(SessionSettings, table, "session.toml"),
     ),
     "trajectory": (TRAJECTORY, lambda table: parse(TrajectoryFile, table, "trajectory.toml")),
+    "study": (documented(conditions), lambda table: parse(StudyFile, table, "study.toml")),
     "state": ({"schema": 2, "steps": {"fit": STEP}}, lambda table: parse(StateFile, table, "state.json")),
 }
 LEAVES = st.one_of(
