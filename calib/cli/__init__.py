@@ -100,7 +100,7 @@ def _failed(error: Exception, given: list[str]) -> int:
 
 
 def _spread(arguments: list[str]) -> list[str]:
-    """Return the arguments of ``fit`` and ``identify``, ``--validate a b`` written as ``--validate a --validate b``.
+    """Return arguments with ``--validate a b`` written as ``--validate a --validate b``, of the commands that take it.
 
     Only where ROBOT and MEASURED have come before: what follows --validate then cannot be one of them.
     """
@@ -118,7 +118,7 @@ def _spread(arguments: list[str]) -> list[str]:
         else:
             positionals += 1
         result.append(word)
-    return result if {"fit", "identify"} & set(arguments[:2]) else arguments
+    return result if {"fit", "identify", "compare"} & set(arguments[:2]) else arguments
 
 
 def _interrupted(given: list[str]) -> int:

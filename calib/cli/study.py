@@ -1,4 +1,4 @@
-"""Comparing methods of identification: study (simulated, truth known)."""
+"""Comparing methods of identification: study (simulated, truth known), compare (recordings)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.shared import Plots, reporting, say
+from calib.cli.shared import Base, Plots, Robot, Seed, Tip, reporting, say
 
 app = typer.Typer()
 SHOWN = 3  # conditions whose tables are printed in full
@@ -44,12 +44,65 @@ def study(
     if out is None and (len(studies) > 1 or any(mark in studies[0] for mark in "*?[")):
         raise UsageError("several studies together need a folder: --out DIR")
     folder = out or Path(f"{Path(studies[0]).stem}-study")
-    chosen = None if methods is None else [name.strip() for name in methods.split(",") if name.strip()]
     with reporting() as (_, progress):
         found = outcome.run_study(
-            studies, folder, methods=chosen, runs=runs, where=workers, report_only=report_only, plots=plots,
+            studies, folder, methods=_names(methods), runs=runs, where=workers, report_only=report_only, plots=plots,
             say=progress,
         )  # fmt: skip
     tables = [report.condition_table(one) for one in found.conditions if one.methods]
     say(*console.rendered(tables if len(tables) <= SHOWN else [report.overview(found.conditions)]))
     say(*outcome.described(found), f"written to {folder}: {outcome.REPORT} shows it")
+
+
+@app.command()
+def compare(
+    robot: Robot,
+    recordings: Annotated[list[str], typer.Argument(help="recordings to learn from; log.npz@0:9.4 cuts")],
+    validate: Annotated[list[str] | None, typer.Option(help="recording of other motion; may be repeated")] = None,
+    methods: Annotated[str | None, typer.Option(help="wls,iv,didim; default: all that the options allow")] = None,
+    friction: Annotated[
+        str, typer.Option(help="as of calib identify; loops are simulated with standard friction")
+    ] = "standard",
+    options: Annotated[
+        Path | None, typer.Option(help="TOML, as of calib identify; with [loop], all methods run")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="CSV to write the table to")] = None,
+    base: Base = None,
+    tip: Tip = None,
+    seed: Seed = 0,
+) -> None:
+    """Rank identification methods on recordings, by what they predict of other motion, with what they cost."""
+    from calib import files
+    from calib.identification.identify_options import read_options
+    from calib.procedure.dynamic_stage import inputs
+    from calib.procedure.dynamic_stage.method_comparison import compare_methods, write_table
+    from calib.procedure.report import console
+    from calib.procedure.study import method_table
+
+    if out is not None:
+        files.check_target(out, [robot, *recordings, *(validate or []), options], (".csv",))
+    chosen = _names(methods)
+    with reporting() as (_, progress):
+        given = inputs.gather(
+            robot, recordings, validate or (), options=read_options(options), base=base, tip=tip, seed=seed,
+            friction=friction, progress=progress,
+        )  # fmt: skip
+        found = compare_methods(given, chosen, friction, progress)
+    say(*console.rendered(method_table.blocks(found)))
+    if out is not None:
+        say(f"written to {write_table(found, out)}")
+
+
+def _names(text: str | None) -> list[str] | None:
+    """Return the methods of a list with commas, held against those there are; None for all."""
+    from calib.errors import UsageError
+    from calib.identification.methods.registry import method_named
+
+    if text is None:
+        return None
+    found = [name.strip() for name in text.split(",") if name.strip()]
+    for name in found:
+        method_named(name)
+    if not found:
+        raise UsageError("--methods names none; calib study --list-methods")
+    return found

@@ -1,0 +1,211 @@
+"""``calib compare``: every method on the same recordings, ranked by what they predict of other motion.
+
+All estimate the same columns (base parameters and standard friction, unless another is asked for), each as
+`calib identify --method` does it: wls draws what the motion does not tell to a prior. Errors are relative, in the
+identification band, over all unseen recordings together; their standard errors, and those of differences between
+methods, come from a jackknife over blocks of time (Künsch 1989), since residuals are not white. Methods within `APART`
+standard errors of the best, or within `SLACK` of its error, are as good; the fastest of them is the one to take.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from calib import files
+from calib.data.signals.motion import in_band
+from calib.errors import CalibError, UsageError
+from calib.identification.cases import Case
+from calib.identification.identify import Identification, identify
+from calib.identification.methods.method import Method
+from calib.identification.methods.registry import METHODS, method_named
+from calib.identification.prediction import predict
+from calib.identification.settings import IdentificationSettings
+from calib.procedure.dynamic_stage.inputs import IdentificationInputs
+
+BLOCKS = 10  # of time in each recording
+APART, SLACK = 2.0, 0.05  # our choices
+
+
+@dataclass(frozen=True)
+class ComparedMethod:
+    """One method.
+
+    Attributes:
+        name: of it.
+        failure: why there is no estimate; "" where there is one.
+        rank: by the error on unseen motion, from 1; 0 without an estimate.
+        unseen, sigma: error on unseen motion in the band, and its standard error [%].
+        raw: the same against the torque as recorded [%].
+        training: in the band, of what was learnt from [%].
+        worst: joint with the largest error on unseen motion, counted from 1, and that [%].
+        behind, behind_sigma: difference from the best, and its standard error [%].
+        good, chosen: whether it is as good as the best, and the one to take.
+        parameters: number of them.
+        seconds: of the method alone.
+        iterations, simulations: of the method.
+    """
+
+    name: str
+    failure: str = ""
+    rank: int = 0
+    unseen: float = np.nan
+    sigma: float = np.nan
+    raw: float = np.nan
+    training: float = np.nan
+    worst: tuple[int, float] = (0, np.nan)
+    behind: float = 0.0
+    behind_sigma: float = 0.0
+    good: bool = False
+    chosen: bool = False
+    parameters: int = 0
+    seconds: float = np.nan
+    iterations: int = 0
+    simulations: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class _Sums:
+    """Per block of time (k, rows): squares of errors and of torques, in the band and as recorded."""
+
+    error: np.ndarray
+    size: np.ndarray
+    raw_error: np.ndarray
+    raw_size: np.ndarray
+
+
+def compare_methods(
+    inputs: IdentificationInputs, methods: Sequence[str] | None = None, friction: str = "standard",
+    say: Callable[[str], None] = lambda words: None,
+) -> list[ComparedMethod]:  # fmt: skip
+    """Return every method on these recordings, best first; those that failed, or that lack a [loop], last.
+
+    Args:
+        inputs: recordings to learn from, and unseen ones.
+        methods: their names; None: all.
+        friction: as of `IdentificationSettings`; methods that simulate know ``standard`` alone.
+
+    Raises:
+        UsageError: where no recording is unseen, or a name is none of a method.
+    """
+    if not inputs.unseen:
+        raise UsageError("methods are ranked by motion that none has seen: give some with --validate")
+    chosen = {name: method_named(name) for name in methods or METHODS}
+    done: list[tuple[ComparedMethod, _Sums]] = []
+    failed: list[ComparedMethod] = []
+    alike = ~np.isin(np.arange(inputs.cases[0].target.shape[1]), inputs.currents.own)
+    for name, method in chosen.items():
+        if method.needs_controller and inputs.options.settings.loop is None:
+            failed.append(ComparedMethod(name, "needs the closed loop: state it in the options, [loop]"))
+            continue
+        say(name)
+        try:
+            found = identify(inputs.robot, inputs.cases, _settings(inputs, method, friction), partial(_said, say, name))
+            done.append(_judged(found, inputs, alike))
+        except CalibError as error:
+            failed.append(ComparedMethod(name, " ".join(str(error).split())))
+    return [*_ranked(done, alike), *failed]
+
+
+def _said(say: Callable[[str], None], name: str, words: str) -> None:
+    say(f"{name}: {words}")
+
+
+def _settings(inputs: IdentificationInputs, method: Method, friction: str) -> IdentificationSettings:
+    """Return the options' settings without what another method alone knows."""
+    settings = replace(inputs.options.settings, method=method.name, essential="none", friction=friction)
+    if not method.takes_constraints:
+        settings = replace(settings, constraints=None)
+    if not method.takes_prior:
+        settings = replace(settings, weights="residuals")
+    return settings if method.needs_controller else replace(settings, loop=None)
+
+
+def _judged(
+    found: Identification, inputs: IdentificationInputs, alike: np.ndarray
+) -> tuple[ComparedMethod, _Sums]:  # fmt: skip
+    """Return a method's errors; nothing of other methods yet."""
+    unseen, training = (_sums(found, cases) for cases in (inputs.unseen, inputs.cases))
+    joints = 100.0 * np.sqrt(unseen.error.sum(axis=0) / np.maximum(unseen.size.sum(axis=0), 1e-300))
+    worst = int(np.argmax(np.where(alike, joints, -1.0)))
+    fitted = found.fitted
+    return ComparedMethod(
+        fitted.method, unseen=_percent(unseen.error[:, alike], unseen.size[:, alike]),
+        sigma=float(_jackknife(_leaving_out(unseen, alike))),
+        raw=_percent(unseen.raw_error[:, alike], unseen.raw_size[:, alike]),
+        training=_percent(training.error[:, alike], training.size[:, alike]),
+        worst=(worst + 1, float(joints[worst])), parameters=len(fitted.estimate.values), seconds=fitted.seconds,
+        iterations=fitted.iterations, simulations=fitted.simulations,
+    ), unseen  # fmt: skip
+
+
+def _sums(found: Identification, cases: Sequence[Case]) -> _Sums:
+    parts = []
+    for case in cases:
+        motion, known = case.motion, case.motion.weight > 0.5
+        predicted = predict(found.dynamics, case)
+        low, target = in_band(motion, predicted), in_band(motion, np.asarray(case.target))
+        starts = np.linspace(0, len(known), BLOCKS, endpoint=False).astype(int)
+        parts.append(
+            [
+                np.add.reduceat(np.where(known[:, None], x, 0.0) ** 2, starts, axis=0)
+                for x in (target - low, target, case.target - predicted, case.target)
+            ]
+        )
+    return _Sums(*(np.concatenate(own) for own in zip(*parts)))
+
+
+def _percent(error: np.ndarray, size: np.ndarray) -> float:
+    return float(100.0 * np.sqrt(error.sum() / max(float(size.sum()), 1e-300)))
+
+
+def _leaving_out(sums: _Sums, alike: np.ndarray) -> np.ndarray:
+    """Return the error (k,) [%] with each block left out."""
+    error, size = sums.error[:, alike].sum(axis=1), sums.size[:, alike].sum(axis=1)
+    return 100.0 * np.sqrt((error.sum() - error) / np.maximum(size.sum() - size, 1e-300))
+
+
+def _jackknife(each: np.ndarray) -> float:
+    return float(np.sqrt((len(each) - 1) / len(each) * np.sum((each - each.mean()) ** 2)))
+
+
+def _ranked(done: Sequence[tuple[ComparedMethod, _Sums]], alike: np.ndarray) -> list[ComparedMethod]:
+    if not done:
+        return []
+    order = sorted(done, key=lambda pair: pair[0].unseen)
+    best, own = order[0]
+    result = []
+    for rank, (one, sums) in enumerate(order, 1):
+        behind = one.unseen - best.unseen
+        sigma = _jackknife(_leaving_out(sums, alike) - _leaving_out(own, alike))
+        good = behind <= max(APART * sigma, SLACK * best.unseen)
+        result.append(replace(one, rank=rank, behind=behind, behind_sigma=sigma, good=bool(good)))
+    fastest = min((one for one in result if one.good), key=lambda one: one.seconds)
+    return [replace(one, chosen=one is fastest) for one in result]
+
+
+def write_table(found: Sequence[ComparedMethod], path: Path) -> Path:
+    """Write the comparison as CSV."""
+    header = [
+        "rank", "method", "unseen_percent", "sigma", "raw_percent", "training_percent", "worst_joint",
+        "worst_joint_percent", "behind", "behind_sigma", "as_good", "take", "parameters", "seconds", "iterations",
+        "simulations", "failure",
+    ]  # fmt: skip
+    lines = [
+        (
+            one.rank or "", one.name, *_cells(one.unseen, one.sigma, one.raw, one.training), one.worst[0] or "",
+            *_cells(one.worst[1], one.behind, one.behind_sigma), "yes" if one.good else "no",
+            "yes" if one.chosen else "no", one.parameters, *_cells(one.seconds), one.iterations, one.simulations,
+            one.failure,
+        )
+        for one in found
+    ]  # fmt: skip
+    return files.write_table(path, header, lines)
+
+
+def _cells(*values: float) -> list[object]:
+    return ["" if np.isnan(value) else value for value in values]

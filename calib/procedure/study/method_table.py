@@ -1,0 +1,37 @@
+"""Methods compared on recordings, as a table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from calib.procedure.dynamic_stage.method_comparison import APART, SLACK, ComparedMethod
+from calib.procedure.report.page import Block, Table, Text
+
+HEADER = (
+    "", "method", "unseen [%]", "behind the best", "raw [%]", "training [%]", "worst joint", "parameters", "rounds",
+    "simulations", "seconds", "",
+)  # fmt: skip
+
+
+def blocks(found: Sequence[ComparedMethod]) -> Iterator[Block]:
+    """Yield the ranked table, and why methods are not in it."""
+    good = [one for one in found if not one.failure]
+    rows = [
+        (
+            str(one.rank), one.name, f"{one.unseen:.3g} ± {one.sigma:.2g}",
+            "" if one.rank == 1 else f"{one.behind:.2g} ± {one.behind_sigma:.2g}", f"{one.raw:.3g}",
+            f"{one.training:.3g}", f"{one.worst[0]}: {one.worst[1]:.3g} %", str(one.parameters), str(one.iterations),
+            str(one.simulations), f"{one.seconds:.2g}", "take" if one.chosen else "as good" if one.good else "",
+        )
+        for one in good
+    ]  # fmt: skip
+    note = (
+        "100 ‖τ - τ̂‖ / ‖τ‖ on motion that was not learnt from, in the identification band, ± its standard error over "
+        f"blocks of time; as good: within {APART:g} standard errors of the difference, or {SLACK:.0%}, of the best"
+    )
+    strong = frozenset(k for k, one in enumerate(good) if one.chosen)
+    if rows:
+        yield Table("Methods", HEADER, rows, note, strong, (0, *range(2, len(HEADER) - 1)))
+    lines = [f"{one.name}: {one.failure}" for one in found if one.failure]
+    if lines:
+        yield Text("Without an estimate", lines, "no estimate")
