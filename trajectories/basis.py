@@ -80,6 +80,13 @@ class Basis:
         moved = (self.tables.reshape(n, 4 * count, c) @ spread[:, :, None]).reshape(n, 4, count)
         return SampledMotion(self.times, *(self.offsets + moved.transpose(1, 2, 0)))
 
+    def nearest(self, q: np.ndarray) -> np.ndarray:
+        """Return the variables (p,) whose positions come nearest to q (N, n): least squares over the times."""
+        found = np.zeros(self.used.shape)
+        for j, used in enumerate(self.used):
+            found[j, used] = np.linalg.lstsq(self.tables[j, 0][:, used], q[:, j] - self.offsets[0, :, j], rcond=None)[0]
+        return found[self.used]
+
     def adjoint(self, slopes: np.ndarray) -> np.ndarray:
         """Return gradients by x (m, p) of m functions with slopes (m, 4, N, n) by q, v, a and jerk."""
         m, _, count, n = slopes.shape

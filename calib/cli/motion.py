@@ -25,8 +25,9 @@ def excite(
     ] = None,
     hard: Annotated[list[str] | None, typer.Option(help="a goal that must be met; repeatable")] = None,
     period: Annotated[float, typer.Option(help="of the motion [s]")] = DESIGN.period,
+    shortest: Annotated[float | None, typer.Option(help="that the search may shorten the period to [s]")] = None,
     harmonics: Annotated[
-        int, typer.Option(help="frequencies per joint; control points for splines")
+        int | None, typer.Option(help="frequencies per joint; control points for splines; default 12")
     ] = DESIGN.harmonics,
     family: Annotated[str, typer.Option(help="fourier or bspline")] = DESIGN.family,
     drives: Annotated[str, typer.Option(help="terms of each drive to identify, without --model")] = DESIGN.drives,
@@ -61,7 +62,8 @@ def excite(
     from calib.workers.interrupts import finishing
 
     settings = ExcitationSettings(
-        goals=tuple(goal or ()), hard=tuple(hard or ()), period=period, harmonics=harmonics, family=family,
+        goals=tuple(goal or ()), hard=tuple(hard or ()), period=period, shortest=shortest,
+        harmonics=harmonics, family=family,
         drives=drives, rate=rate, starts=starts, evaluations=evaluations, seed=seed, front=front,
         start=_stands(start), repeat=repeat, slower=slower, existing=tuple(existing or ()), lock=tuple(lock or ()),
     )  # fmt: skip

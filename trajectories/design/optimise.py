@@ -16,8 +16,10 @@ from typing import get_args
 import numpy as np
 
 from trajectories.design.problem import ExcitationProblem, exact_values, stretched, unmet
-from trajectories.design.search import Method, SearchResult, Stuck, one_start
+from trajectories.design.search import STAGES, Method, SearchResult, Stage, Stuck, one_start
 from trajectories.errors import BadInput, NotExciting, NothingFeasible
+
+KEPT = 1 / 3  # of the starts, which the last stages are for (our choice)
 
 
 def design(
@@ -38,7 +40,7 @@ def design(
         starts: random ones, each from its own child of the seed, besides the guesses.
         evaluations: most per start.
         method: "slsqp" (Kraft 1988), "auglag" (augmented Lagrangian, Birgin & Martínez 2008, over L-BFGS) or "mma"
-            (Svanberg 2002), all in NLopt.
+            (Svanberg 2002), the latter two of NLopt.
         guesses: variables to start from, (p,) each.
         map: the builtin, or one that spreads the work; results in order.
         report: called with starts done, starts, and the best so far in words.
@@ -52,31 +54,67 @@ def design(
     tasks: list[int | np.ndarray] = [*guesses, *range(starts)]
     if not tasks:
         raise BadInput("no starts: ask for one at least, or give a guess")
-    found, stuck, spent = list[SearchResult](), list[Stuck](), 0
-    interrupted = False
+    search, polished = _Starts(problem, evaluations, method, seed, map, report, len(tasks)), list[SearchResult]()
     try:
-        wanted = takewhile(lambda _: not interrupted, tasks)  # a map in other processes may still hand back what it has
-        for number, run in enumerate(map(partial(one_start, problem, evaluations, method, seed), wanted), 1):
-            if isinstance(run, SearchResult):
-                found.append(run)
-            else:
-                stuck.append(run)
-            spent += run.evaluations
-            if report:
-                best = min((one.merit for one in found), default=np.inf)
-                report(number, len(tasks), f"best so far {best:.4g}" if found else "nothing feasible yet")
-            interrupted |= isinstance(run, SearchResult) and run.interrupted
+        search.run(tasks, STAGES[:2])
+        if not search.interrupted:
+            polished = search.run(search.promising(), STAGES[2:])
     except KeyboardInterrupt:
-        if not found:
+        if not search.found:
             raise
-        interrupted = True
-    if not found:
-        raise _nothing(problem, stuck)
-    best = min(found, key=lambda one: one.merit)
-    share = sum(one.feasible * one.evaluations for one in found) / spent
+        search.interrupted = True
+    if not search.found:
+        raise _nothing(problem, search.stuck)
+    best = min(polished or search.found, key=lambda one: one.merit)
+    share = sum(one.feasible * one.evaluations for one in search.found) / search.spent
     return replace(
-        best, evaluations=spent, feasible=share, seconds=time.perf_counter() - began, interrupted=interrupted
-    )
+        best, evaluations=search.spent, feasible=share, seconds=time.perf_counter() - began,
+        interrupted=search.interrupted,
+    )  # fmt: skip
+
+
+class _Starts:
+    """Starts that are searched from, round by round."""
+
+    def __init__(
+        self, problem: ExcitationProblem, evaluations: int, method: Method, seed: int, map: Callable,
+        report: Callable[[int, int, str], None] | None, starts: int,
+    ):  # fmt: skip
+        self.problem, self.arguments, self.map, self.report = problem, (evaluations, method, seed), map, report
+        self.found, self.stuck = list[SearchResult](), list[Stuck]()
+        self.done, self.total = 0, starts + _kept(starts)
+        self.spent, self.interrupted = 0, False
+
+    def run(self, tasks: list[int | np.ndarray], stages: tuple[Stage, ...]) -> list[SearchResult]:
+        """Search from each task through some stages; return what was found."""
+        fresh = list[SearchResult]()
+        # a map in other processes may still hand back what it has
+        wanted = takewhile(lambda _: not self.interrupted, tasks)
+        for run in self.map(partial(one_start, self.problem, *self.arguments, stages=stages), wanted):
+            self.spent += run.evaluations
+            self.done += 1
+            if isinstance(run, SearchResult):
+                fresh.append(run)
+                self.found.append(run)
+                self.interrupted |= run.interrupted
+            else:
+                self.stuck.append(run)
+            if self.report:
+                best = min((one.merit for one in self.found), default=np.inf)
+                words = f"best so far {best:.4g}" if self.found else "nothing feasible yet"
+                self.report(self.done, self.total, words)
+        return fresh
+
+    def promising(self) -> list[int | np.ndarray]:
+        """Return the variables of the best motions so far, those that break the constraints least behind."""
+        ranked = sorted(self.found, key=lambda one: one.merit) + sorted(self.stuck, key=lambda one: one.excess)
+        chosen = ranked[: _kept(len(ranked))]
+        return [np.append(one.x, one.factor) if self.problem.free_period else one.x for one in chosen]
+
+
+def _kept(starts: int) -> int:
+    """Return how many of the starts are searched to the end."""
+    return max(1, round(KEPT * starts))
 
 
 def _nothing(problem: ExcitationProblem, stuck: list[Stuck]) -> NothingFeasible:

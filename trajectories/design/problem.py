@@ -55,6 +55,7 @@ class ExcitationProblem:
         stretch: (least, most) factor on the period; equal ends fix it.
         tightening: how far inside the constraints to stay, as a share of each one's scale: room for what happens
             between the samples.
+        coarse: a family of fewer variables and the same period, in which random starts begin; None: the family itself.
     """
 
     family: Family
@@ -66,12 +67,15 @@ class ExcitationProblem:
     samples: int = 200
     stretch: tuple[float, float] = (1.0, 1.0)
     tightening: float = 0.003
+    coarse: Family | None = None
 
     def __post_init__(self) -> None:
         if not 0 < self.stretch[0] <= self.stretch[1]:
             raise BadInput(f"stretch {self.stretch}: expected two positive factors, the smaller first")
         if self.samples < 8:
             raise BadInput(f"{self.samples} samples: expected 8 or more over a period")
+        if self.coarse is not None and (self.coarse.n, self.coarse.period) != (self.family.n, self.family.period):
+            raise BadInput("the coarse family has other joints or another period than the family")
         if not self.objectives and not self.goals:
             raise BadInput("nothing to design for: give objectives or goals")
 

@@ -1,16 +1,19 @@
-"""One start's search: NLopt on the smoothed problem, three times, each time sharper, from where the last one ended.
+"""One start's search: sequential quadratic programming on the smoothed problem, sharper from stage to stage.
 
-The best motion that kept all constraints at the samples is returned, not the last one.
+The first stage looks at half of the samples, and at motions of few harmonics where the problem names a coarser family:
+most of the way costs a fraction there. The best motion that kept all constraints at the samples is returned, not the
+last one.
 """
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
 
 import nlopt
 import numpy as np
+from scipy.optimize import minimize
 
 from trajectories.basis import Basis
 from trajectories.design.problem import (
@@ -25,9 +28,38 @@ from trajectories.design.starts import random_start
 from trajectories.errors import NotExciting
 
 Method = Literal["slsqp", "auglag", "mma"]
-STAGES = ((4.0, 100.0), (10.0, 200.0), (30.0, 500.0))
-"""Sharpness of the spectra and of the constraints, stage by stage (our choice)."""
+
+
+class Stage(NamedTuple):
+    """Sharpness p of the spectra and ρ of the constraints, tolerance of SLSQP, and a share of the evaluations.
+
+    Rough: at half of the samples; coarse: in the coarse family.
+    """
+
+    spectra: float
+    constraints: float
+    tolerance: float
+    share: float
+    rough: bool = False
+    coarse: bool = False
+
+    @property
+    def sharpness(self) -> tuple[float, float]:
+        return self.spectra, self.constraints
+
+
+STAGES = (
+    Stage(4.0, 100.0, 1e-4, 0.2, rough=True, coarse=True),
+    Stage(10.0, 200.0, 1e-5, 0.35, rough=True),
+    Stage(30.0, 500.0, 1e-5, 0.25),
+    Stage(100.0, 2000.0, 1e-6, 0.2),
+)
+"""Our choice."""
 S_RANGE = (-4.0, 12.0)
+
+
+class _Spent(Exception):
+    """The evaluations are used up."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,48 +109,58 @@ class Stuck:
 
 
 def one_start(
-    problem: ExcitationProblem, evaluations: int, method: Method, seed: int, start: int | np.ndarray
+    problem: ExcitationProblem,
+    evaluations: int,
+    method: Method,
+    seed: int,
+    start: int | np.ndarray,
+    stages: tuple[Stage, ...] = STAGES,
 ) -> SearchResult | Stuck:
-    """Search from one random start (its number) or from given variables."""
-    began = time.perf_counter()
-    run = StartSearch(problem, problem.basis())
-    if isinstance(start, int | np.integer):
-        rng = np.random.default_rng([seed, int(start)])
-        y = random_start(problem, run.basis, rng)
+    """Search from one random start (its number) or from given variables.
+
+    Args:
+        evaluations: most, if all of `STAGES` are gone through.
+        stages: those to go through; a given start is not led away by a coarse one.
+    """
+    began, drawn = time.perf_counter(), isinstance(start, int | np.integer)
+    chosen = stages if drawn else tuple(stage for stage in stages if not stage.coarse)
+    run = StartSearch(*_at_stage(problem, chosen[0]))
+    if drawn:
+        y = random_start(run.problem, run.basis, np.random.default_rng([seed, int(start)]))
     else:
         y = np.asarray(start, dtype=float)
         y = np.append(y, np.clip(1.0, *problem.stretch)) if problem.free_period and len(y) == run.basis.p else y
-    stages = STAGES if isinstance(start, int | np.integer) else STAGES[1:]  # a guess is not to be led far away
-    run.sharpness = stages[0]
     try:
-        y = run.repaired(y)
-        for stage, sharpness in enumerate(stages):
-            run.sharpness = sharpness
-            y = run.solve(run.best if run.best is not None and stage else y, max(1, evaluations // len(stages)), method)
+        for number, stage in enumerate(chosen):
+            if number:
+                run, y = run.continued(*_at_stage(problem, stage))
+            run.sharpness = stage.sharpness
+            y = run.solve(run.repaired(y), max(2, round(evaluations * stage.share)), method, stage.tolerance)
     except KeyboardInterrupt:
         if run.best is None:
             raise
         run.interrupted = True
-    factor = float(run.best[-1] if run.best is not None and problem.free_period else problem.stretch[0])
-    p = run.basis.p
-    if run.best is None:
-        nearest = run.nearest if run.nearest is not None else y
-        factor = float(nearest[p]) if problem.free_period else factor
-        return Stuck(nearest[:p], factor, run.least, run.count, run.reason)
-    seconds, share = time.perf_counter() - began, run.kept / run.count
-    label = int(start) if isinstance(start, int | np.integer) else -1
-    return SearchResult(
-        run.best[:p], factor, run.merit, run.values, tuple(run.history), run.count, share, seconds, label,
-        run.interrupted, tuple(run.times),
-    )  # fmt: skip
+    if run.problem.family is not problem.family:  # interrupted before the whole family was looked at
+        run, y = run.continued(problem, problem.basis())
+        run.repaired(y)
+    return run.result(y, time.perf_counter() - began, int(start) if drawn else -1)
+
+
+def _at_stage(problem: ExcitationProblem, stage: Stage) -> tuple[ExcitationProblem, Basis]:
+    """Return the problem that a stage searches in, and its basis."""
+    if stage.rough:
+        problem = replace(problem, samples=max(8, problem.samples // 2))
+    if stage.coarse and problem.coarse is not None:
+        problem = replace(problem, family=problem.coarse)
+    return problem, problem.basis()
 
 
 class StartSearch:
-    """One start's search: the state that NLopt's callbacks share."""
+    """One start's search in one problem: the state that the optimiser's callbacks share."""
 
     def __init__(self, problem: ExcitationProblem, basis: Basis):
         self.problem, self.basis = problem, basis
-        self.sharpness = STAGES[0]
+        self.sharpness = STAGES[0].sharpness
         self.best: np.ndarray | None = None
         self.nearest: np.ndarray | None = None
         self.merit, self.least = np.inf, (np.inf, np.inf)
@@ -130,6 +172,36 @@ class StartSearch:
         self.interrupted, self.reason, self.scale = False, "", 1.0
         self._at: tuple[bytes, tuple[float, float]] | None = None
         self._evaluation: Evaluation | None = None
+
+    def continued(self, problem: ExcitationProblem, basis: Basis) -> tuple[StartSearch, np.ndarray]:
+        """Return the search of another problem that goes on from here, and the point where it begins."""
+        y = self.best if self.best is not None else self.nearest
+        assert y is not None
+        if problem.family is not self.problem.family:
+            p = self.basis.p
+            path = self.problem.family.basis(basis.times).motion(y[:p])
+            y = np.append(basis.nearest(path.q), y[p:])
+        new = StartSearch(problem, basis)
+        new.history, new.times, new.began = self.history, self.times, self.began
+        new.count, new.kept, new.interrupted, new.reason = self.count, self.kept, self.interrupted, self.reason
+        return new, y
+
+    def result(self, y: np.ndarray, seconds: float, seed: int) -> SearchResult | Stuck:
+        """Return what the search came to; y: its last point."""
+        p, stretch = self.basis.p, self.problem.stretch
+        best = self.best if self.best is not None else self.nearest if self.nearest is not None else y
+        factor = float(best[p]) if self.problem.free_period else stretch[0]
+        if self.best is None:
+            return Stuck(best[:p], factor, self.least, self.count, self.reason)
+        told = list[int]()  # fewer samples may have promised more
+        for k, value in enumerate(self.history):
+            if value >= self.merit and (not told or value < self.history[told[-1]]):
+                told.append(k)
+        history, times = tuple(self.history[k] for k in told), tuple(self.times[k] for k in told)
+        return SearchResult(
+            best[:p], factor, self.merit, self.values, history, self.count, self.kept / self.count, seconds, seed,
+            self.interrupted, times,
+        )  # fmt: skip
 
     def at(self, y: np.ndarray) -> Evaluation:
         """Evaluate once per point, and keep the best feasible one."""
@@ -172,23 +244,26 @@ class StartSearch:
         self._bound(solver, len(y))
         return self._optimised(solver, y)
 
-    def solve(self, y: np.ndarray, evaluations: int, method: Method) -> np.ndarray:
-        """Run NLopt on the smoothed problem from y (with s, of γ = e^s - 1, behind it where there are goals)."""
+    def solve(self, y: np.ndarray, evaluations: int, method: Method, tolerance: float = 1e-5) -> np.ndarray:
+        """Search the smoothed problem from y (with s, of γ = e^s - 1, behind it where there are goals)."""
         goals = self.problem.goals
         start = np.append(y, self._attainment(y)) if goals else y
-        if not goals:  # a slope of at most 1 at the start: SLSQP's first step is as long as the slope
-            slope, self.scale = np.zeros(len(y)), 1.0
+        last = self.count + evaluations
+        self.scale = 1.0
+        if not goals:  # a slope of at most 1 at the start: the first step is as long as the slope
+            slope = np.zeros(len(y))
             self._sum(np.ascontiguousarray(y), slope)
             self.scale = 1.0 / max(1.0, float(np.linalg.norm(slope)))
-        algorithm = {"slsqp": nlopt.LD_SLSQP, "auglag": nlopt.AUGLAG, "mma": nlopt.LD_MMA}[method]
-        solver = nlopt.opt(algorithm, len(start))
+        if method == "slsqp":
+            return self._by_scipy(start, last, tolerance * self.scale)[: len(y)]
+        solver = nlopt.opt({"auglag": nlopt.AUGLAG, "mma": nlopt.LD_MMA}[method], len(start))
         if method == "auglag":
             inner = nlopt.opt(nlopt.LD_LBFGS, len(start))
             inner.set_ftol_rel(1e-5)
             inner.set_maxeval(max(20, evaluations // 6))
             solver.set_local_optimizer(inner)
         solver.set_min_objective(self._last if goals else self._sum)
-        rows = len(self.at(np.ascontiguousarray(y)).constraints) + len(goals)
+        rows = self._count(y)
         if rows:
             solver.add_inequality_mconstraint(self._rows, np.full(rows, 1e-8))
         self._bound(solver, len(start))
@@ -196,14 +271,58 @@ class StartSearch:
         solver.set_maxeval(evaluations)
         return self._optimised(solver, start)[: len(y)]
 
-    def _bound(self, solver: nlopt.opt, size: int) -> None:
-        """Bound the factor on the period, and s to γ from -0.98 to 10⁵: SLSQP may try any length of step."""
+    def _count(self, y: np.ndarray) -> int:
+        """Return the number of inequalities, those of goals included."""
+        return len(self.at(np.ascontiguousarray(y)).constraints) + len(self.problem.goals)
+
+    def _by_scipy(self, start: np.ndarray, last: int, tolerance: float) -> np.ndarray:
+        """Run SciPy's SLSQP (Kraft 1988) until `last` evaluations: it solves its subproblems faster than NLopt's."""
+        rows, size = self._count(start[: len(start) - bool(self.problem.goals)]), len(start)
+        objective = self._last if self.problem.goals else self._sum
+
+        def value(y: np.ndarray) -> tuple[float, np.ndarray]:
+            if self.count >= last:
+                raise _Spent
+            slope = np.zeros(size)
+            return objective(np.ascontiguousarray(y), slope), slope
+
+        def inequalities(y: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+            found = np.empty(rows)
+            self._rows(found, np.ascontiguousarray(y), slopes)
+            return found
+
+        def sloped(y: np.ndarray) -> np.ndarray:
+            slopes = np.empty((rows, size))
+            inequalities(y, slopes)
+            return -slopes
+
+        kept = {"type": "ineq", "fun": lambda y: -inequalities(y, np.empty((0, size))), "jac": sloped}
+        bounds = None
+        if self.problem.free_period or self.problem.goals:
+            bounds = np.column_stack(self._ends(size))
+        try:
+            found = minimize(
+                value, start, method="SLSQP", jac=True, bounds=bounds, constraints=[kept] if rows else (),
+                options={"maxiter": max(2, last - self.count), "ftol": tolerance},
+            )  # fmt: skip
+        except (_Spent, NotExciting) as error:
+            self.reason = str(error)
+            return start
+        self.reason = "" if found.success else str(found.message)
+        return found.x
+
+    def _ends(self, size: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return bounds of the factor on the period, and of s: γ from -0.98 to 10⁵; a step may be of any length."""
         lower, upper = np.full(size, -np.inf), np.full(size, np.inf)
         p = self.basis.p
         if self.problem.free_period:
             lower[p], upper[p] = self.problem.stretch
         if size > p + self.problem.free_period:
             lower[-1], upper[-1] = S_RANGE
+        return lower, upper
+
+    def _bound(self, solver: nlopt.opt, size: int) -> None:
+        lower, upper = self._ends(size)
         solver.set_lower_bounds(lower)
         solver.set_upper_bounds(upper)
 

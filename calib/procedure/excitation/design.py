@@ -16,7 +16,7 @@ from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel, re
 from calib.procedure.excitation.limits import MotionLimits
 from calib.procedure.excitation.metrics import DesignCondition
 from calib.procedure.excitation.playback import Playback, check_playback, play
-from calib.procedure.excitation.settings import DEFAULT_DESIGN, ExcitationSettings
+from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, HARMONICS, ExcitationSettings
 from calib.robot.calibrated import CalibratedChain
 from calib.workers.interrupts import finishing
 from trajectories.basis import Family
@@ -115,6 +115,7 @@ def excite(
     search = partial(design, evaluations=settings.evaluations, seed=settings.seed, map=map, report=report)
     found, problem = _searched(problem, wanted, settings.starts, search, say)
     say("verifying")
+    found, problem = _whole(found, problem, settings.rate)
     with finishing():
         found, proof = ensured(problem, found, checked)
     front = None
@@ -139,11 +140,30 @@ def _excitation_problem(
     search, checked, notes = _constraints(given.model, given.limits)
     condition, smooth = _condition_objective(given, settings), given.model.smooth
     objectives = tuple((replace(condition, scaling=scaling), 0.5) for scaling in SCALINGS)
+    family, coarse = _family(given, settings)
     problem = ExcitationProblem(
-        _family(given, settings), smooth.regressor, smooth.regressor_gradient, objectives, search,
-        samples=settings.samples,
+        family, smooth.regressor, smooth.regressor_gradient, objectives, search, samples=settings.samples,
+        stretch=_stretch(settings), coarse=coarse,
     )  # fmt: skip
     return problem, checked, notes
+
+
+def _stretch(settings: ExcitationSettings) -> tuple[float, float]:
+    """Return the factors on the period that the search may take."""
+    if settings.shortest is None:
+        return 1.0, 1.0
+    if settings.shortest > settings.period:
+        raise UsageError(f"--shortest {settings.shortest:g} s: expected at most the period, {settings.period:g} s")
+    return settings.shortest / settings.period, 1.0
+
+
+def _whole(found: SearchResult, problem: ExcitationProblem, rate: float) -> tuple[SearchResult, ExcitationProblem]:
+    """Return a motion whose period is a whole number of a controller's samples, and the problem of that period."""
+    if not problem.free_period:
+        return found, problem
+    whole = problem.family.period * rate
+    factor = np.ceil(found.factor * whole - 1e-6) / whole
+    return replace(found, factor=factor), replace(problem, stretch=(factor, factor))
 
 
 def _condition_objective(given: ExcitationInputs, settings: ExcitationSettings) -> Excitation:
@@ -196,15 +216,25 @@ def _condition_of(given: ExcitationInputs, family: Family, found: SearchResult, 
     return DesignCondition(**both, **named)
 
 
-def _family(given: ExcitationInputs, settings: ExcitationSettings) -> Family:
+def _family(given: ExcitationInputs, settings: ExcitationSettings) -> tuple[Family, Family | None]:
+    """Return the family of motions, and the one of few harmonics that its search begins with."""
     fixed = {j: value for j, value in given.locked.items() if value is not None}
-    counts = [settings.harmonics] * given.chain.n
+    resonance, most = given.limits.resonance, settings.harmonics
+    if most is None:
+        most = HARMONICS if resonance is None else round(0.99 * settings.period * resonance / (2 * np.pi) - 0.5)
+        most = max(2, min(most, HARMONICS))
+    counts = np.full(given.chain.n, most)
+    counts[list(given.locked)] = 0 if settings.family == "fourier" else 1
     if settings.family == "fourier":
-        counts = [0 if j in given.locked else count for j, count in enumerate(counts)]
-        return fourier_family(counts, settings.period, held=fixed, resonance=given.limits.resonance, rate=settings.rate)
+        full, few = (
+            fourier_family(
+                np.minimum(counts, top), settings.period, held=fixed, resonance=resonance, rate=settings.rate
+            )
+            for top in (most, COARSE)
+        )  # fmt: skip
+        return full, few if most > COARSE else None
     if settings.family == "bspline":
-        counts = [1 if j in given.locked else count for j, count in enumerate(counts)]
-        return bspline_family(counts, settings.period, held=fixed, rate=settings.rate)
+        return bspline_family(counts, settings.period, held=fixed, rate=settings.rate), None
     raise UsageError(f"family '{settings.family}' is none of fourier, bspline")
 
 

@@ -17,7 +17,7 @@ from calib.mechanism.parallel_model import ParallelModel, rows_named
 from calib.mechanism.platform_motion import PlatformRegressor, along
 from calib.mechanism.velocities import LoopMotion, loop_jacobians
 from calib.procedure.excitation.goals import SCALINGS
-from calib.procedure.excitation.settings import ExcitationSettings
+from calib.procedure.excitation.settings import COARSE, ExcitationSettings
 from trajectories.basis import SampledMotion
 from trajectories.constraints import BoxLimit, MotionConstraint
 from trajectories.design.objectives import Excitation, Index, condition_numbers
@@ -138,7 +138,7 @@ def design_parallel(
     effort = np.array([joint.effort for joint in robot.joints])
     if values is not None and np.isfinite(effort).all():
         constraints.append(ActuatorLimit(plan, robot.joint_names, effort, margin))
-    family = fourier_family(settings.harmonics, settings.period, robot.r, rate=settings.rate)
+    family = fourier_family(settings.harmonics or COARSE, settings.period, robot.r, rate=settings.rate)
     problem = ExcitationProblem(
         family, plan.regressor,
         plan.regressor_gradient, _objectives(plan, index),

@@ -9,6 +9,8 @@ from calib.arguments import Within, checked
 
 Rate = Annotated[float, Within(above=0.0, most=1e5)]  # [Hz]
 Slower = Annotated[float, Within(1.0, 1000.0)]
+HARMONICS = 12  # per joint: cond falls by a fifth from 5 to 12, by a tenth more to 20 at twice the cost (our choice)
+COARSE = 5  # harmonics that a search begins with (our choice)
 
 
 @checked
@@ -20,8 +22,9 @@ class ExcitationSettings:
         goals, hard: ``raw=35``, ``normalised=6`` (condition numbers), ``wrist=0.1`` or ``joint6=0.1`` (mean torque as a
             share of the limit, at least), ``coverage=0.1`` (share of time at low and at high speed, either way); hard
             ones must be met. Without any the logarithms of both condition numbers are minimised in equal parts.
-        period: T0 of the motion [s].
-        harmonics: frequencies per joint, or control points beside the rest conditions of splines.
+        period: T0 of the motion [s], at most; shortest: what the search may shorten it to [s]; None: it is kept.
+        harmonics: frequencies per joint, or control points beside the rest conditions of splines; None: `HARMONICS`, or
+            as many as stay below the limits' resonance.
         family: "fourier" or "bspline".
         drives: terms of each joint's drive, where no identified model has its own.
         rate: of the controller [Hz].
@@ -39,13 +42,14 @@ class ExcitationSettings:
     goals: tuple[str, ...] = ()
     hard: tuple[str, ...] = ()
     period: Annotated[float, Within(above=0.0, most=3600.0)] = 20.0
-    harmonics: Annotated[int, Within(1, 200)] = 5
+    shortest: Annotated[float, Within(above=0.0, most=3600.0)] | None = None
+    harmonics: Annotated[int, Within(1, 200)] | None = None
     family: str = "fourier"
     drives: str = "Fv Fc off"
     rate: Rate = 1000.0
     samples: Annotated[int, Within(10, 100_000)] = 200
-    starts: Annotated[int, Within(1, 10_000)] = 6
-    evaluations: Annotated[int, Within(1, 10_000_000)] = 600
+    starts: Annotated[int, Within(1, 10_000)] = 4
+    evaluations: Annotated[int, Within(1, 10_000_000)] = 1500
     seed: Annotated[int, Within(0, 2**63)] = 0
     front: Annotated[int, Within(0, 1000)] = 0
     start: tuple[float, ...] | None = None

@@ -137,11 +137,11 @@ class DynamicsSection:
     plan: Annotated[Flag, About("false: recorded files hold other motions than those designed here")] = True
     validation: Annotated[Flag, About("false: no second motion is designed or asked for")] = True
     period: Annotated[Positive, About("of the designed motion [s]; the validation motion's is 0.8 of it")] = 20.0
-    harmonics: Annotated[int, Whole(1), About("frequencies per joint")] = 5
+    harmonics: Annotated[int, Whole(1), About("frequencies per joint")] = 12
     rate: Annotated[float, Real(above=0, most=1e5, unit="Hz"), About("of the controller [Hz]")] = 1000.0
     repeats: Annotated[int, Whole(1), About("how often the robot plays each motion")] = 3
     starts: Annotated[int, Whole(1), About("random starts of the search for a motion")] = 4
-    evaluations: Annotated[int, Whole(1), About("most per start")] = 400
+    evaluations: Annotated[int, Whole(1), About("most per start")] = 1000
     limits: Annotated[Beside, About("a TOML file beside this one; see `calib formats limits`")] = ""
     torques: Annotated[
         str,

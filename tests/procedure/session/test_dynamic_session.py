@@ -222,7 +222,7 @@ def test_the_validation_motion_is_not_learnt_from_and_the_training_motion_no_pro
 
 def test_recordings_keep_the_plan_they_were_made_to(recorded: Session) -> None:
     before = recorded.path("6-excitation/training/trajectory.csv").read_text()
-    edit(recorded.path("session.toml"), "harmonics = 5", "harmonics = 4")
+    edit(recorded.path("session.toml"), "harmonics = 12", "harmonics = 4")
     assert kinds(recorded)["excite"] == steps.KEPT
     assert recorded.path("6-excitation/training/trajectory.csv").read_text() == before
 
