@@ -281,22 +281,27 @@ def simulated_case(case: Case, run: SimulatedRun, loop: Loop) -> Case:
     The same low-pass and differences: what they do to a motion (they round off reversals) is in W and in Z alike, and
     what tells W from Z is noise.
     """
-    step = loop.reference.period * loop.every
-    t = case.motion.t - loop.reference.t[0]
-    index = np.rint(t / step).astype(int)
-    if index[0] < 0 or index[-1] >= len(run.t) or np.abs(index * step - t).max() > 0.01 * step:
-        raise CalibError(
-            f"the recording runs from {case.motion.t[0]:.6g} s to {case.motion.t[-1]:.6g} s in steps of "
-            f"{1 / case.motion.rate:.6g} s, the simulation from {run.t[0]:.6g} s to {run.t[-1]:.6g} s in steps of "
-            f"{step:.6g} s: give the whole reference, and `every`"
-        )
-    motion = case.motion
-    q = _filtered(run.q, motion)
+    index, motion = simulated_samples(case, run.t, loop), case.motion
+    q = low_passed(run.q, motion)
     v, a = slope(q, motion.rate), curvature(q, motion.rate)
     return replace(case, motion=replace(motion, q=q[index], v=v[index], a=a[index]))
 
 
-def _filtered(q: np.ndarray, motion: Motion) -> np.ndarray:
+def simulated_samples(case: Case, t: np.ndarray, loop: Loop) -> np.ndarray:
+    """Return the places of a case's instants among the simulated ones `t` [s]."""
+    step = loop.reference.period * loop.every
+    since = case.motion.t - loop.reference.t[0]
+    index = np.rint(since / step).astype(int)
+    if index[0] < 0 or index[-1] >= len(t) or np.abs(index * step - since).max() > 0.01 * step:
+        raise CalibError(
+            f"the recording runs from {case.motion.t[0]:.6g} s to {case.motion.t[-1]:.6g} s in steps of "
+            f"{1 / case.motion.rate:.6g} s, the simulation from {t[0]:.6g} s to {t[-1]:.6g} s in steps of "
+            f"{step:.6g} s: give the whole reference, and `every`"
+        )
+    return index
+
+
+def low_passed(q: np.ndarray, motion: Motion) -> np.ndarray:
     """Return simulated positions through the low-pass of the recorded ones."""
     result = np.empty_like(q)
     for cutoff in np.unique(motion.cutoff):
@@ -414,7 +419,7 @@ def _distance(runs: Runs) -> np.ndarray:
     for (case, loop), run in runs:
         motion = case.motion
         index = np.rint((motion.t - loop.reference.t[0]) / (loop.reference.period * loop.every)).astype(int)
-        away += np.sum((motion.q - _filtered(run.q, motion)[index]) ** 2, axis=0)
+        away += np.sum((motion.q - low_passed(run.q, motion)[index]) ** 2, axis=0)
         size += np.sum((motion.q - motion.q.mean(axis=0)) ** 2, axis=0)
     return frozen(100.0 * np.sqrt(away / size))
 

@@ -69,6 +69,7 @@ class IdentificationProblem:
         loop: the closed loop that the recordings came from; None where none is stated.
         cad: standard parameters of the bodies by the robot's description, for a loop that feeds them forward.
         constraints: what the options ask of the estimate of a method that takes constraints; None: the defaults.
+        start: (p,) values that methods which simulate start from; None: least squares, where that can be simulated.
     """
 
     model: RegressorModel
@@ -83,6 +84,7 @@ class IdentificationProblem:
     loop: LoopSettings | None = None
     cad: np.ndarray | None = None
     constraints: ConstraintSettings | None = None
+    start: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "groups", frozen(self.groups, int))

@@ -10,6 +10,7 @@ from calib.identification.methods.least_squares import IRLS, OLS, PC_IRLS, PC_OL
 from calib.identification.methods.maximum_likelihood import ML
 from calib.identification.methods.method import Method
 from calib.identification.methods.networks import ADALINE, HOPFIELD
+from calib.identification.methods.output_error import CLIE, CLOE
 from calib.identification.methods.simulated import DIDIM, IV, PC_DIDIM, PC_IV
 
 
@@ -69,6 +70,14 @@ LISTING: tuple[MethodEntry, ...] = (
     MethodEntry(
         DIDIM, "least squares on the simulated motion alone (the slides' CLIE)", "Gautier, Janot & Vandanjon 2013",
         ("tolerance 2.5 %", "10 rounds"),
+    ),
+    MethodEntry(
+        CLOE, "closed-loop output error: simulated positions meet measured ones", "Landau 1979; Leboutet et al. 2021",
+        ("damping", "tolerance 0.05 sigma"),
+    ),
+    MethodEntry(
+        CLIE, "closed-loop input error: simulated torques meet measured ones", "Leboutet et al. 2021",
+        ("damping", "tolerance 0.05 sigma"),
     ),
     MethodEntry(
         ADALINE, "adaptive linear neuron, trained sample by sample", "Widrow & Hoff 1960; Widrow & Stearns 1985",

@@ -17,7 +17,7 @@ import numpy as np
 from calib.arrays import frozen, shaped
 from calib.dynamics.bodies import Bodies
 from calib.dynamics.drives import DriveTerm
-from calib.errors import CalibError, NotConverged
+from calib.errors import CalibError, CannotSimulate, Diverged, NotConverged
 from calib.simulation.loop.controllers import Controller
 from calib.simulation.loop.references import Reference
 
@@ -244,7 +244,7 @@ def forward_dynamics(
     layout = layout_of(plant)
     failed = loop_kernels.forward_dynamics(*packed(plant), *layout, np.ascontiguousarray(values), q, v, tau, out)
     if failed >= 0:
-        raise CalibError(f"sample {failed}: the inertia matrix is not positive definite")
+        raise CannotSimulate(f"sample {failed}: the inertia matrix is not positive definite")
     return out
 
 
@@ -344,22 +344,22 @@ def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int) -> tuple[np.
     return linear, acts
 
 
-def _failure(status: int, time: float) -> CalibError:
+def _failure(status: int, time: float) -> NotConverged:
     """Return what went wrong at `time` [s]."""
     from calib.simulation.loop import loop_kernels
 
     if status == loop_kernels.SINGULAR:
-        return CalibError(
+        return CannotSimulate(
             f"at {time:.4g} s the inertia matrix is not positive definite: these parameters belong to no possible "
             "robot there; use a physically consistent estimate, or start from regular inertia"
         )
     if status == loop_kernels.STIFF:
-        return CalibError(
+        return CannotSimulate(
             f"at {time:.4g} s friction at rest is too stiff for the control period, by more than "
             f"{loop_kernels.MOST} steps: "
             "smooth the sign over a larger velocity, or give the joint its motor inertia"
         )
-    return NotConverged(
+    return Diverged(
         f"the loop diverged at {time:.4g} s: these gains do not hold this robot at this rate; lower kp and kd "
         "(are they in the unit of the torque?), or the delay",
         None,

@@ -1,0 +1,116 @@
+"""The robot that a problem's parameters make, to be simulated, and where methods that simulate it start."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.dynamics.idim import IdentificationModel, with_terms
+from calib.errors import CalibError, CannotSimulate, UsageError
+from calib.identification.cases import Case
+from calib.identification.methods.method import IdentificationProblem
+from calib.simulation.loop.closed_loop import Plant
+
+SHARES = (
+    1.0,
+    0.9,
+    0.75,
+    0.5,
+    0.25,
+    0.0,
+)  # of least squares on the way to a regular robot, where it cannot be simulated
+
+
+@dataclass(frozen=True, eq=False)
+class BelievedRobot:
+    """A problem's columns as parameters of a robot.
+
+    Attributes:
+        model: with richer friction, where the problem has any.
+        columns: (p,) place of each of the problem's parameters among the plant's.
+        plant: with all parameters zero.
+    """
+
+    model: IdentificationModel
+    columns: np.ndarray
+    plant: Plant
+
+    def at(self, values: np.ndarray, case: Case | None = None) -> Plant:
+        """Return the robot with the problem's parameters (p,), without payloads that the case does not carry."""
+        parameters = np.zeros(len(self.plant.parameters))
+        parameters[self.columns] = values
+        return replace(self.plant, parameters=parameters * self.carried(case))
+
+    def carried(self, case: Case | None) -> np.ndarray:
+        """Return (plant's parameters,) one for what is on board of a case, zero for payloads that are not."""
+        if case is None:
+            return np.ones(len(self.plant.parameters))
+        return np.append(self.model.carried_columns(case.carried), np.ones(len(self.plant.terms)))
+
+
+def believed_robot(problem: IdentificationProblem, method: str) -> BelievedRobot:
+    """Return the robot of a problem.
+
+    Raises:
+        UsageError: for a model that is no serial arm with motor torques.
+        CannotSimulate: for friction that the simulator does not know, or an exact sign.
+    """
+    model = problem.model
+    if not isinstance(model, IdentificationModel) or not model.torque_rows.motors_alone:
+        raise UsageError(f"method '{method}' simulates a serial arm with motor torques")
+    extra = [one for one in problem.terms[problem.base.b :] if one is not None]
+    model = with_terms(model, *extra)
+    columns = np.array([*problem.base.kept, *range(model.p - len(extra), model.p)], dtype=int)
+    try:
+        plant = Plant(model.bodies, model.terms, np.zeros(model.p))
+    except CalibError as error:
+        raise CannotSimulate(str(error)) from error
+    return BelievedRobot(model, columns, plant)
+
+
+def start_of(
+    problem: IdentificationProblem, plain: np.ndarray, inertia: np.ndarray, simulated: Callable[[np.ndarray], object]
+) -> np.ndarray:
+    """Return values (p,) to start from: those stated, or those nearest to least squares that can be simulated.
+
+    Args:
+        plain: (p,) of weighted least squares.
+        inertia: (n,) of a regular robot, which nothing couples [kg m² or kg].
+        simulated: raises `CalibError` where values cannot be simulated.
+
+    Raises:
+        CannotSimulate: where none can be.
+    """
+    if problem.start is not None:
+        return np.array(problem.start, dtype=float)
+    model, own = problem.model, problem.base.b
+    assert isinstance(model, IdentificationModel)  # `believed_robot` asks first
+    standard = np.zeros(model.p)
+    for k, one in enumerate(model.columns):
+        if one.shape == "acceleration" and one.joint is not None:
+            standard[model.inertial + k] = inertia[one.joint]
+    regular = np.append(problem.base.transform @ standard, np.zeros(len(plain) - own))
+    if not np.any(standard):
+        regular = np.append(problem.base.transform @ _hubs(model, inertia), np.zeros(len(plain) - own))
+    failure: CalibError | None = None
+    for share in SHARES:
+        values = share * plain + (1.0 - share) * regular
+        try:
+            simulated(values)
+        except CalibError as error:
+            failure = failure or error
+        else:
+            return values
+    raise CannotSimulate(f"no robot between least squares and a regular one can be simulated: {failure}", plain)
+
+
+def _hubs(model: IdentificationModel, inertia: np.ndarray) -> np.ndarray:
+    """Return parameters (p,) of bodies that are hubs: of this inertia about their own axis, or mass along it."""
+    result = np.zeros(model.p)
+    for i, (coordinate, axis) in enumerate(zip(model.bodies.coordinates, model.bodies.axes)):
+        if coordinate >= 0:
+            place = 9 if model.prismatic[coordinate] else (0, 3, 5)[int(axis)]
+            result[10 * i + place] = inertia[coordinate]
+    return result
