@@ -97,7 +97,7 @@ def accuracy(found: CameraCell, images: Pixels, counts: tuple[int, ...], seed: i
     for count in counts:
         rows = np.arange(count)
         block = complete_camera(arm, take(images, rows))
-        assert isinstance(block, Pixels)
+        assert isinstance(block, Pixels) and block.sigma is not None
         result = fitted(arm, block)
         noise = result.pieces[0].part.noise  # type: ignore[attr-defined]
         anywhere = random_joints(arm, count, seed + 1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -23,6 +23,8 @@ from calib.procedure.session.folder import PREDICTED, SELECTION, Session
 from calib.robot.chain import Chain
 from poses.candidates import draw_candidates
 from poses.space import is_feasible
+
+BLIND = "whether the camera sees the board (state [camera] in the limits file: calib formats constraints)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +54,8 @@ def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], N
         robot_file, wanted.fit, choice, constraints=constraints, base=links[0], tip=links[1],
         progress=lambda done, total, what: say(f"choosing poses: {what}"),
     )  # fmt: skip
+    if instrument.measures == Pixels.kind and chosen.predicted is None:
+        chosen = replace(chosen, unchecked=(*chosen.unchecked, BLIND))
     found = chosen.selection
     assert found.q is not None
     if found.interrupted:  # a session is resumed, not gone on with half a search

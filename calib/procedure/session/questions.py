@@ -107,19 +107,33 @@ def _of_the_cell(name: str) -> Callable[[Answers], bool]:
 
     def is_open(given: Answers) -> bool:
         told = not known or known in cell_tables(given.instrument_at)
-        return given.limits is None and getattr(given, name) is None and told
+        asked = name != "instrument_at" or not _by_camera(given)
+        return given.limits is None and getattr(given, name) is None and told and asked
 
     return is_open
+
+
+def _by_camera(given: Answers) -> bool:
+    """Say whether images are taken: where the camera is takes more than a place, and a file states it ([camera])."""
+    return given.instrument in INSTRUMENTS and INSTRUMENTS[given.instrument].measures == "pixels"
 
 
 CELL = ("instrument_at", "cone", "facing", "box", "obstacles")
 QUESTIONS = (
     Question("robot", f"robot (.urdf, .toml, or {' '.join(library.names())})", "", _unanswered("robot")),
     Question("instrument", f"instrument ({' '.join(INSTRUMENTS)})", "tracker", _unanswered("instrument")),
-    Question("tool", "where the target sits in the tip's frame, x,y,z [m]", "0.05,0,0.05", _unanswered("tool")),
+    Question(
+        "tool", "where the target sits in the tip's frame, x,y,z [m]", "0.05,0,0.05",
+        lambda given: given.tool is None and not _by_camera(given),
+    ),
     Question(
         "limits", "file that states the cell: instrument, obstacles, speeds (none: asked for now)", "none",
-        lambda given: given.limits is None and not given.cell,
+        lambda given: given.limits is None and not given.cell and not _by_camera(given),
+    ),
+    Question(
+        "limits", "file that states the cell, [camera] with it: lens, board, roughly where both are, so that poses see "
+        "the board (calib formats constraints; none: they are chosen blindly)", "none",
+        lambda given: given.limits is None and not given.cell and _by_camera(given),
     ),
     Question(
         "instrument_at", "where the instrument roughly stands, x,y,z [m] in the robot's base frame (unknown; none: "

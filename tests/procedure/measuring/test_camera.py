@@ -161,6 +161,7 @@ def test_the_prediction_is_what_a_fit_then_states(cell):
     assert np.corrcoef(np.log(stated), np.log(predicted.sigma))[0, 1] > 0.5
 
 
+@pytest.mark.slow
 def test_images_beside_another_instrument_are_another_tool_and_their_coverage_is_drawn(cell, tmp_path):
     """A tracker's reflector in the same hand, and distances of pairs of it; no option names the tools."""
     from calib.geometry.images.camera_guess import complete_camera

@@ -88,3 +88,15 @@ def test_metres_under_a_header_of_millimetres_are_refused_in_validation_files_to
     path.write_text("\n".join([head, *(",".join(map(str, row)) for row in table)]) + "\n")
     with pytest.raises(MeasurementError, match=r"validation.csv: .*are they m under a header that says mm"):
         check_file(measured, chain_of(measured), path, None)
+
+
+def test_a_camera_is_asked_for_its_own_place_and_not_for_a_reflectors():
+    """Where a tracker is asked for target, place and cone, a camera is asked for the file that states [camera]."""
+    asked = {}
+    for instrument in ("tracker", "camera"):
+        given = Answers(robot="lwr4plus", instrument=instrument)
+        asked[instrument] = [question for question in QUESTIONS if question.open(given)]
+    names = {key: [question.name for question in found] for key, found in asked.items()}
+    assert {"tool", "instrument_at"} <= set(names["tracker"]) and not {"tool", "instrument_at"} & set(names["camera"])
+    assert [names[key].count("limits") for key in names] == [1, 1]
+    assert "[camera]" in next(question.words for question in asked["camera"] if question.name == "limits")
