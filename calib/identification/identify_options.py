@@ -66,6 +66,7 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     [constraints]                    # what parameters must satisfy, for the methods pc-*
     signs = true                     # inertia and friction of drives are not negative
     inertia = 50                     # random postures in which M(q) is positive definite; 0: not asked
+    bodies = false                   # of bodies that can exist (pseudo-inertias), in place of M(q) over postures
     bounds = { Fv1 = [0.5, 5.0], ZZ1R = [0.0, inf] }   # [lower, upper]; both alike fix a parameter
     [[constraints.sum]]              # a weighted sum of parameters: equal, or least and most
     weights = { Fv5 = 1.0, Fv6 = -1.0 }

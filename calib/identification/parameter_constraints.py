@@ -4,6 +4,7 @@ A row is lower <= aᵀ β <= upper over the columns that are estimated. A standa
 is such a row where the torques depend on it alone: cᵀ χ = aᵀ β with c = Tᵀ a, T the regrouping of the base; any other
 has no effect, and a bound on it would say nothing of the estimate (Janot's slides on the TX40). Inertia matrices M(q)
 over random postures are curved: h(β) = λ_min(S M(q; β) S) - `LEAST`, S making the mean diagonal one, which is concave.
+Bodies that can exist are a cone (`calib.identification.possible.cone`), which M(q) > 0 follows from.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from calib.errors import NotConverged, UsageError, suggestion
 from calib.estimation.constrained import Constrained, Curved, contradicting, restricted, within
 from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import Triangles, residual_squares
+from calib.identification.possible.cone import BodyCone, cone_of
 
 POSTURES = 50  # at which M(q) must be positive definite (our choice)
 LEAST = 1e-3  # of the smallest eigenvalue of S M(q) S (our choice): what falls below moves at no torque at all
@@ -68,12 +70,14 @@ class ConstraintSettings:
     Attributes:
         signs: drives' inertia and friction are not negative.
         inertia: number of random postures in which M(q) is positive definite; 0: none.
+        bodies: the parameters are those of bodies that can exist, in place of `inertia`.
         bounds: name of a parameter → [lower, upper]; both alike fix it.
         sum: weighted sums of parameters.
     """
 
     signs: Flag = True
     inertia: Annotated[int, Whole(0, 10_000)] = POSTURES
+    bodies: Flag = False
     bounds: Mapping[str, Bounds] = field(default_factory=dict)
     sum: tuple[WeightedSum, ...] = ()
 
@@ -86,6 +90,8 @@ class Constraints:
         names: c, of the rows, as a user reads them.
         matrix, lower, upper: (c, p), (c,), (c,).
         inertia: (K, n, n, p), M(q_k; β) = inertia[k] β.
+        cone: of bodies that can exist; None where that is not asked.
+        plane: name of the row that stands for the cone (`touched`); empty where none does.
     """
 
     names: tuple[str, ...]
@@ -93,6 +99,8 @@ class Constraints:
     lower: np.ndarray
     upper: np.ndarray
     inertia: np.ndarray
+    cone: BodyCone | None = None
+    plane: str = ""
 
     def __post_init__(self) -> None:
         for key in ("matrix", "lower", "upper", "inertia"):
@@ -104,6 +112,8 @@ class Constraints:
         Raises:
             NotConverged: with the last β, where no robot of definite inertia satisfies the others.
         """
+        if self.cone is not None:
+            return self.touched(factor).solve(factor)
         p = len(factor) - 1
         free = np.linalg.solve(factor[:p, :p], factor[:p, p])
         try:
@@ -115,6 +125,30 @@ class Constraints:
                 f"({error})",
                 error.last,
             ) from error
+
+    def touched(self, factor: np.ndarray) -> Constraints:
+        """Return these constraints with the cone of bodies replaced by the plane that holds the optimum of `factor`.
+
+        Raises:
+            NotConverged: where no bodies that can exist satisfy the others.
+        """
+        if self.cone is None:
+            return self
+        try:
+            plane = self.cone.touching(factor, self.matrix, self.lower, self.upper)
+        except NotConverged as error:
+            raise NotConverged(
+                f"[constraints]: no bodies that can exist satisfy {'; '.join(self.names) or 'them'}: take bounds back "
+                f"({error})",
+                error.last,
+            ) from error
+        if plane is None:
+            return replace(self, cone=None)
+        named = f"bodies that can exist ({', '.join(plane.bodies) or 'all'} on the border)"
+        return replace(
+            self, cone=None, plane=named, names=(*self.names, named), matrix=np.vstack([self.matrix, plane.normal]),
+            lower=np.append(self.lower, plane.bound), upper=np.append(self.upper, np.inf),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,6 +182,7 @@ class Held:
         binding: those that hold it.
         postures: number of postures in which M(q) is on its bound.
         free: the free estimate.
+        plane: name of the one that stands for bodies that can exist.
     """
 
     names: tuple[str, ...]
@@ -155,13 +190,20 @@ class Held:
     binding: tuple[Binding, ...]
     postures: int
     free: LinearFit
+    plane: str = ""
 
     def lines(self) -> list[str]:
         """Return what a user should know of constraints that hold the estimate."""
         told = []
         for one in self.binding:
             said = f"the data alone say {one.free:.3g} ± {one.sigma:.2g}"
-            if not one.equality:
+            if one.name == self.plane:
+                away = abs(one.free - one.bound) / max(one.sigma, 1e-300)
+                told.append(
+                    f"held to {one.name}: the data alone lie {away:.3g} standard deviations beyond; the motion is too "
+                    "poor, or the estimate is biased"
+                )
+            elif not one.equality:
                 told.append(
                     f"an estimate sits on its bound, {one.name}: {said}; the bound may exclude the truth, or the "
                     "estimate is biased"
@@ -228,7 +270,9 @@ def make_constraints(
             f"[constraints] contradict each other: {'; '.join(told[k] for k in against)}: no estimate satisfies them "
             "together; take one of them back"
         )
-    return Constraints(tuple(told), matrix, low, high, _inertia(settings, model, base, p, seed))
+    cone = cone_of(model, base) if settings.bodies and model.inertial else None
+    curved = _inertia(settings if cone is None else replace(settings, inertia=0), model, base, p, seed)
+    return Constraints(tuple(told), matrix, low, high, curved, cone)
 
 
 def signs(names: Sequence[str], positive: Sequence[str]) -> Constraints:
@@ -262,6 +306,7 @@ def hold(
             estimate.
     """
     free = fit.estimate
+    constraints = constraints.touched(factor)
     found = constraints.solve(factor)
     normals = found.normals[found.binding]
     before, after = (residual_squares(data, values) for values in (free.values, found.values))
@@ -294,7 +339,7 @@ def _told(constraints: Constraints, found: Constrained, free: LinearFit) -> Held
             float(np.sqrt(max(row @ free.estimate.covariance @ row, 0.0))), float(bound), bool(same[places[k]]),
         ))  # fmt: skip
     bent = int(np.sum(found.binding[places < 0]))
-    return Held(constraints.names, found, tuple(binding), bent, free)
+    return Held(constraints.names, found, tuple(binding), bent, free, constraints.plane)
 
 
 def _words(name: str, low: float, high: float) -> str:

@@ -79,13 +79,11 @@ def simulate(
 
     Raises:
         CannotSimulate: for a run that leaves its reference.
-        UsageError: for a robot whose platform's twist is no plain choice of coordinates, or other drive terms.
+        UsageError: for other drive terms.
     """
     from calib.mechanism import closure_kernels
 
     known, robot = model.known, model.known.robot
-    if not known.fixed:
-        raise UsageError(f"'{robot.name}': a platform that moves beside its named coordinates cannot be simulated yet")
     motion = along(known, x, v, a)
     plan = (
         motion.posture.q[:, robot.actuated],
@@ -126,6 +124,7 @@ def _compiled(model: ParallelModel) -> tuple:
         tuple(bodies.links for bodies, _ in legs), tuple(bodies.constants for bodies, _ in legs),
         tuple(tail for _, tail in legs), tuple(leg.attachment for leg in robot.legs), robot.starts,
         np.array([leg.held for leg in robot.legs]), robot.selected, robot.actuated, robot.gravity,
+        model.known.fixed,
     )  # fmt: skip
 
 

@@ -179,14 +179,18 @@ def test_cvxpy_finds_the_same_optimum():
 
 
 @pytest.mark.slow
-def test_log_cholesky_factors_lead_to_the_same_nearest_robot():
-    """An independent way without a cone: P = L Lᵀ with exp on L's diagonal, exp of drive terms, by least squares."""
+@pytest.mark.parametrize("pull", [0.0, 50.0])
+def test_log_cholesky_factors_lead_to_the_same_nearest_robot(pull):
+    """An independent way without a cone: P = L Lᵀ with exp on L's diagonal, exp of drive terms, by least squares.
+
+    With a pull, the rows of the Euclidean prior beside those of the data.
+    """
     _, model, base, data = planted(1)
     values = np.array(data.values)
     values[list(data.names).index("Fv1")] = -0.3  # no robot has that
     data = told(data.chain, model, base, values, data.covariance)
     problem = make_problem(data, next(iter(find_prior_bodies(data.chain, model))))
-    solution = nearest(problem)
+    solution = nearest(problem, pull=pull)
     lower, bodies = np.tril_indices(4), problem.bodies
     start = np.linalg.cholesky(problem.references)
     positive = problem.positive & (problem.sizes > 0.0)
@@ -201,10 +205,21 @@ def test_log_cholesky_factors_lead_to_the_same_nearest_robot():
         pseudo = start @ roots @ roots.transpose(0, 2, 1) @ start.transpose(0, 2, 1)
         return np.concatenate([pseudo_inertia.to_standard(pseudo).ravel(), drives])
 
+    inverse, sized = np.linalg.inv(start), problem.sizes > 0.0
+
+    def rows(values: np.ndarray) -> np.ndarray:
+        pseudo = inverse @ pseudo_inertia.from_standard(values[: 10 * bodies].reshape(-1, 10))
+        away = (pseudo @ inverse.transpose(0, 2, 1) - np.eye(4)) * np.sqrt(0.5 * problem.weights(pull))[:, None, None]
+        ratio = values[10 * bodies :][sized] / problem.sizes[sized]
+        drives = np.where(problem.positive[sized], np.sqrt(0.5) * (ratio - 1.0), ratio)
+        drawn = np.concatenate([away.ravel(), drives]) if pull else np.zeros(0)
+        return np.concatenate([problem.factor[:, :-1] @ values - problem.factor[:, -1], drawn])
+
     found = least_squares(
-        lambda x: problem.factor[:, :-1] @ parameters(x) - problem.factor[:, -1],
-        np.zeros(10 * bodies + len(positive)), x_scale="jac", max_nfev=400,
-    )  # fmt: skip
+        lambda x: rows(parameters(x)), np.zeros(10 * bodies + len(positive)), x_scale="jac", max_nfev=400
+    )
+    costs = [float(np.linalg.norm(rows(one))) for one in (solution, parameters(found.x))]
+    assert costs[0] <= costs[1] * (1.0 + 1e-4) and costs[1] == pytest.approx(costs[0], rel=1e-3)
     away = data.distance(solution)
     assert away > 5.0
-    assert data.distance(parameters(found.x)) == pytest.approx(away, rel=1e-3)
+    assert pull or data.distance(parameters(found.x)) == pytest.approx(away, rel=1e-3)

@@ -7,7 +7,7 @@ import pytest
 
 from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
-from calib.errors import CannotSimulate, UsageError
+from calib.errors import CannotSimulate
 from calib.identification.cases import make_case
 from calib.identification.identify import identify_model
 from calib.identification.settings import IdentificationSettings
@@ -112,10 +112,31 @@ def test_what_cannot_be_simulated_is_said(dualv):
     _, model, values, _ = dualv
     with pytest.raises(CannotSimulate, match="away from the reference"):
         simulate(model, values, ComputedTorque(-values), *reference(1.0))
-    fivebar = closed(parallel_files.read(library.path("fivebar")))
-    small = make_parallel_model(fivebar, [""])
-    with pytest.raises(UsageError, match="cannot be simulated yet"):
-        simulate(small, np.zeros(small.p), ComputedTorque(np.zeros(small.p)), *np.zeros((3, 10, 2)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["fivebar", "stewart"])
+def test_platforms_that_move_beside_their_coordinates_are_simulated(name):
+    """The five-bar's platform turns as its loop says: held torques meet those of the model as 1 / rate."""
+    known = closed(parallel_files.read(library.path(name)))
+    model = make_parallel_model(known, ["Ia Fv Fc"], v0=0.05, passive="Fv")
+    drives = {"Ia": 0.02, "Fv": 0.2, "Fc": 0.3}
+    values = np.concatenate([model.known_parameters(), [drives[one.name[:2]] for one in model.terms]])
+    wrong = []
+    for rate in (1000.0, 4000.0):
+        t, rng = np.arange(int(0.5 * rate))[:, None] / rate, np.random.default_rng(0)
+        x, v, a = np.zeros((3, len(t), known.robot.r))
+        for w in 2 * np.pi * np.array([0.7, 1.6]):
+            size, phase = 0.17 * (known.robot.upper - known.robot.lower), rng.uniform(0, 6, known.robot.r)
+            x, v = x + size * np.sin(w * t + phase), v + size * w * np.cos(w * t + phase)
+            a = a - size * w**2 * np.sin(w * t + phase)
+        log = simulate(model, values, ComputedTorque(values, rate=rate), x, v, a)
+        assert np.abs(log.q - log.reference).max() < 1e-4
+        motion, part = along(known, x, v, a), slice(len(t) // 10, None)
+        forces = model.platform_force(values, motion)
+        own = np.einsum("nar,na->nr", motion.jacobians.readings, log.tau)
+        wrong.append(np.abs(own - forces)[part].max() / np.abs(forces).max())
+    assert wrong[0] < 0.02 and wrong[1] < 0.35 * wrong[0]
 
 
 def test_slopes_for_the_design_are_derivatives():

@@ -4,6 +4,9 @@
 
 (Sousa & Cortesão 2014; Wensing, Kim & Slotine 2018): a semidefinite program, written in cvxpy and solved by Clarabel.
 Its optimum lies on the border wherever the estimate itself is impossible; it says what consistency costs and no more.
+With a pull γ towards the prior bodies P_i⁰ = L Lᵀ it is the Euclidean counterpart of the entropic prior of
+`calib.identification.possible.solve`, whose second order it is: + ½ γ Σ ½ ‖L⁻¹ P_i L⁻ᵀ - 1‖², the drives' likewise. In
+these coordinates no weight between kg and kg m² is needed; unlike the entropic one it does not keep off the border.
 """
 
 from __future__ import annotations
@@ -18,16 +21,17 @@ from calib.dynamics import pseudo_inertia
 from calib.errors import NotConverged
 from calib.estimation.triangles import retriangulate
 from calib.identification.possible.information import Information
-from calib.identification.possible.problem import BodyCost
+from calib.identification.possible.problem import DRIVE, BodyCost
 
 LARGEST = 1e3  # of tr(P⁰⁻¹ P) / 4: keeps what the data do not see finite
 
 
-def nearest(problem: BodyCost, spared: int | None = None) -> np.ndarray:
+def nearest(problem: BodyCost, spared: int | None = None, pull: float = 0.0) -> np.ndarray:
     """Return the standard parameters (p,) of the possible robot nearest to the data.
 
     Args:
         spared: a body (counted from 0, or from B on a term) that may be impossible.
+        pull: γ of the Euclidean prior; 0: none.
 
     Raises:
         NotConverged: where Clarabel finds no optimum.
@@ -51,7 +55,15 @@ def nearest(problem: BodyCost, spared: int | None = None) -> np.ndarray:
     bound = [cp.trace(body) <= 4.0 * LARGEST for body in bodies]
     bound += [terms[k] >= 0.0 for k in np.flatnonzero(problem.positive) if problem.bodies + k != spared]
     rows = triangle[:-1] / scale
-    task = cp.Problem(cp.Minimize(cp.sum_squares(rows[:, :-1] @ unknowns - rows[:, -1])), bound)
+    goal = cp.sum_squares(rows[:, :-1] @ unknowns - rows[:, -1])
+    if pull > 0.0:
+        drawn = [0.5 * w * cp.sum_squares(body - np.eye(4)) for w, body in zip(problem.weights(pull), bodies)]
+        drawn += [
+            0.5 * DRIVE * cp.square(terms[k] - 1.0) if problem.positive[k] else cp.square(terms[k])
+            for k in np.flatnonzero(problem.sizes > 0.0)
+        ]
+        goal = goal + cp.sum(cp.hstack(drawn)) / scale**2
+    task = cp.Problem(cp.Minimize(goal), bound)
     try:
         with warnings.catch_warnings():  # a reduced accuracy (1e-5) does for a distance in sigmas
             warnings.filterwarnings("ignore", message="Solution may be inaccurate")

@@ -11,6 +11,7 @@ from calib.identification.possible.information import Information
 from calib.identification.possible.prior_bodies import PriorBodies
 from calib.identification.prior import DRIVES, ROTOR
 
+DRIVE = 1.0  # weight of the prior of Ia, Fv, Fc
 WEAK = 2.0  # γ of payloads: nothing is known of them but the order of size
 
 

@@ -46,12 +46,11 @@ from calib.errors import NotConverged, UsageError
 from calib.identification.possible import nearest as border
 from calib.identification.possible.information import Information
 from calib.identification.possible.prior_bodies import PriorBodies, find_prior_bodies
-from calib.identification.possible.problem import BodyCost, make_problem
+from calib.identification.possible.problem import DRIVE, BodyCost, make_problem
 from calib.identification.prediction import Dynamics
 
 LEAST = 20.0  # of γ with a CAD
 WEIGHTS = tuple(float(10.0 ** (k / 4)) for k in range(0, 19))  # γ tried, 1 to 30 000
-DRIVE = 1.0  # the same of Ia, Fv, Fc
 SMALLEST = 1e-3  # of γ, where the estimate asks for less CAD than the evidence does
 STEPS = 200
 SETTLED = 1e-8  # Newton decrement²: the cost is within half of it of its least

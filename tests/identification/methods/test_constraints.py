@@ -9,6 +9,7 @@ import numpy as np
 import planted_motion as planted
 import pytest
 
+from calib.dynamics import pseudo_inertia
 from calib.errors import UsageError
 from calib.estimation.triangles import combine
 from calib.identification.identify import identify
@@ -113,6 +114,44 @@ def test_bounds_that_no_definite_inertia_meets_are_a_failure_that_says_so(proble
     assert not found.found and "no estimate was found that satisfies 1 ZZ3 + 1 Ia3 <= -1, with M(q)" in str(
         found.failure
     )
+
+
+@pytest.mark.parametrize("name", ["pc-ols", "pc-wls"])
+def test_bodies_that_cannot_exist_are_held_to_the_border_of_those_that_can(problem, name):
+    """The optimum of cvxpy over standard parameters with P_i >= 0, what no torque tells of them free."""
+    cp = pytest.importorskip("cvxpy")
+    free = METHODS["wls"].estimate(problem)
+    pulled = {"ZZ2R": (-np.inf, 0.3 * value(free, "ZZ2"))}
+    loose = METHODS[name].estimate(asked(problem, bounds=pulled, inertia=0))
+    held = METHODS[name].estimate(asked(problem, bounds=pulled, bodies=True))
+    assert held.held is not None and held.held.plane in [one.name for one in held.held.binding]
+    assert any("bodies that can exist" in line for line in held.held.lines())
+    assert np.all(held.estimate.sigma <= loose.estimate.sigma * 1.5)
+    base, count = problem.base, problem.model.inertial // 10
+    factor = combine(problem.pooled, loose.std if name == "pc-wls" else np.ones(len(loose.std)))
+    size = np.linalg.norm(factor[:-1, :-1], axis=0)
+    chi, terms = cp.Variable(10 * count), cp.Variable(problem.model.p - 10 * count)
+    beta = base.transform[:, : 10 * count] @ chi + base.transform[:, 10 * count :] @ terms
+    asks = [beta[base.names.index("ZZ2R")] <= pulled["ZZ2R"][1]]
+    asks += [terms[k] >= 0.0 for k, one in enumerate(problem.model.columns) if one.nonnegative]
+    asks += [sum(chi[10 * i + k] * pseudo_inertia.BASIS[k] for k in range(10)) >> 0 for i in range(count)]
+    scale = np.linalg.norm(factor[:-1, -1])
+    cp.Problem(cp.Minimize(cp.sum_squares((factor[:-1, :-1] @ beta - factor[:-1, -1]) / scale)), asks).solve(
+        solver=cp.CLARABEL
+    )
+    costs = [np.linalg.norm(factor[:-1, :-1] @ b - factor[:-1, -1]) for b in (held.estimate.values, beta.value)]
+    assert costs[0] == pytest.approx(costs[1], rel=1e-4)
+    assert np.abs((held.estimate.values - beta.value) * size).max() < 2e-2 * scale
+
+
+def test_bodies_that_exist_are_left_alone_and_impossible_bounds_are_told(problem):
+    free = METHODS["wls"].estimate(problem)
+    held = METHODS["pc-wls"].estimate(asked(problem, bodies=True))
+    assert held.held is not None and not held.held.plane
+    assert np.abs((held.estimate.values - free.estimate.values) / free.estimate.sigma).max() < 0.02
+    last = WeightedSum({"ZZ3": 1.0, "Ia3": 1.0}, most=-1.0)
+    found = METHODS["pc-wls"].estimate(asked(problem, sum=(last,), signs=False, bodies=True))
+    assert not found.found and "no bodies that can exist satisfy 1 ZZ3 + 1 Ia3 <= -1" in str(found.failure)
 
 
 def test_a_sum_of_standard_parameters_that_the_torques_tell_is_its_base_parameter(problem):
