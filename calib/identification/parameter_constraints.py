@@ -4,7 +4,7 @@ A row is lower <= aᵀ β <= upper over the columns that are estimated. A standa
 is such a row where the torques depend on it alone: cᵀ χ = aᵀ β with c = Tᵀ a, T the regrouping of the base; any other
 has no effect, and a bound on it would say nothing of the estimate (Janot's slides on the TX40). Inertia matrices M(q)
 over random postures are curved: h(β) = λ_min(S M(q; β) S) - `LEAST`, S making the mean diagonal one, which is concave.
-Bodies that can exist are a cone (`calib.identification.possible.cone`), which M(q) > 0 follows from.
+Bodies that can exist are a cone (`calib.identification.body_cone`), which M(q) > 0 follows from.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from calib.errors import NotConverged, UsageError, suggestion
 from calib.estimation.constrained import Constrained, Curved, contradicting, restricted, within
 from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import Triangles, residual_squares
-from calib.identification.possible.cone import BodyCone, cone_of
+from calib.identification.body_cone import BodyCone, cone_of
 
 POSTURES = 50  # at which M(q) must be positive definite (our choice)
 LEAST = 1e-3  # of the smallest eigenvalue of S M(q) S (our choice): what falls below moves at no torque at all
