@@ -21,7 +21,7 @@ TOML; SI units. Every combination of robot, noise, decimation, cutoff and mismat
     duration = 10.0                  # of the motion [s]
     guess = 0.15                     # relative error of the bodies' parameters in the robot's description, for methods
                                      # that start from it
-    resimulated = 10                 # data sets whose estimate is simulated once more, for the survey's position error
+    resimulated = 3                  # data sets whose estimate is simulated once more, for the survey's position error
     [[noise]]                        # at least one
     name = "1"
     sigma_q = "1e-4 deg"             # of every encoder, in the loop
@@ -91,7 +91,7 @@ class StudyFile:
     seed: Count = 0
     duration: Annotated[float, Real(least=2.0, most=600.0, unit="s")] = 10.0
     guess: Annotated[float, Real(least=0, most=10.0)] = 0.15
-    resimulated: Count = 10
+    resimulated: Count = 3
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class Condition:
     mismatch: str = "none"
     duration: float = 10.0
     guess: float = 0.15
-    resimulated: int = 10
+    resimulated: int = 3
 
     @property
     def digest(self) -> str:

@@ -173,10 +173,14 @@ def _check_columns(path: Path, found: Sequence[str]) -> None:
     if tuple(found) == _HEAD:
         return
     other = found[0].removeprefix("calib-study-") if found[0].startswith("calib-study-") else ""
-    what = f"of another version of this toolkit (format {other}, here {FORMAT})" if other else "no rows of a study"
-    missing = sorted(set(_HEAD[1:]) - set(found[1:]))
-    lacks = f"; it lacks {', '.join(missing)}" if other and missing else ""
-    raise UsageError(f"{path}: holds {what}{lacks}; run this study in another folder (--out), or with that version")
+    if not other:
+        raise UsageError(f"{path} holds no rows of a study: run this one in another folder (--out)")
+    missing = ", ".join(sorted(set(_HEAD[1:]) - set(found[1:]))[:5])
+    lacks = f"; it lacks {missing}" if missing else ""
+    raise UsageError(
+        f"{path} is of another version of this toolkit (format {other}, here {FORMAT}{lacks}): run this study in "
+        "another folder (--out), or with that version"
+    )
 
 
 def _cell(value: object) -> str:

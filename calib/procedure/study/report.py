@@ -11,7 +11,7 @@ from importlib import metadata, resources
 from calib.procedure.report.page import Pictures, Section, Table, Text
 from calib.procedure.study import figures
 from calib.studies.conditions import Condition, Study
-from calib.studies.summary import FIGURES, LEVEL, RELIABLE, SLACK, ConditionSummary, MethodSummary, Spread
+from calib.studies.summary import FIGURES, LEAST, LEVEL, RELIABLE, SLACK, ConditionSummary, MethodSummary, Spread
 from calib.studies.trial import Row
 
 RULE = (
@@ -20,6 +20,7 @@ RULE = (
     f"test, {LEVEL:.0%}), or whose median is larger by at most {SLACK:.0%}.",
     "The cheapest of these, by processor time, is the one to take.",
     "A trial without an estimate counts as an infinite error, in medians and in comparisons.",
+    f"Fewer than {LEAST} common data sets tell no methods apart: all are then as good.",
 )
 MEANING = (
     "torque: 100 ‖τ̂ - τ‖ / ‖τ‖ along a motion that no method saw, against the noise-free torques of the true robot.",
