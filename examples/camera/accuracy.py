@@ -32,14 +32,13 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.data.camera.board_pose import board_poses
 from calib.data.camera.lens import Lens
 from calib.data.poses.image_folders import find_corners, read_images
-from calib.data.poses.measurements import PoseMeasurements, Poses, take
+from calib.data.poses.measurements import PoseMeasurements, take
 from calib.data.poses.pixels import IN_HAND, Pixels
 from calib.geometry.first_guess import install
 from calib.geometry.fit import GeometricFit, fit
-from calib.geometry.images.camera_guess import complete_camera, seen_target
+from calib.geometry.images.camera_guess import complete_camera, pnp_poses
 from calib.geometry.parameters import layout
 from calib.robot.chain import random_joints
 from calib.simulation.cells.camera_cell import (
@@ -54,7 +53,7 @@ from calib.simulation.cells.camera_cell import (
 from calib.simulation.cells.cell import Cell, SimulatedInstrument, measure
 from calib.simulation.cells.truth import position_errors
 from calib.simulation.cells.virtual_cells import rigid, virtual_cell
-from calib.transforms import pose, to_quaternion
+from calib.transforms import pose
 
 COUNTS = (20, 40, 80)
 SMALL = Lens("pinhole", np.array([780.0, 782.0, 400.0, 298.0, -0.12, 0.05, 4e-4, -3e-4, 0.0]), (800, 600))
@@ -67,14 +66,6 @@ def fitted(chain: Any, block: PoseMeasurements) -> GeometricFit:
     start = install(chain, [block])
     table = layout(start)
     return fit(start, [block], np.concatenate([table.arm_index, table.frame_index]))
-
-
-def two_steps(block: Pixels) -> Poses:
-    """Return PnP's poses of what the arm carries, as a file of measured poses would hold them."""
-    assert block.lens is not None
-    seen = seen_target(block.mounting, board_poses(block.lens, block.board, block.pixel).poses)
-    names: dict[str, Any] = {"station": block.station, "tool_names": block.tool_names}
-    return Poses(block.q, block.joint_names, seen[:, :3, 3], to_quaternion(seen), **names)
 
 
 def tracked(cell: Cell, q: np.ndarray, seed: int) -> PoseMeasurements:
@@ -103,7 +94,7 @@ def accuracy(found: CameraCell, images: Pixels, counts: tuple[int, ...], seed: i
         anywhere = random_joints(arm, count, seed + 1)
         table[str(count)] = {
             "reprojection_mm": error(result),
-            "two_steps_mm": error(fitted(arm, two_steps(block))),
+            "two_steps_mm": error(fitted(arm, pnp_poses(block))),
             "tracker_same_postures_mm": error(fitted(arm, tracked(cell, images.q[rows], seed))),
             "tracker_anywhere_mm": error(fitted(arm, tracked(cell, anywhere, seed))),
             "corner_px": float(noise.factor * np.nanmedian(block.sigma)),
@@ -165,7 +156,7 @@ def repeated(found: CameraCell, seeds: int, images: int = 40) -> dict[str, Any]:
         known = [k for k, name in enumerate(result.estimate.names) if name in true]
         off = result.estimate.values[known] - [true[result.estimate.names[k]] for k in known]
         inside.append(np.abs(off) <= 1.96 * result.estimate.sigma[known])
-        two = fitted(nominal, two_steps(block))
+        two = fitted(nominal, pnp_poses(block))
         one, other = (position_errors(found.cell, each.cell, each.cell.chain)[2] for each in (result, two))
         rows.append({"seed": seed, "inside": float(inside[-1].mean()), "reprojection_mm": one, "two_steps_mm": other})
     ratios = np.array([row["two_steps_mm"] / row["reprojection_mm"] for row in rows])

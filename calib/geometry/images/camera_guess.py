@@ -16,13 +16,13 @@ from calib.data.camera.board import corners
 from calib.data.camera.board_pose import board_poses
 from calib.data.camera.lens import project
 from calib.data.poses.image_folders import listed
-from calib.data.poses.measurements import PoseMeasurements, take
+from calib.data.poses.measurements import PoseMeasurements, Poses, take
 from calib.data.poses.pixels import IN_HAND, TO_HAND, Pixels
 from calib.errors import MeasurementError
 from calib.geometry.images.hand_eye import Placement, misfit, place_robustly
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
-from calib.transforms import invert, pose
+from calib.transforms import invert, pose, to_quaternion
 
 ROUNDS = 4  # of leaving corners out
 MEDIAN = 1.1774  # of the length of a vector of two standard normals
@@ -157,6 +157,15 @@ def _strangers(block: Pixels, arm: np.ndarray, placed: Placement, poses: np.ndar
 def seen_target(mounting: str, poses: np.ndarray) -> np.ndarray:
     """Return poses of what the arm carries, in the frame of what stands: of board poses (m, 4, 4) in the camera."""
     return invert(poses) if mounting == IN_HAND else poses
+
+
+def pnp_poses(block: Pixels) -> Poses:
+    """Return images as poses of what the arm carries, each by its own corners alone: what a pose fit would get."""
+    seen = seen_target(block.mounting, _own_poses(block, np.arange(len(block))))
+    return Poses(
+        block.q, block.joint_names, seen[:, :3, 3], to_quaternion(seen), station=block.station,
+        tool_names=block.tool_names, file=block.file, rows=block.rows,
+    )  # fmt: skip
 
 
 def place_camera(block: Pixels, arm: np.ndarray) -> CameraPlacement:

@@ -6,7 +6,8 @@ marginal, until the options' ``accept`` says that it is meant. Findings of poses
 unexplained   on rows left out even the chosen model leaves more than `NO_ARM` of the reach: fail
 reflection    with the instrument's y turned the nominal arm fits `BETTER` times as well: its axes are left-handed: fail
 scale         one factor on all measured lengths takes away `SHARE` of the squares of the nominal arm's errors; off one
-              by more than `GROWN`: marginal, else a note; a note where the fitted lengths grew together
+              by more than `GROWN`: marginal, else a note; so where the fitted lengths grew together, marginal where
+              that is more than `ALONE` of their change
 commanded     less than `TOO_GOOD` remains, which no instrument measures: a note
 """
 
@@ -16,17 +17,20 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import PoseMeasurements, take
+from calib.data.poses.pixels import Pixels
 from calib.geometry.accuracy import errors
 from calib.geometry.checks.plausible import Scale, length_factor, mirrored_rms, scale_of
+from calib.geometry.images.camera_guess import pnp_poses
 from calib.geometry.installation import Installation
 from calib.geometry.result import GeometricFit
 from calib.procedure.findings import Finding
 
 NO_ARM = 0.015
 BETTER = 3.0
-SHARE, LEAST, GROWN = 0.3, 1e-3, 5e-3
+SHARE, LEAST, GROWN, ALONE = 0.3, 1e-3, 5e-3, 0.8
 TOO_GOOD = 2e-6  # [m]
+LOOKED_AT = 100  # images
 
 
 def findings(
@@ -52,10 +56,23 @@ def findings(
     if before > NO_ARM * reach:
         found += _reflection(before, mirrored_rms(nominal, blocks, torques))
     found += [*_unexplained(remains, reach), *_commanded(before, after)]
-    scale = scale_of(nominal, blocks, torques)
+    scale = scale_of(nominal, *_as_positions(blocks, torques))
     if scale is not None and before * np.sqrt(1.0 - scale.explained) < NO_ARM * reach:
         found += _scale(scale) or _lengths(length_factor(fit))
     return found
+
+
+def _as_positions(
+    blocks: Sequence[PoseMeasurements], torques: Sequence[np.ndarray | None]
+) -> tuple[list[PoseMeasurements], list[np.ndarray | None]]:
+    """Return blocks and torques with some images as the poses they show: a board's square is the scale there."""
+    shown = []
+    for block, torque in zip(blocks, torques):
+        if isinstance(block, Pixels):
+            rows = np.unique(np.linspace(0, len(block) - 1, LOOKED_AT).astype(int))
+            block, torque = pnp_poses(take(block, rows)), None if torque is None else torque[rows]
+        shown.append((block, torque))
+    return [block for block, _ in shown], [torque for _, torque in shown]
 
 
 def _unexplained(remains: float, reach: float) -> Iterator[Finding]:
@@ -93,11 +110,12 @@ def _lengths(found: Scale | None) -> list[Finding]:
     """Tell that the fitted lengths grew together, whatever else of the nominal arm was wrong."""
     if found is None or abs(found.factor - 1.0) < max(LEAST, 3.0 * found.sigma):
         return []
+    doubtful = abs(found.factor - 1.0) > GROWN and found.explained > ALONE
     one = Finding(
-        "scale", "pass",
+        "scale", "marginal" if doubtful else "pass",
         f"the fitted lengths are together {found.factor:.4f} ± {found.sigma:.1g} times the nominal ones, and that one "
-        f"factor is {100 * found.explained:.0f} % of their change: an arm may be so, an instrument's scale may be so, "
-        "and these measurements do not tell which",
+        f"factor is {100 * found.explained:.0f} % of their change: an arm may be so, the instrument's scale (or the "
+        "size of a board's square) may be so, and these measurements do not tell which",
     )  # fmt: skip
     return [one]
 

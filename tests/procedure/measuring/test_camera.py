@@ -193,3 +193,18 @@ def test_images_beside_another_instrument_are_another_tool_and_their_coverage_is
     assert np.sum(seen.count) == block.seen.sum() and seen.size == cell.lens.size
     assert 0.03 < np.sqrt(np.sum(np.square(seen.rms) * seen.count) / np.sum(seen.count)) < 0.15
     assert "coverage" in figures.captioned(fit_report.collect(found))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share, word", [(1.0, "pass"), (0.98, "marginal"), (1.02, "marginal")])
+def test_a_board_printed_too_large_or_too_small_is_no_pass(cell, share, word):
+    """A square that is off by less than its own check tells makes all fitted lengths grow by one factor."""
+    from calib.procedure.kinematic_stage.fit import run as fitted
+    from calib.procedure.kinematic_stage.inputs import gather
+    from calib.procedure.kinematic_stage.settings import FitSettings
+
+    block = camera.photograph(cell, camera.views(cell, 36, 5), 0.05, 5)
+    board = replace(block.board, square=share * block.board.square, marker=share * block.board.marker)
+    given = gather("lwr4plus", [replace(block, board=board)])
+    found = fitted(given, wanted=FitSettings(model="geometry"))
+    assert found.verdict.level == word and (word == "pass" or "lengths are" in found.verdict.reason)
