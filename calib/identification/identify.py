@@ -23,7 +23,7 @@ from calib.identification.cases import Case
 from calib.identification.friction.friction_ladder import FrictionCandidates, FrictionSelection, select_friction
 from calib.identification.friction.ripple import Ripple, find_all
 from calib.identification.friction.time_folds import estimate
-from calib.identification.methods.bias import LoopTest, compare_with_loop, require_loop
+from calib.identification.methods.bias import LoopTest, compare_with_loop, require_loop, require_robot
 from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate
 from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.prediction import Dynamics, Model, predict, transmitted
@@ -149,7 +149,8 @@ def identify_model(
     if not cases:
         raise UsageError("no recording to identify from")
     method = method_named(settings.method)
-    settings = require_loop(settings) if method.needs_controller else settings
+    if method.needs_simulation:
+        settings = require_loop(settings) if method.needs_controller else require_robot(settings)
     _require_constrainable(method, settings)
     _require_motion(cases)
     noise = _repeats_noise(cases, settings)

@@ -77,7 +77,8 @@ def test_total_least_squares_is_right_where_columns_are_as_noisy_as_it_says():
 
 def test_every_method_says_what_it_assumes():
     least_squares = {"ols", "wls", "irls", "iv", "didim"}
-    others = {"tls", "ml", "cloe", "clie", "adaline", "hopfield"}
+    others = {"tls", "ml", "cloe", "clie", "adaline", "hopfield", "ekf", "srekf", "ukf", "srukf", "cdkf",
+              "srcdkf"}  # fmt: skip
     assert set(METHODS) == least_squares | others | {f"pc-{name}" for name in least_squares}
     assert all(one.name == name and len(one.assumes) > 20 for name, one in METHODS.items())
     assert all("\n" not in one.description and one.description and one.source for one in LISTING)

@@ -50,6 +50,18 @@ class BelievedRobot:
         return np.append(self.model.carried_columns(case.carried), np.ones(len(self.plant.terms)))
 
 
+def serial_arm(problem: IdentificationProblem, method: str) -> IdentificationModel:
+    """Return the model of a problem, if it is one of motor torques of a serial arm.
+
+    Raises:
+        UsageError: for another.
+    """
+    model = problem.model
+    if not isinstance(model, IdentificationModel) or not model.torque_rows.motors_alone:
+        raise UsageError(f"method '{method}' simulates a serial arm with motor torques")
+    return model
+
+
 def believed_robot(problem: IdentificationProblem, method: str) -> BelievedRobot:
     """Return the robot of a problem.
 
@@ -57,9 +69,7 @@ def believed_robot(problem: IdentificationProblem, method: str) -> BelievedRobot
         UsageError: for a model that is no serial arm with motor torques.
         CannotSimulate: for friction that the simulator does not know, or an exact sign.
     """
-    model = problem.model
-    if not isinstance(model, IdentificationModel) or not model.torque_rows.motors_alone:
-        raise UsageError(f"method '{method}' simulates a serial arm with motor torques")
+    model = serial_arm(problem, method)
     extra = [one for one in problem.terms[problem.base.b :] if one is not None]
     model = with_terms(model, *extra)
     columns = np.array([*problem.base.kept, *range(model.p - len(extra), model.p)], dtype=int)

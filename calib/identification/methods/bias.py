@@ -68,6 +68,20 @@ def require_loop(settings: IdentificationSettings) -> IdentificationSettings:
     return replace(settings, friction="standard")
 
 
+def require_robot(settings: IdentificationSettings) -> IdentificationSettings:
+    """Return the settings of a method that simulates the robot alone, whose model is one that can be.
+
+    Raises:
+        UsageError: for other torques than the motors', or richer friction.
+    """
+    name = settings.method
+    if not settings.torque_rows.motors_alone:
+        raise UsageError(f"method '{name}' explains motor torques; rows = '{settings.torque_rows.name}' needs wls")
+    if settings.friction not in ("auto", "standard"):
+        raise UsageError(f"method '{name}' simulates standard friction only, not friction = '{settings.friction}'")
+    return replace(settings, friction="standard")
+
+
 def compare_with_loop(problem: IdentificationProblem, estimate: MethodEstimate) -> LoopTest:
     """Return what instruments from simulation say of an estimate's problem; nothing without a loop.
 

@@ -26,7 +26,7 @@ from calib.estimation.correlated import scatter
 from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import condition_numbers, require_rank
 from calib.identification.loop.loop_recordings import ClosedLoops, close_loops
-from calib.identification.methods.believed import BelievedRobot, believed_robot, start_of
+from calib.identification.methods.believed import BelievedRobot, believed_robot, serial_arm, start_of
 from calib.identification.methods.instrumental import low_passed, simulated_samples
 from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, MethodEstimate, attempted
@@ -81,7 +81,7 @@ class OutputError:
         plain = WLS.estimate(problem)
         if not plain.found:
             return replace(plain, method=self.name)
-        bodies = believed_robot(problem, self.name).plant.bodies
+        bodies = serial_arm(problem, self.name).bodies
         loops = close_loops(bodies, problem.cases, problem.decimator, problem.loop, problem.cad)
         return attempted(self.name, problem, lambda: self._estimate(problem, plain, loops), loops)
 
@@ -184,7 +184,7 @@ class _Task:
 def _gradient(residual: np.ndarray, slopes: np.ndarray) -> np.ndarray:
     """Return the next Gauss-Newton step in standard deviations, were residuals white: Qᵀ r."""
     p = slopes.shape[2]
-    return scipy.linalg.qr(slopes.reshape(-1, p), mode="economic")[0].T @ residual.ravel()
+    return np.linalg.qr(slopes.reshape(-1, p))[0].T @ residual.ravel()
 
 
 def _packed(
@@ -199,7 +199,7 @@ def _packed(
     p, rows = len(values), int(np.sum(residual != 0.0))
     flat = white.reshape(-1, p)
     size = np.linalg.norm(flat, axis=0)
-    factor = scipy.linalg.qr(flat / np.where(size > 0.0, size, 1.0), mode="r")[0][:p]
+    factor = np.linalg.qr(flat / np.where(size > 0.0, size, 1.0), mode="r")
     require_rank(factor, plain.pooled.names, "the simulated motion does not tell them apart")
     inverse = scipy.linalg.solve_triangular(factor, np.eye(p)) / size[:, None]
     bread = inverse @ inverse.T

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from calib.errors import UsageError, suggestion
+from calib.identification.methods.filters import CDKF, EKF, SRCDKF, SREKF, SRUKF, UKF
 from calib.identification.methods.least_squares import IRLS, OLS, PC_IRLS, PC_OLS, PC_WLS, TLS, WLS
 from calib.identification.methods.maximum_likelihood import ML
 from calib.identification.methods.method import Method
@@ -47,6 +48,7 @@ class MethodEntry:
 
 
 _CONSTRAINED = " under constraints on its parameters"
+_TUNED = ("first covariance of the parameters", "rate of the filter")
 _SOUSA = "Sousa & Cortesão 2014; Wensing et al. 2018"
 LISTING: tuple[MethodEntry, ...] = (
     MethodEntry(OLS, "least squares, all rows alike", "Gauss; Atkeson, An & Hollerbach 1986"),
@@ -79,6 +81,12 @@ LISTING: tuple[MethodEntry, ...] = (
         CLIE, "closed-loop input error: simulated torques meet measured ones", "Leboutet et al. 2021",
         ("damping", "tolerance 0.05 sigma"),
     ),
+    MethodEntry(EKF, "extended Kalman filter, parameters as states", "Gautier & Poignet 2001", _TUNED),
+    MethodEntry(SREKF, "the same, square-root form", "Kaminski, Bryson & Schmidt 1971", _TUNED),
+    MethodEntry(UKF, "unscented Kalman filter, the same", "Julier & Uhlmann 2004", (*_TUNED, "α = 0.1")),
+    MethodEntry(SRUKF, "the same, square-root form", "van der Merwe & Wan 2001", (*_TUNED, "α = 0.1")),
+    MethodEntry(CDKF, "central-difference Kalman filter, the same", "Nørgaard, Poulsen & Ravn 2000", _TUNED),
+    MethodEntry(SRCDKF, "the same, square-root form", "van der Merwe & Wan 2001", _TUNED),
     MethodEntry(
         ADALINE, "adaptive linear neuron, trained sample by sample", "Widrow & Hoff 1960; Widrow & Stearns 1985",
         ("decay of the learning rate", "60 epochs"),

@@ -248,6 +248,57 @@ def forward_dynamics(
     return out
 
 
+@dataclass(frozen=True, eq=False)
+class Stepper:
+    """A plant made ready to be advanced many times with other parameters and states, one at a time."""
+
+    parts: Packed
+    layout: Packed
+
+    def points(
+        self, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, tau: np.ndarray, period: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return states (K, n) a period later under one torque (n,), and M⁻¹ (n, n) of the first.
+
+        Args:
+            parameters: (K, p) of each state's robot.
+
+        Raises:
+            CannotSimulate, Diverged: naming the first point that cannot be followed.
+        """
+        from calib.simulation.loop import loop_kernels
+
+        q, v, gain = np.array(q), np.array(v), np.empty((q.shape[1], q.shape[1]))
+        order, entries, shares, owners, _ = self.layout
+        where = (order, entries, shares, owners, np.ascontiguousarray(parameters), q, v, tau, period, gain)
+        status, reached = loop_kernels.advance_points(*self.parts, *where)
+        if status != loop_kernels.FINE:
+            raise _failure(status, 0.0, f"point {reached}: ")
+        return q, v, gain
+
+    def linearised(
+        self, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, tau: np.ndarray, period: float, columns: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return q, v (n,) a period later, M⁻¹ (n, n), and slopes (2 n, 2 n + columns) by q, v and parameters."""
+        from calib.simulation.loop import loop_kernels, tangent_kernels
+
+        n = len(q)
+        q, v, gain = np.array(q), np.array(v), np.empty((n, n))
+        slopes = np.empty((2, n, 2 * n + columns))
+        args = (self.parts, self.layout, np.ascontiguousarray(parameters), q, v, tau, period, gain)
+        status = tangent_kernels.advance_linearised(*args, slopes[0], slopes[1])
+        if status != loop_kernels.FINE:
+            raise _failure(status, 0.0, "")
+        return q, v, gain, slopes.reshape(2 * n, -1)
+
+
+def stepper(plant: Plant, columns: np.ndarray) -> Stepper:
+    """Return a plant made ready to be advanced, with slopes by the parameters `columns` (c,)."""
+    find = np.full(len(plant.parameters), -1)
+    find[np.asarray(columns, dtype=int)] = 2 * plant.bodies.n + np.arange(len(columns))
+    return Stepper(packed(plant), (*layout_of(plant), find))
+
+
 def with_parameters(plant: Plant, parameters: np.ndarray) -> Plant:
     """Return the plant with other parameters."""
     return replace(plant, parameters=parameters)
@@ -344,18 +395,19 @@ def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int) -> tuple[np.
     return linear, acts
 
 
-def _failure(status: int, time: float) -> NotConverged:
-    """Return what went wrong at `time` [s]."""
+def _failure(status: int, time: float, where: str | None = None) -> NotConverged:
+    """Return what went wrong at `time` [s], or `where`."""
     from calib.simulation.loop import loop_kernels
 
+    place = f"at {time:.4g} s " if where is None else where
     if status == loop_kernels.SINGULAR:
         return CannotSimulate(
-            f"at {time:.4g} s the inertia matrix is not positive definite: these parameters belong to no possible "
+            f"{place}the inertia matrix is not positive definite: these parameters belong to no possible "
             "robot there; use a physically consistent estimate, or start from regular inertia"
         )
     if status == loop_kernels.STIFF:
         return CannotSimulate(
-            f"at {time:.4g} s friction at rest is too stiff for the control period, by more than "
+            f"{place}friction at rest is too stiff for the control period, by more than "
             f"{loop_kernels.MOST} steps: "
             "smooth the sign over a larger velocity, or give the joint its motor inertia"
         )

@@ -465,6 +465,37 @@ def advance(
 
 
 @njit(**OPTIONS)
+def advance_points(tree, body, linear, kinds, acts, order, entries, shares, owners, values, q, v, tau, period, gain):
+    """Advance each state q, v (K, n) with parameters of its own (K, p) by a period under one torque (n,).
+
+    Writes M⁻¹ of the first into gain (n, n); returns (status, point reached).
+    """
+    n, count = q.shape[1], kinds.shape[0]
+    work, matrix, slopes = np.empty((tree.shape[0] + 1, 46)), np.empty((n, n)), np.empty((4, n))
+    memory, loads, at, rate = np.zeros((count, 2)), np.zeros(n), np.empty(n), np.empty(n)
+    plant = (tree, body, linear, kinds, acts, memory, loads)
+    for k in range(q.shape[0]):
+        set_parameters(values[k], order, entries, shares, owners, body, linear, acts)
+        unstressed(kinds, acts, q[k], memory)
+        if not accelerate(*plant, q[k], v[k], tau, work, matrix, slopes[0]):
+            return SINGULAR, k
+        if k == 0:
+            for i in range(n):
+                for j in range(n):
+                    at[j] = 1.0 if i == j else 0.0
+                substitute(matrix, at)
+                for j in range(n):
+                    gain[j, i] = at[j]
+        status = advance(*plant, q[k], v[k], tau, period, slopes, work, matrix, at, rate)
+        if status != FINE:
+            return status, k
+        for j in range(n):
+            if not abs(v[k, j]) < 1e6:
+                return DIVERGED, k
+    return FINE, q.shape[0]
+
+
+@njit(**OPTIONS)
 def command(gains, aim, speed, seen, rate, integral, period, wish):
     """Write what feedback asks for (n,) from reference and measurement; rows of `gains` as in `closed_loop`."""
     for j in range(wish.shape[0]):

@@ -50,8 +50,10 @@ from calib.simulation.loop.loop_kernels import (
     dynamics,
     linearise_command,
     seen,
+    set_parameters,
     shape,
     stiffness,
+    substitute,
 )
 
 JOINED = {**OPTIONS, "forceinline": True}
@@ -394,6 +396,42 @@ def workspace(bodies, n, c):
     own, more, ten = np.empty((bodies, 10)), np.empty((bodies + 1, 36)), np.empty(10)
     square, wide = (np.empty((n, n)), np.empty((n, n))), np.empty((n, c))
     return own, more, ten, square[0], square[1], wide, np.empty(n), np.empty(n), np.empty((n, c)), np.empty((n, c))
+
+
+@njit(**OPTIONS)
+def advance_linearised(plant, layout, values, q, v, tau, period, gain, dq, dv):
+    """Advance a state q, v (n,) with parameters (p,) by a period under one torque (n,), with its slopes.
+
+    dq, dv (n, 2 n + c): slopes by q, v and the c parameters of `layout`, whose columns start at 2 n. Writes M⁻¹ into
+    gain (n, n); returns a status.
+    """
+    tree, body, linear, kinds, acts = plant
+    order, entries, shares, owners, _ = layout
+    n, c = dq.shape
+    set_parameters(values, order, entries, shares, owners, body, linear, acts)
+    work, matrix = np.empty((tree.shape[0] + 1, 46)), np.empty((n, n))
+    slopes, dslopes = np.empty((4, n)), np.empty((4, n, c))
+    memory, loads, dtau = np.zeros((kinds.shape[0], 2)), np.zeros(n), np.zeros((n, c))
+    rooms = workspace(tree.shape[0], n, c)
+    dq[:] = 0.0
+    dv[:] = 0.0
+    for j in range(n):
+        dq[j, j], dv[j, n + j] = 1.0, 1.0
+    if not accelerate(tree, body, linear, kinds, acts, memory, loads, q, v, tau, work, matrix, slopes[0]):
+        return SINGULAR
+    unit = np.empty(n)
+    for i in range(n):
+        for j in range(n):
+            unit[j] = 1.0 if i == j else 0.0
+        substitute(matrix, unit)
+        for j in range(n):
+            gain[j, i] = unit[j]
+    state = (q, v, dq, dv, tau, dtau, period, slopes, dslopes, work, matrix, rooms)
+    status = advance_tangent(plant, layout, memory, loads, *state)
+    for j in range(n):
+        if not abs(v[j]) < 1e6:
+            return DIVERGED
+    return status
 
 
 @njit(**OPTIONS)

@@ -1,0 +1,67 @@
+"""An arm that turns and slides, in a closed loop, for methods that simulate it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from calib.data.recordings.recording import Recording
+from calib.data.signals.motion import FilterOptions, make_motion
+from calib.dynamics import base as bases
+from calib.dynamics import drives
+from calib.dynamics.bodies import bodies_of
+from calib.dynamics.idim import IdentificationModel
+from calib.identification.cases import make_case
+from calib.identification.loop.loop_settings import LoopSettings
+from calib.identification.methods.method import IdentificationProblem
+from calib.identification.rows import observe
+from calib.robot import mdh
+from calib.simulation.loop import controllers, references
+from calib.simulation.loop.closed_loop import Plant, Sensing, simulate
+
+RATE = 700.0
+ROWS = [
+    mdh.Row("joint1", 1, "revolute", np.pi / 2, 0.0, 0.0, 0.0, lower=-2.0, upper=2.0),
+    mdh.Row("joint2", 2, "prismatic", np.pi / 2, 0.1, 0.0, 0.3, lower=-1.0, upper=1.0),
+]
+LINKS = np.array([0.3, 0, 0, 0.1, 0, 0.4, 0.6, 0.1, 0, 3.0, 0.05, 0, 0, 0.04, 0, 0.1, 0.2, 0.05, 0, 1.0])
+DRIVES = np.array([0.2, 1.0, 1.5, 0.1, 5.0, 0.8])  # Ia Fv Fc
+PD = controllers.pd(np.array([900.0, 600.0]), np.array([40.0, 30.0]))
+LOOP = LoopSettings(controller="pd", kp=tuple(PD.kp), kd=tuple(PD.kd), rate=RATE)
+
+
+@cache
+def robot() -> tuple[Plant, IdentificationModel, bases.Base]:
+    chain = mdh.chain("turn and slide", ROWS)
+    terms = drives.standard(["Ia Fv Fc"] * 2, 0.2, [False, True])
+    model = IdentificationModel(bodies_of(chain), terms)
+    return Plant(model.bodies, terms, np.concatenate([LINKS, DRIVES])), model, bases.find(model)
+
+
+@cache
+def motion(rate: float = RATE) -> references.Reference:
+    limit = np.array([1.5, 0.6])
+    return references.random_fourier(-limit, limit, np.full(2, 3.0), 5.0, rate, 8, acceleration=20.0, seed=5)
+
+
+def problem(seed: int, sigma_q: float = 0.0, sigma_tau: float = 0.05, rate: float = RATE) -> IdentificationProblem:
+    """Return the problem of a log at 200 Hz; of a loop at 700 Hz 3.5 periods per sample."""
+    plant, model, base = robot()
+    tick = rate / 200.0
+    run = simulate(plant, PD, motion(rate), Sensing(sigma_q, sigma_tau=sigma_tau, every=tick), seed)
+    asked = motion(rate).at(np.arange(len(run.t)) * tick)[0]
+    recording = Recording(run.t, run.measured, run.tau, "torque", ("joint1", "joint2"), q_ref=asked)
+    case = make_case("log", make_motion(recording, FilterOptions(cutoff=40.0, band=20.0, clock="stamps")))
+    decimator = case.motion.decimator
+    rows = (observe(model, base.kept, case, decimator),)
+    terms = tuple(None if k < model.inertial else model.columns[k - model.inertial] for k in base.kept)
+    return IdentificationProblem(
+        model, base, (case,), decimator, rows, terms, np.full(base.b, -1), loop=replace(LOOP, rate=rate)
+    )  # fmt: skip
+
+
+def truth() -> np.ndarray:
+    plant, _, base = robot()
+    return base.transform @ plant.parameters
