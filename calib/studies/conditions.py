@@ -19,8 +19,7 @@ TOML; SI units. Every combination of robot, noise, decimation, cutoff and mismat
     runs_of = { iv = 10 }            # for single methods
     seed = 0                         # number of the first data set
     duration = 10.0                  # of the motion [s]
-    guess = 0.15                     # relative error of the bodies' parameters in the robot's description, for methods
-                                     # that start from it
+    guess = 0.15                     # relative error of what cloe, clie and the Kalman filters start from
     resimulated = 3                  # data sets whose estimate is simulated once more, for the survey's position error
     [[noise]]                        # at least one
     name = "1"
@@ -106,7 +105,7 @@ class Condition:
         cutoff: of the positions' filter [Hz]; 0 for none.
         mismatch: what is believed wrongly, one of `MISMATCHES`.
         duration: [s].
-        guess: relative error of the bodies' parameters in the robot's description.
+        guess: relative error of the parameters that methods start from which ask for some.
         resimulated: seeds below it get the survey's position error.
     """
 

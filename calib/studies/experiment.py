@@ -30,6 +30,7 @@ from calib.geometry.first_guess import install
 from calib.identification.cases import Case, make_case
 from calib.identification.loop.loop_settings import LoopSettings
 from calib.identification.methods.method import IdentificationProblem
+from calib.identification.parameter_constraints import ConstraintSettings
 from calib.identification.rows import observe
 from calib.robot.chain import Chain, random_joints, sampling_limits
 from calib.robot.load import load
@@ -141,7 +142,8 @@ def make_experiment(condition: Condition, seed: int) -> Experiment:
     terms = tuple(None if k < model.inertial else model.columns[k - model.inertial] for k in base.kept)
     problem = IdentificationProblem(
         model, base, (case,), decimator, (rows,), terms, np.full(base.b, -1),
-        loop=_loop(condition, controller), cad=_described(setup.plant, condition.guess, seed),
+        loop=_loop(condition, controller), start=base.transform @ _guess(setup.plant, condition.guess, seed),
+        constraints=ConstraintSettings(bodies=True),
     )  # fmt: skip
     matrix, torque = _validation(setup, model, base, truth if condition.mismatch == "payload" else true)
     return Experiment(
@@ -215,13 +217,13 @@ def _validation(setup: Setup, model: IdentificationModel, base: Base, true: Plan
     return model.regressor(thin.q, thin.v, thin.a)[:, :, base.kept], feed_forward(true, thin)
 
 
-def _described(plant: Plant, spread: float, seed: int) -> np.ndarray:
-    """Return the bodies' parameters as a maker might state them: each off by a normal relative error, bodies possible.
+def _guess(plant: Plant, spread: float, seed: int) -> np.ndarray:
+    """Return the robot's parameters, each off by a normal relative error, of bodies that can be and drives that brake.
 
     A body is drawn until it can be (the survey's way, but body by body); where that takes long, from a smaller spread.
     """
     rng = np.random.default_rng([seed, 15])
-    values = np.array(plant.parameters[: plant.inertial])
+    values = np.array(plant.parameters)
     for first in range(0, plant.inertial, 10):
         body, own = plant.parameters[first : first + 10], spread
         for attempt in range(1000):
@@ -229,4 +231,7 @@ def _described(plant: Plant, spread: float, seed: int) -> np.ndarray:
             if margin(values[first : first + 10]) > 0.0:
                 break
             own *= 0.5 if attempt % 100 == 99 else 1.0
+    drives_ = plant.parameters[plant.inertial :]
+    off = 1.0 + spread * rng.standard_normal(len(drives_))
+    values[plant.inertial :] = drives_ * np.maximum(off, 0.01)
     return values
