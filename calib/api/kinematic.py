@@ -56,6 +56,17 @@ class PoseSelection:
         """Write the run through the poses, in their order, as CSV: t [s], pose (0 for a via-point), joints."""
         return write_run(Path(path), self.chosen.run, self.chosen.chain)
 
+    def plot(self) -> dict[str, Figure]:
+        """Return the figures by name: what fewer and more poses would tell of the tool; none for a camera."""
+        from calib.procedure.report.uncertainty_figures import outlook_figure
+
+        look = self.chosen.outlook
+        if look is None or not look.others or not np.isfinite(look.poses.rms):
+            return {}
+        curve = [(float(one.poses), 1e3 * one.rms) for one in look.others]
+        own = (float(look.poses.poses), 1e3 * look.poses.rms)
+        return {"outlook": outlook_figure(curve, own, "poses", "σ of the tool's position [mm]")}
+
     def to_dict(self) -> dict[str, Any]:
         """Return what the selection came to: index, its value, that of random sets, efficiency, seconds, notes."""
         return selection.record(self.chosen)

@@ -25,6 +25,9 @@ def identify_dynamics(
     options: Annotated[
         Path | None, typer.Option(help="TOML: drives, payloads, gains, filters, how to identify")
     ] = None,
+    excitation: Annotated[
+        Path | None, typer.Option(help="folder of calib excite: what it predicted is held against what is found")
+    ] = None,
     base: Base = None,
     tip: Tip = None,
     seed: Seed = 0,
@@ -33,6 +36,7 @@ def identify_dynamics(
     """Identify ROBOT's dynamics from recordings, and judge them. What counts is how well other motion is predicted."""
     from calib.api.dynamic import identify_dynamics as identified
     from calib.procedure.dynamic_stage import folder
+    from calib.procedure.excitation import prediction
     from calib.procedure.parallel_stage import folder as parallel_folder
     from calib.procedure.parallel_stage.robots import path_of
     from calib.procedure.report import console as shown
@@ -40,6 +44,8 @@ def identify_dynamics(
 
     check = parallel_folder.check_identified if path_of(robot) else folder.check_identification_target
     check(out, [options, *recordings, *(validate or [])])
+    if excitation is not None:
+        prediction.check_folder(excitation)
 
     def read(given: Any) -> None:
         folder.check_identification_target(out, [given.source, given.source.parent])
@@ -52,4 +58,5 @@ def identify_dynamics(
         )  # fmt: skip
         show("writing")
         found.save(out, plots=plots)
-    say_written(found.renderables(), out, found.verdict.level)
+    promises = [] if excitation is None else prediction.kept_promise(excitation, found.outcome)
+    say_written([*found.renderables(), *promises], out, found.verdict.level)

@@ -113,6 +113,9 @@ def select(
         Path | None,
         typer.Option(help="CSV of the run: t, pose (0: via-point), joints; calib view rehearses it"),
     ] = None,
+    plot: Annotated[
+        Path | None, typer.Option(help="PNG: what fewer and more poses would tell of the tool's position")
+    ] = None,
     speed: Annotated[float, typer.Option(help="share of the joints' speeds that the run is driven at")] = 0.3,
     dwell: Annotated[float, typer.Option(help="seconds that each pose takes to settle and be measured")] = 6.0,
     candidates: Annotated[int, typer.Option(help="poses to choose from")] = 2000,
@@ -130,10 +133,13 @@ def select(
     from calib.files import check_target
     from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
     from calib.procedure.measuring.run import RunSettings
+    from calib.procedure.report.style import save
 
     check_target(out, [robot, existing, constraints])
     if run:
         check_target(run, [robot, existing, constraints, out])
+    if plot:
+        check_target(plot, [robot, existing, constraints, out, run])
     targets = tuple(tuple(numbers(text, 3, "--tool")) for text in tool or [])
     sigmas = None if sigma is None else numbers(sigma, 2, "--sigma")
     stated = None if sigmas is None else (sigmas[0], sigmas[1])
@@ -150,6 +156,9 @@ def select(
     if run:
         chosen.save_run(run)
         say(f"the run: {run}; calib view {run} --robot {robot}")
+    for figure in chosen.plot().values() if plot else ():
+        save(figure, plot)
+        say(f"the curve: {plot}")
     say(str(chosen))
     say(f"{m} poses written to {out}")
 

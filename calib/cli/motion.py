@@ -48,6 +48,12 @@ def excite(
     lock: Annotated[
         list[str] | None, typer.Option(help="joints that stay: joint4,joint7, or joint4=0.5 [rad or m]; repeatable")
     ] = None,
+    noise: Annotated[
+        float | None, typer.Option(help="share of the torque limits that no parameter explains, to predict sigmas by")
+    ] = DESIGN.noise,
+    outlook: Annotated[
+        bool, typer.Option("--outlook/--no-outlook", help="look at what other periods would tell")
+    ] = DESIGN.outlook,
     workers: Annotated[str, typer.Option(help="local processes, or the address of a Dask scheduler")] = "1",
     base: Base = None,
     tip: Tip = None,
@@ -66,6 +72,7 @@ def excite(
         harmonics=harmonics, family=family,
         drives=drives, rate=rate, starts=starts, evaluations=evaluations, seed=seed, front=front,
         start=_stands(start), repeat=repeat, slower=slower, existing=tuple(existing or ()), lock=tuple(lock or ()),
+        noise=noise, outlook=outlook,
     )  # fmt: skip
     check = parallel_folder.check_moved if path_of(robot) else folder.check_design_target
     check(out, [robot, model, limits, *settings.existing])

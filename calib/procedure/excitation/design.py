@@ -16,6 +16,7 @@ from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel, re
 from calib.procedure.excitation.limits import MotionLimits
 from calib.procedure.excitation.metrics import DesignCondition
 from calib.procedure.excitation.playback import Playback, check_playback, play
+from calib.procedure.excitation.prediction import Outlook, foretell
 from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, HARMONICS, ExcitationSettings
 from calib.robot.calibrated import CalibratedChain
 from calib.workers.interrupts import finishing
@@ -31,6 +32,7 @@ from trajectories.design.verify import Verification, dense_motion, ensured
 from trajectories.fourier import fourier_family
 
 GUARD = 0.2  # share of the torque limits kept free where no friction is known (our choice)
+QUICK = 240  # evaluations for a motion of another period, which is only looked at (our choice)
 INSTANTS = 1000  # over the period, at which condition numbers are reported
 Progress = Callable[[str], None]
 Search = Callable[..., SearchResult]
@@ -49,6 +51,7 @@ class Designed:
         front: trade-offs, where asked for.
         playback: what a controller is to run.
         notes: what a user should know.
+        outlook: what the motion will tell; None where no torque limits say how large errors are.
     """
 
     inputs: ExcitationInputs
@@ -61,6 +64,7 @@ class Designed:
     front: Front | None
     playback: Playback
     notes: tuple[str, ...]
+    outlook: Outlook | None = None
 
     @property
     def family(self) -> Family:
@@ -125,11 +129,34 @@ def excite(
     with finishing():
         played = play(problem.family, found, given, settings)
         condition_found = _condition_of(given, problem.family, found, settings.repeat)
+    outlook = None
+    with suppress(KeyboardInterrupt):
+        outlook = _outlook(given, settings, problem, found, say)
     cut = ("interrupted before any motion met the goals",) if wanted and not problem.goals else ()
     return Designed(
         given, settings, problem, found, proof, condition_found,
         _reached(problem, found), front, played,
-        (*given.limits.notes, *given.model.notes, *notes, *given.columns.notes, *cut, *played.notes),
+        (*given.limits.notes, *given.model.notes, *notes, *given.columns.notes, *cut, *played.notes), outlook,
+    )  # fmt: skip
+
+
+def _outlook(
+    given: ExcitationInputs,
+    settings: ExcitationSettings,
+    problem: ExcitationProblem,
+    found: SearchResult,
+    say: Progress,
+) -> Outlook | None:
+    """Return what a motion will tell, and what others of other periods would."""
+
+    def problem_of(period: float) -> ExcitationProblem:
+        return _excitation_problem(given, replace(settings, period=period, shortest=None))[0]
+
+    look = settings.outlook and not found.interrupted
+    say("what other periods would tell")
+    evaluations = min(QUICK, settings.evaluations // 4) if look else 0
+    return foretell(
+        given, problem, found, settings.repeat, settings.noise, problem_of, evaluations, settings.seed
     )  # fmt: skip
 
 

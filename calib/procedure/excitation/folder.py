@@ -14,7 +14,7 @@ import numpy as np
 
 from calib import files
 from calib.folders import METRICS, check_target, write_staged
-from calib.procedure.excitation import coefficients
+from calib.procedure.excitation import coefficients, prediction
 from calib.procedure.excitation.coefficients import Periodic
 from calib.procedure.excitation.design import INSTANTS, Designed
 from calib.procedure.excitation.planning import Planned
@@ -29,8 +29,8 @@ DESIGN = (METRICS, coefficients.SAMPLES, coefficients.NAME)
 PLAN = (METRICS, coefficients.PLANNED, "trajectory.yaml", "trajectory.json")
 """Files by which an earlier run's folder is known."""
 REHEARSAL = "rehearsal.csv"
-FIGURES = tuple(f"plot_{name}.png" for name in ("motion", "path", "history", "front", "profile"))
-ALL = (*DESIGN, *PLAN[1:], coefficients.RUN, "front.csv", "approach.csv", REHEARSAL, *FIGURES)
+FIGURES = tuple(f"plot_{name}.png" for name in ("motion", "path", "history", "front", "profile", "outlook"))
+ALL = (*DESIGN, *PLAN[1:], coefficients.RUN, prediction.NAME, "front.csv", "approach.csv", REHEARSAL, *FIGURES)
 """Files of an earlier run that a new one replaces."""
 MESSAGES = 100.0  # points per second of the ROS message, whose controllers interpolate (our choice)
 
@@ -67,6 +67,8 @@ def write_design(designed: Designed, out: Path, draw: Callable[[Designed, Path],
         if designed.front is not None and len(designed.front.values):
             rows = [[*map(float, row), bool(best)] for row, best in zip(designed.front.values, designed.front.best)]
             files.write_table(folder / "front.csv", [*designed.front.names, "not dominated"], rows)
+        if designed.outlook is not None:
+            prediction.write(designed.outlook, folder)
         files.write_json(folder / METRICS, design_metrics(designed))
 
     return write_staged(out, ALL, write)
@@ -158,6 +160,7 @@ def design_metrics(designed: Designed) -> dict[str, Any]:
             "repeat": designed.playback.repeat, "seconds": designed.playback.run.duration,
             "approach": _seconds(designed.playback.approach), "rehearsal": _seconds(designed.playback.rehearsal),
         },
+        "prediction": None if designed.outlook is None else prediction.table(designed.outlook),
         "notes": list(designed.notes),
     }  # fmt: skip
 
@@ -188,6 +191,7 @@ def design_lines(designed: Designed) -> list[str]:
     parts = ["the approach"] if played.approach is not None else []
     parts.append(f"{played.repeat} period{'s' if played.repeat > 1 else ''}")
     result.append(f"to run: {' and '.join(parts)}, {played.run.duration:.1f} s")
+    result += [] if designed.outlook is None else prediction.lines(designed.outlook)
     return result + [f"note: {note}" for note in designed.notes]
 
 

@@ -37,6 +37,9 @@ class ExcitationSettings:
         existing: recordings (``log.npz@0:9.4`` cuts), or folders of earlier excitations, that count already; the new
             motion counts `repeat` times.
         lock: joints that stay, ``joint4`` or ``joint4=0.5`` [rad or m].
+        noise: of the torques, what no parameter explains, as a share of their limits; for the prediction alone. None:
+            `calib.procedure.excitation.prediction.NOISE`.
+        outlook: whether to look at what other periods would tell.
     """
 
     goals: tuple[str, ...] = ()
@@ -57,6 +60,8 @@ class ExcitationSettings:
     slower: Slower = 1.0
     existing: tuple[str, ...] = ()
     lock: tuple[str, ...] = ()
+    noise: Annotated[float, Within(above=0.0, most=1.0)] | None = None
+    outlook: bool = True
 
 
 DEFAULT_DESIGN = ExcitationSettings()

@@ -23,6 +23,7 @@ from calib.procedure.report.style import (
     styled,
     thinned,
 )
+from calib.procedure.report.uncertainty_figures import outlook_figure
 from calib.robot.kinematics import sweep
 from calib.units import motion_units
 from trajectories.constraints import BoxLimit
@@ -164,7 +165,7 @@ def _limits(designed: Designed, order: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def design_figures(designed: Designed) -> dict[str, Figure]:
-    """Return the figures of a designed motion by name: motion, tool path, search, and front if any."""
+    """Return the figures of a designed motion by name: motion, tool path, search, front and outlook if any."""
     figures = {
         "motion": _motion_figure(designed),
         "path": _path_figure(designed),
@@ -172,6 +173,10 @@ def design_figures(designed: Designed) -> dict[str, Figure]:
     }
     if designed.front is not None and len(designed.front.values):
         figures["front"] = _front_figure(designed.front)
+    if (look := designed.outlook) is not None and look.others:
+        curve = [(one.seconds, 100 * look.torque_share(one)) for one in look.others]
+        own = (look.own.seconds, 100 * look.torque_share(look.own))
+        figures["outlook"] = outlook_figure(curve, own, "motion [s]", "σ of torques [% of limits]")
     return figures
 
 

@@ -1,7 +1,7 @@
-"""The figures of consistent geometry and dynamics: the estimate on two geometries, and the errors that matter.
+"""Figures of what is known how well: what more measurements would tell, the estimate on two geometries, what matters.
 
-Both are drawn from an identification's folder (``geometries.csv``, ``geometry_effects.csv``), so that a certificate
-made later shows the same.
+The latter two are drawn from an identification's folder (``geometries.csv``, ``geometry_effects.csv``), so that a
+certificate made later shows the same.
 """
 
 from __future__ import annotations
@@ -23,11 +23,13 @@ from calib.procedure.report.page import Picture
 from calib.procedure.report.style import (
     AFTER,
     BEFORE,
+    HALF,
     MARK,
     QUIET,
     WIDE,
     label_ticks,
     legend,
+    log_axis,
     number,
     picture,
     room,
@@ -37,8 +39,30 @@ from calib.procedure.report.style import (
 from calib.records import read_rows
 from calib.units import small
 
+Curve = Sequence[tuple[float, float]]
 TOP = 15  # elements in the ranked figure
 T = TypeVar("T")
+
+
+def outlook_figure(others: Curve, own: tuple[float, float], along: str, across: str) -> Figure:
+    """Draw a predicted sigma over the effort of measuring, both logarithmic; the plan in hand is marked.
+
+    Args:
+        others: pairs of effort and sigma; own: the same of the plan.
+        along, across: what they are, with units.
+    """
+    points = np.array(sorted(others)).reshape(-1, 2)
+    every = np.vstack([points, [own]])
+    with styled():
+        figure, (axis,) = sheet(width=HALF, height=2.5)
+        axis.plot(*points.T, "o-", color=BEFORE, linewidth=1.0, markersize=3.5)
+        axis.plot(*own, "o", color=MARK, markersize=5.5)
+        axis.annotate("this plan", own, (5, 5), textcoords="offset points", fontsize=7)
+        log_axis(axis.xaxis, 0.8 * every[:, 0].min(), 1.25 * every[:, 0].max())
+        log_axis(axis.yaxis, 0.7 * every[:, 1].min(), 1.4 * every[:, 1].max())
+        axis.set(xlabel=along, ylabel=across, title="predicted, before anything is moved")
+        axis.grid(True)
+    return figure
 
 
 def from_folder(folder: Path) -> dict[str, Picture]:

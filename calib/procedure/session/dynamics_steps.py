@@ -19,7 +19,7 @@ from calib.identification.settings import Payload
 from calib.procedure.dynamic_stage import identify as identifying
 from calib.procedure.dynamic_stage import inputs
 from calib.procedure.dynamic_stage.validation import assess
-from calib.procedure.excitation import coefficients
+from calib.procedure.excitation import coefficients, prediction
 from calib.procedure.excitation.coefficients import Periodic
 from calib.procedure.session import arrival
 from calib.procedure.session.folder import CUTS, MOTION_CHECKED, Session
@@ -91,7 +91,7 @@ def excite(session: Session, say: Say) -> list[str]:
             period=wanted.period * (1.0 if first else SHORTER), harmonics=wanted.harmonics, rate=wanted.rate,
             starts=wanted.starts if first else 1,
             evaluations=wanted.evaluations if first else max(20, wanted.evaluations // 3),
-            seed=session.settings.seed + (0 if first else OTHER), repeat=wanted.repeats,
+            seed=session.settings.seed + (0 if first else OTHER), repeat=wanted.repeats, outlook=first,
         )  # fmt: skip
         designed = design.excite(
             session.fit.path, settings, limits=limits,
@@ -189,6 +189,9 @@ def identify(session: Session, say: Say) -> list[str]:
         "condition "
         f"number {raw:.3g}, with unit columns {normalised:.3g}; {own.raw.total:.2f} % of the torque unexplained"
     ]
+    designed = session.path("6-excitation/training")
+    if session.settings.dynamics.plan and (designed / prediction.NAME).is_file():
+        notes += prediction.kept_promise(designed, outcome)
     return [*notes, *outcome.warnings]
 
 

@@ -1,0 +1,295 @@
+"""What a motion will tell of the dynamics, before anything is moved: sigmas of parameters and of torques.
+
+With Y one sample's regressor and σ_j the error of joint j's torque that no parameter explains, a log of R independent
+rows per joint leaves the base parameters with the covariance
+
+    C = (R · mean over the period of Σ_j Y_jᵀ Y_j / σ_j²)⁻¹,
+
+and a torque on other motion with the variance Y C Yᵀ. R counts the rows that `calib identify` keeps: twice the band
+that its own rules read from the accelerations. What is not known before a log is σ_j: noise, and friction that no term
+holds. It is taken as a share of the torque limits, stated or `NOISE`; all sigmas go with it in proportion.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib import files
+from calib.data.signals.bandwidth import LOWEST, SHARE
+from calib.errors import UsageError
+from calib.folders import METRICS
+from calib.procedure.dynamic_stage.identify import IdentificationOutcome
+from calib.procedure.excitation.inputs import ExcitationInputs
+from trajectories.basis import Family, SampledMotion
+from trajectories.design.problem import ExcitationProblem
+from trajectories.design.search import STAGES, SearchResult, one_start
+from trajectories.design.verify import dense_motion
+
+NAME = "prediction.csv"
+HEADER = ("name", "unit", "value", "sigma", "rsd")
+NOISE = 0.01  # of the torque limits: what no parameter explains, where nothing is stated (our choice)
+PERIODS = (5.0, 10.0, 20.0, 40.0)
+TOLD = 0.3  # a parameter that is known to so much of its value is told (our choice)
+INSTANTS = 500  # over a period
+TASK = 400  # states of the typical task: anywhere within the joint limits, up to half of the speed limits
+RISE = 2.0  # accelerations [1/s] times the speed (our choice, as of measuring runs)
+
+
+@dataclass(frozen=True, eq=False)
+class MotionPrediction:
+    """What a log of a motion will tell.
+
+    Attributes:
+        seconds: of motion; rows: independent ones per joint.
+        sigmas: (c,) of the parameters.
+        torque: (n,) rms of the predicted torque's sigma over the typical task [N m or N].
+    """
+
+    seconds: float
+    rows: float
+    sigmas: np.ndarray
+    torque: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Outlook:
+    """What a designed motion will tell, and what others of other lengths would.
+
+    Attributes:
+        names, units: (c,) of the parameters; values (c,), NaN where nobody knows them.
+        noise: (n,) taken as the torques' error [N m or N]; share: of the torque limits.
+        limits: (n,) of the torques.
+        own: of the motion as it is to be run; others: of other lengths. Longer ones run the same motion again, shorter
+            ones are designed quickly.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: np.ndarray
+    noise: np.ndarray
+    share: float
+    limits: np.ndarray
+    own: MotionPrediction
+    others: tuple[MotionPrediction, ...]
+
+    def told(self, one: MotionPrediction) -> int:
+        """Return how many parameters are known to `TOLD` of their value."""
+        return int(np.sum(one.sigmas < TOLD * np.abs(np.nan_to_num(self.values))))
+
+    def torque_share(self, one: MotionPrediction) -> float:
+        """Return the sigma of torques on the typical task, rms over the joints, as a share of the limits."""
+        return float(np.sqrt(np.mean((one.torque / self.limits) ** 2)))
+
+
+def foretell(
+    given: ExcitationInputs,
+    problem: ExcitationProblem,
+    found: SearchResult,
+    repeat: int,
+    noise: float | None,
+    problem_of: Callable[[float], ExcitationProblem],
+    evaluations: int,
+    seed: int,
+) -> Outlook | None:
+    """Return what a motion found will tell; None where a joint has no torque limit to take an error from.
+
+    Args:
+        given, problem, found: the robot, what was solved, and the motion.
+        repeat: periods that are run.
+        noise: share of the torque limits; None: `NOISE`.
+        problem_of: a period [s] -> the problem with it.
+        evaluations: for each of the other periods; 0: none are looked at.
+        seed: of the typical task.
+    """
+    limits, share = given.limits.torque, NOISE if noise is None else noise
+    if not np.isfinite(limits).all():
+        return None
+    sigmas = share * limits
+    task = _task(given, seed)
+    tell = partial(_prediction, given, sigmas, task)
+    own = tell(problem.family, found.x, found.factor, repeat)
+    others = []
+    own_period = problem.family.period * found.factor
+    for period in PERIODS if evaluations else ():
+        if period >= own_period - 1e-9:
+            others.append(tell(problem.family, found.x, found.factor, period / own_period))
+            continue
+        shorter = _shortened(problem, found, problem_of, period, evaluations)
+        others += [] if shorter is None else [tell(shorter[0], shorter[1].x, shorter[1].factor, 1.0)]
+    model, columns = given.model, given.columns.columns
+    kept = slice(None) if columns is None else columns
+    values = np.full(len(model.exact.names), np.nan) if model.values is None else model.values
+    units = tuple(np.array(model.exact.units)[kept])
+    return Outlook(given.columns.names, units, values[kept], sigmas, share, limits, own, tuple(others))
+
+
+def _task(given: ExcitationInputs, seed: int) -> np.ndarray:
+    """Return regressors (TASK, n, c) of typical states."""
+    box, rng, n = given.limits.positions, np.random.default_rng([seed, 3]), given.chain.n
+    low, high = np.where(np.isfinite(box.lower), box.lower, -np.pi), np.where(np.isfinite(box.upper), box.upper, np.pi)
+    speeds = np.array([joint.velocity for joint in given.chain.joints])
+    fast = 0.5 * np.where(np.isfinite(speeds), speeds, 1.0)
+    q, v, a = low + (high - low) * rng.random((TASK, n)), *(2.0 * rng.random((2, TASK, n)) - 1.0)
+    for j, value in given.locked.items():
+        q[:, j], v[:, j], a[:, j] = 0.0 if value is None else value, 0.0, 0.0
+    return _columns(given, given.model.exact.regressor(q, fast * v, RISE * fast * a))
+
+
+def _columns(given: ExcitationInputs, Y: np.ndarray) -> np.ndarray:
+    return Y if given.columns.columns is None else Y[:, :, given.columns.columns]
+
+
+def _prediction(
+    given: ExcitationInputs, noise: np.ndarray, task: np.ndarray, family: Family, x: np.ndarray, factor: float,
+    repeat: float,
+) -> MotionPrediction:  # fmt: skip
+    """Return what `repeat` periods of a motion tell."""
+    period = family.period * factor
+    motion = dense_motion(family, x, period / INSTANTS * np.arange(INSTANTS), factor)
+    counted = np.ones(given.chain.n) if given.columns.sigmas is None else given.columns.sigmas
+    Y = _columns(given, given.model.exact.regressor(motion.q, motion.v, motion.a)) / (noise * counted)[:, None]
+    W = Y.reshape(-1, Y.shape[2])
+    rows = 2.0 * _band(motion, period) * period * repeat
+    scale = np.maximum(np.linalg.norm(W, axis=0), 1e-300)
+    _, s, vt = np.linalg.svd(W / scale, full_matrices=False)
+    root = (vt.T / np.maximum(s, 1e-12 * s[0])) / scale[:, None] * np.sqrt(INSTANTS / rows)
+    torque = np.sqrt(np.mean(np.sum((task @ root) ** 2, axis=2), axis=0))
+    return MotionPrediction(period * repeat, rows, np.linalg.norm(root, axis=1), torque)
+
+
+def _band(motion: SampledMotion, period: float) -> float:
+    """Return the band [Hz] that identification compares torques in: twice f_dyn (`calib.data.signals.bandwidth`)."""
+    power = np.abs(np.fft.rfft(motion.a, axis=0)) ** 2
+    total = np.cumsum(power, axis=0)
+    lines = np.argmax(total >= SHARE * total[-1], axis=0)[total[-1] > 0]
+    return 2.0 * max(LOWEST, float(lines.max(initial=0)) / period)
+
+
+def _shortened(
+    problem: ExcitationProblem,
+    found: SearchResult,
+    problem_of: Callable[[float], ExcitationProblem],
+    period: float,
+    evaluations: int,
+) -> tuple[Family, SearchResult] | None:
+    """Return a motion of a shorter period, searched from the same path made so small that its speeds stay."""
+    try:
+        other = replace(problem_of(period), stretch=(1.0, 1.0))
+    except ValueError:  # as many harmonics of a short period are beyond the resonance, or it is no whole sample
+        return None
+    basis, own = other.basis(), problem.family.period * found.factor
+    path = problem.family.basis(basis.times * problem.family.period / period).motion(found.x).q
+    middle = path.mean(axis=0)
+    run = one_start(other, evaluations, "slsqp", 0, basis.nearest(middle + period / own * (path - middle)), STAGES[1:3])
+    return (other.family, run) if isinstance(run, SearchResult) else None
+
+
+def table(one: Outlook) -> dict[str, Any]:
+    """Return the entry of ``metrics.json``."""
+
+    def entry(each: MotionPrediction) -> dict[str, Any]:
+        return {
+            "seconds": each.seconds, "rows_per_joint": each.rows, "told": one.told(each),
+            "torque_sigma_share": one.torque_share(each), "torque_sigma": each.torque.tolist(),
+        }  # fmt: skip
+
+    return {
+        "noise_share": one.share, "noise": one.noise.tolist(), "own": entry(one.own),
+        "by_period": [entry(each) for each in one.others],
+    }  # fmt: skip
+
+
+def write(one: Outlook, folder: Path) -> Path:
+    """Write the parameters' predicted sigmas as CSV; values and rsd [%] are left out where nobody knows the value."""
+    rows = []
+    for name, unit, value, sigma in zip(one.names, one.units, one.values, one.own.sigmas):
+        known = np.isfinite(value) and value != 0.0
+        rows.append((name, unit, float(value) if known else None, float(sigma), _percent(sigma, value, known)))
+    return files.write_table(folder / NAME, HEADER, rows)
+
+
+def _percent(sigma: float, value: float, known: bool) -> float | None:
+    return float(100.0 * sigma / abs(value)) if known else None
+
+
+def lines(one: Outlook) -> list[str]:
+    """Return the prediction in words: what this motion tells, and what other lengths would."""
+    own, c = one.own, len(one.names)
+    told = f"{one.told(own)} of {c} parameters to {TOLD:.0%} of their value, " if np.isfinite(one.values).all() else ""
+    result = [
+        f"predicted from {own.seconds:g} s, if {one.share:.2g} of the torque limits stays unexplained: {told}torques "
+        f"on a typical task to {100 * one.torque_share(own):.2g} % of the limits"
+    ]
+    if one.others:
+        numbers = " / ".join(f"{each.seconds:g}" for each in one.others)
+        shares = " / ".join(f"{100 * one.torque_share(each):.2g}" for each in one.others)
+        counts = " / ".join(f"{one.told(each)}" for each in one.others)
+        more = f", {counts} parameters told" if told else ""
+        result.append(
+            f"from {numbers} s (longer: the same again; shorter: designed quickly): torques to {shares} %{more}"
+        )
+    return result
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse, before any work is done, a folder without a prediction."""
+    if not (folder / NAME).is_file():
+        raise UsageError(f"{folder} holds no {NAME}: give the folder that calib excite wrote")
+
+
+def kept_promise(folder: Path, outcome: IdentificationOutcome) -> list[str]:
+    """Return lines that hold what an excitation's folder predicted against what an identification states.
+
+    Raises:
+        UsageError: where the folder holds no prediction, or one of other parameters.
+    """
+    limits = np.array([joint.effort for joint in outcome.inputs.chain.joints])
+    rms = next(iter(outcome.fit.values())).filtered.rms[-len(limits) :]  # the motors' rows come last
+    known = np.isfinite(limits).all() and len(rms) == len(limits) and np.isfinite(rms).all()
+    unexplained = float(np.sqrt(np.mean((rms / limits) ** 2))) if known else None
+    return compared(folder, outcome.found.names, outcome.found.fitted.estimate.sigma, unexplained)
+
+
+def compared(folder: Path, names: Sequence[str], sigmas: np.ndarray, unexplained: float | None = None) -> list[str]:
+    """Return lines that hold what an excitation predicted against what an identification states.
+
+    Args:
+        folder: that `calib excite` wrote.
+        names, sigmas: (b,) parameters of the estimate, and what it states of them.
+        unexplained: rms of its residuals as a share of the torque limits; None: not known.
+
+    Raises:
+        UsageError: where the folder holds no prediction, or one of other parameters.
+    """
+    stated = {name: float(sigma) for name, sigma in zip(names, sigmas) if sigma > 0}
+    try:
+        noise = float(json.loads((folder / METRICS).read_text(encoding="utf-8"))["prediction"]["noise_share"])
+        with (folder / NAME).open(encoding="utf-8", newline="") as file:
+            promised = {row["name"]: float(row["sigma"]) for row in csv.DictReader(file)}
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise UsageError(
+            f"{folder} holds no prediction: give the folder that calib excite wrote ({error!r})"
+        ) from error
+    common = [name for name in promised if name in stated]
+    if not common:
+        raise UsageError(f"{folder} predicts none of the {len(stated)} parameters identified: it is of another robot")
+    ratios = np.array([stated[name] / promised[name] for name in common])
+    low, middle, high = np.quantile(ratios, [0.1, 0.5, 0.9])
+    result = [
+        f"sigmas stated over those predicted, {len(common)} parameters: {middle:.2g} in the median, {low:.2g} to "
+        f"{high:.2g} for eight in ten"
+    ]
+    if unexplained is not None:
+        result.append(
+            f"{unexplained:.2g} of the torque limits stayed unexplained, {noise:.2g} was taken: with that known "
+            f"before, the median would have been {middle * noise / max(unexplained, 1e-12):.2g}"
+        )
+    return result

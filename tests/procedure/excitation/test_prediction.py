@@ -1,0 +1,92 @@
+"""What a motion is said to tell, before it is played: held against what an identification states afterwards."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.data.recordings.recording import Recording
+from calib.errors import UsageError
+from calib.identification.identify_options import IdentifyOptions
+from calib.procedure.dynamic_stage import identify, inputs
+from calib.procedure.excitation import design, prediction
+from calib.procedure.excitation import folder as motion_folder
+from calib.procedure.excitation.settings import ExcitationSettings
+
+SHORT = ExcitationSettings(
+    starts=1, evaluations=60, period=10.0, harmonics=4, rate=100.0, samples=100, repeat=2,
+    drives="Ia Fv Fc off",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def designed() -> design.Designed:
+    return design.excite("lwr4plus", SHORT)
+
+
+@pytest.fixture(scope="module")
+def motion(designed: design.Designed, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return motion_folder.write_design(designed, tmp_path_factory.mktemp("designed") / "e")
+
+
+@pytest.fixture(scope="module")
+def outcome(designed: design.Designed) -> identify.IdentificationOutcome:
+    """An identification of the motion, its torques as wrong in the band as was said: by white noise."""
+    run, model, outlook = designed.playback.run, designed.inputs.model, designed.outlook
+    assert outlook is not None and model.values is not None
+    band = outlook.own.rows / outlook.own.seconds / 2
+    noise = np.random.default_rng(0).normal(size=run.q.shape) * outlook.noise / np.sqrt(2 * band / run.rate)
+    names = model.exact.names
+    friction = [0.05 * outlook.limits[int(name[2]) - 1] if name[:2] in ("Fv", "Fc") else 0.0 for name in names]
+    tau = model.exact.regressor(run.q, run.v, run.a) @ (model.values + friction) + noise
+    log = Recording(run.times, run.q, tau, "torque", tuple(designed.inputs.chain.joint_names))
+    options = IdentifyOptions()
+    options = replace(options, settings=replace(options.settings, friction="standard", prior="none", method="wls"))
+    return identify.run(inputs.gather("lwr4plus", [log], options=options))
+
+
+def test_sigmas_stated_are_those_predicted_within_a_factor(motion, outcome):
+    with (motion / prediction.NAME).open() as file:
+        promised = {line.split(",")[0]: float(line.split(",")[3]) for line in file.readlines()[1:]}
+    found = outcome.found
+    ratios = [sigma / promised[name] for name, sigma in zip(found.names, found.fitted.estimate.sigma)]
+    assert 0.85 < np.median(ratios) < 1.2
+    assert np.quantile(ratios, 0.05) > 0.7 and np.quantile(ratios, 0.95) < 1.4
+    first, second = prediction.kept_promise(motion, outcome)
+    assert f"{len(found.names)} parameters: {np.median(ratios):.2g} in the median" in first
+    assert "0.01 was taken" in second
+
+
+def test_longer_motion_tells_more_and_the_figures_are_in_the_folder(designed, motion):
+    outlook = designed.outlook
+    shares = {round(one.seconds): outlook.torque_share(one) for one in outlook.others}
+    assert set(shares) >= {10, 20, 40} and shares[20] == pytest.approx(shares[10] / np.sqrt(2))
+    assert shares[20] == pytest.approx(outlook.torque_share(outlook.own))  # two periods of 10 s are run
+    stored = json.loads((motion / "metrics.json").read_text())["prediction"]
+    assert stored["own"]["torque_sigma_share"] == pytest.approx(shares[20])
+    assert [one["seconds"] for one in stored["by_period"]][-2:] == [20.0, 40.0]
+
+
+def test_sigmas_go_with_the_noise(designed):
+    more = prediction.foretell(
+        designed.inputs,
+        designed.problem,
+        designed.found,
+        SHORT.repeat,
+        0.03,
+        lambda period: designed.problem,
+        0,
+        SHORT.seed,
+    )
+    assert more.own.sigmas == pytest.approx(3 * designed.outlook.own.sigmas) and more.others == ()
+
+
+def test_a_folder_without_a_prediction_is_refused(motion, outcome, tmp_path):
+    with pytest.raises(UsageError, match=r"holds no prediction\.csv"):
+        prediction.check_folder(tmp_path)
+    with pytest.raises(UsageError, match="none of the 2 parameters identified"):
+        prediction.compared(motion, ["one", "two"], np.ones(2))
