@@ -236,7 +236,7 @@ def _richer_friction(
     loads = nothing if settings.friction in ("standard", "ripple") else [transmitted(plain, case) for case in cases]
     candidates = FrictionCandidates(
         cases, rows, loads, decimator, std, tau, np.array(per_joint(settings.v0, model.n, "v0")), model.prismatic,
-        None if prior is None else prior.rows,
+        None if prior is None else prior.rows, settings.apart,
     )  # fmt: skip
     return select_friction(candidates, settings.friction, progress), loads
 

@@ -71,6 +71,7 @@ class IdentificationSettings:
         loop: the closed loop that recordings came from, for instrumental variables.
         constraints: what parameters must satisfy, for the methods pc-*; None: their defaults.
         seed: for random states.
+        apart: joints, from 0, whose torque is in a unit of its own: no total holds them.
     """
 
     sets: tuple[str, ...] = ()
@@ -96,6 +97,7 @@ class IdentificationSettings:
     loop: LoopSettings | None = None
     constraints: ConstraintSettings | None = None
     seed: int = 0
+    apart: tuple[int, ...] = ()
 
 
 def make_model(chain: Chain, settings: IdentificationSettings) -> IdentificationModel:

@@ -82,6 +82,7 @@ class FrictionCandidates:
         std, inflation: (rows,) of the first fit's residuals.
         v0: (n,) smoothing of the Coulomb sign.
         linear: (n,) prismatic joints.
+        apart: rows in a unit of their own, which no total holds.
         prior: (k, b + 1) what is known of the base parameters (`calib.identification.prior`); None for nothing.
     """
 
@@ -94,6 +95,7 @@ class FrictionCandidates:
     v0: np.ndarray
     linear: np.ndarray
     prior: np.ndarray | None = None
+    apart: tuple[int, ...] = ()
 
     @property
     def n(self) -> int:
@@ -120,7 +122,7 @@ def select_friction(
     say("friction: standard")
     size = _sizes(candidates, validation)
     error = validation.errors(base)
-    steps = [_step("standard", len(base), error, size, tuple(range(candidates.n)))]
+    steps = [_step("standard", len(base), error, size, tuple(range(candidates.n)), candidates.apart)]
     taken: list[int] = []
     waiting = list(offered)
     for second in (False, True):
@@ -131,7 +133,8 @@ def select_friction(
             found, new, at = _try(validation, base, taken, columns, every, error, wanted != "auto")
             note = "" if at else "no better on unseen time: left out"
             shown = new if found else validation.errors(np.array([*base, *taken, *columns]))
-            steps.append(_step(f"+ {name}", len(base) + len(taken) + len(found or columns), shown, size, at, note))
+            count = len(base) + len(taken) + len(found or columns)
+            steps.append(_step(f"+ {name}", count, shown, size, at, candidates.apart, note))
             if found:
                 taken, error = [*taken, *found], new
             else:
@@ -257,9 +260,16 @@ def _sizes(candidates: FrictionCandidates, validation: CrossValidation) -> np.nd
 
 
 def _step(
-    name: str, parameters: int, error: np.ndarray, size: np.ndarray, at: tuple[int, ...], note: str = ""
+    name: str,
+    parameters: int,
+    error: np.ndarray,
+    size: np.ndarray,
+    at: tuple[int, ...],
+    apart: Sequence[int],
+    note: str = "",
 ) -> FrictionTrial:
     with np.errstate(divide="ignore", invalid="ignore"):
         joints = 100.0 * np.sqrt(error.sum(axis=0) / size)
-    total = float(100.0 * np.sqrt(error.sum() / size.sum()))
+    alike = np.setdiff1d(np.arange(len(size)), apart)
+    total = float(100.0 * np.sqrt(error[:, alike].sum() / size[alike].sum()))
     return FrictionTrial(name, parameters, total, tuple(float(x) for x in np.nan_to_num(joints)), at, note)

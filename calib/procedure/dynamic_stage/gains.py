@@ -137,6 +137,7 @@ def _relative(chain: Chain, options: IdentifyOptions, currents: Sequence[tuple[s
         "totals leave them out",
     )
     notes = (note, *(own if apart else ()), *_unsure(found))
+    options = replace(options, settings=replace(options.settings, apart=tuple(found.own)))
     return FoundGains(options, found.gains, found, f"A of joint {reference + 1}", notes)
 
 

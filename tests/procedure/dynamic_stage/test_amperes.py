@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import planted_motion as planted
 import pytest
 from without_figures import run
+
+from calib.identification.identify import identify
+from calib.identification.settings import IdentificationSettings
 
 GAINS = np.array([10.0, 12.0, 8.0])
 
@@ -119,3 +123,16 @@ def test_terms_the_ridge_switched_off_are_named_and_measured_ones_are_not():
 
     sigma = np.array([1e-12, 0.1, 1e-12, 0.02])
     assert switched_off(("ZZ1R", "Fc1", "Fs1", "Fs2"), 2, sigma) == ("Fs1",)
+
+
+def test_totals_of_the_friction_ladder_leave_out_joints_in_units_of_their_own() -> None:
+    """A joint in amperes of its own may have any size: no total changes with it, and that joint's own error stays."""
+    case = planted.case("train", 0, noise=0.05)
+    large = replace(case, target=case.target * np.array([1.0, 1.0, 1e3]))
+    settings = IdentificationSettings(friction="stribeck", essential="none", prior="none", apart=(2,))
+    apart = identify(planted.arm(), [large], settings).friction.steps
+    mixed = identify(planted.arm(), [large], replace(settings, apart=())).friction.steps
+    for own, together in zip(apart, mixed, strict=True):
+        assert own.joints == together.joints
+        assert min(own.joints[:2]) <= own.cross_validated <= max(own.joints[:2])
+        assert together.cross_validated == pytest.approx(together.joints[2], rel=0.01)

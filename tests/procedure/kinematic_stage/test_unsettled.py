@@ -1,0 +1,43 @@
+"""A placement of base and tool that did not settle is said, and not scored."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.geometry import fit as geometric_fit
+from calib.geometry.weighing import Settings
+from calib.procedure.kinematic_stage import fit, inputs
+from calib.procedure.kinematic_stage.settings import FitSettings
+from calib.procedure.kinematic_stage.validation import Arms, assess
+from calib.robot.calibrated import CalibratedChain
+from calib.robot.load import load
+from calib.simulation.cells.cell import SimulatedInstrument, measure
+from calib.simulation.cells.virtual_cells import perturbed_cell
+
+
+def test_a_placement_that_ran_out_of_steps_proves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The optimiser gets one linearisation for the file's own frames: what it leaves there means nothing."""
+    cell = perturbed_cell(load("ur10"), 0, SimulatedInstrument("6-D probe", 30e-6, 1e-4), hidden=0.3)
+    rng = np.random.default_rng(0)
+    seen, other = (measure(cell, rng.uniform(-2.0, 2.0, (count, 6)), count) for count in (40, 30))
+    wanted = FitSettings(model="offsets", refit_frames=True)
+    given = inputs.gather(
+        CalibratedChain(cell.nominal),
+        [replace(seen, file="seen.csv")],
+        [replace(other, file="other.csv")],
+        settings=wanted,
+    )
+    found = fit.run(given, wanted=wanted)
+    (name,) = found.validation
+    assert found.validation[name].settled and found.validation[name].proves and name in found.verdict.reason
+    monkeypatch.setattr(geometric_fit, "CRAWLS", 1)
+    chosen = found.selection
+    arms = Arms(chosen.nominal.cell, chosen.fit.cell, found.rigid.cell.chain, found.expected)
+    again = assess(arms, given, found.findings, Settings(limit=1), asked="offsets")
+    assert not again.validation[name].settled and not again.validation[name].proves
+    assert any(f"{name} is not scored: base and tool placement did not settle" in line for line in again.warnings)
+    assert name not in again.verdict.reason and "cross-validation" in again.verdict.reason
+    assert not any("95 % interval" in line for line in again.warnings)
