@@ -98,6 +98,18 @@ def check_target(out: Path, inputs: Iterable[str | Path | None], suffixes: Seque
     check_not_input([out], inputs)
 
 
+def check_targets(targets: Sequence[Path], inputs: Sequence[str | Path | None]) -> None:
+    """Refuse, before any work is done, files that cannot be written or are read (`check_target`), or are one file.
+
+    Raises:
+        UsageError: with the file concerned.
+    """
+    for number, target in enumerate(targets):
+        check_target(target, inputs)
+        if any(same_file(target, other) for other in targets[:number]):
+            raise UsageError(f"{target} is to be written twice; give each file a name of its own")
+
+
 def check_writable(folder: Path) -> None:
     """Refuse, before any work is done, a folder that cannot be written to, or made.
 

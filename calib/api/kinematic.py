@@ -57,15 +57,22 @@ class PoseSelection:
         return write_run(Path(path), self.chosen.run, self.chosen.chain)
 
     def plot(self) -> dict[str, Figure]:
-        """Return the figures by name: what fewer and more poses would tell of the tool; none for a camera."""
+        """Return the figures by name: sigma of the tool's position over the workspace, and by number of poses.
+
+        There are none where the poses do not tell all parameters.
+        """
+        from calib.procedure.report.geometry_figures import predicted_map
         from calib.procedure.report.uncertainty_figures import outlook_figure
 
         look = self.chosen.outlook
-        if look is None or not look.others or not np.isfinite(look.poses.rms):
+        if not np.isfinite(look.poses.rms):
             return {}
         curve = [(float(one.poses), 1e3 * one.rms) for one in look.others]
         own = (float(look.poses.poses), 1e3 * look.poses.rms)
-        return {"outlook": outlook_figure(curve, own, "poses", "σ of the tool's position [mm]")}
+        figures = {"predicted": predicted_map(look.poses.points, look.poses.spread)}
+        if curve:
+            figures["outlook"] = outlook_figure(curve, own, "poses", "σ of the tool's position [mm]")
+        return figures
 
     def to_dict(self) -> dict[str, Any]:
         """Return what the selection came to: index, its value, that of random sets, efficiency, seconds, notes."""

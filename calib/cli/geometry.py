@@ -113,9 +113,6 @@ def select(
         Path | None,
         typer.Option(help="CSV of the run: t, pose (0: via-point), joints; calib view rehearses it"),
     ] = None,
-    plot: Annotated[
-        Path | None, typer.Option(help="PNG: what fewer and more poses would tell of the tool's position")
-    ] = None,
     speed: Annotated[float, typer.Option(help="share of the joints' speeds that the run is driven at")] = 0.3,
     dwell: Annotated[float, typer.Option(help="seconds that each pose takes to settle and be measured")] = 6.0,
     candidates: Annotated[int, typer.Option(help="poses to choose from")] = 2000,
@@ -127,19 +124,22 @@ def select(
     base: Base = None,
     tip: Tip = None,
     seed: Seed = 0,
+    plots: Plots = True,
 ) -> None:
-    """Choose the poses at which the geometry of ROBOT shows best."""
-    from calib.api.kinematic import select_poses
-    from calib.files import check_target
-    from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
-    from calib.procedure.measuring.run import RunSettings
-    from calib.procedure.report.style import save
+    """Choose the poses at which the geometry of ROBOT shows best.
 
-    check_target(out, [robot, existing, constraints])
-    if run:
-        check_target(run, [robot, existing, constraints, out])
-    if plot:
-        check_target(plot, [robot, existing, constraints, out, run])
+    Beside OUT.csv, OUT_predicted.png shows how well the tool will be known over the workspace, and OUT_outlook.png what
+    fewer and more poses would tell.
+    """
+    from calib.api.kinematic import select_poses
+    from calib.files import check_targets
+    from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
+    from calib.procedure.measuring.constraints_file import beside
+    from calib.procedure.measuring.run import RunSettings
+
+    named = beside(constraints).values() if constraints else ()
+    drawn = {name: out.with_name(f"{out.stem}_{name}.png") for name in ("predicted", "outlook") if plots}
+    check_targets([out, *([run] if run else []), *drawn.values()], [robot, existing, constraints, *named])
     targets = tuple(tuple(numbers(text, 3, "--tool")) for text in tool or [])
     sigmas = None if sigma is None else numbers(sigma, 2, "--sigma")
     stated = None if sigmas is None else (sigmas[0], sigmas[1])
@@ -152,13 +152,18 @@ def select(
             robot, m, settings, constraints=constraints, existing=existing, base=base, tip=tip, workers=workers,
             progress=show,
         )  # fmt: skip
+        show("writing")
+        figures = chosen.plot() if plots else {}
     chosen.save(out)
     if run:
         chosen.save_run(run)
         say(f"the run: {run}; calib view {run} --robot {robot}")
-    for figure in chosen.plot().values() if plot else ():
-        save(figure, plot)
-        say(f"the curve: {plot}")
+    if figures:
+        from calib.procedure.report.style import save
+
+        for name, figure in figures.items():
+            save(figure, drawn[name])
+        say(f"drawn: {', '.join(str(drawn[name]) for name in figures)}")
     say(str(chosen))
     say(f"{m} poses written to {out}")
 

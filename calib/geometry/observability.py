@@ -52,6 +52,10 @@ class Observation:
                 rows.append(jacobian[:, 3:] / self.sigmas[1])
         return np.concatenate(rows, axis=1).transpose(2, 1, 0)
 
+    def position(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return where the first target is (m, 3) [m], and its Jacobian (m, 3, p), not whitened."""
+        return see(self.cell, q).point.T, self(q)[:, :3] * self.sigmas[0]
+
     def product(self, q: np.ndarray, G: np.ndarray) -> np.ndarray:
         """Return Σ G[i] · ∂J[i]/∂q (m, n) for weights G (m, rows, p) of the whitened Jacobian; exact."""
         chain, count = self.cell.chain, len(self.cell.chain.elements)

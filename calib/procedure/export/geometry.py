@@ -62,12 +62,10 @@ def without_corrections(folder: Path) -> str:
 
 def check_targets(folder: Path, source: Path | None, targets: Sequence[Path]) -> None:
     """Refuse, before any work is done, files that cannot be written, are read or are a result, or are one file."""
-    for number, target in enumerate(targets):
+    for target in targets:
         if source is not None and files.same_file(source, target):
             raise UsageError(f"{target} is the source URDF, which stays as it is; give another name to write to")
-        files.check_target(target, [source, *results(folder)])
-        if any(files.same_file(target, other) for other in targets[:number]):
-            raise UsageError(f"{target} is to be written twice; give each file a name of its own")
+    files.check_targets(targets, [source, *results(folder)])
 
 
 def results(folder: Path) -> list[Path]:

@@ -13,12 +13,12 @@ import numpy as np
 from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.plans import read_poses, write_poses
 from calib.errors import UsageError
-from calib.geometry.observability import Observation, observation, targets_of
+from calib.geometry.observability import observation, targets_of
 from calib.procedure.kinematic_stage.inputs import joint_kinds, load_robot
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
-from calib.procedure.measuring.camera_view import ImageObservation, Predicted, image_observation, predict
+from calib.procedure.measuring.camera_view import ASSUMED, image_observation
 from calib.procedure.measuring.pose_limits import Limits, read_limits
-from calib.procedure.measuring.prediction import Prediction, by_count
+from calib.procedure.measuring.prediction import Prediction, Seen, by_count
 from calib.procedure.measuring.prediction import predicted as foretold
 from calib.procedure.measuring.prediction import table as outlook_table
 from calib.procedure.measuring.run import Run, RunSettings, plan_run
@@ -32,7 +32,6 @@ from poses.select import SearchSettings, Selection, select_poses
 from poses.space import SearchSpace, is_feasible
 
 Progress = Callable[[int, int, str], None]
-EVERYWHERE = 600  # postures that accuracy is predicted at (our choice)
 VIEWS = 600  # postures that see a camera's board, to choose from (our choice)
 
 
@@ -67,7 +66,8 @@ class Chosen:
         existing: index of the poses measured before alone; None without them, or where they are too few.
         checked, unchecked: what the poses were held against, and what they could not be, in words.
         notes: what else a user should know.
-        outlook: what the poses will tell; None for a camera.
+        outlook: what the poses will tell.
+        by_images: whether the poses are those at which a camera sees its board.
         run, driven: the poses' order, in which `selection.q` is, and the ways between them; how they are driven.
     """
 
@@ -78,10 +78,10 @@ class Chosen:
     checked: tuple[str, ...]
     unchecked: tuple[str, ...]
     notes: tuple[str, ...]
-    outlook: Outlook | None
+    outlook: Outlook
     run: Run
     driven: RunSettings
-    predicted: Predicted | None = None
+    by_images: bool
 
 
 def choose(
@@ -145,21 +145,16 @@ def choose(
     candidates = _drawn(space, limits, settings) if joints is None else joints
     found = select_poses(None, m, search, q=candidates, space=space, existing=before, map=map, progress=progress)
     assert found.q is not None
-    outlook = predicted = None
-    if isinstance(jacobian, Observation):
-        comparable = float(found.history[0]) if method == "polish" else found.value
-        outlook = _outlook(jacobian, limits, search, m, found.q, candidates, before, comparable)
-    if isinstance(jacobian, ImageObservation):
-        everywhere = np.random.default_rng(settings.seed).uniform(limits.lower, limits.upper, (EVERYWHERE, chain.n))
-        predicted = predict(jacobian, found.q, everywhere)
-        notes.append(predicted.words)
+    comparable = float(found.history[0]) if method == "polish" else found.value
+    outlook = _outlook(jacobian, limits, search, m, found.q, candidates, before, comparable)
+    notes += [] if view is None else [ASSUMED]
     q = same_turn(chain, found.q, limits.lower, limits.upper)
     run = plan_run(chain, q, limits, settings.run, settings.seed, lambda words: progress and progress(0, 1, words))
     indices = None if found.indices is None else found.indices[run.order]
     found = replace(found, q=q[run.order], indices=indices)
     return Chosen(
         chain, found, len(jacobian.free), value, limits.checked, limits.unchecked, tuple(notes), outlook, run,
-        settings.run, predicted,
+        settings.run, view is not None,
     )  # fmt: skip
 
 
@@ -178,7 +173,7 @@ def _drawn(space: SearchSpace, limits: Limits, settings: SelectionSettings) -> n
 
 
 def _outlook(
-    seen: Observation,
+    seen: Seen,
     limits: Limits,
     search: SearchSettings,
     m: int,
@@ -197,7 +192,7 @@ def _outlook(
     return Outlook(foretold(seen, np.concatenate([rows, past]), typical, m), others, blind, comparable)
 
 
-def typical_poses(limits: Limits, seen: Observation, seed: int) -> np.ndarray:
+def typical_poses(limits: Limits, seen: Seen, seed: int) -> np.ndarray:
     """Return poses (s, n) all over the workspace, seen or not, at which the tool's sigma is told."""
     free = limits.space(seen, sight=False)
     stream = np.random.default_rng([seed, 2])
@@ -205,7 +200,7 @@ def typical_poses(limits: Limits, seen: Observation, seed: int) -> np.ndarray:
 
 
 def _blind(
-    seen: Observation, free: SearchSpace, typical: np.ndarray, search: SearchSettings, m: int, past: np.ndarray
+    seen: Seen, free: SearchSpace, typical: np.ndarray, search: SearchSettings, m: int, past: np.ndarray
 ) -> tuple[float, Prediction]:
     """Return the index that would be reached if every pose were seen, by the same choice, and what would be known."""
     quick = replace(search, method="detmax", climbs=0)
@@ -270,7 +265,7 @@ def record(chosen: Chosen) -> dict[str, Any]:
         "efficiency": found.efficiency,
         "efficiency_covers": bound_words(found),
         "seconds": found.seconds,
-        "tool_sigma": None if chosen.outlook is None else chosen.outlook.poses.rms,
+        "tool_sigma": chosen.outlook.poses.rms if np.isfinite(chosen.outlook.poses.rms) else None,
         "run_seconds": chosen.run.seconds,
         "checked": list(chosen.checked),
         "unchecked": list(chosen.unchecked),
@@ -299,8 +294,6 @@ def table(chosen: Chosen) -> list[tuple[str, str]]:
 
 def promised(chosen: Chosen) -> list[tuple[str, str]]:
     """Return what the poses will tell, and what it costs that the instrument has to see them where that is asked."""
-    if chosen.outlook is None:
-        return []
     rows = outlook_table(chosen.outlook.poses, chosen.outlook.others)
     if chosen.outlook.blind is None:
         return rows

@@ -25,16 +25,19 @@ from calib.geometry.images.image_noise import ImageNoise
 from calib.geometry.images.optics import BoardShape, Optics
 from calib.geometry.installation import Installation, see
 from calib.geometry.inverse import Goal, reach, seen_at
-from calib.geometry.observation import observe, prepare
+from calib.geometry.observation import observe, prepare, target_jacobian
 from calib.geometry.parameters import layout
 from calib.geometry.pixel_residuals import PixelPart
-from calib.geometry.uncertainty.spread import pose_sigmas
 from calib.robot.chain import Chain
 from calib.robot.tables import placement
 from calib.transforms import invert, pose
 from poses.space import PoseConstraint
 
 CORNER, DISPLACEMENT, TURN = 0.05, 2e-5, 2e-5  # noise that a pose is judged by [px], [m], [rad]; our choice
+ASSUMED = (
+    f"σ is predicted for corners of {CORNER:g} px and an arm that repeats to {1e3 * DISPLACEMENT:g} mm and "
+    f"{1e3 * TURN:g} mrad per axis; what no model holds comes on top"
+)
 TRIES = 60
 Angle = Annotated[float, Real(above=0, quantity="angle")]
 Distance = Annotated[float, Real(least=0, quantity="length")]
@@ -158,6 +161,17 @@ class ImageObservation:
         """Whether orientations are seen."""
         return True
 
+    @property
+    def cell(self) -> Installation:
+        """The arm with camera and board."""
+        return self.view.cell
+
+    def position(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return where what the arm carries is in its base (m, 3) [m], and its Jacobian (m, 3, p), not whitened."""
+        seen = see(self.cell, q, -1)
+        columns = target_jacobian(self.cell, seen, self.free, -1, np.zeros(len(q), dtype=int))
+        return seen.point.T, columns[:, :3].transpose(2, 1, 0)
+
     def __call__(self, q: np.ndarray) -> np.ndarray:
         part = _part(self.view, q, self.free)
         noise = ImageNoise(1.0, DISPLACEMENT, TURN, np.ones(len(q)))
@@ -225,32 +239,3 @@ def camera_view(stated: CameraTable, chain: Chain, where: str, folder: Path) -> 
     optics = Optics((lens,), ("camera",), (BoardShape(),), ("board",), free)
     cell = Installation(chain, invert(stands)[None], carried[None], names[:1], names[1:], optics=optics)
     return CameraView(cell, board, stated.mounting, stated.tilt, stated.range, stated.margin)
-
-
-@dataclass(frozen=True, eq=False)
-class Predicted:
-    """How well the arm will be known: where the tool is in its base (m, 3) [m], and sigma there (m,) [m]."""
-
-    points: np.ndarray
-    sigma: np.ndarray
-
-    @property
-    def words(self) -> str:
-        """The prediction in a sentence."""
-        rms, most = (1e3 * float(value) for value in (np.sqrt(np.mean(self.sigma**2)), np.quantile(self.sigma, 0.95)))
-        return (
-            f"predicted before measuring: these images tell the tool's position to {rms:.3f} mm rms over the joint "
-            f"range ({most:.3f} mm at 95 %), for corners of {CORNER:g} px and an arm that repeats to "
-            f"{1e3 * DISPLACEMENT:g} mm and {1e3 * TURN:g} mrad per axis; what no model holds comes on top"
-        )
-
-
-def predict(seen: ImageObservation, q: np.ndarray, everywhere: np.ndarray) -> Predicted:
-    """Return what images at q (m, n) will tell of the tool at postures all over (k, n) [rad or m]."""
-    rows = seen(q).reshape(-1, len(seen.free))
-    size = np.linalg.norm(rows, axis=0) + 1e-300
-    factor = np.asarray(np.linalg.qr(rows / size, mode="r"))
-    covariance = np.linalg.pinv(factor.T @ factor, rcond=1e-12, hermitian=True) / np.outer(size, size)
-    cell = seen.view.cell
-    sigma = pose_sigmas(cell, everywhere, seen.free, covariance, station=-1)[:, 0]
-    return Predicted(see(cell, everywhere, -1).point.T, sigma)

@@ -54,6 +54,7 @@ class Limits:
         clearance: the least distance it asks for [m].
         sight: lines of sight; None where nothing is asked.
         camera: the view of a camera, where that is the instrument.
+        views: what it takes to be seen by it.
         checked: what is kept, in words.
         unchecked: what cannot be, since nobody has stated it, in words.
         notes: what else a user should know.
@@ -69,15 +70,16 @@ class Limits:
     checked: tuple[str, ...] = ()
     unchecked: tuple[str, ...] = ()
     camera: CameraView | None = None
+    views: tuple[PoseConstraint, ...] = ()
 
     def space(self, seen: Observation | ImageObservation, sight: bool = True) -> SearchSpace:
         """Return the continuous problem of choosing poses by what an instrument would see.
 
         Args:
             seen: all targets' rows.
-            sight: False leaves the lines of sight out, to tell what they cost.
+            sight: False leaves out what it takes to be seen, to tell what that costs.
         """
-        looked = self.sight.constraints() if self.sight is not None and sight else ()
+        looked = (*self.views, *(self.sight.constraints() if self.sight is not None else ())) if sight else ()
         kept, rows = (*self.constraints, *looked), seen  # what is quick to tell, and excludes most, comes first
         if self.collision is not None and self.collision.pairs:
             slope = partial(_closing, self.collision)
@@ -137,7 +139,7 @@ def _with_camera(limits: Limits, stated: CameraTable, cell: Installation, path: 
     words = "the whole board in the camera's view, its range and its tilt"
     past = ("view past the arm",) if sight is not None else ()
     return replace(
-        limits, constraints=(*limits.constraints, *found), camera=view, unchecked=unchecked,
+        limits, views=found, camera=view, unchecked=unchecked,
         checked=(*limits.checked, words, *past),
     )  # fmt: skip
 

@@ -14,11 +14,13 @@ from numpy.typing import ArrayLike
 
 from calib.geometry.observability import Observation
 from calib.geometry.parameters import layout
+from calib.procedure.measuring.camera_view import ImageObservation
 from poses.design import Pool
 from poses.errors import NotIdentifiable, TooFewCandidates
 from poses.exchange import greedy
 from poses.information import prepared
 
+Seen = Observation | ImageObservation
 COUNTS = (10, 20, 40, 80)
 WORST = 0.95
 
@@ -29,20 +31,30 @@ class Prediction:
 
     Attributes:
         poses: m.
-        rms, worst: sigma of the tool's position [m] over typical poses: rms, and what 95 % of them stay below; infinite
+        points, spread: (s, 3), (s,) where the tool is at typical poses, and sigma of its position there [m]; infinite
             where the poses do not tell all parameters.
         names, units, sigmas: (p,) of the parameters [m, rad].
     """
 
     poses: int
-    rms: float
-    worst: float
+    points: np.ndarray
+    spread: np.ndarray
     names: tuple[str, ...]
     units: tuple[str, ...]
     sigmas: np.ndarray
 
+    @property
+    def rms(self) -> float:
+        """Over typical poses [m]."""
+        return float(np.sqrt(np.mean(self.spread**2)))
 
-def predicted(seen: Observation, jacobians: np.ndarray, typical: np.ndarray, poses: int | None = None) -> Prediction:
+    @property
+    def worst(self) -> float:
+        """What 95 % of typical poses stay below [m]."""
+        return float(np.quantile(self.spread, WORST)) if np.isfinite(self.spread).all() else float("inf")
+
+
+def predicted(seen: Seen, jacobians: np.ndarray, typical: np.ndarray, poses: int | None = None) -> Prediction:
     """Return what measurements with Jacobians (m, rows, p) will know of a tool at typical poses (s, n).
 
     Args:
@@ -58,16 +70,16 @@ def predicted(seen: Observation, jacobians: np.ndarray, typical: np.ndarray, pos
     count = len(jacobians) if poses is None else poses
     told = len(rows) >= rows.shape[1] and len(s) == rows.shape[1] and s[-1] > 1e-9 * s[0]
     root = (vt.T / s) / scale[:, None] if told else np.full((rows.shape[1], 1), np.inf)
-    position = seen(typical)[:, :3] * seen.sigmas[0]
-    spread = np.sqrt(((position @ root) ** 2).sum((1, 2))) if told else np.array([np.inf])
+    points, slopes = seen.position(typical)
+    spread = np.sqrt(((slopes @ root) ** 2).sum((1, 2))) if told else np.full(len(typical), np.inf)
     return Prediction(
-        count, float(np.sqrt(np.mean(spread**2))), float(np.quantile(spread, WORST)) if told else float("inf"),
-        tuple(names[k] for k in seen.free), tuple(units[k] for k in seen.free), np.linalg.norm(root, axis=1),
+        count, points, spread, tuple(names[k] for k in seen.free), tuple(units[k] for k in seen.free),
+        np.linalg.norm(root, axis=1),
     )  # fmt: skip
 
 
 def by_count(
-    seen: Observation,
+    seen: Seen,
     candidates: np.ndarray,
     typical: np.ndarray,
     before: np.ndarray | None = None,

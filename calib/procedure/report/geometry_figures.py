@@ -175,6 +175,11 @@ def error_map(
     return figure
 
 
+def predicted_map(points: np.ndarray, sigma: np.ndarray) -> Figure:
+    """Draw where in the workspace (m, 3) [m] the tool will be known how well (m,) [m], before anything is measured."""
+    return error_map(points, sigma, words="predicted σ up to {}")
+
+
 def image_coverage(size: tuple[int, int], count: np.ndarray, rms: np.ndarray) -> Figure:
     """Draw where in its images a camera saw corners, and their reprojection error; where none was seen stays white.
 

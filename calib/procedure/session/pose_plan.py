@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from calib import files
 from calib.data.poses.pixels import Pixels
 from calib.dynamics.gravity import gravity_torques
 from calib.geometry.observability import SIGMA_ORIENTATION, observation, targets_of
@@ -54,7 +53,7 @@ def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], N
         robot_file, wanted.fit, choice, constraints=constraints, base=links[0], tip=links[1],
         progress=lambda done, total, what: say(f"choosing poses: {what}"),
     )  # fmt: skip
-    if instrument.measures == Pixels.kind and chosen.predicted is None:
+    if instrument.measures == Pixels.kind and not chosen.by_images:
         chosen = replace(chosen, unchecked=(*chosen.unchecked, BLIND))
     found = chosen.selection
     assert found.q is not None
@@ -66,12 +65,12 @@ def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], N
         f"random sets, {100 * found.efficiency:.1f} % of the convex bound ({selection.bound_words(found)})"
     )
     record = {"words": words, **selection.record(chosen), "seed": settings.seed}
-    if chosen.predicted is not None and session.plots:
-        from calib.procedure.report.geometry_figures import error_map
-        from calib.procedure.report.style import png
+    promised = chosen.outlook.poses
+    if session.plots and np.isfinite(promised.rms):
+        from calib.procedure.report.geometry_figures import predicted_map
+        from calib.procedure.report.style import save
 
-        figure = error_map(chosen.predicted.points, chosen.predicted.sigma, words="sigma up to {}")
-        files.write(session.path(PREDICTED), png(figure))
+        save(predicted_map(promised.points, promised.spread), session.path(PREDICTED))
     unseen = _unseen(session, robot_file, chain, wanted.validation)
     kept = (*selection.kept(chosen), *(f"{words}: {number}" for words, number in selection.promised(chosen)))
     return Plan(found.q, unseen, words, kept, record, chosen.run)
@@ -114,14 +113,16 @@ def kept_promise(session: Session, robot_file: Any, chain: Chain) -> str:
         return ""
     promised = json.loads(path.read_text()).get("tool_sigma")
     instrument, name = session.settings.instrument, session.settings.poses.constraints
-    if promised is None or seen_as(instrument.measures) != instrument.measures:
+    if promised is None:
         return ""
-    cell = targets_of(chain, [instrument.tool])
+    cell, by_images = targets_of(chain, [instrument.tool]), instrument.measures == Pixels.kind
     limits = read_limits(session.path(name) if name else None, cell, robot_file)
-    q = selection.typical_poses(limits, observation(cell, instrument.measures), session.settings.seed)
+    if by_images and limits.camera is None:
+        return ""
+    q = selection.typical_poses(limits, observation(cell, seen_as(instrument.measures)), session.settings.seed)
     found = compensation.read(session.fit.path)
     torque = gravity_torques(found.cell.chain, q) if chain.inertias is not None else None
-    stated = pose_sigmas(found.cell, q, found.free, found.covariance, torque)[:, 0]
+    stated = pose_sigmas(found.cell, q, found.free, found.covariance, torque, -1 if by_images else 0)[:, 0]
     rms = float(np.sqrt(np.mean(stated**2)))
     return (
         f"σ of the tool's position: {1e3 * promised:.3g} mm rms were predicted when the poses were chosen, the fit "

@@ -68,6 +68,8 @@ def test_chosen_poses_see_the_board_and_tell_what_images_tell(cell, tmp_path):
     assert chosen.parameters == 42  # 34 of the arm with both placements, 8 of the lens
     assert chosen.selection.value > 1.05 * chosen.selection.random_baseline
     assert (limits.camera(chosen.selection.q) <= 1e-8).all()
+    others = chosen.outlook.others
+    assert [one.poses for one in others] == [10, 20, 40, 80] and np.all(np.diff([one.rms for one in others]) < 0.0)
 
 
 @pytest.mark.slow
@@ -145,20 +147,21 @@ def test_the_prediction_is_what_a_fit_then_states(cell):
     from calib.geometry.images.camera_guess import complete_camera
     from calib.geometry.parameters import layout
     from calib.geometry.uncertainty.spread import pose_sigmas
-    from calib.procedure.measuring.camera_view import predict
+    from calib.procedure.measuring.prediction import predicted as foretold
     from calib.robot.chain import random_joints
 
     with camera_files.limits_of(cell) as path:
         limits = read_limits(path, targets_of(cell.cell.nominal))
     q, everywhere = camera.views(cell, 40, 5), random_joints(cell.cell.nominal, 200, 1)
-    predicted = predict(image_observation(limits.camera, limits.lower, limits.upper), q, everywhere)
+    seen = image_observation(limits.camera, limits.lower, limits.upper)
+    predicted = foretold(seen, seen(q), everywhere)
     block = complete_camera(cell.cell.nominal, camera.photograph(cell, q, 0.05, 5))
     start = install(cell.cell.nominal, [block])
     table = layout(start)
     found = fit(start, [block], np.concatenate([table.arm_index, table.frame_index]))
     stated = pose_sigmas(found.cell, everywhere, found.free, found.estimate.covariance, station=-1)[:, 0]
-    assert 0.4 < np.median(stated / predicted.sigma) < 2.5  # the noise of the arm is our choice there
-    assert np.corrcoef(np.log(stated), np.log(predicted.sigma))[0, 1] > 0.5
+    assert 0.4 < np.median(stated / predicted.spread) < 2.5  # the noise of the arm is our choice there
+    assert np.corrcoef(np.log(stated), np.log(predicted.spread))[0, 1] > 0.5
 
 
 @pytest.mark.slow

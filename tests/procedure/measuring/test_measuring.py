@@ -10,6 +10,7 @@ import pytest
 from differences import check
 
 import calib
+from calib.cli import run
 from calib.geometry.observability import observation, targets_of
 from calib.procedure.measuring.constraints_file import ConstraintsFile
 from calib.procedure.measuring.pose_limits import Limits, limits_of, read_limits
@@ -110,6 +111,18 @@ def test_the_cell_as_told_becomes_tables():
 def test_answers_that_cannot_be(answers, words):
     with pytest.raises(calib.CalibError, match=words.replace("|", r"\|")):
         cell_tables(**answers)
+
+
+def test_a_selection_is_drawn_beside_its_poses_never_onto_what_is_read(tmp_path, capsys):
+    given = ["select", "lwr4plus", "-m", "12", "--candidates", "150", "--out"]
+    assert run([*given, str(tmp_path / "a.csv")]) == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"a.csv", "a_predicted.png", "a_outlook.png"}
+    assert run([*given, str(tmp_path / "b.csv"), "--no-plots"]) == 0 and not (tmp_path / "b_predicted.png").exists()
+    (tmp_path / "a.csv").rename(tmp_path / "c_outlook.png")
+    assert run([*given, str(tmp_path / "c.csv"), "--existing", str(tmp_path / "c_outlook.png")]) == 2
+    assert "c_outlook.png is read" in capsys.readouterr().err
+    assert run([*given, str(tmp_path / "d.csv"), "--run", str(tmp_path / "d.csv")]) == 2
+    assert "written twice" in capsys.readouterr().err and not (tmp_path / "d.csv").exists()
 
 
 def test_what_is_unknown_is_named_and_what_is_not_there_is_not():
