@@ -1,12 +1,13 @@
-"""How the errors that a fit states hold on real recordings: one row per recording and split.
+"""How the errors that fits and identifications state hold: one row per recording and split, and simulated parameters.
 
-CALIB_DATA=... python examples/interval_coverage.py
+CALIB_DATA=... python examples/interval_coverage.py [torques] [parameters] [positions]
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,8 +17,17 @@ import calib
 from calib.api.kinematic import GeometryFit
 from calib.data.poses.measurements import take
 from calib.geometry.model_choice.folds import region_folds
+from calib.identification.identify import Identification
+from calib.identification.identify_options import parse_options
 from calib.procedure.kinematic_stage.inputs import gather
 from calib.procedure.kinematic_stage.settings import FitSettings
+from calib.robot.calibrated import as_calibrated
+from calib.robot.chain import sampling_limits
+from calib.simulation.cells.truth import true_base
+from calib.simulation.cells.unmodelled import TorqueErrors
+from calib.simulation.cells.virtual_arm import MovingArm, moving_arm, record
+from calib.simulation.cells.virtual_cells import virtual_cell
+from calib.simulation.loop.references import random_fourier
 
 DATA = Path(os.environ.get("CALIB_DATA", "data"))
 UR10, UR5, MOTOMAN = DATA / "ur10_ipa", DATA / "ur5_gts3800", DATA / "motoman_leica"
@@ -31,7 +41,34 @@ RECORDINGS = {
 STATIONS = (
     ("UR10 A", "UR10 B"), ("UR10 B", "UR10 A"), ("Motoman small", "Motoman wide"), ("Motoman wide", "Motoman small"),
 )  # fmt: skip
+SECONDS, RATE, SEEDS = 20.0, 1000.0, 50
 REGION_SEED = 7  # regions that are none of the fit's own folds
+
+
+PANDA, LWR = "franka_panda_inria/traj1_first60pct.npz", "kuka_lwr4plus_iit/measurements_1.npz"
+TX40, TIAGO = "staubli_tx40/tx40_first_5p4s.npz", "tiago_laas/dynamic.npz"
+KR300 = ("kuka_kr300_tuk/traj_A.npz", "kuka_kr300_tuk/traj_B.npz")
+UR10E = {harmonics: f"ur10e_innopolis/ur-20_02_{name}.npz" for harmonics, name in (
+    (8, "05-20sec_8harm"), (12, "10-30sec_12harm"), (14, "19_14harm50sec"),
+)}  # fmt: skip
+GAINS = {"gains": [14.87, 13.26, 11.13, 10.62, 11.03, 11.47]}
+WRIST = {"coupling": [{"joints": [5, 6], "label": "6"}]}
+MOTIONS = (
+    ("Panda, first 9.4 s", f"{PANDA}@0:9.387", f"{PANDA}@9.387:", {}),
+    ("Panda, first 4 s", f"{PANDA}@0:4", f"{PANDA}@4:", {}),
+    ("Panda, first 1 s", f"{PANDA}@0:1", f"{PANDA}@4:", {}),
+    ("Panda, last 8.8 s", f"{PANDA}@3.13:", f"{PANDA}@0:3.13", {}),
+    ("UR10e, 12 harmonics", UR10E[12], UR10E[14], GAINS),
+    ("UR10e, 8 harmonics", UR10E[8], UR10E[14], GAINS),
+    ("UR10e, 8 harmonics", UR10E[8], UR10E[12], GAINS),
+    ("UR10e, 4 s of 12 harmonics", f"{UR10E[12]}@8:12", UR10E[14], GAINS),
+    ("TX40, first 4 s", f"{TX40}@0:4", f"{TX40}@4:", WRIST),
+    ("TX40, first 2.7 s", f"{TX40}@0:2.7", f"{TX40}@2.7:", WRIST),
+    ("KR300 A", *KR300, {}),
+    ("KR300 B", *KR300[::-1], {}),
+    ("TIAGo, first 50 s", f"{TIAGO}@0:50", f"{TIAGO}@50:", {}),
+    ("LWR4+, first half", f"{LWR}@2.5:8.75", f"{LWR}@8.75:15", {}),
+)
 
 
 def row(name: str, split: str, fits: list[GeometryFit]) -> str:
@@ -57,7 +94,23 @@ def regions(robot: Path, file: Path) -> Iterator[GeometryFit]:
         yield calib.fit_geometry(robot, take(block, np.flatnonzero(~inside)), FitSettings(), validate=left_out)
 
 
-def main() -> None:
+def torque_row(name: str, train: str, unseen: str, options: dict) -> str:
+    """Return a row of the torques' table: intervals on motion that the identification has not seen."""
+    robot = (DATA / train).parent / "model.urdf"
+    model = calib.identify_dynamics(
+        robot, str(DATA / train), validate=str(DATA / unseen), options=parse_options(options)
+    )
+    ((case, found),) = model.outcome.assessment.intervals.items()
+    joints = 100.0 * found.joints
+    return (
+        f"| {name} | {Path(unseen).name} | {model.outcome.validation[case].raw.total:.1f} % | "
+        f"{100 * found.covered:.1f} % | {joints.min():.0f}–{joints.max():.0f} % | "
+        f"{' '.join(f'{one:.2g}' for one in found.median)} | {100 * found.beyond.mean():.0f} % |"
+    )
+
+
+def positions() -> None:
+    """Print the table of positions."""
     print("| recording | split | unseen rows | rms [mm] | within 95 % interval | median interval [mm] | extrapolated |")
     print("|---|---|---|---|---|---|---|", flush=True)
     for name, (robot, file, share) in RECORDINGS.items():
@@ -68,6 +121,59 @@ def main() -> None:
         robot, file, _ = RECORDINGS[one]
         fit = calib.fit_geometry(robot, file, FitSettings(refit_frames=True), validate=RECORDINGS[other][1])
         print(row(one, f"→ {other}", [fit]), flush=True)
+
+
+def torques() -> None:
+    """Print the table of torques."""
+    print("| learnt from | unseen motion | unexplained | within 95 % | by joint | median ± by joint | extrapolated |")
+    print("|---|---|---|---|---|---|---|", flush=True)
+    for motion in MOTIONS:
+        print(torque_row(*motion), flush=True)
+
+
+def identified(arm: MovingArm, seeds: Sequence[int]) -> Identification:
+    """Return the identification of a simulated arm from random motions of 20 s, on its true geometry."""
+    lower, upper = sampling_limits(arm.chain)
+    speed = np.array([joint.velocity for joint in arm.chain.joints])
+    logs = []
+    for seed in seeds:
+        motion = random_fourier(0.8 * lower, 0.8 * upper, 0.8 * speed, SECONDS, RATE, seed=seed)
+        logs.append(replace(record(arm, motion, seed), file=f"motion {seed}"))
+    model = calib.identify_dynamics(as_calibrated(arm.chain), logs, options=parse_options({"rows": "both"}))
+    return model.outcome.found
+
+
+def parameters(seeds: int = SEEDS) -> None:
+    """Print the share of identified parameters within 1.96 sigma of two truths, over seeds of motion and noise.
+
+    The arm's own value, and the one that the model takes on eight other motions together: where the arm does what no
+    parameter holds, its parameters stand for that, too.
+    """
+    print("| simulated LWR4+ | of the arm's own values | of those from 8 other motions | identifications |")
+    print("|---|---|---|---|", flush=True)
+    cell = virtual_cell("lwr4plus")
+    for name, beyond in (("model exact", TorqueErrors()), ("effects that no parameter holds", None)):
+        arm = moving_arm(cell, "lwr4plus", unmodelled=beyond)
+        rich = identified(arm, range(1000, 1008))
+        other, inside = dict(zip(rich.names, rich.fitted.estimate.values)), []
+        for seed in range(seeds):
+            found = identified(arm, [seed])
+            estimate, true = found.fitted.estimate, true_base(found.dynamics.model, cell, arm, 0)
+            for known, value, sigma in zip(found.names, estimate.values, estimate.sigma):
+                if (own := known.removesuffix("R")) in true and known in other and sigma > 1e-9:
+                    inside.append([abs(value - one) < 1.96 * sigma for one in (true[own], other[known])])
+        shares = 100.0 * np.mean(inside, axis=0)
+        print(f"| {name} | {shares[0]:.1f} % | {shares[1]:.1f} % | {seeds} |", flush=True)
+
+
+def main() -> None:
+    wanted = sys.argv[1:] or ["torques", "parameters", "positions"]
+    if "torques" in wanted:
+        torques()
+    if "parameters" in wanted:
+        parameters()
+    if "positions" in wanted:
+        positions()
 
 
 if __name__ == "__main__":
