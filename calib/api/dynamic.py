@@ -13,6 +13,7 @@ from calib.api.reading import listed, optional
 from calib.api.rendering import as_text, data_frame
 from calib.arguments import checked
 from calib.data.recordings.recording import Recording
+from calib.errors import UsageError
 from calib.estimation.estimate import Estimate
 from calib.identification.identify_options import IdentifyOptions, read_options
 from calib.procedure.dynamic_stage import folder, identify, inputs
@@ -55,7 +56,20 @@ class DynamicsModel:
     def torques(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the torques (N, rows) [N m or N] of a motion q, v, a (N, n) [rad or m, and per s, s²]."""
         dynamics = self.outcome.found.dynamics
-        return dynamics.model.regressor(q, v, a) @ dynamics.values
+        return dynamics.model.torque(dynamics.values, *(np.asarray(x, dtype=float) for x in (q, v, a)))
+
+    def torque_sigma(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        """Return the standard deviations (N, rows) [N m or N] of the errors of `torques`: 1.96 of them hold 95 %.
+
+        They are those of recorded torques, with what of them no model in the band explains.
+
+        Raises:
+            UsageError: for a model of too short a recording to learn errors from.
+        """
+        expected = self.outcome.findings.errors
+        if expected is None:
+            raise UsageError("too little was recorded to say what errors the torques have: record longer")
+        return expected.sigma(self.outcome.found.dynamics, *(np.asarray(x, dtype=float) for x in (q, v, a)))
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write the folder that `calib identify --out` writes."""

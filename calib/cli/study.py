@@ -82,12 +82,14 @@ def compare(
     if out is not None:
         files.check_target(out, [robot, *recordings, *(validate or []), options], (".csv",))
     chosen = _names(methods)
-    with reporting() as (_, progress):
+    with reporting() as (say_now, progress):
         given = inputs.gather(
             robot, recordings, validate or (), options=read_options(options), base=base, tip=tip, seed=seed,
             friction=friction, progress=progress,
         )  # fmt: skip
-        found = compare_methods(given, chosen, friction, progress)
+        found = compare_methods(
+            given, chosen, friction, progress, lambda one: say_now(method_table.line(one))
+        )  # fmt: skip
     say(*console.rendered(method_table.blocks(found)))
     if out is not None:
         say(f"written to {write_table(found, out)}")

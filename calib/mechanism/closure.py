@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from calib.arrays import frozen, shaped
 from calib.errors import CalibError, RobotError
 from calib.mechanism.leg_links import LegLinks, Posture, leg_links, pseudo_inverse, times
-from calib.mechanism.parallel_robot import COORDINATES, ParallelRobot
+from calib.mechanism.parallel_robot import COORDINATES, Leg, ParallelRobot
 
 CLOSED = 1e-10  # gap and step [m or rad] below which a loop is closed
 STRIDE = 0.25  # of a reading or coordinate between two solutions on the way from home [rad or m] (our choice)
@@ -88,9 +88,7 @@ def closed(robot: ParallelRobot) -> ClosedRobot:
                 f"{1e3 * apart:.3g} mm (or mrad) from its attachment; look at its home, base, attachment and lengths"
             )
         if (rcond := float(_leg_rcond(one, one)[0])) < SINGULAR:
-            raise RobotError(
-                f"robot '{robot.name}': {leg.name} is singular at home (stretched or folded): rcond {rcond:.1g}"
-            )
+            raise RobotError(f"robot '{robot.name}': {leg.name} {_why_singular(robot, start, leg)}: rcond {rcond:.1g}")
     minors = tuple(_best_rows(one.jacobian[0]) for one in links)
     fixed = _check_freedom(robot, start, links)
     opened = ClosedRobot(robot, start, minors, np.zeros(len(links) + 1), fixed)
@@ -100,6 +98,18 @@ def closed(robot: ParallelRobot) -> ClosedRobot:
             f"robot '{robot.name}': home is singular (type 2): locked actuators do not hold it, rcond {rcond:.1g}"
         )
     return ClosedRobot(robot, start, minors, frozen(_determinants(opened, links)[0]), fixed)
+
+
+def _why_singular(robot: ParallelRobot, home: Posture, leg: Leg) -> str:
+    """Say whether a leg is singular at home alone, or wherever its joints are."""
+    rng, k = np.random.default_rng(0), robot.legs.index(leg)
+    elsewhere = [Posture(home.q + rng.uniform(-1.0, 1.0, home.q.shape), home.pose) for _ in range(4)]
+    if all(float(_leg_rcond(one, one)[0]) < SINGULAR for one in (leg_links(robot, own)[k] for own in elsewhere)):
+        return (
+            f"is singular wherever its joints are: they do not move its {leg.end} end in {leg.chain.n} independent "
+            "ways (parallel axes behind a spherical end?)"
+        )
+    return "is singular at home (stretched or folded)"
 
 
 def locate(known: ClosedRobot, readings: np.ndarray, near: Posture | None = None) -> Posture:

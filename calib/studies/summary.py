@@ -6,7 +6,8 @@ data set go together and their distributions have long tails.
 
 The rule: of the methods that give an estimate in at least `RELIABLE` of the trials, those whose torque error on unseen
 motion is not told from the best one's (`LEVEL`), or larger by no more than `SLACK` in the median, are as good as the
-best; of these the cheapest is the one to take.
+best. Of these one is taken that is cheap: no more than `ALIKE` times the processor time of the cheapest, and of such
+the first in rank.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import numpy as np
 from calib.studies.conditions import Condition, Study
 from calib.studies.trial import Row
 
-RELIABLE, LEVEL, SLACK = 0.95, 0.05, 0.05  # our choices
+RELIABLE, LEVEL, SLACK, ALIKE = 0.95, 0.05, 0.05, 2.0  # our choices
 LEAST = 6  # common data sets below which the sign test cannot tell at 5 %
 FIGURES = (
     "torque_error", "torque_worst", "beta_error", "beta_distance", "beta_sigma", "coverage", "survey_tau", "survey_q",
@@ -47,7 +48,7 @@ class MethodSummary:
         figures: name of a figure (`FIGURES`) → its spread.
         rank: by the median torque error, from 1.
         as_good: not told from the best, or within `SLACK` of it, and reliable.
-        chosen: the cheapest of those.
+        chosen: the one of those to take.
         p: of the sign test against the best; NaN for the best itself.
     """
 
@@ -105,8 +106,9 @@ def _ranked(condition: Condition, rows: Mapping[str, Sequence[Row]]) -> Conditio
         good = one.reliable and np.isfinite(size) and (one is best or near or p > LEVEL)
         judged.append(replace(one, rank=rank, as_good=bool(good), p=p))
     good = [one for one in judged if one.as_good]
-    cheapest = min(good, key=lambda one: one.figures["cpu"].median, default=None)
-    return ConditionSummary(condition, tuple(replace(one, chosen=one is cheapest) for one in judged))
+    least = min((one.figures["cpu"].median for one in good), default=0.0)
+    chosen = next((one for one in good if not one.figures["cpu"].median > ALIKE * least), None)
+    return ConditionSummary(condition, tuple(replace(one, chosen=one is chosen) for one in judged))
 
 
 def _error(row: Row) -> float:

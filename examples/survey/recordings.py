@@ -53,7 +53,7 @@ def compare(name: str, data: Path, out: Path) -> int:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--data", type=Path, default=Path(os.environ.get("CALIB_DATA", "../shared/data")))
     parser.add_argument("--out", type=Path, default=Path("survey-recordings"))
     given = parser.parse_args()

@@ -82,7 +82,7 @@ def pace(rows: Iterable[Row]) -> Iterator[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--rows", type=Path, default=HERE / "rows")
     parser.add_argument("--full", default="", help="all figures of this condition")
     given = parser.parse_args()

@@ -3,21 +3,19 @@
 After Janot's slides (TX40, IDIM-LS, IDIM-IV, PC-IDIM-IV), with a simulated robot: BIRDy's parameters and controller,
 the coupled wrist, six torque offsets, 60 base parameters; 5 kHz control, 1 kHz log, 50 Hz Butterworth, 20 Hz parallel
 decimation. By construction, so no evidence about a real arm: the size of what no model holds (5 % of the torque,
-coloured at 10 Hz), and the noise of the degraded data (white, on the logged positions only, of the size that brings
-least squares to the slides' 25 % on joints 1 and 2; the slides do not say how they degraded). Not by construction: what
-IV makes of it.
+coloured at 10 Hz), and the noise of the degraded data. The slides do not say how they degraded; here, twice:
 
-The wrist lives on friction, and least squares needs noise of 1 degree there to reach 25 %. Then the velocity's noise is
-many times the width of the Coulomb sign, W is no longer its true value plus noise, and IV is biased as well: the last
-set shows it. DIDIM is not, as it uses no measured position at all: with torques that are not degraded it finds the same
-on all sets.
+    degraded    white noise on the logged positions only, of the size that brings least squares to the slides' 25 %
+    in the loop position noise that the controller acts on, coloured at 10 Hz: the torques answer it, so that noise of
+                the regressor and of the torque are correlated through the loop, which is why IV exists
 
 A direct error of least squares is |y - W x| with the noisy W, one of IV is |y - Z x| with the simulated Z: no other
 reading lets IV come out below least squares on its own rows, and the slides' do. It judges robot and controller at
-once: with a wrong controller it grows although the parameters stay right. `torque_error` compares fairly: the torque of
-another motion, noise-free, against the truth. A dash: that estimate could not be simulated along that motion.
+once: with a wrong controller it grows although the parameters stay right, and of noise in the loop it holds the torques
+that answered the noise, which no prediction can. `torque_error` compares fairly: the torque of another motion,
+noise-free, against the truth. A dash: that estimate could not be simulated along that motion.
 
-    python examples/tx40/identification.py --out tx40-study [--quick] [--seed 0]
+    python examples/tx40/identification.py --out tx40-study [--quick] [--seed 0] [--readme]
 """
 
 from __future__ import annotations
@@ -40,6 +38,7 @@ from calib.estimation.essential import Rule, eliminate
 from calib.estimation.instrumental_variables import least_squares
 from calib.estimation.linear import LinearFit, subsystem_std
 from calib.estimation.triangles import collect, combine
+from calib.estimation.whiteness import examine
 from calib.identification.cases import Case, make_case
 from calib.identification.loop.controller import identify_controller
 from calib.identification.loop.loop_recordings import Loop
@@ -58,10 +57,10 @@ REACH = np.array([2.8, 1.8, 2.0, 3.5, 1.9, 4.0])  # [rad]
 SPEED = 0.8 * np.deg2rad([287.0, 287.0, 430.0, 410.0, 320.0, 700.0])
 OFFSETS = np.array([0.3, -0.4, 0.2, 0.1, -0.1, 0.05])  # [N m], chosen
 UNMODELLED = 0.05  # of each joint's rms torque, chosen
-DEGRADED = {  # noise of the logged positions [rad], chosen: see above
-    "degraded": np.array([1.9, 3.0, 4.0, 3.0, 3.0, 3.0]) * 1e-3,
-    "degraded, wrist as much": np.array([1.9, 3.0, 6.4, 14.0, 14.0, 17.0]) * 1e-3,
-}
+DEGRADED = np.array([2.3, 2.7, 7.0, 9.0, 12.0, 13.0]) * 1e-3  # noise of the logged positions [rad], chosen: see above
+LOOP, LOOP_BAND = 3e-4, 10.0  # noise of the positions that the controller sees [rad], its colour [Hz], chosen
+KINDS = ("clean", "degraded", "in the loop")
+MARKS = ("<!-- the table is written by --readme -->", "<!-- end of the table -->")
 SLIDES = {
     "clean": {"direct": {"LS": [5.2, 5.0, 5.0, 5.6, 7.2, 7.1], "IV": [5.4, 5.3, 5.1, 5.7, 7.2, 7.5]},
               "cross": {"LS": [6.1, 6.3, 6.7], "IV": [6.4, 6.8, 7.0]}},
@@ -123,10 +122,12 @@ def record(study: Study, reference: Reference, kind: str, number: int) -> Log:
     silent = simulate(study.plant, study.controller, reference, Sensing(every=EVERY))
     push = UNMODELLED * np.sqrt(np.mean(silent.torque**2, axis=0))
     sensing = Sensing(np.deg2rad(1e-4), 0.0, 0.05, push, push_band=10.0, every=EVERY)
+    if kind == "in the loop":
+        sensing = replace(sensing, sigma_q=LOOP, q_band=LOOP_BAND)
     run = simulate(study.plant, study.controller, reference, sensing, [study.seed, number])
     seen = run.measured
-    if kind in DEGRADED:
-        seen = seen + DEGRADED[kind] * np.random.default_rng([study.seed, number, 7]).normal(size=seen.shape)
+    if kind == "degraded":
+        seen = seen + DEGRADED * np.random.default_rng([study.seed, number, 7]).normal(size=seen.shape)
     recording = Recording(run.t, seen, run.tau, "torque", tuple(f"joint_{j + 1}" for j in range(6)), file=kind)
     return Log(reference, run, seen, make_case(kind, make_motion(recording, FILTERS)))
 
@@ -219,19 +220,16 @@ def verdict(result: Instrumental) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def estimate(
-    study: Study, log: Log, controller: Controller, method: str, columns: np.ndarray | None = None
-) -> Instrumental:
+def estimate(study: Study, log: Log, controller: Controller, method: str) -> Instrumental:
     """Return what IV, PC-IV or DIDIM makes of a log under the belief that this was the controller.
 
     The regular robot they start from has the motors' inertia, as on a data sheet.
     """
-    names = study.base.names if columns is None else tuple(study.base.names[k] for k in columns)
     return identify_instrumental(
         study.model, study.base, [(log.case, Loop(controller, log.reference, EVERY))], log.case.motion.decimator,
-        method="didim" if method == "DIDIM" else "iv", columns=columns, limit=20,
+        method="didim" if method == "DIDIM" else "iv", limit=20,
         inertia=np.array(known_robots.truth("tx40")["drives"]["Ia"]),
-        positive=signs(names) if method == "PC-IV" else (),
+        positive=signs(study.base.names) if method == "PC-IV" else (),
     )  # fmt: skip
 
 
@@ -269,21 +267,19 @@ def run(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
         "by_construction": ["unmodelled torque", "noise of the degraded data", "offsets", "truth"],
         "slides": SLIDES,
     }
-    essential = None
-    for kind in ("clean", *list(DEGRADED)[: 1 if quick else None]):
+    for kind in KINDS[: 2 if quick else None]:
         log = record(study, training, kind, 0)
         rest = [record(study, reference, kind, number + 1) for number, reference in enumerate(others)]
         if kind == "clean":
             metrics["essential"] = essential_count(study, log)
-            essential = np.array([study.base.names.index(name) for name in metrics["essential"]["names"]])
-        columns = essential if kind == "degraded, wrist as much" else None
-        results = {name: estimate(study, log, study.controller, name, columns) for name in ("IV", "PC-IV", "DIDIM")}
+        results = {name: estimate(study, log, study.controller, name) for name in ("IV", "PC-IV", "DIDIM")}
         metrics[kind] = judge(study, log, rest, results, study.controller)
+        draw(study, log, results["IV"], out / f"residuals_{kind.replace(' ', '_')}.png")
         if kind == "degraded":
-            metrics["wrong controllers"] = {
-                name: judge(study, log, rest, {"IV": estimate(study, log, controller, "IV")}, controller)
-                for name, controller in controllers(study, log).items()
-            }
+            metrics["wrong controllers"] = {}
+            for name, controller in controllers(study, log).items():
+                tried = {each: estimate(study, log, controller, each) for each in ("IV", "PC-IV")}
+                metrics["wrong controllers"][name] = judge(study, log, rest, tried, controller)
     metrics["parameters"]["essential"] = metrics["essential"]["F"]
     files.write_json(out / "metrics.json", metrics)
     return metrics
@@ -300,8 +296,8 @@ def show(metrics: dict[str, Any]) -> None:
     print(
         f"{count['standard']} standard, {count['base']} base parameters; F-test keeps {count['essential']} (slides: 27)"
     )
-    for kind in filter(metrics.__contains__, ("clean", *DEGRADED)):
-        table(kind, metrics[kind], SLIDES[kind.split(",")[0]])
+    for kind in filter(metrics.__contains__, KINDS):
+        table(kind, metrics[kind], SLIDES.get(kind, {}))
     for name, found in metrics["wrong controllers"].items():
         table(f"degraded, controller {name}", found, {})
 
@@ -319,14 +315,72 @@ def table(title: str, found: dict[str, Any], slides: dict[str, Any]) -> None:
             print(f"  {part:12} {method:6}" + " ".join("     -" if x is None else f"{x:6.2f}" for x in errors) + beside)
 
 
+def draw(study: Study, log: Log, found: Instrumental, path: Path) -> None:
+    """Draw autocorrelation, partial autocorrelation and histogram of residuals, joint by joint, as the slides do."""
+    import matplotlib.pyplot as plt
+
+    series = {
+        "LS": np.subtract(*with_measured(study, log, full(study, found, found.ordinary))),
+        "IV": np.subtract(*with_simulated(study, log, full(study, found, found.fit), study.controller)),
+    }
+    figure, axes = plt.subplots(3, 6, figsize=(15, 7))
+    for j in range(6):
+        for k, (name, values) in enumerate(series.items()):
+            looked = examine(values[:, j])
+            lags = np.arange(1, len(looked.acf) + 1) + 0.3 * k
+            for axis, heights in ((axes[0, j], looked.acf), (axes[1, j], looked.pacf)):
+                axis.vlines(lags, 0.0, heights, color=f"C{k}", lw=1.0, label=name)
+                axis.axhspan(-looked.bound, looked.bound, color="0.9", zorder=0)
+                axis.set_ylim(-0.6, 1.0)
+            axes[2, j].hist(values[:, j] / values[:, j].std(), 40, histtype="step", color=f"C{k}", density=True)
+        x = np.linspace(-4.0, 4.0, 100)
+        axes[2, j].plot(x, np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi), "k:", lw=0.8)
+        axes[0, j].set_title(f"joint {j + 1}")
+    for row, name in zip(axes[:, 0], ("autocorrelation", "partial autocorrelation", "residual / std")):
+        row.set_ylabel(name)
+    axes[0, 0].legend(fontsize=7)
+    figure.tight_layout()
+    figure.savefig(path, dpi=80)
+    plt.close(figure)
+
+
+def readme_rows(metrics: dict[str, Any]) -> list[str]:
+    """Return the README's table [%]: joints 1 to 6, or three other motions."""
+    sets = {kind: metrics[kind] for kind in KINDS if kind in metrics}
+    sets |= {f"degraded, {name}": found for name, found in metrics["wrong controllers"].items()}
+    rows = ["| | LS | PC-LS | IV | PC-IV | slides: LS, IV |", "|---|---|---|---|---|---|"]
+    for kind, found in sets.items():
+        known = SLIDES.get("identified controllers" if kind == "degraded, identified" else kind, {})
+        for part, words in (("direct", "direct"), ("cross", "cross"), ("torque_error", "another motion, noise-free")):
+            cells = [_cell(found[part][name]) for name in ("LS", "PC-LS", "IV", "PC-IV")]
+            said = [_cell(known[part][name]) if name in known.get(part, {}) else "–" for name in ("LS", "IV")]
+            rows.append(f"| {kind}, {words} | {' | '.join(cells)} | {' / '.join(said) if known.get(part) else '–'} |")
+    return rows
+
+
+def _cell(values: list[float | None]) -> str:
+    return " ".join("–" if x is None else f"{x:.1f}" for x in values)
+
+
+def write_readme(metrics: dict[str, Any], path: Path) -> None:
+    """Put the table between the marks of a README."""
+    text = path.read_text(encoding="utf-8")
+    head, rest = text.split(MARKS[0])
+    files.write(path, "\n".join([head + MARKS[0], *readme_rows(metrics), MARKS[1] + rest.split(MARKS[1])[1]]))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, required=True, help="folder for metrics.json")
-    parser.add_argument("--quick", action="store_true", help="shorter motions, fewer candidates, no third set")
+    parser.add_argument("--quick", action="store_true", help="shorter motions, fewer candidates, two sets")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--readme", action="store_true", help="put the table into the README beside this script")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    show(run(options.out, options.quick, options.seed))
+    metrics = run(options.out, options.quick, options.seed)
+    show(metrics)
+    if options.readme:
+        write_readme(metrics, Path(__file__).with_name("README.md"))
 
 
 if __name__ == "__main__":

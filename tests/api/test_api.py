@@ -175,6 +175,14 @@ def test_recordings_in_memory_and_later_validation(model, logs):
     assert judged.verdict.level == model.verdict.level
 
 
+def test_torques_have_sigmas(model):
+    motion = model.outcome.inputs.cases[0].motion
+    states = motion.q[:50], motion.v[:50], motion.a[:50]
+    own, fast = model.torque_sigma(*states), model.torque_sigma(states[0], 3.0 * states[1], 9.0 * states[2])
+    assert own.shape == model.torques(*states).shape and (own > 0.0).all()
+    assert (np.median(fast, axis=0) > np.median(own, axis=0)).all()
+
+
 def test_export_and_compensation_take_results_in_memory(fitted, model, cell, logs, tmp_path, monkeypatch):
     written = calib.export(fitted, tmp_path / "geometry")
     assert (tmp_path / "geometry/robot.urdf").is_file() and any("robot.urdf" in line for line in written)

@@ -18,6 +18,7 @@ from scipy.spatial import KDTree
 
 from calib.data.poses.measurements import PoseMeasurements, Positions, take
 from calib.estimation.relevance import Gram, gram, relevance
+from calib.estimation.variances import variance_weights
 from calib.geometry.fit import plausible_deviation
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.effects import term_groups, term_sizes
@@ -35,7 +36,6 @@ COVERED = 0.95
 SOME = 0.02  # share of the poses (our choice)
 END = 0.2  # share of the poses at each end of a joint's range that is left out (our choice)
 FEWEST = 20  # poses from which errors on rows left out are worth a model (our choice)
-ROUNDS = 200  # of the fixed point for κ and v
 MOST = 1500  # poses that folds are judged by (our choice)
 UNTOLD = 1.0  # what is known beforehand of a parameter that a fold does not tell [m, rad] (our choice)
 
@@ -303,20 +303,11 @@ def _placed_anew(columns: np.ndarray, frames: np.ndarray) -> np.ndarray:
 
 
 def _most_probable(rows: np.ndarray) -> np.ndarray:
-    """Return κ, v_0, v_1, v_2 of  |e|² ~ variance · χ²_3 / 3  from rows (m, 4), by multiplicative updates.
-
-    Each update multiplies by the ratio of the two halves of the likelihood's gradient, so that all stay positive; gross
-    rows count as three sigmas at most.
-    """
+    """Return κ, v_0, v_1, v_2 of  |e|² ~ variance · χ²_3 / 3  from rows (m, 4)."""
     size, design = rows[:, 0], np.column_stack([rows[:, 1], np.ones(len(rows)), rows[:, 2:]])
     scale = np.array([1.0, np.median(size), 0.0, 0.0])
     scale[2:] = 0.3 * np.median(size) / np.maximum(design[:, 2:].mean(axis=0), 1e-12)
-    for _ in range(ROUNDS):
-        variance = np.maximum(design @ scale, 1e-30)
-        ratio = np.minimum(size / variance, 9.0)
-        push, pull = (ratio / variance) @ design, (1.0 / variance) @ design
-        scale = scale * push / np.maximum(pull, 1e-300)
-    return scale
+    return variance_weights(size, design, scale)
 
 
 def _radius(rows: np.ndarray, scale: np.ndarray) -> float:

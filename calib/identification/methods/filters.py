@@ -27,6 +27,7 @@ from calib.estimation.kalman import Belief, Filter, believe, corrected, linearly
 from calib.estimation.linear import LinearFit
 from calib.identification.cases import Case
 from calib.identification.methods.believed import BelievedRobot, believed_robot, start_of
+from calib.identification.methods.instrumental import low_passed
 from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, MethodEstimate, attempted
 from calib.identification.rows import segments
@@ -35,6 +36,7 @@ from calib.simulation.loop.closed_loop import Stepper, forward_dynamics, stepper
 FASTER = 4.0  # times the positions' cut-off: rate of the filter, at least
 WIDE = 5.0  # standard deviations of least squares that the parameters are uncertain by at first
 NARROWER = (1.0, 0.5, 0.25, 0.1, 0.03)  # of a rule's points, where the wider ones are no robots
+LONGEST = 2.5e-3  # [s] of a step of the dynamics
 LOST = 30.0  # times the stated mean square: innovations of a filter that has lost the robot
 
 
@@ -137,13 +139,18 @@ def _moves(robot: BelievedRobot, problem: IdentificationProblem, values: np.ndar
 
 
 def _steps(case: Case, part: slice) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield q (n,) as seen, and the mean torque (n,) since the last one, every few samples of a segment."""
+    """Yield q (n,) as seen, and the mean torques (s, n) of s equal steps since the last one, of a segment."""
     motion = case.motion
     thin = _thin(case)
-    q, tau = motion.q[part], case.target[part]
-    mean = 0.5 * (tau[1:] + tau[:-1])
+    q, tau = motion.q[part], low_passed(case.target[part], motion)  # as the positions were: the same band on both sides
+    whole = np.concatenate([np.zeros((1, motion.n)), np.cumsum(0.5 * (tau[1:] + tau[:-1]), axis=0)])
+    steps = max(1, int(np.ceil(thin / (motion.rate * LONGEST) - 1e-6)))
+    place = np.arange(len(q), dtype=float)
     for k in range(thin, len(q), thin):
-        yield q[k], mean[k - thin : k].mean(axis=0)
+        ends = np.linspace(k - thin, k, steps + 1)
+        near = slice(k - thin, k + 1)
+        sums = np.column_stack([np.interp(ends, place[near], own) for own in whole[near].T])
+        yield q[k], np.diff(sums, axis=0) * (steps / thin)
 
 
 def _thin(case: Case) -> int:
@@ -168,7 +175,7 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
     full = _Stepping(made, before.kind, n, len(before.robot.plant.parameters), columns, there)
     sizes = []
     for q, tau in _steps(case, part):
-        belief = full.step(belief, tau, period, torque)
+        belief = full.step(belief, np.ascontiguousarray(tau), period / len(tau), torque)
         belief, size = corrected(belief, q, n, seen)
         if not np.isfinite(size):
             raise Diverged("the filter's estimate is no longer finite", belief.mean)
@@ -200,7 +207,7 @@ class _Stepping:
     there: np.ndarray
 
     def step(self, before: Belief, tau: np.ndarray, period: float, torque: np.ndarray) -> Belief:
-        """Return the belief a period later.
+        """Return the belief after torques tau (s, n), each for a period; `torque` (n,) is the noise of their mean.
 
         Raises:
             CannotSimulate: where not even points near the mean are robots.
@@ -208,25 +215,28 @@ class _Stepping:
         n = self.n
         if self.kind.rule == "ekf":
             mean, values = np.array(before.mean), self._values(before.mean[None])[0]
-            q, v, gain, own = self.made.linearised(
-                values, mean[:n], mean[n : 2 * n], tau, period, len(self.columns)
-            )  # fmt: skip
-            slopes = np.eye(len(mean))
-            slopes[: 2 * n] = own
-            slopes[: 2 * n, 2 * n :] *= self.there
-            mean[:n], mean[n : 2 * n] = q, v
-            return linearly_predicted(before, mean, slopes, self._noise(gain, period, torque, len(mean)), self.kind)
+            slopes, gain = np.eye(len(mean)), np.eye(n)
+            for own in tau:
+                made = self.made.linearised(values, mean[:n], mean[n : 2 * n], own, period, len(self.columns))
+                mean[:n], mean[n : 2 * n], gain, part = made
+                part[:, 2 * n :] *= self.there
+                slopes[: 2 * n] = part[:, : 2 * n] @ slopes[: 2 * n]
+                slopes[: 2 * n, 2 * n :] += part[:, 2 * n :]
+            noise = self._noise(gain, len(tau) * period, torque, len(mean))
+            return linearly_predicted(before, mean, slopes, noise, self.kind)
         failure: CalibError | None = None
         for narrower in NARROWER:
             spread = points(before, self.kind, narrower)
             values = self._values(spread)
+            q, v, gain = spread[:, :n], spread[:, n : 2 * n], np.eye(n)
             try:
-                q, v, gain = self.made.points(values, spread[:, :n], spread[:, n : 2 * n], tau, period)
+                for own in tau:
+                    q, v, gain = self.made.points(values, q, v, own, period)
             except CalibError as error:
                 failure = error
                 continue
             spread[:, :n], spread[:, n : 2 * n] = q, v
-            noise = self._noise(gain, period, torque, spread.shape[1])
+            noise = self._noise(gain, len(tau) * period, torque, spread.shape[1])
             return predicted(spread, noise, self.kind, narrower)
         raise CannotSimulate(f"the filter believes in no robot: {failure}", before.mean)
 

@@ -5,7 +5,9 @@
 (Janot, Vandanjon & Gautier 2014). Same reference, same controller: the simulation feels what the robot was asked to do,
 and not its noise, so Z is uncorrelated with the noise that the feedback brings into W. It starts from a regular robot:
 inertia diag(J), no gravity, no friction. DIDIM (Gautier, Janot & Vandanjon 2013) estimates from the simulated W alone,
-x_{k+1} = W_s⁺ y. Constraints on base parameters, min ½ ‖P_Z (y - W x)‖² in every round, make it PC-IDIM-IV
+x_{k+1} = W_s⁺ y. A Coulomb sign whose measured speed is noisier than the width of its smoothing is no true column plus
+noise: no instrument helps there, and the simulated column, which rests on the reference, takes its place in W (our
+choice). Constraints on base parameters, min ½ ‖P_Z (y - W x)‖² in every round, make it PC-IDIM-IV
 (`calib.identification.parameter_constraints`); they do not cure a bias.
 """
 
@@ -19,7 +21,7 @@ import numpy as np
 from calib.arrays import frozen
 from calib.data.signals.decimation import Decimator
 from calib.data.signals.filtering import curvature, low_pass, slope
-from calib.data.signals.motion import Motion
+from calib.data.signals.motion import Motion, velocity_noise
 from calib.dynamics import base as bases
 from calib.dynamics.base import Base
 from calib.dynamics.drives import standard
@@ -257,9 +259,25 @@ def _estimate_round(task: _Fixed, runs: Runs, std: np.ndarray, tau: float) -> _F
         observe(task.model, columns, simulated_case(case, run, loop), task.decimator).matrix
         for (case, loop), run in runs
     ]
-    problem = _stack(task.observed, simulated)
+    observed = [
+        replace(rows, matrix=np.where(_drowned_signs(task.model, columns, case), z, rows.matrix))
+        for rows, z, (case, _) in zip(task.observed, simulated, task.cases)
+    ]
+    problem = _stack(observed, simulated)
     fit, bound = _held_fit(task, problem, std, tau)
-    return _Found(problem, fit, _inflation(task.observed, fit), bound)
+    return _Found(problem, fit, _inflation(observed, fit), bound)
+
+
+def _drowned_signs(model: IdentificationModel, columns: np.ndarray, case: Case) -> np.ndarray:
+    """Return (p,) which columns are Coulomb signs of a joint whose measured speed is noisier than their smoothing."""
+    noise, found = velocity_noise(case.motion), np.zeros(len(columns), dtype=bool)
+    for place, k in enumerate(columns - model.inertial):
+        if k < 0 or model.columns[k].shape != "sign":
+            continue
+        one = model.columns[k]
+        speeds = [float(np.hypot.reduce([weight * noise[j] for j, weight in motion])) for _, motion in one.acts]
+        found[place] = max(speeds) > one.settings[0]
+    return found
 
 
 def _result(

@@ -199,7 +199,7 @@ def _packed(
     p, rows = len(values), int(np.sum(residual != 0.0))
     flat = white.reshape(-1, p)
     size = np.linalg.norm(flat, axis=0)
-    factor = np.linalg.qr(flat / np.where(size > 0.0, size, 1.0), mode="r")
+    factor = np.asarray(np.linalg.qr(flat / np.where(size > 0.0, size, 1.0), mode="r"))
     require_rank(factor, plain.pooled.names, "the simulated motion does not tell them apart")
     inverse = scipy.linalg.solve_triangular(factor, np.eye(p)) / size[:, None]
     bread = inverse @ inverse.T

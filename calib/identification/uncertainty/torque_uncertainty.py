@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from calib.dynamics.base import standard_name
-from calib.dynamics.idim import with_load
+from calib.dynamics.idim import friction_states, with_load
 from calib.errors import UsageError
 from calib.identification.model_file import read_covariance
 from calib.identification.prediction import Dynamics
@@ -36,18 +36,45 @@ class Uncertainty:
 
     def sigma(self, sampled: Sampled) -> np.ndarray:
         """Return the largest standard deviation (n,) of each torque along a motion: √(w Σ wᵀ) [N m or N]."""
-        model, n = self.dynamics.model, sampled.q.shape[1]
-        largest = np.zeros(n)
-        for start in range(0, len(sampled.q), BLOCK):
-            part = slice(start, start + BLOCK)
-            q, v, a = (np.ascontiguousarray(x[part]) for x in (sampled.q, sampled.v, sampled.a))
-            load = None
-            if with_load(model):
-                load = model.transmitted(self.dynamics.values, q, v, a)
-            W = model.regressor(q, v, a, load, self.carried)[:, -n:][:, :, self.columns]
-            variance = np.einsum("Nib,bc,Nic->Ni", W, self.covariance, W, optimize=True)
-            largest = np.maximum(largest, np.sqrt(np.maximum(variance, 0.0)).max(axis=0))
-        return largest
+        state = sampled.q, sampled.v, sampled.a
+        variances = parameter_variances(self.dynamics, self.columns, self.covariance, *state, self.carried)
+        return np.sqrt(variances.max(axis=0))[-sampled.q.shape[1] :]
+
+
+def estimated_columns(dynamics: Dynamics, names: Sequence[str]) -> np.ndarray:
+    """Return which columns of the regressor (k,) estimated parameters are of.
+
+    Raises:
+        ValueError: for a name that the model does not have.
+    """
+    standard = dynamics.model.names
+    return np.array([standard.index(standard_name(name, standard)) for name in names])
+
+
+def parameter_variances(
+    dynamics: Dynamics, columns: np.ndarray, covariance: np.ndarray, q: np.ndarray, v: np.ndarray,
+    a: np.ndarray, carried: Collection[str] | None = None, states: np.ndarray | None = None,
+) -> np.ndarray:  # fmt: skip
+    """Return w Σ wᵀ (N, rows) of torques, with Σ (k, k) of the parameters of these columns (k,) [N² m² or N²].
+
+    Args:
+        q, v, a: (N, n) states.
+        carried: labels of the payloads on board; None: all.
+        states: (s, N) of friction with memory; None: q is one uninterrupted record.
+    """
+    model, result = dynamics.model, []
+    loaded = bool(with_load(model))
+    states = friction_states(model, q) if states is None else states
+    unit = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))
+    root = unit[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    for start in range(0, len(q), BLOCK):
+        part = slice(start, start + BLOCK)
+        state = [np.ascontiguousarray(x[part]) for x in (q, v, a)]
+        load = model.transmitted(dynamics.values, *state, carried) if loaded else None
+        rows = model.regressor(*state, load, carried, states[:, part])[:, :, columns]
+        result.append(np.sum((rows @ root) ** 2, axis=2))
+    return np.concatenate(result)
 
 
 def read_uncertainty(folder: Path, dynamics: Dynamics, carried: Sequence[str]) -> Uncertainty | None:
@@ -57,8 +84,7 @@ def read_uncertainty(folder: Path, dynamics: Dynamics, carried: Sequence[str]) -
         return None
     names, covariance = found
     try:
-        standard = dynamics.model.names
-        columns = np.array([standard.index(standard_name(name, standard)) for name in names])
+        columns = estimated_columns(dynamics, names)
     except ValueError as error:
         raise UsageError(f"{folder}/covariance.csv does not fit dynamics.json beside it: {error}") from error
     return Uncertainty(dynamics, tuple(carried), columns, covariance)

@@ -23,10 +23,13 @@ from calib.identification.parameter_constraints import Held
 from calib.identification.possible import information
 from calib.identification.prediction import Dynamics
 from calib.identification.scores import PredictionErrors, Score
+from calib.identification.uncertainty.torque_errors import TorqueDiscrepancy, TorqueErrorModel, TorqueIntervals
+from calib.identification.uncertainty.torque_uncertainty import read_uncertainty
 from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.loop_tables import INSTRUMENTAL, loop_table, write_instrumental
+from calib.procedure.dynamic_stage.metrics import TorqueCoverage
 from calib.procedure.dynamic_stage.tracking import tracking_table
 from calib.procedure.dynamic_stage.validation import Assessment, ModelFindings
 from calib.procedure.dynamic_stage.verdict import Resting
@@ -86,6 +89,7 @@ class StoredFindings:
     rests: Resting
     notes: tuple[str, ...]
     controller: StoredController | None = None
+    errors: TorqueDiscrepancy | None = None
 
 
 @dataclass(frozen=True)
@@ -151,8 +155,10 @@ class IdentificationFolder:
         metrics = self.metrics()
         if metrics.findings is None:
             return ModelFindings(Resting(), metrics.warnings)
-        known = metrics.findings.controller
-        return ModelFindings(metrics.findings.rests, metrics.findings.notes, known and known.controller())
+        known, stated = metrics.findings.controller, metrics.findings.errors
+        found = None if stated is None else read_uncertainty(self.path, self.dynamics(), ())
+        errors = stated and found and TorqueErrorModel(found.columns, found.covariance, stated)
+        return ModelFindings(metrics.findings.rests, metrics.findings.notes, known and known.controller(), errors)
 
 
 @dataclass(frozen=True)
@@ -169,7 +175,8 @@ class UnseenFolder:
     def write(self, inputs: IdentificationInputs, found: Assessment) -> None:
         """Write a table of torques per unseen recording, and the report."""
         for number, case in enumerate(inputs.unseen, 1):
-            _write_torques(case, found.predictions[case.name], self.path / f"torques_{number}.csv")
+            predicted, expected = found.predictions[case.name], found.intervals.get(case.name)
+            _write_torques(case, predicted, expected, self.path / f"torques_{number}.csv")
         files.write_json(self.report, report(inputs, found))
 
     def verdict(self) -> StoredVerdict:
@@ -217,7 +224,8 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     if found.prior is not None or held:  # else estimate and covariance say it all
         information.write(found, folder)
     first = (*inputs.unseen, *inputs.cases)[0]
-    _write_torques(first, outcome.predictions[first.name], folder / "torques_1.csv")
+    expected = outcome.assessment.intervals.get(first.name)
+    _write_torques(first, outcome.predictions[first.name], expected, folder / "torques_1.csv")
     table = to_table(found.dynamics, found.base, inputs.unit) | {"drive_gains": _gain_table(inputs.gains, inputs.unit)}
     files.write_json(folder / MODEL, table)
     if inputs.gains is not None:
@@ -226,14 +234,22 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     files.write_json(folder / METRICS, metrics(outcome))
 
 
-def _write_torques(case: Case, predicted: np.ndarray, path: Path) -> Path:
-    """Write measured and predicted torques (N, rows) of a recording and its joints (N, n), at about `TORQUE_RATE`."""
+def _write_torques(case: Case, predicted: np.ndarray, expected: TorqueIntervals | None, path: Path) -> Path:
+    """Write measured and predicted torques (N, rows) of a recording and its joints (N, n), at about `TORQUE_RATE`.
+
+    Where it is known, with the standard deviation expected of the errors, and 1 where the model extrapolates.
+    """
     motion, rows = case.motion, case.target.shape[1]
     step = max(1, round(motion.rate / TORQUE_RATE))
     names = [f"{what}_{j + 1}" for what in ("measured", "predicted") for j in range(rows)]
     joints = [f"q{j + 1}" for j in range(motion.q.shape[1])]
     table = np.column_stack([motion.t, case.target, predicted, motion.q])[::step]
-    return files.write_numbers(path, ["t [s]", *names, *joints], table)
+    if expected is None:
+        return files.write_numbers(path, ["t [s]", *names, *joints], table)
+    near = np.searchsorted(expected.index, np.arange(len(motion))[::step])
+    table = np.column_stack([table, expected.sigma[near], expected.beyond[near]])
+    sigmas = [f"sigma_{j + 1}" for j in range(rows)]
+    return files.write_numbers(path, ["t [s]", *names, *joints, *sigmas, "extrapolated"], table)
 
 
 def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:
@@ -293,7 +309,9 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
     return {
         "identification": {name: _score_table(found_score) for name, found_score in outcome.fit.items()},
         "validation": {
-            name: _score_table(found_score) | {"evidence": name not in outcome.repeated}
+            name: _score_table(found_score)
+            | {"evidence": name not in outcome.repeated}
+            | _interval_table(outcome.assessment.intervals.get(name), outcome.inputs)
             for name, found_score in outcome.validation.items()
         },
         "parameters": {
@@ -339,7 +357,10 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
         "repeated": dict(outcome.repeated),
         "findings": asdict(
             StoredFindings(
-                outcome.findings.rests, outcome.findings.notes, StoredController.of(outcome.findings.controller)
+                outcome.findings.rests,
+                outcome.findings.notes,
+                StoredController.of(outcome.findings.controller),
+                outcome.findings.errors and outcome.findings.errors.discrepancy,
             )
         ),
         "warnings": list(outcome.warnings),
@@ -380,6 +401,17 @@ def _score_table(found: Score) -> dict[str, Any]:
         ],
         "motion_share": found.motion_share,
     }
+
+
+def _interval_table(found: TorqueIntervals | None, inputs: IdentificationInputs) -> dict[str, Any]:
+    """Return how the errors that the model stated held on a recording; nothing where it states none."""
+    if found is None:
+        return {}
+    coverage = TorqueCoverage(
+        100.0 * found.covered, tuple((100.0 * found.joints).tolist()), tuple(found.median.tolist()),
+        int(found.known.sum()), 100.0 * float(found.beyond.mean()), tuple(found.ways(inputs.chain.joint_names)),
+    )  # fmt: skip
+    return {"interval95": asdict(coverage)}
 
 
 def _part_table(part: PredictionErrors) -> dict[str, Any]:
@@ -440,7 +472,10 @@ def report(inputs: IdentificationInputs, found: Assessment) -> dict[str, Any]:
         "units": list(rows.units([joint.kind == "prismatic" for joint in chain.joints])),
         "fit": {name: _score_table(one) for name, one in found.fit.items()},
         "validation": {
-            name: _score_table(one) | {"evidence": name not in found.repeated} for name, one in found.validation.items()
+            name: _score_table(one)
+            | {"evidence": name not in found.repeated}
+            | _interval_table(found.intervals.get(name), inputs)
+            for name, one in found.validation.items()
         },
         "curves": [_curves(case, found.predictions[case.name]) for case in (inputs.unseen or inputs.cases)],
         "tracking": tracking_table(found.tracking),

@@ -12,6 +12,7 @@ from calib.identification.friction.passivity import driven
 from calib.identification.identify import Identification, identify
 from calib.identification.scores import Score
 from calib.identification.uncertainty.geometry_uncertainty import GeometryUncertainty, propagate
+from calib.identification.uncertainty.torque_errors import learn_torque_errors
 from calib.identification.uncertainty.two_geometries import GeometryComparison, compare
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, Progress
 from calib.procedure.dynamic_stage.tracking import Tracking
@@ -94,9 +95,10 @@ def run(inputs: IdentificationInputs, progress: Progress | None = None) -> Ident
     carried, geometries = _carry(inputs, found, say)
     excitation = {case.name: report_excitation(case.motion) for case in inputs.cases}
     loops = found.bias.loops
+    say("errors on time left out")
     findings = ModelFindings(
         resting_parameters(found), model_warnings(inputs.cases, found, excitation),
-        None if loops is None else loops.controller,
+        None if loops is None else loops.controller, learn_torque_errors(found, inputs.cases, carried.covariance),
     )  # fmt: skip
     result = assess(inputs, found.dynamics, findings, wrong, progress=say)
     return IdentificationOutcome(inputs, found, findings, result, carried, geometries, settings.seed)

@@ -4,7 +4,8 @@ All estimate the same columns (base parameters and standard friction, unless ano
 `calib identify --method` does it: wls draws what the motion does not tell to a prior. Errors are relative, in the
 identification band, over all unseen recordings together; their standard errors, and those of differences between
 methods, come from a jackknife over blocks of time (Künsch 1989), since residuals are not white. Methods within `APART`
-standard errors of the best, or within `SLACK` of its error, are as good; the fastest of them is the one to take.
+standard errors of the best, or within `SLACK` of its error, are as good; of these one is taken that is fast: at most
+`ALIKE` times the time of the fastest, the first in rank.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 
 BLOCKS = 10  # of time in each recording
-APART, SLACK = 2.0, 0.05  # our choices
+APART, SLACK, ALIKE = 2.0, 0.05, 2.0  # our choices
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ class _Sums:
 
 def compare_methods(
     inputs: IdentificationInputs, methods: Sequence[str] | None = None, friction: str = "standard",
-    say: Callable[[str], None] = lambda words: None,
+    say: Callable[[str], None] = lambda words: None, each: Callable[[ComparedMethod], None] = lambda one: None,
 ) -> list[ComparedMethod]:  # fmt: skip
     """Return every method on these recordings, best first; those that failed, or that lack a [loop], last.
 
@@ -88,6 +89,8 @@ def compare_methods(
         inputs: recordings to learn from, and unseen ones.
         methods: their names; None: all.
         friction: as of `IdentificationSettings`; methods that simulate know ``standard`` alone.
+        say: called with words on progress.
+        each: called with every method when it is done, not yet ranked.
 
     Raises:
         UsageError: where no recording is unseen, or a name is none of a method.
@@ -106,8 +109,10 @@ def compare_methods(
         try:
             found = identify(inputs.robot, inputs.cases, _settings(inputs, method, friction), partial(_said, say, name))
             done.append(_judged(found, inputs, alike))
+            each(done[-1][0])
         except CalibError as error:
             failed.append(ComparedMethod(name, " ".join(str(error).split())))
+            each(failed[-1])
     return [*_ranked(done, alike), *failed]
 
 
@@ -184,8 +189,9 @@ def _ranked(done: Sequence[tuple[ComparedMethod, _Sums]], alike: np.ndarray) -> 
         sigma = _jackknife(_leaving_out(sums, alike) - _leaving_out(own, alike))
         good = behind <= max(APART * sigma, SLACK * best.unseen)
         result.append(replace(one, rank=rank, behind=behind, behind_sigma=sigma, good=bool(good)))
-    fastest = min((one for one in result if one.good), key=lambda one: one.seconds)
-    return [replace(one, chosen=one is fastest) for one in result]
+    least = min(one.seconds for one in result if one.good)
+    taken = next(one for one in result if one.good and one.seconds <= ALIKE * least)
+    return [replace(one, chosen=one is taken) for one in result]
 
 
 def write_table(found: Sequence[ComparedMethod], path: Path) -> Path:

@@ -36,11 +36,32 @@ class RowWhiteness:
 
 
 @dataclass(frozen=True)
+class TorqueCoverage:
+    """How many errors were within the 95 % interval that the model states, how wide that was, where it extrapolates.
+
+    Attributes:
+        coverage_percent: of all rows.
+        joints_percent, median: of each, and the half width of its interval in its unit.
+        samples: at which this was looked at.
+        extrapolated_percent: of them.
+        extrapolates: in words how the motion leaves what was learnt from.
+    """
+
+    coverage_percent: float
+    joints_percent: Numbers
+    median: Numbers
+    samples: int
+    extrapolated_percent: float
+    extrapolates: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class RecordingErrors:
     """One recording, predicted; see `calib.identification.scores.Score`.
 
     Attributes:
         evidence: False for a repeat of the training motion.
+        interval95: how the errors that the model stated held here.
     """
 
     raw: PredictionErrors
@@ -50,6 +71,7 @@ class RecordingErrors:
     above_band_percent: Numbers
     whiteness: tuple[RowWhiteness | None, ...]
     evidence: bool = True
+    interval95: TorqueCoverage | None = None
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -15,11 +15,19 @@ from calib.identification.checks.recording_sizes import compare_sizes
 from calib.identification.friction.passivity import driven
 from calib.identification.prediction import Dynamics, predict
 from calib.identification.scores import Score, score
+from calib.identification.uncertainty.torque_errors import TorqueErrorModel, TorqueIntervals, intervals
 from calib.procedure.dynamic_stage import plausibility
 from calib.procedure.dynamic_stage.gains import relative_warnings
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, Progress
 from calib.procedure.dynamic_stage.tracking import Tracking, track
-from calib.procedure.dynamic_stage.verdict import Resting, judge, warnings, with_prior
+from calib.procedure.dynamic_stage.verdict import (
+    Resting,
+    extrapolates,
+    judge,
+    warnings,
+    with_intervals,
+    with_prior,
+)
 from calib.procedure.findings import Verdict, held_by, settled
 from calib.simulation.loop.controllers import Controller
 from calib.units import TORQUE
@@ -35,11 +43,13 @@ class ModelFindings:
         rests: its parameters that rest on a prior.
         notes: what a user should know of the model, whatever the unseen recordings are.
         controller: that was stated or identified; None without any.
+        errors: what errors its torques are expected to have; None where too little was recorded to say.
     """
 
     rests: Resting
     notes: tuple[str, ...] = ()
     controller: Controller | None = None
+    errors: TorqueErrorModel | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +64,7 @@ class Assessment:
         verdict: as of `calib.procedure.dynamic_stage.verdict`.
         warnings: what a user should know of the recordings, and of the model.
         tracking: with the model fed forward.
+        intervals: unseen case (without any, the first learnt from) → what errors were expected there, and found.
     """
 
     fit: Mapping[str, Score]
@@ -64,6 +75,7 @@ class Assessment:
     verdict: Verdict
     warnings: tuple[str, ...]
     tracking: Tracking
+    intervals: Mapping[str, TorqueIntervals] = field(default_factory=dict)
 
 
 def assess(
@@ -90,6 +102,10 @@ def assess(
         say(f"predicting {case.name}")
         predictions[case.name] = predict(dynamics, case)
         scores[case.name] = score(case, predictions[case.name], inputs.options.slow, inputs.currents.own)
+    expected: dict[str, TorqueIntervals] = {}
+    for case in (inputs.unseen or inputs.cases[:1]) if findings.errors is not None else ():
+        say(f"errors to expect of {case.name}")
+        expected[case.name] = intervals(findings.errors, dynamics, case, predictions[case.name])
     say("judging")
     shares = {case.name: max(repeats(own.motion, case.motion) for own in inputs.cases) for case in inputs.unseen}
     repeated = {name: share for name, share in shares.items() if share >= REPEAT}
@@ -101,8 +117,9 @@ def assess(
     labels = settings.torque_rows.numbered(inputs.chain.n)
     sizes = [compare_sizes(case, inputs.chain, settings.gravity, inputs.unit == TORQUE) for case in inputs.cases]
     odd = settled(plausibility.findings(sizes, inputs.chain.joint_names), inputs.options.accept)
-    verdict = with_prior(judge(fit, proofs, repeated, excitation, wrong, labels), findings.rests)
-    verdict = held_by(verdict, odd)
+    verdict = judge(fit, proofs, repeated, excitation, wrong, labels)
+    verdict = with_intervals(verdict, {name: expected[name] for name in proofs if name in expected}, labels)
+    verdict = held_by(with_prior(verdict, findings.rests), odd)
     say("tracking with the model fed forward")
     amperes = relative_warnings(inputs.unit)
     tracking = (
@@ -113,11 +130,12 @@ def assess(
     said = (
         *amperes, *(one.told for one in odd),
         *warnings(inputs.cases, inputs.unseen, validation, repeated, excitation, inputs.chain),
+        *(line for name in validation if name in expected for line in extrapolates(name, expected[name])),
         *findings.notes,
     )  # fmt: skip
     return Assessment(
         fit, validation, predictions, repeated, excitation, _tolerated(verdict, proofs, tolerance),
-        tuple(dict.fromkeys(said)), tracking,
+        tuple(dict.fromkeys(said)), tracking, expected,
     )  # fmt: skip
 
 

@@ -5,8 +5,9 @@ validation recording in which the robot moves and which does not repeat the trai
 it passes up to 10 % and up to 2 times the training's own error; between, it is marginal. It is marginal as well
 without such a recording, or where the training motion is too poor to tell parameters apart. A joint of which 50 % or
 more is unexplained (in the band, and while it moves) is named and allows no pass; from 95 % on it fails the model
-where its rms torque is 10 % or more of the greatest joint's. Friction that drives a joint fails. The reason says
-which of these held.
+where its rms torque is 10 % or more of the greatest joint's. Friction that drives a joint fails. A model of which the
+95 % intervals hold less than 93 % of the errors on unseen motion, beyond chance, is no better than marginal. The reason
+says which of these held.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from calib.identification.identify import Identification
 from calib.identification.prior import resting
 from calib.identification.reweighted import standstill_shift
 from calib.identification.scores import Score
+from calib.identification.uncertainty.torque_errors import COVERED, TorqueIntervals
 from calib.procedure.findings import Verdict
 from calib.robot.chain import Chain
 
@@ -37,6 +39,7 @@ BEYOND = 0.05  # of a joint's range by which a recording may leave it: encoders 
 CONDITION = 200.0  # of the observation matrix with columns of unit norm
 MOVES = 0.1  # share of moving rows below which a recording is no motion
 BEND = 1e-4  # rms of link minus motor position that shows elasticity [rad or m]
+HOLDS = 0.93  # least share of errors on unseen motion within the 95 % intervals, beyond chance
 SURELY = 2.0  # sigmas below zero from which on a drive's inertia or friction is called negative
 SLOW_SHARE = 0.1  # share of samples near standstill from which on Coulomb friction is drawn down
 
@@ -145,6 +148,36 @@ def _held_by_joint(verdict: Verdict, scores: Mapping[str, Score], rows: Sequence
     return Verdict(
         level, f"{verdict.reason}; the model does not hold for {named}: is this the robot, are the columns in order?"
     )
+
+
+def with_intervals(verdict: Verdict, expected: Mapping[str, TorqueIntervals], rows: Sequence[str]) -> Verdict:
+    """Return the verdict, no pass where errors on unseen motion are larger than the model states, beyond chance.
+
+    Args:
+        expected: by unseen case.
+        rows: what the torque rows are called.
+    """
+    for name, one in expected.items():
+        chance = 3.0 * np.sqrt((1.0 - COVERED) * COVERED / np.maximum(one.independent, 1.0))
+        low = [f"{rows[k]} ({100 * one.joints[k]:.0f} %)" for k in np.flatnonzero(one.joints < HOLDS - chance)]
+        if not low and one.covered >= HOLDS - np.sqrt(np.sum(chance**2)) / len(chance):
+            continue
+        where = f", least at joint {', '.join(low)}" if low else ""
+        told = (
+            f"its 95 % intervals do not hold: {100 * one.covered:.0f} % of the errors on {name} are within them{where}"
+        )
+        level = "marginal" if verdict.level == "pass" else verdict.level
+        return Verdict(level, f"{verdict.reason}; {told}; learn from motion like this, too")
+    return verdict
+
+
+def extrapolates(name: str, expected: TorqueIntervals) -> list[str]:
+    """Say how a recording leaves what was learnt from."""
+    if not (share := float(expected.beyond.mean())):
+        return []
+    joints = [str(joint + 1) for joint in range(expected.extrapolated.shape[2])]
+    ways = "; ".join(expected.ways(joints))
+    return [f"{name}: for {max(100 * share, 1.0):.0f} % of its time the model extrapolates: {ways}"]
 
 
 def with_prior(verdict: Verdict, rests: Resting) -> Verdict:

@@ -16,7 +16,8 @@ from calib.errors import MeasurementError, UsageError
 from calib.identification.cases import Case, case_names, make_case
 from calib.identification.identify import Identification, identify_model
 from calib.identification.identify_options import IdentifyOptions, file_settings
-from calib.identification.methods.registry import method_named
+from calib.identification.methods.method import Method
+from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.prediction import predict
 from calib.identification.scores import Score, score
 from calib.identification.settings import IdentificationSettings, per_joint
@@ -228,12 +229,16 @@ def _refuse(settings: IdentificationSettings, options: IdentifyOptions) -> None:
         raise UsageError(f"{options.source}: [gain_identification] and cut_slow are for serial arms yet")
     if settings.friction not in ("auto", "standard"):
         raise UsageError(f"friction = '{settings.friction}': a parallel robot has standard friction only (Fv Fc off)")
-    if settings.prior == "cad":
-        raise UsageError('prior = "cad" is for serial arms yet, not for parallel robots')
     method = method_named(settings.method)
-    if method.needs_simulation or method.name == "ml":
+    if _of_arms(method):
         what = "simulates" if method.needs_simulation else "differentiates the torques of"
-        raise UsageError(f"method '{method.name}' {what} a serial arm; parallel robots take ols, wls, irls, tls")
+        known = ", ".join(name for name, one in METHODS.items() if not _of_arms(one))
+        raise UsageError(f"method '{method.name}' {what} a serial arm; parallel robots take {known}")
+
+
+def _of_arms(method: Method) -> bool:
+    """Tell whether a method needs what only a serial arm's model has."""
+    return method.needs_simulation or method.name == "ml"
 
 
 def _recording_notes(model: ParallelModel, cases: Sequence[Case]) -> list[str]:

@@ -127,6 +127,7 @@ def outcome_section(outcome: IdentificationOutcome) -> Section:
     units = units if found.unit == "N m" else (found.unit,) * len(units)
     blocks += [
         _error_table(found.identification, found.validation, rows, units),
+        *_interval_blocks(found.validation, rows, units),
         *tracking_blocks(found.tracking, found.tracking_failure),
     ]
     blocks.append(Text("", [_plain(line) for line in found.warnings], "note"))
@@ -146,6 +147,7 @@ def certificate_section(
     metrics, unseen = found.metrics, found.unseen
     pictures = lambda name: [drawn[name]] if name in drawn else []  # noqa: E731
     blocks: list[Block] = [_error_table(unseen.fit, unseen.validation, unseen.rows, unseen.units)]
+    blocks += _interval_blocks(unseen.validation, unseen.rows, unseen.units)
     blocks += [*pictures("errors"), *pictures("torques"), *pictures("excitation")]
     if len(metrics.ladder) > 1:
         blocks.append(_friction_table(metrics))
@@ -220,6 +222,23 @@ def _error_table(
             ))  # fmt: skip
     header = ("torque", "error", "in band", "moving", "standing", "torque above band", "rms", "ACF outside")
     return Table("Torque errors", header, cells, ERROR_NOTE, frozenset(strong), range(1, 8))
+
+
+def _interval_blocks(
+    unseen: Mapping[str, RecordingErrors], rows: Sequence[str], units: Sequence[str]
+) -> list[Block]:  # fmt: skip
+    """Return how many errors are within the 95 % interval that the model states, per row of unseen recordings."""
+    cells: list[Sequence[str]] = []
+    for name, one in unseen.items():
+        if (found := one.interval95) is None:
+            continue
+        cells.append((name, f"{found.coverage_percent:.1f} %", *(f"{x:.0f} %" for x in found.joints_percent)))
+        cells.append(("  median half width", "", *(f"{x:.3g} {unit}" for x, unit in zip(found.median, units))))
+        cells.append(("  of the time extrapolated", f"{found.extrapolated_percent:.0f} %"))
+    if not cells:
+        return []
+    header = ("errors within the 95 % interval", "all", *rows)
+    return [Table("Intervals stated", header, cells, numbers=range(1, 2 + len(rows)))]
 
 
 def _friction_table(metrics: ModelMetrics) -> Table:

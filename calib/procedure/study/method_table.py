@@ -13,6 +13,12 @@ HEADER = (
 )  # fmt: skip
 
 
+def line(one: ComparedMethod) -> str:
+    """Return what is known of a method before the others are done."""
+    words = one.failure or f"{one.unseen:.3g} % on unseen motion, {one.seconds:.2g} s"
+    return f"{one.name}: {words}"
+
+
 def blocks(found: Sequence[ComparedMethod]) -> Iterator[Block]:
     """Yield the ranked table, and why methods are not in it."""
     good = [one for one in found if not one.failure]
@@ -32,6 +38,6 @@ def blocks(found: Sequence[ComparedMethod]) -> Iterator[Block]:
     strong = frozenset(k for k, one in enumerate(good) if one.chosen)
     if rows:
         yield Table("Methods", HEADER, rows, note, strong, (0, *range(2, len(HEADER) - 1)))
-    lines = [f"{one.name}: {one.failure}" for one in found if one.failure]
+    lines = [line(one) for one in found if one.failure]
     if lines:
         yield Text("Without an estimate", lines, "no estimate")

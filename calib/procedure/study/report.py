@@ -11,14 +11,14 @@ from importlib import metadata, resources
 from calib.procedure.report.page import Pictures, Section, Table, Text
 from calib.procedure.study import figures
 from calib.studies.conditions import Condition, Study
-from calib.studies.summary import FIGURES, LEAST, LEVEL, RELIABLE, SLACK, ConditionSummary, MethodSummary, Spread
+from calib.studies.summary import ALIKE, FIGURES, LEAST, LEVEL, RELIABLE, SLACK, ConditionSummary, MethodSummary, Spread
 from calib.studies.trial import Row
 
 RULE = (
     f"Of the methods that give an estimate in at least {RELIABLE:.0%} of the trials, those are as good as the best "
     "whose torque error on unseen motion, noise-free, is not told from the best one's on the same data sets (sign "
     f"test, {LEVEL:.0%}), or whose median is larger by at most {SLACK:.0%}.",
-    "The cheapest of these, by processor time, is the one to take.",
+    f"Of these one is taken that is cheap, at most {ALIKE:g} times the processor time of the cheapest: the best such.",
     "A trial without an estimate counts as an infinite error, in medians and in comparisons.",
     f"Fewer than {LEAST} common data sets tell no methods apart: all are then as good.",
 )

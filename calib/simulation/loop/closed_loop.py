@@ -69,7 +69,8 @@ class Sensing:
     """What the controller and the log see.
 
     Attributes:
-        sigma_q: (n,) white noise of every measured position [rad or m].
+        sigma_q: (n,) white noise of every measured position [rad or m]; the controller acts on it.
+        q_band: cut-off of the first-order low-pass that colours it, σ kept [Hz]; None: white.
         quantum: (n,) resolution of the encoders [rad or m]; 0 for none.
         sigma_tau: (n,) white noise of the recorded torque [N m or N]; it does not act.
         push: (n,) torque that acts and is not recorded: ripple, cables, all that no model holds [N m or N].
@@ -83,6 +84,7 @@ class Sensing:
     push: np.ndarray | float = 0.0
     push_band: float | None = None
     every: float = 1
+    q_band: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,6 +136,8 @@ def simulate(
     rng = np.random.default_rng(seed)
     noise = {name: np.broadcast_to(getattr(sensing, name), (n,)) for name in ("sigma_q", "push", "sigma_tau")}
     drawn = {name: _draw(rng, size, count) for name, size in noise.items()}
+    if sensing.q_band is not None:
+        drawn["sigma_q"] = _coloured(drawn["sigma_q"], 2.0 * np.pi * sensing.q_band * reference.period)
     if sensing.push_band is not None:
         drawn["push"] = _coloured(drawn["push"], 2.0 * np.pi * sensing.push_band * reference.period)
     if push is not None:

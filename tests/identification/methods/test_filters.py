@@ -69,6 +69,7 @@ def test_six_filters_make_one_estimate_whose_sigma_covers():
     assert 0.5 < np.sqrt(np.mean(np.square(away))) < 1.6
 
 
+@pytest.mark.slow
 def test_a_filter_finds_back_from_a_start_that_is_off():
     problem = small_arm.problem(0, 0.0, 0.1, rate=2000.0)
     plain = METHODS["srukf"].estimate(problem)

@@ -34,11 +34,12 @@ def test_methods_are_ranked_by_unseen_motion(robot: Path, tmp_path: Path):
     assert "[loop]" in found[2].failure
 
 
-def test_what_is_not_told_apart_is_as_good_and_the_fastest_is_taken(robot: Path, tmp_path: Path):
+def test_what_is_not_told_apart_is_as_good_and_a_fast_one_is_taken(robot: Path, tmp_path: Path):
     train, other = recorded(tmp_path)
     found = compare_methods(gather(robot, [train], [other]), ["wls", "ols"])
     good = [one for one in found if one.good]
-    assert [one.name for one in good if one.chosen] == [min(good, key=lambda one: one.seconds).name]
+    (taken,) = (one for one in good if one.chosen)
+    assert taken.seconds <= 2.0 * min(one.seconds for one in good)
 
 
 def test_without_unseen_motion_there_is_no_ranking(robot: Path, tmp_path: Path):
