@@ -21,7 +21,8 @@ def excite(
     model: Annotated[Path | None, typer.Option(help="folder of an identification: predicts the torques")] = None,
     limits: Annotated[Path | None, typer.Option(help="TOML: speeds, torques, workspace, collision, friction")] = None,
     goal: Annotated[
-        list[str] | None, typer.Option(help="raw=35, normalised=6, wrist=0.1, joint6=0.1, coverage=0.1; repeatable")
+        list[str] | None,
+        typer.Option(help="raw=35, normalised=6, wrist=0.1, joint6=0.1, coverage=0.1, duration=12, logdet, smallest"),
     ] = None,
     hard: Annotated[list[str] | None, typer.Option(help="a goal that must be met; repeatable")] = None,
     period: Annotated[float, typer.Option(help="of the motion [s]")] = DESIGN.period,

@@ -56,6 +56,7 @@ STAGES = (
 )
 """Our choice."""
 S_RANGE = (-4.0, 12.0)
+REPAIR = 30  # evaluations to bring a stage's last motion back inside
 
 
 class _Spent(Exception):
@@ -136,6 +137,7 @@ def one_start(
                 run, y = run.continued(*_at_stage(problem, stage))
             run.sharpness = stage.sharpness
             y = run.solve(run.repaired(y), max(2, round(evaluations * stage.share)), method, stage.tolerance)
+            y = run.repaired(y, REPAIR)  # SLSQP travels outside, and may have ended there
     except KeyboardInterrupt:
         if run.best is None:
             raise
@@ -172,6 +174,7 @@ class StartSearch:
         self.interrupted, self.reason, self.scale = False, "", 1.0
         self._at: tuple[bytes, tuple[float, float]] | None = None
         self._evaluation: Evaluation | None = None
+        self._tried = np.zeros(0)
 
     def continued(self, problem: ExcitationProblem, basis: Basis) -> tuple[StartSearch, np.ndarray]:
         """Return the search of another problem that goes on from here, and the point where it begins."""
@@ -277,13 +280,14 @@ class StartSearch:
 
     def _by_scipy(self, start: np.ndarray, last: int, tolerance: float) -> np.ndarray:
         """Run SciPy's SLSQP (Kraft 1988) until `last` evaluations: it solves its subproblems faster than NLopt's."""
+        self._tried = start
         rows, size = self._count(start[: len(start) - bool(self.problem.goals)]), len(start)
         objective = self._last if self.problem.goals else self._sum
 
         def value(y: np.ndarray) -> tuple[float, np.ndarray]:
             if self.count >= last:
                 raise _Spent
-            slope = np.zeros(size)
+            self._tried, slope = np.array(y), np.zeros(size)
             return objective(np.ascontiguousarray(y), slope), slope
 
         def inequalities(y: np.ndarray, slopes: np.ndarray) -> np.ndarray:
@@ -305,7 +309,9 @@ class StartSearch:
                 value, start, method="SLSQP", jac=True, bounds=bounds, constraints=[kept] if rows else (),
                 options={"maxiter": max(2, last - self.count), "ftol": tolerance},
             )  # fmt: skip
-        except (_Spent, NotExciting) as error:
+        except _Spent:
+            return self._tried
+        except NotExciting as error:
             self.reason = str(error)
             return start
         self.reason = "" if found.success else str(found.message)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.errors import UsageError
-from calib.procedure.excitation.goals import SCALINGS, NamedGoal, read_goals, torque_slack, wrist
+from calib.procedure.excitation.goals import SCALINGS, NamedGoal, objectives_of, read_goals, torque_slack, wrist
 from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel, read_inputs
 from calib.procedure.excitation.limits import MotionLimits
 from calib.procedure.excitation.metrics import DesignCondition
@@ -95,7 +95,8 @@ def excite(
 ) -> Designed:
     """Design a motion that excites the dynamics of a robot within its limits.
 
-    Without goals the logarithms of both condition numbers, raw and normalised, are minimised in equal parts. With goals
+    Without goals the logarithms of both condition numbers, raw and normalised, are minimised in equal parts, or the
+    index that ``logdet`` or ``smallest`` name. With goals
     (``wrist=0.1``) both take part with what a single-objective run reached as their goal (the study's advice), unless
     they are given themselves.
 
@@ -166,7 +167,7 @@ def _excitation_problem(
     """Return the problem of both condition numbers within the limits, the constraints to verify, and notes."""
     search, checked, notes = _constraints(given.model, given.limits)
     condition, smooth = _condition_objective(given, settings), given.model.smooth
-    objectives = tuple((replace(condition, scaling=scaling), 0.5) for scaling in SCALINGS)
+    objectives = objectives_of(settings, condition)
     family, coarse = _family(given, settings)
     problem = ExcitationProblem(
         family, smooth.regressor, smooth.regressor_gradient, objectives, search, samples=settings.samples,
@@ -308,5 +309,5 @@ def _front(
     bare = replace(problem, goals=())
     (end, alone), *_ = proposed_goals(bare, [slack], starts=1, evaluations=150, guesses=(found.x,))
     levels = np.linspace(begin, end, count + 1)[:-1].tolist() if end < begin else [begin]
-    normalised = problem.objectives[SCALINGS.index("normalised")][0]
-    return sweep(problem, normalised, slack, levels, found.x, alone.x, report=report)
+    index = problem.objectives[-1][0]  # the normalised condition number, or the aim in its place
+    return sweep(problem, index, slack, levels, found.x, alone.x, report=report)

@@ -1,6 +1,8 @@
 """The goals of an excitation, as said on the command line.
 
-``raw=35``, ``normalised=6``: condition numbers; ``wrist=0.1``, ``joint6=0.1``: mean torque; ``coverage=0.1``: speeds.
+``raw=35``, ``normalised=6``: condition numbers; ``wrist=0.1``, ``joint6=0.1``: mean torque; ``coverage=0.1``: speeds;
+``duration=12``: the period [s], where ``--shortest`` leaves it free. ``logdet`` and ``smallest``, without a number: the
+information's determinant, or its smallest singular value, is made as large as can be in place of condition numbers.
 """
 
 from __future__ import annotations
@@ -12,10 +14,19 @@ import numpy as np
 from calib.errors import UsageError
 from calib.procedure.excitation.inputs import ExcitationInputs
 from calib.procedure.excitation.settings import ExcitationSettings
-from trajectories.design.objectives import Excitation, FrictionCoverage, Objective, Scaling, TorqueSlack
+from trajectories.design.objectives import (
+    Duration,
+    Excitation,
+    FrictionCoverage,
+    Index,
+    Objective,
+    Scaling,
+    TorqueSlack,
+)
 from trajectories.design.problem import AttainmentGoal
 
 SCALINGS: tuple[Scaling, ...] = ("raw", "normalised")
+AIMS: tuple[Index, ...] = ("logdet", "smallest")
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,6 +35,24 @@ class NamedGoal:
 
     name: str
     goal: AttainmentGoal
+
+
+def objectives_of(settings: ExcitationSettings, condition: Excitation) -> tuple[tuple[Objective, float], ...]:
+    """Return what is minimised: the aim of the settings, or both condition numbers in equal parts.
+
+    Args:
+        condition: see `read_goals`.
+
+    Raises:
+        UsageError: for two aims, or one beside the condition numbers that it replaces.
+    """
+    aims: list[Index] = [one for one in AIMS if one in settings.goals]
+    if not aims:
+        return tuple((replace(condition, scaling=scaling), 0.5) for scaling in SCALINGS)
+    others = [text for text in (*settings.goals, *settings.hard) if text.partition("=")[0] in (*SCALINGS, *AIMS)]
+    if len(others) > 1:
+        raise UsageError(f"goals {', '.join(others)}: '{aims[0]}' takes the place of the others; leave them out")
+    return ((replace(condition, index=aims[0]), 1.0),)
 
 
 def read_goals(settings: ExcitationSettings, given: ExcitationInputs, condition: Excitation) -> list[NamedGoal]:
@@ -38,23 +67,31 @@ def read_goals(settings: ExcitationSettings, given: ExcitationInputs, condition:
     result = []
     for weight, texts in ((None, settings.goals), (0.0, settings.hard)):
         for text in texts:
+            if text in AIMS and weight is None:
+                continue
             name, _, amount = text.partition("=")
             try:
                 value = float(amount)
             except ValueError:
-                raise UsageError(f"goal '{text}': expected NAME=NUMBER, e.g. wrist=0.1") from None
-            objective, goal = _objective(name, value, given, condition)
+                raise UsageError(f"goal '{text}': expected NAME=NUMBER, e.g. wrist=0.1, or {', '.join(AIMS)}") from None
+            objective, goal = _objective(name, value, given, condition, settings.shortest)
             result.append(NamedGoal(name, AttainmentGoal(objective, goal, weight)))
     return result
 
 
-def _objective(name: str, value: float, given: ExcitationInputs, condition: Excitation) -> tuple[Objective, float]:
+def _objective(
+    name: str, value: float, given: ExcitationInputs, condition: Excitation, shortest: float | None
+) -> tuple[Objective, float]:
     """Return the objective of a name, and the goal to minimise it to."""
     text, chain = f"{name}={value:g}", given.chain
     if name in SCALINGS:
         if not value > 1:
             raise UsageError(f"goal '{text}': a condition number is above 1")
         return replace(condition, scaling=name), value
+    if name == "duration":
+        if shortest is None or not value > 0:
+            raise UsageError(f"goal '{text}': needs --shortest, and a period above 0 s")
+        return Duration(), value
     if name == "coverage":
         speeds = np.array([joint.velocity for joint in chain.joints])
         if not np.isfinite(speeds).all() or not 0 < value < 0.25:
@@ -62,7 +99,7 @@ def _objective(name: str, value: float, given: ExcitationInputs, condition: Exci
         return FrictionCoverage(0.1 * speeds, 0.5 * speeds, value), 0.01
     numbered = {f"joint{j + 1}": (j,) for j in range(chain.n)} | {"wrist": wrist(chain.n)}
     if name not in numbered:
-        raise UsageError(f"goal '{text}': '{name}' is none of raw, normalised, coverage, wrist, joint1 …")
+        raise UsageError(f"goal '{text}': '{name}' is none of raw, normalised, duration, coverage, wrist, joint1 …")
     if not 0 < value < 1:
         raise UsageError(f"goal '{text}': the mean torque is a share of its limit, above 0 and below 1")
     return torque_slack(numbered[name], given, f"goal '{text}'"), 1.0 - value

@@ -20,8 +20,9 @@ class ExcitationSettings:
 
     Attributes:
         goals, hard: ``raw=35``, ``normalised=6`` (condition numbers), ``wrist=0.1`` or ``joint6=0.1`` (mean torque as a
-            share of the limit, at least), ``coverage=0.1`` (share of time at low and at high speed, either way); hard
-            ones must be met. Without any the logarithms of both condition numbers are minimised in equal parts.
+            share of the limit, at least), ``coverage=0.1`` (share of time at low and at high speed, either way),
+            ``duration=12`` [s]; hard ones must be met. Without any the logarithms of both condition numbers are
+            minimised in equal parts; ``logdet`` or ``smallest`` among the goals: that index in their place.
         period: T0 of the motion [s], at most; shortest: what the search may shorten it to [s]; None: it is kept.
         harmonics: frequencies per joint, or control points beside the rest conditions of splines; None: `HARMONICS`, or
             as many as stay below the limits' resonance.

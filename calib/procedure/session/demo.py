@@ -37,9 +37,8 @@ FIT, VALIDATION, AGAIN = 40, 20, 3
 DRIFT = 10e-6  # how far the simulated instrument wanders over a series [m]
 MOTION = {
     "period": 10.0,
-    "harmonics": 5,
     "starts": 2,
-    "evaluations": 300,
+    "evaluations": 150,
     "repeats": 2,
     "torques": "both",
 }  # little effort, for time

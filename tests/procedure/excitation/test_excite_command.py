@@ -248,6 +248,15 @@ def test_ctrl_c_keeps_the_best_motion_so_far(cell, calib, monkeypatch):
     assert metrics["history"][-1] < metrics["history"][0]
 
 
+def test_an_aim_in_place_of_condition_numbers_and_a_shorter_period():
+    plain = design.excite("lwr4plus", replace(SHORT, outlook=False))
+    told = design.excite("lwr4plus", replace(SHORT, goals=("logdet",), outlook=False))
+    assert told.condition.raw > plain.condition.raw and told.found.merit < 0.0
+    short = design.excite("lwr4plus", replace(SHORT, goals=("duration=12",), shortest=10.0, outlook=False))
+    samples = short.period * SHORT.rate
+    assert 10.0 <= short.period < 16.0 and samples == pytest.approx(round(samples)) and short.proof.feasible
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("whom", ["the terminal's group", "the command alone"])
 def test_ctrl_c_in_worker_processes(tmp_path, whom):
@@ -291,6 +300,10 @@ def test_ctrl_c_in_worker_processes(tmp_path, whom):
         ("", ("--goal", "wrist=2"), "above 0 and below 1"),
         ("", ("--goal", "elbow=0.1"), "none of raw"),
         ("", ("--goal", "wrist"), "expected NAME=NUMBER"),
+        ("", ("--goal", "logdet", "--goal", "raw=30"), "'logdet' takes the place of the others"),
+        ("", ("--hard", "logdet"), "expected NAME=NUMBER"),
+        ("", ("--goal", "duration=8"), "needs --shortest"),
+        ("", ("--shortest", "99"), "at most the period"),
         ("", ("--period", "16.003"), "take 16 s"),
         ("", ("--period", "nan"), "period nan"),
         ("", ("--family", "steps"), "none of fourier"),
