@@ -43,6 +43,30 @@ def test_tx40_least_squares_fails_on_degraded_data_and_instruments_do_not(study)
 
 
 @pytest.mark.slow
+def test_tx40_readme_holds_what_a_fresh_run_gives(tmp_path):
+    """Cell by cell within 0.3 %."""
+    place = EXAMPLES / "tx40"
+    command = [sys.executable, str(place / "identification.py"), "--out", str(tmp_path)]
+    subprocess.run(command, check=True, capture_output=True, text=True)
+    sys.path.insert(0, str(place))
+    try:
+        import identification  # pyright: ignore[reportMissingImports]
+    finally:
+        sys.path.remove(str(place))
+    fresh = identification.readme_rows(json.loads((tmp_path / "metrics.json").read_text()))
+    text = (place / "README.md").read_text()
+    kept = text.split(identification.MARKS[0])[1].split(identification.MARKS[1])[0].strip().splitlines()
+    assert len(kept) == len(fresh) and kept[:2] == fresh[:2]
+    for old, new in zip(kept[2:], fresh[2:]):
+        there, here = ([cell.split() for cell in row.split("|")[2:7]] for row in (old, new))
+        assert old.split("|")[1] == new.split("|")[1]
+        for one, two in zip(there, here):
+            assert len(one) == len(two)
+            assert all(a == b or abs(float(a) - float(b)) <= 0.3 for a, b in zip(one, two)), (old, new)
+    assert all((tmp_path / f"residuals_{kind}.png").exists() for kind in ("clean", "degraded", "in_the_loop"))
+
+
+@pytest.mark.slow
 def test_lwr4plus_counts_essential_set_and_torques(study):
     metrics = study("lwr4plus/dynamics.py")
     assert {name: metrics["counts"][name] for name in metrics["counts_asked"]} == metrics["counts_asked"]

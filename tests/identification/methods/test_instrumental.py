@@ -18,6 +18,7 @@ from calib.estimation import instrumental_variables
 from calib.identification.cases import make_case
 from calib.identification.loop.controller import identify_controller
 from calib.identification.loop.loop_recordings import Loop
+from calib.identification.methods import instrumental
 from calib.identification.methods.instrumental import identify_instrumental
 from calib.identification.parameter_constraints import ConstraintSettings, make_constraints
 from calib.robot import mdh
@@ -93,14 +94,22 @@ def test_instruments_are_right_where_least_squares_is_biased():
     assert all(result.verdict.biased() and result.valid for result in results)
 
 
-def test_instruments_do_not_help_where_the_noise_enters_nonlinearly_and_didim_does():
-    """A velocity noise of many widths of the Coulomb sign shrinks the sign column of W: IV makes up by too much Fc."""
-    case = log(2e-3, 1, 0.02)
-    names = list(arm(0.02)[2].names)
-    place = names.index("Fc2")
-    instrumental, didim = found(case, v0=0.02), found(case, v0=0.02, method="didim", limit=20)
-    gone = [abs(one.fit.estimate.values[place] / truth(0.02)[place] - 1.0) for one in (instrumental, didim)]
-    assert gone[1] < 0.01 < 0.05 < gone[0]
+def test_a_sign_drowned_in_noise_is_taken_from_the_simulation(monkeypatch):
+    """A velocity noise of many widths of the Coulomb sign shrinks its column of W: IV makes up by too much Fc.
+
+    Measured: Fc 26 and 38 % too large with the measured sign, 0.2 and 6 % with the simulated one.
+    """
+    case = log(3e-3, 0, 0.02)
+    place = [k for k, name in enumerate(arm(0.02)[2].names) if name.startswith("Fc")]
+
+    def wrong(**options) -> float:
+        values = found(case, v0=0.02, **options).fit.estimate.values
+        return float(np.abs(values / truth(0.02) - 1.0)[place].max())
+
+    simulated, didim = wrong(), wrong(method="didim", limit=20)
+    monkeypatch.setattr(instrumental, "_drowned_signs", lambda model, columns, case: np.zeros(len(columns), bool))
+    measured = wrong()
+    assert didim < 0.01 and simulated < 0.08 and measured > 0.2
 
 
 def test_without_noise_in_the_positions_least_squares_is_cleared():
