@@ -1,6 +1,6 @@
 """The DualV study: parameters of an actuation-redundant parallel robot by its inverse dynamic and power models.
 
-    python examples/dualv/study.py --out dualv-study
+    python examples/dualv/study.py --out dualv-study [--seed 0] [--readme]
 
 A simulated DualV (Briot, Gautier & Krut 2013, two papers) runs designed motions without and with a payload of 5.37 kg,
 under computed torque with an internal preload. IDIM-WLS on the platform's coordinates and PIM-WLS on the power identify
@@ -53,12 +53,14 @@ PAPERS = {  # identified value, sigma %: Table II of either paper
 }  # fmt: skip
 CROSS = (0.0987, 0.0841, 0.1492)  # the IDIM paper's relative errors of x, y, rz
 COORDINATES = ("x", "y", "rz")
+MARKS = ("<!-- the table is written by --readme -->", "<!-- end of the table -->")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("dualv-study"))
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--readme", action="store_true", help="put the table into the README beside this script")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     began = time.perf_counter()
@@ -78,6 +80,11 @@ def main() -> None:
     seconds["all"] = time.perf_counter() - began
     metrics = found | {"seconds": seconds, "seed": options.seed}
     (options.out / "metrics.json").write_text(json.dumps(metrics, indent=1), encoding="utf-8")
+    if options.readme:
+        path = Path(__file__).with_name("README.md")
+        head, rest = path.read_text(encoding="utf-8").split(MARKS[0])
+        tail = MARKS[1] + rest.split(MARKS[1])[1]
+        path.write_text("\n".join([head + MARKS[0], *readme_rows(metrics), tail]), encoding="utf-8")
     print(f"{seconds['all']:.0f} s; figures and metrics.json in {options.out}")
 
 
@@ -157,6 +164,7 @@ def report(robot: Robot, designs: list[ParallelDesign], results: dict[str, Metho
         "idim_free": idim.free, "pim_free": pim.free,
     }  # fmt: skip
     metrics: dict = {"methods": {name: _table(estimate, truth) for name, estimate in tables.items()}}
+    metrics["truth"] = {name: float(truth[name]) for name in NINE}
     metrics["base_parameters"] = {name: one.found.base.b for name, one in results.items()}
     metrics["inertial_base_parameters"] = sum(
         1 for k in idim.found.base.kept if k < idim.model.inertial and not idim.model.names[k].endswith("5")
@@ -188,6 +196,29 @@ def report(robot: Robot, designs: list[ParallelDesign], results: dict[str, Metho
         )
     figures(robot, idim, pim, out)
     return metrics
+
+
+def readme_rows(metrics: dict) -> list[str]:
+    """Return the README's table: values with sigma [%] by inverse dynamics, power, and power with equal legs."""
+    rows = [
+        "| | truth | IDIM | paper | PIM | paper | PIM, equal legs | paper |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for name in NINE:
+        cells = [f"{metrics['truth'][name]:.4g}"]
+        for key in ("idim", "pim", "pim_case2"):
+            own = metrics["methods"][key]
+            if name in own["values"]:
+                cells.append(f"{own['values'][name]:.4g} ({own['sigma_percent'][name]:.1f})")
+            else:
+                cells.append("=")
+            cells.append("{:.3g} ({:.1f})".format(*PAPERS[key][name]))
+        rows.append(f"| {name}{'R' if name in NINE[:6] else ''} | {' | '.join(cells)} |")
+    cross = metrics["cross_validation"]
+    rows += ["", "| relative error on another loaded motion | x | y | rz |", "|---|---|---|---|"]
+    for words, values in (("IDIM", cross["idim"]), ("paper", cross["papers"])):
+        rows.append(f"| {words} | {' | '.join(f'{x:.3f}' for x in values)} |")
+    return rows
 
 
 def _values_of(robot: Robot, method: Method) -> np.ndarray:
