@@ -1,0 +1,29 @@
+"""Claims on six joints: the survey's TX40 at its lowest noise, encoders in the loop; slow."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib.identification.methods.registry import METHODS
+from calib.studies.conditions import Condition
+from calib.studies.experiment import make_experiment
+
+# torque error [%] on unseen motion, and size of the errors in stated standard deviations (None: biased by more than
+# their sigma, since filtered positions round off friction's reversals)
+EXPECTED = {
+    "ml": (0.4, None), "adaline": (0.4, None), "hopfield": (0.4, None), "srekf": (1.0, None), "cloe": (0.05, 1.6),
+    "clie": (0.4, 1.4),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EXPECTED)
+def test_a_tx40_is_recovered(name):
+    data = make_experiment(Condition("lowest noise", "tx40", np.deg2rad(1e-4), 0.05), 0)
+    found, (percent, sigmas) = METHODS[name].estimate(data.problem), EXPECTED[name]
+    assert found.found
+    wrong = data.matrix @ found.estimate.values - data.torque
+    assert 100.0 * np.linalg.norm(wrong) / np.linalg.norm(data.torque) < percent
+    away = (found.estimate.values - data.truth) / found.estimate.sigma
+    assert sigmas is None or np.sqrt(np.mean(away**2)) < sigmas
