@@ -5,9 +5,9 @@ on the same data sets, pair by pair, by the sign test (Conover 1999, section 3.4
 data set go together and their distributions have long tails.
 
 The rule: of the methods that give an estimate in at least `RELIABLE` of the trials, those whose torque error on unseen
-motion is not told from the best one's (`LEVEL`), or larger by no more than `SLACK` in the median, are as good as the
-best. Of these one is taken that is cheap: no more than `ALIKE` times the processor time of the cheapest, and of such
-the first in rank.
+motion is not told from the best one's (`LEVEL`), or larger by no more than `SLACK` in the median data set, are as good
+as the best; a method of fewer than `LEAST` runs is listed and takes no part. Of these one is taken that is cheap: no
+more than `ALIKE` times the processor time of the cheapest, and of such the first in rank.
 """
 
 from __future__ import annotations
@@ -62,6 +62,11 @@ class MethodSummary:
     p: float = float("nan")
 
     @property
+    def enough(self) -> bool:
+        """Whether there are runs enough to tell it from others."""
+        return self.trials >= LEAST
+
+    @property
     def reliable(self) -> bool:
         return sum(self.failures.values()) <= (1.0 - RELIABLE) * self.trials
 
@@ -97,18 +102,26 @@ def _ranked(condition: Condition, rows: Mapping[str, Sequence[Row]]) -> Conditio
     plain.sort(key=lambda one: (not one.reliable, one.figures["torque_error"].median))
     if not plain:
         return ConditionSummary(condition, ())
-    best = plain[0]
-    size = best.figures["torque_error"].median
+    best = next((one for one in plain if one.enough), None)
     judged = []
     for rank, one in enumerate(plain, 1):
-        p = float("nan") if one is best else sign_test(errors[one.method], errors[best.method])
-        near = one.figures["torque_error"].median <= (1.0 + SLACK) * size
-        good = one.reliable and np.isfinite(size) and (one is best or near or p > LEVEL)
-        judged.append(replace(one, rank=rank, as_good=bool(good), p=p))
+        if best is None or one is best or not one.enough:
+            good = one is best and one.reliable and bool(np.isfinite(one.figures["torque_error"].median))
+            judged.append(replace(one, rank=rank, as_good=good))
+            continue
+        p = sign_test(errors[one.method], errors[best.method])
+        near = _ratio(errors[one.method], errors[best.method]) <= 1.0 + SLACK
+        judged.append(replace(one, rank=rank, as_good=one.reliable and best.reliable and (near or p > LEVEL), p=p))
     good = [one for one in judged if one.as_good]
     least = min((one.figures["cpu"].median for one in good), default=0.0)
     chosen = next((one for one in good if not one.figures["cpu"].median > ALIKE * least), None)
     return ConditionSummary(condition, tuple(replace(one, chosen=one is chosen) for one in judged))
+
+
+def _ratio(one: Mapping[int, float], other: Mapping[int, float]) -> float:
+    """Return the median of a method's error over another's on the same data sets; infinite where there are none."""
+    both = [(one[seed], other[seed]) for seed in one.keys() & other.keys() if np.isfinite(other[seed])]
+    return float(np.median([a / max(b, 1e-300) for a, b in both])) if both else float("inf")
 
 
 def _error(row: Row) -> float:

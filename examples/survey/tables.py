@@ -45,7 +45,9 @@ def _cell(one: ConditionSummary, name: str) -> str:
     if found is None:
         return ""
     failed = sum(found.failures.values())
-    text = number(found.figures["torque_error"].median) + (f" ({failed}/{found.trials})" if failed else "")
+    text = number(found.figures["torque_error"].median) + (f" ({failed}/{found.trials} failed)" if failed else "")
+    if not found.enough:
+        return f"{text} (n = {found.trials})"
     return f"**{text}**" if found.chosen else f"{text} ·" if found.as_good else text
 
 

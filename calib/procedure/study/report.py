@@ -17,10 +17,10 @@ from calib.studies.trial import Row
 RULE = (
     f"Of the methods that give an estimate in at least {RELIABLE:.0%} of the trials, those are as good as the best "
     "whose torque error on unseen motion, noise-free, is not told from the best one's on the same data sets (sign "
-    f"test, {LEVEL:.0%}), or whose median is larger by at most {SLACK:.0%}.",
+    f"test, {LEVEL:.0%}), or, in the median data set, larger by at most {SLACK:.0%}.",
     f"Of these one is taken that is cheap, at most {ALIKE:g} times the processor time of the cheapest: the best such.",
     "A trial without an estimate counts as an infinite error, in medians and in comparisons.",
-    f"Fewer than {LEAST} common data sets tell no methods apart: all are then as good.",
+    f"A method with fewer than {LEAST} runs is listed, and neither the best nor as good: so few tell nothing apart.",
 )
 MEANING = (
     "torque: 100 ‖τ̂ - τ‖ / ‖τ‖ along a motion that no method saw, against the noise-free torques of the true robot.",
@@ -78,7 +78,7 @@ def condition_table(one: ConditionSummary) -> Table:
 def _line(one: MethodSummary) -> tuple[str, ...]:
     found = one.figures
     failed = ", ".join(f"{count} {status}" for status, count in one.failures.items())
-    mark = "take" if one.chosen else "as good" if one.as_good else ""
+    mark = "take" if one.chosen else "as good" if one.as_good else "" if one.enough else "few runs"
     return (
         one.method, str(one.trials), failed or "0", _short(found["torque_error"].median),
         _quartiles(found["torque_error"]), _short(found["torque_worst"].median), _short(found["beta_error"].median),
