@@ -1,0 +1,26 @@
+"""The survey's rows and tables: the rows that are kept are of this version's conditions, and the tables come of them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+from calib.studies.conditions import read_study
+from calib.studies.rows import read_rows
+
+SURVEY = Path(__file__).parents[2] / "examples" / "survey"
+
+
+def test_kept_rows_count():
+    """Each of the 15 conditions has rows of this version, none twice."""
+    rows = read_rows(SURVEY / "rows")
+    assert len({row.key for row in rows}) == len(rows)
+    there = {row.digest for row in rows}
+    assert [one.name for one in read_study(["MCS-*"]).conditions if one.digest not in there] == []
+
+
+def test_tables_are_those_of_the_readme():
+    done = subprocess.run([sys.executable, SURVEY / "tables.py"], capture_output=True, text=True, check=True)
+    printed = [line for line in done.stdout.splitlines() if line.startswith("| wls ")]
+    assert printed and all(line in (SURVEY / "README.md").read_text() for line in printed)
