@@ -1,4 +1,4 @@
-"""The survey's rows and tables: the rows that are kept are of this version's conditions, and the tables come of them."""
+"""The survey: the rows that are kept are of the conditions of this version, and the tables come of them."""
 
 from __future__ import annotations
 
