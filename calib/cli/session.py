@@ -44,6 +44,17 @@ def new(
     obstacle: Annotated[
         list[str] | None, typer.Option(help="'table box 1.2,0.8,0.05 at 0.7,0,-0.03' [m]; unknown, none; repeatable")
     ] = None,
+    mounting: Annotated[
+        str | None, typer.Option(help="of a camera: in hand (the arm carries it), to hand (the board), or unknown")
+    ] = None,
+    lens: Annotated[str | None, typer.Option(help="camera_info YAML of the camera, roughly right; or unknown")] = None,
+    board: Annotated[str | None, typer.Option(help="board.toml, or unknown")] = None,
+    carried: Annotated[
+        str | None, typer.Option(help="'x,y,z facing z': camera or board in the tip's frame [m]; or unknown")
+    ] = None,
+    stands: Annotated[
+        str | None, typer.Option(help="'x,y,z facing z': the other in the base frame [m]; or unknown")
+    ] = None,
     dynamics: Annotated[
         bool | None, typer.Option("--dynamics/--geometry-only", help="identify the dynamics, too (default)")
     ] = None,
@@ -72,8 +83,9 @@ def new(
     refuse_parallel(robot, "calib new")
     told = tuple(obstacle) if obstacle else None
     given = Answers(
-        robot, instrument, tool, limits, dynamics, tuple(payload or ()), torques, instrument_at, cone, facing, box, told
-    )
+        robot, instrument, tool, limits, dynamics, tuple(payload or ()), torques, instrument_at, cone, facing, box,
+        told, mounting, lens, board, carried, stands,
+    )  # fmt: skip
     if robot is None or instrument is None:
         given = _asked(given)
     made = new_session(

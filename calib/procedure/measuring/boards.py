@@ -12,7 +12,7 @@ from calib.data.camera import board as boards
 from calib.data.camera.board import KINDS, Board
 from calib.data.camera.corner_file import Found
 from calib.data.poses.image_folders import JOINTS, find_corners, joint_table, problem_words, read_own_board
-from calib.errors import UsageError
+from calib.errors import MeasurementError, UsageError
 
 Show = Callable[[str], None]
 USUAL = {"charuco": ("5x5_100", 0.7, 9), "chessboard": ("5x5_100", 0.7, 10), "apriltag": ("apriltag_36h11", 0.3, 9)}
@@ -83,20 +83,26 @@ def _images(folder: Path) -> list[str]:
 
 
 def summary(found: Found, board: Board, names: Iterable[str]) -> list[str]:
-    """Return what was found in images, in sentences: how many are of use, why others are not, what they cover."""
+    """Return what was found in images, in sentences: how many are of use, why others are not, what they cover.
+
+    Raises:
+        MeasurementError: where none is of use, with the reasons.
+    """
     kept = [one for one in found.images.values() if not one.problem]
     total = len(boards.corners(board))
-    lines = [f"{len(kept)} of {len(list(names))} images are of use ({board.words})"]
-    if kept:
-        seen = np.array([one.seen.sum() for one in kept])
-        sigma = float(np.nanmedian(np.concatenate([one.sigma[one.seen] for one in kept])))
-        edge = float(np.nanmedian([one.edge for one in kept]))
-        lines.append(
-            f"{seen.mean():.1f} of {total} corners per image, each to about {sigma:.2f} px; edges {edge:.1f} px wide"
-        )
-        if found.size[0]:
-            lines.append(coverage_words(np.concatenate([one.pixel[one.seen] for one in kept]), found.size))
-    return [*lines, *problem_words({name: one.problem for name, one in found.images.items()})]
+    problems = problem_words({name: one.problem for name, one in found.images.items()})
+    if not kept:
+        raise MeasurementError("; ".join([f"none of {len(list(names))} images is of use ({board.words})", *problems]))
+    seen = np.array([one.seen.sum() for one in kept])
+    sigma = float(np.nanmedian(np.concatenate([one.sigma[one.seen] for one in kept])))
+    edge = float(np.nanmedian([one.edge for one in kept]))
+    lines = [
+        f"{len(kept)} of {len(list(names))} images are of use ({board.words})",
+        f"{seen.mean():.1f} of {total} corners per image, each to about {sigma:.2f} px; edges {edge:.1f} px wide",
+    ]
+    if found.size[0]:
+        lines.append(coverage_words(np.concatenate([one.pixel[one.seen] for one in kept]), found.size))
+    return [*lines, *problems]
 
 
 def coverage(pixels: np.ndarray, size: tuple[int, int], weights: np.ndarray | None = None) -> np.ndarray:

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.config import strict
-from calib.config_types import Expect, Name, OneOf, Real
+from calib.config_types import Checked, Expect, Name, OneOf, Real, shown
 from calib.data.camera.board import Board, corners, read_board
 from calib.data.camera.camera_info import read_lens
 from calib.data.camera.lens import Lens, project
@@ -39,23 +39,40 @@ ASSUMED = (
     f"{1e3 * TURN:g} mrad per axis; what no model holds comes on top"
 )
 TRIES = 60
+UNKNOWN = "unknown"
+BLIND = "whether the camera sees the board"
 Angle = Annotated[float, Real(above=0, quantity="angle")]
 Distance = Annotated[float, Real(least=0, quantity="length")]
+
+
+def _place_or_unknown(value: Any) -> Any:
+    if value != UNKNOWN and not isinstance(value, Mapping):
+        raise ValueError(f'expected a table with xyz and rpy, or "{UNKNOWN}", found {shown(value)}')
+    return value
+
+
+Place = Annotated[Any, Checked(_place_or_unknown, {"anyOf": [{"type": "object"}, {"const": UNKNOWN}]})]
 
 
 @strict
 @dataclass(frozen=True, kw_only=True)
 class CameraTable:
-    """[camera], see the module."""
+    """[camera], see the module; what is ``unknown`` leaves unchecked whether the board is seen."""
 
-    mounting: Annotated[str, OneOf((IN_HAND, TO_HAND))]
+    mounting: Annotated[str, OneOf((IN_HAND, TO_HAND, UNKNOWN))]
     lens: Name
     board: Name
-    carried: Mapping[str, Any]
-    stands: Mapping[str, Any]
+    carried: Place
+    stands: Place
     tilt: Angle = float(np.radians(50.0))
     range: Annotated[tuple[Distance, Distance], Expect("two distances, least and largest")] = (0.2, 3.0)
     margin: Annotated[float, Real(least=0)] = 10.0
+
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        """What would have to be known to tell whether the board is seen."""
+        names = ("mounting", "lens", "board", "carried", "stands")
+        return tuple(name for name in names if getattr(self, name) == UNKNOWN)
 
 
 @dataclass(frozen=True, eq=False)

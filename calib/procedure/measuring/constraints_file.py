@@ -24,6 +24,7 @@ TOML; every table is optional, a key that is none of these is refused. Lengths i
     sight = "40 deg"                 # half angle of the cone, around facing, in which the target sees the instrument
     range = [0.5, 20.0]              # least and largest distance of the target
     [camera]                         # in place of an instrument; places may be rough, a centimetre and some degrees do
+    # what is "unknown" of the first five keys is said; the poses are then not held against the camera's view
     mounting = "in hand"             # the arm carries the camera; to hand: the board
     lens = "camera.yaml"             # beside the file; ROS camera_info
     board = "board.toml"
@@ -55,7 +56,7 @@ import numpy as np
 
 from calib.config import parse, read_toml, strict
 from calib.config_types import Checked, Expect, Name, Numeric, OneOf, OneOrMany, Real, shown
-from calib.procedure.measuring.camera_view import CameraTable
+from calib.procedure.measuring.camera_view import UNKNOWN, CameraTable
 
 MOTION = ("velocity", "acceleration", "jerk", "torque", "friction", "point", "frequency")  # `motion_limits` reads them
 MARGIN, JOINT_MARGIN = 0.01, 0.01  # [m], share of a joint's range: where the file does not tell (our choice)
@@ -189,7 +190,8 @@ def beside(path: Path) -> dict[str, Path]:
     """Return the files that a constraints file names, by name: a camera's lens and its board."""
     table = {key: value for key, value in read_toml(path).items() if key not in MOTION}
     camera = parse(ConstraintsFile, table, str(path)).camera
-    return {} if camera is None else {name: path.parent / name for name in (camera.lens, camera.board)}
+    names = () if camera is None else (camera.lens, camera.board)
+    return {name: path.parent / name for name in names if name != UNKNOWN}
 
 
 def rising(span: tuple[float, ...], where: str) -> None:

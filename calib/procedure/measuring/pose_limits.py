@@ -21,7 +21,7 @@ from calib.data.poses.pixels import IN_HAND
 from calib.errors import RobotError, UsageError
 from calib.geometry.installation import Installation
 from calib.geometry.observability import Observation, Target, TargetJacobian
-from calib.procedure.measuring.camera_view import CameraTable, CameraView, ImageObservation, camera_view
+from calib.procedure.measuring.camera_view import BLIND, CameraTable, CameraView, ImageObservation, camera_view
 from calib.procedure.measuring.constraints_file import (
     CELL,
     DEFAULTS,
@@ -123,7 +123,10 @@ def read_limits(
 
 
 def _with_camera(limits: Limits, stated: CameraTable, cell: Installation, path: Path, absent: set[str]) -> Limits:
-    """Return limits that keep the board in the camera's view, past the arm's own links."""
+    """Return limits that keep the board in the camera's view, past the arm's own links, where enough is known of it."""
+    unchecked = tuple(each for each in limits.unchecked if not each.startswith("line of sight"))
+    if stated.unknown:
+        return replace(limits, unchecked=(*unchecked, f"{BLIND} (not known: {', '.join(stated.unknown)})"))
     try:
         view = camera_view(stated, cell.chain, str(path), path.parent)
     except RobotError as error:
@@ -135,7 +138,6 @@ def _with_camera(limits: Limits, stated: CameraTable, cell: Installation, path: 
     model = None if "view" in absent else limits.collision
     sight = sight_of(arm, stand, [[0.0, 0.0, 1.0]], None, (0.0, np.inf), model)
     found = (view.constraint(), *(sight.targets[0] if sight is not None else ()))
-    unchecked = tuple(each for each in limits.unchecked if not each.startswith("line of sight"))
     words = "the whole board in the camera's view, its range and its tilt"
     past = ("view past the arm",) if sight is not None else ()
     return replace(

@@ -7,16 +7,23 @@ that there is no such thing, and nothing is missing.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from calib.config_types import number
+from calib.data.camera.board import FILE, read_board
+from calib.data.camera.camera_info import read_lens
+from calib.data.poses.pixels import IN_HAND, TO_HAND
 from calib.errors import UsageError
+from calib.transforms import pose, to_xyz_rpy
 
 UNKNOWN = ("", "unknown", "not known", "?", "-")
 NONE = "none"
-FAR, WIDE = 100.0, 10.0  # [m]: an instrument, an arm's cell, beyond which a number is taken for millimetres
+FAR, WIDE, HELD = 100.0, 10.0, 3.0  # [m]: an instrument, a cell, a tool beyond which a number is taken for millimetres
+CAMERA = ("mounting", "lens", "board", "carried", "stands")
 AXES = {
     f"{sign}{axis}": [(-1.0 if sign == "-" else 1.0) * (k == j) for j in range(3)]
     for k, axis in enumerate("xyz")
@@ -30,6 +37,7 @@ def cell_tables(
     facing: str | None = None,
     box: str | None = None,
     obstacles: Sequence[str] | None = None,
+    **camera: str | None,
 ) -> dict[str, Any]:
     """Return the tables of a limits file that answers come to; empty where nothing is known.
 
@@ -39,6 +47,7 @@ def cell_tables(
         facing: the target's direction in the tip's frame: x, -z … or three numbers.
         box: x,x,y,y,z,z that the arm stays in, in its base frame [m].
         obstacles: ``NAME KIND SIZES at X,Y,Z`` each: ``table box 1.2,0.8,0.05 at 0.7,0,-0.03`` [m].
+        camera: `CAMERA`, see `_camera`.
 
     Raises:
         UsageError: for an answer that cannot be one, with what can.
@@ -53,7 +62,7 @@ def cell_tables(
             raise UsageError(f"--cone {angle}: say where the instrument stands, too (--instrument-at x,y,z)")
         found["instrument"]["sight"] = _cone(angle)
     if (direction := _known(facing)) is not None:
-        found["target"] = {"facing": _direction(direction)}
+        found["target"] = {"facing": _direction("--facing", direction)}
     if (walls := _known(box)) is not None:
         sides = _numbers("--box", walls, 6, "x,x,y,y,z,z in metres, the smaller one first", WIDE)
         found["collision"] = {"box": [sides[k : k + 2] for k in (0, 2, 4)]}
@@ -64,6 +73,7 @@ def cell_tables(
     without += ["obstacles"] if [_plain(text) for text in stated] == [NONE] else []
     things = [_obstacle(text) for text in stated if _plain(text) != NONE]
     found |= {"obstacle": things} if things else {}
+    found |= {"camera": _camera(**camera)} if any(_known(text) for text in camera.values()) else {}
     return {**({"without": without} if without else {}), **found}
 
 
@@ -94,13 +104,68 @@ def _cone(text: str) -> float:
     return angle
 
 
-def _direction(text: str) -> list[float]:
+def _direction(option: str, text: str) -> list[float]:
     if (axis := AXES.get(text.lower())) is not None:
         return axis
-    values = _numbers("--facing", text, 3, "an axis of the tip's frame (x, -z …) or three numbers", FAR)
+    frame = "base" if option == "--stands" else "tip"
+    values = _numbers(option, text, 3, f"an axis of the {frame}'s frame (x, -z …) or three numbers", FAR)
     if not any(values):
-        raise UsageError(f"--facing {text}: no direction")
+        raise UsageError(f"{option} {text}: no direction")
     return values
+
+
+def _camera(
+    mounting: str | None = None,
+    lens: str | None = None,
+    board: str | None = None,
+    carried: str | None = None,
+    stands: str | None = None,
+) -> dict[str, Any]:
+    """Return [camera], ``unknown`` where nothing was said.
+
+    Args:
+        mounting: in hand (the arm carries the camera) or to hand (it carries the board).
+        lens, board: files.
+        carried: ``X,Y,Z facing AXIS`` [m] of what the arm carries, in the tip's frame; a camera faces what it looks at.
+        stands: the same of the other, in the base's frame.
+    """
+    found: dict[str, Any] = dict.fromkeys(CAMERA, UNKNOWN[1])
+    if (how := _known(mounting)) is not None:
+        words = how.lower().replace("-", " ").replace("_", " ")
+        if words not in (IN_HAND, TO_HAND):
+            raise UsageError(f"--mounting {how}: expected {IN_HAND} (the arm carries the camera), {TO_HAND} or unknown")
+        found["mounting"] = words
+    for name, text in (("lens", lens), ("board", board)):
+        if (file := _known(text)) is not None:
+            found[name] = _file(name, Path(file).expanduser())
+    for name, text, most in (("carried", carried, HELD), ("stands", stands, FAR)):
+        if (place := _known(text)) is not None:
+            if found["mounting"] == UNKNOWN[1]:
+                raise UsageError(f"--{name} {place}: of the camera or of the board? Say --mounting, too")
+            looks = (found["mounting"] == IN_HAND) == (name == "carried")
+            found[name] = _turned(f"--{name}", place, most, looks)
+    return found
+
+
+def _file(name: str, path: Path) -> str:
+    """Return the path of a lens or a board that can be read."""
+    path = path / FILE if name == "board" and path.is_dir() else path
+    if not path.is_file():
+        raise UsageError(f"--{name} {path}: no such file; give one, or unknown")
+    read_board(path) if name == "board" else read_lens(path)
+    return str(path)
+
+
+def _turned(option: str, text: str, most: float, looks: bool) -> dict[str, list[float]]:
+    """Return a place whose z axis is the direction of view: along a camera's, against a board's facing."""
+    form = "x,y,z in metres and the way it faces, e.g. 0.5,0,0 facing z"
+    spot, _, way = text.partition("facing")
+    if not way.strip() and option == "--stands":
+        raise UsageError(f"{option} {text}: expected {form}, or unknown")
+    along = np.array(_direction(option, way.strip() or "z"))
+    turn = Rotation.align_vectors([along if looks else -along], [[0.0, 0.0, 1.0]])[0].as_matrix()
+    xyz, rpy = to_xyz_rpy(pose(turn, _numbers(option, spot.strip(), 3, form, most)))
+    return {"xyz": [float(x) for x in xyz], "rpy": [round(float(x), 6) for x in rpy]}
 
 
 def _check_inside(box: list[list[float]], text: str) -> None:

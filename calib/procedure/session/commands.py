@@ -18,6 +18,7 @@ from calib.folders import CERTIFICATE
 from calib.geometry.observability import targets_of
 from calib.procedure.excitation.limits import read_motion_limits
 from calib.procedure.kinematic_stage.folder import URDF
+from calib.procedure.measuring.camera_view import camera_view
 from calib.procedure.measuring.constraints_file import ConstraintsFile, beside
 from calib.procedure.measuring.pose_limits import limits_of, read_limits
 from calib.procedure.session import instructions, steps
@@ -38,6 +39,7 @@ from calib.robot.tables import dumps
 
 Say = Callable[[str], None]
 LIMITS = "limits.toml"
+BESIDE = {"lens": "camera.yaml", "board": "board.toml"}  # a camera's files, beside the limits
 HEAD = "# What the cell is like, as calib new was told; calib formats limits says what may stand here.\n"
 COLOURS = {"done": "green", "kept": "green", "ready": "cyan", "stale": "yellow", "waiting": "yellow", "after": "dim"}
 
@@ -109,8 +111,16 @@ def _limits(stated: Path | Mapping[str, Any] | None, chain: Chain, source: Path)
         read_motion_limits(stated, chain, source)
         read_limits(stated, targets_of(chain), source)
         return {LIMITS: stated, **beside(stated)}, LIMITS
-    limits_of(parse(ConstraintsFile, stated, "the cell"), targets_of(chain), source, "the cell")
-    return {LIMITS: f"{HEAD}{dumps(stated)}"}, LIMITS
+    told = parse(ConstraintsFile, stated, "the cell")
+    limits_of(told, targets_of(chain), source, "the cell")
+    if told.camera is None:
+        return {LIMITS: f"{HEAD}{dumps(stated)}"}, LIMITS
+    if not told.camera.unknown:
+        camera_view(told.camera, chain, "the cell", Path())
+    given = {key: getattr(told.camera, key) for key in BESIDE if key not in told.camera.unknown}
+    tables = {**stated, "camera": {**stated["camera"], **{key: BESIDE[key] for key in given}}}
+    copied = {BESIDE[key]: Path(name) for key, name in given.items()}
+    return {LIMITS: f"{HEAD}{dumps(tables)}", **copied}, LIMITS
 
 
 def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", plots: bool = True) -> Stop:

@@ -16,6 +16,7 @@ from calib.geometry.observability import SIGMA_ORIENTATION, observation, targets
 from calib.geometry.uncertainty.spread import pose_sigmas
 from calib.procedure.kinematic_stage import compensation, selection
 from calib.procedure.kinematic_stage.settings import SelectionSettings
+from calib.procedure.measuring.camera_view import BLIND
 from calib.procedure.measuring.pose_limits import read_limits
 from calib.procedure.measuring.run import Run
 from calib.procedure.session.folder import PREDICTED, SELECTION, Session
@@ -23,7 +24,7 @@ from calib.robot.chain import Chain
 from poses.candidates import draw_candidates
 from poses.space import is_feasible
 
-BLIND = "whether the camera sees the board (state [camera] in the limits file: calib formats constraints)"
+HOW = "state [camera] in the limits file: calib formats constraints"
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +54,9 @@ def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], N
         robot_file, wanted.fit, choice, constraints=constraints, base=links[0], tip=links[1],
         progress=lambda done, total, what: say(f"choosing poses: {what}"),
     )  # fmt: skip
-    if instrument.measures == Pixels.kind and not chosen.by_images:
-        chosen = replace(chosen, unchecked=(*chosen.unchecked, BLIND))
+    said = any(words.startswith(BLIND) for words in chosen.unchecked)
+    if instrument.measures == Pixels.kind and not chosen.by_images and not said:
+        chosen = replace(chosen, unchecked=(*chosen.unchecked, f"{BLIND} ({HOW})"))
     found = chosen.selection
     assert found.q is not None
     if found.interrupted:  # a session is resumed, not gone on with half a search

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from calib.errors import UsageError
-from calib.procedure.session.cell_answers import cell_tables
+from calib.procedure.session.cell_answers import CAMERA, UNKNOWN, cell_tables
 from calib.procedure.session.settings import TORQUES
 from calib.robot import library
 from calib.robot.load import resolve
@@ -80,11 +80,21 @@ class Answers:
     facing: str | None = None
     box: str | None = None
     obstacles: tuple[str, ...] | None = None
+    mounting: str | None = None
+    lens: str | None = None
+    board: str | None = None
+    carried: str | None = None
+    stands: str | None = None
 
     @property
     def cell(self) -> dict[str, Any]:
         """What was said of the cell."""
         return {name: value for name in CELL if (value := getattr(self, name)) is not None}
+
+    @property
+    def by_camera(self) -> bool:
+        """Whether images are taken: where the camera is takes more than a place."""
+        return self.instrument in INSTRUMENTS and INSTRUMENTS[self.instrument].measures == "pixels"
 
 
 @dataclass(frozen=True)
@@ -107,33 +117,60 @@ def _of_the_cell(name: str) -> Callable[[Answers], bool]:
 
     def is_open(given: Answers) -> bool:
         told = not known or known in cell_tables(given.instrument_at)
-        asked = name != "instrument_at" or not _by_camera(given)
+        asked = name != "instrument_at" or not given.by_camera
         return given.limits is None and getattr(given, name) is None and told and asked
 
     return is_open
 
 
-def _by_camera(given: Answers) -> bool:
-    """Say whether images are taken: where the camera is takes more than a place, and a file states it ([camera])."""
-    return given.instrument in INSTRUMENTS and INSTRUMENTS[given.instrument].measures == "pixels"
+def _of_the_camera(name: str, mounting: str = "") -> Callable[[Answers], bool]:
+    """Put a question on a camera where no file states it, once it is known what the arm carries."""
+
+    def is_open(given: Answers) -> bool:
+        how = (given.mounting or "").lower().replace("-", " ")
+        told = name == "mounting" or how == mounting or (not mounting and how not in UNKNOWN)
+        return given.by_camera and given.limits is None and getattr(given, name) is None and told
+
+    return is_open
 
 
-CELL = ("instrument_at", "cone", "facing", "box", "obstacles")
+CELL = ("instrument_at", "cone", "facing", "box", "obstacles", *CAMERA)
 QUESTIONS = (
     Question("robot", f"robot (.urdf, .toml, or {' '.join(library.names())})", "", _unanswered("robot")),
     Question("instrument", f"instrument ({' '.join(INSTRUMENTS)})", "tracker", _unanswered("instrument")),
     Question(
         "tool", "where the target sits in the tip's frame, x,y,z [m]", "0.05,0,0.05",
-        lambda given: given.tool is None and not _by_camera(given),
+        lambda given: given.tool is None and not given.by_camera,
     ),
     Question(
         "limits", "file that states the cell: instrument, obstacles, speeds (none: asked for now)", "none",
-        lambda given: given.limits is None and not given.cell and not _by_camera(given),
+        lambda given: given.limits is None and not given.cell and not given.by_camera,
     ),
     Question(
-        "limits", "file that states the cell, [camera] with it: lens, board, roughly where both are, so that poses see "
-        "the board (calib formats constraints; none: they are chosen blindly)", "none",
-        lambda given: given.limits is None and not given.cell and _by_camera(given),
+        "limits", "file that states the cell, [camera] with it: lens, board, roughly where both are (none: asked for "
+        "now)", "none", lambda given: given.limits is None and not given.cell and given.by_camera,
+    ),
+    Question(
+        "mounting", "what the arm carries: the camera (in hand), or the board (to hand); unknown: whether poses see "
+        "the board is not checked", "unknown", _of_the_camera("mounting"),
+    ),
+    Question("lens", "the lens: a camera_info YAML, roughly right (unknown)", "unknown", _of_the_camera("lens")),
+    Question("board", "the board's board.toml, of calib board (unknown)", "unknown", _of_the_camera("board")),
+    Question(
+        "carried", "where the camera roughly sits in the tip's frame, and looks: x,y,z facing z [m] (unknown)",
+        "unknown", _of_the_camera("carried", "in hand"),
+    ),
+    Question(
+        "carried", "where the board's middle roughly sits in the tip's frame, and faces: x,y,z facing z [m] (unknown)",
+        "unknown", _of_the_camera("carried", "to hand"),
+    ),
+    Question(
+        "stands", "where the board's middle roughly is in the robot's base frame, and faces: 0.5,0,0 facing z [m] "
+        "(unknown)", "unknown", _of_the_camera("stands", "in hand"),
+    ),
+    Question(
+        "stands", "where the camera roughly stands in the robot's base frame, and looks: 1.5,0,0.5 facing -x [m] "
+        "(unknown)", "unknown", _of_the_camera("stands", "to hand"),
     ),
     Question(
         "instrument_at", "where the instrument roughly stands, x,y,z [m] in the robot's base frame (unknown; none: "
@@ -205,12 +242,14 @@ def checked(given: Answers) -> dict[str, Any]:
     result: dict[str, Any] = {"robot": robot, "instrument": instrument, "dynamics": dynamics}
     if given.tool is not None:
         result["tool"] = _place(given.tool)
+    if not given.by_camera and (told := [name for name in CAMERA if getattr(given, name) is not None]):
+        raise UsageError(f"--{told[0]} is about a camera that takes images; the instrument is {instrument}")
     if given.limits is not None:
         if not given.limits.is_file():
             raise UsageError(f"--limits {given.limits}: no such file")
         if given.cell:
-            told = f"--{next(iter(given.cell)).replace('_', '-').removesuffix('s')}"
-            raise UsageError(f"{told} and --limits both say what the cell is like; put it into {given.limits}")
+            told = next(iter(given.cell)).replace("_", "-").replace("obstacles", "obstacle")
+            raise UsageError(f"--{told} and --limits both say what the cell is like; put it into {given.limits}")
         result["limits"] = given.limits
     elif tables := cell_tables(**given.cell):
         result["limits"] = tables

@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from functools import partial
 
+import cv2
 import numpy as np
 import pytest
 
@@ -22,6 +23,7 @@ from calib.procedure.kinematic_stage.settings import SelectionSettings
 from calib.procedure.measuring.boards import make
 from calib.procedure.measuring.camera_view import image_observation
 from calib.procedure.measuring.pose_limits import read_limits
+from calib.procedure.session.cell_answers import cell_tables
 from calib.procedure.session.commands import NewSession, begin, go_on
 from calib.procedure.session.folder import open_session
 from calib.robot.deflection import Deflection
@@ -30,7 +32,7 @@ from calib.simulation.cells import camera_cell as camera
 from calib.simulation.cells import camera_files
 from calib.simulation.cells.cell import SimulatedInstrument
 from calib.simulation.cells.virtual_cells import rigid, virtual_cell
-from calib.transforms import pose
+from calib.transforms import from_xyz_rpy, pose
 from poses.space import is_feasible
 
 SILENT = partial(lambda *words: None)
@@ -81,6 +83,33 @@ def test_a_camera_that_sees_no_board_is_refused(cell, tmp_path):
         path.write_text(path.read_text().replace("camera.yaml", "lens.yaml"))
         with pytest.raises(UsageError, match=r"camera: no file 'lens.yaml' beside it"):
             read_limits(path, targets_of(load("lwr4plus")))
+
+
+def test_a_camera_as_told_is_held_against_its_view_or_said_not_to_be(cell, tmp_path):
+    """A camera looks along its z, a board's z goes into it; what is unknown is named in what is unchecked."""
+    arm = targets_of(cell.cell.nominal)
+    with camera_files.limits_of(cell) as path:
+        told = {
+            "mounting": "in-hand", "lens": str(path.parent / "camera.yaml"), "board": str(path.parent),
+            "carried": "0.04,0.02,0.06", "stands": "0.46,0,0 facing z",
+        }  # fmt: skip
+        whole, part = cell_tables(**told), cell_tables(**{**told, "lens": "unknown", "stands": None})
+        for name, tables in (("whole", whole), ("part", part)):
+            begin(tmp_path / name, NewSession("lwr4plus", "camera", 30, 10, 0, limits=tables, dynamics=False))
+    carried, stands = (from_xyz_rpy(**whole["camera"][key])[:3, 2] for key in ("carried", "stands"))
+    np.testing.assert_allclose([carried, stands], [[0, 0, 1], [0, 0, -1]], atol=1e-5)
+    seen, blind = (read_limits(tmp_path / name / "limits.toml", arm) for name in ("whole", "part"))
+    assert seen.camera is not None and not any("camera" in words for words in seen.unchecked)
+    assert blind.camera is None and "whether the camera sees the board (not known: lens, stands)" in blind.unchecked
+    assert not (tmp_path / "part/camera.yaml").exists() and (tmp_path / "part/board.toml").exists()
+
+
+def test_images_without_a_board_are_an_error(tmp_path, capsys):
+    assert run(["board", "--out", str(tmp_path)]) == 0
+    for k in range(2):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), np.full((200, 300), 128, np.uint8))
+    assert run(["images", str(tmp_path)]) == 2
+    assert "none of 2 images is of use (ChArUco" in capsys.readouterr().err
 
 
 def test_boards_are_made_and_impossible_ones_refused(tmp_path, capsys):

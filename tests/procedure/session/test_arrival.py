@@ -12,6 +12,7 @@ from calib.data.poses.measurements import take
 from calib.errors import MeasurementError, UsageError
 from calib.procedure.kinematic_stage import inputs
 from calib.procedure.session import arrival
+from calib.procedure.session.cell_answers import CAMERA
 from calib.procedure.session.commands import NewSession, begin
 from calib.procedure.session.dynamics_steps import options_of
 from calib.procedure.session.folder import Session
@@ -91,7 +92,7 @@ def test_metres_under_a_header_of_millimetres_are_refused_in_validation_files_to
 
 
 def test_a_camera_is_asked_for_its_own_place_and_not_for_a_reflectors():
-    """Where a tracker is asked for target, place and cone, a camera is asked for the file that states [camera]."""
+    """Where a tracker is asked for target, place and cone, a camera is asked what the arm carries, and for files."""
     asked = {}
     for instrument in ("tracker", "camera"):
         given = Answers(robot="lwr4plus", instrument=instrument)
@@ -100,3 +101,7 @@ def test_a_camera_is_asked_for_its_own_place_and_not_for_a_reflectors():
     assert {"tool", "instrument_at"} <= set(names["tracker"]) and not {"tool", "instrument_at"} & set(names["camera"])
     assert [names[key].count("limits") for key in names] == [1, 1]
     assert "[camera]" in next(question.words for question in asked["camera"] if question.name == "limits")
+    assert "mounting" in names["camera"] and not {"mounting", "lens", "carried"} & set(names["tracker"])
+    for mounting, others in (("unknown", 0), ("in hand", 4), ("to-hand", 4)):
+        given = with_answer(Answers("lwr4plus", "camera"), asked["camera"][1], mounting)
+        assert sum(question.open(given) for question in QUESTIONS if question.name in CAMERA) == others
