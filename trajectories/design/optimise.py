@@ -64,7 +64,7 @@ def design(
             raise
         search.interrupted = True
     if not search.found:
-        raise _nothing(problem, search.stuck)
+        raise _nothing(problem, search.stuck, len(tasks))
     best = min(polished or search.found, key=lambda one: one.merit)
     share = sum(one.feasible * one.evaluations for one in search.found) / search.spent
     return replace(
@@ -117,7 +117,7 @@ def _kept(starts: int) -> int:
     return max(1, round(KEPT * starts))
 
 
-def _nothing(problem: ExcitationProblem, stuck: list[Stuck]) -> NothingFeasible:
+def _nothing(problem: ExcitationProblem, stuck: list[Stuck], starts: int) -> NothingFeasible:
     """Return the error that names the constraint which was in the way."""
     best = min(stuck, key=lambda one: one.excess)
     motion = stretched(problem.basis().motion(best.x), best.factor)
@@ -126,7 +126,7 @@ def _nothing(problem: ExcitationProblem, stuck: list[Stuck]) -> NothingFeasible:
         lacking, goal, value = unmet(problem, values)
         assert goal is not None  # the search kept every limit, so a hard goal stood in its way
         return NothingFeasible(
-            f"the hard goal {goal.objective.name} ≤ {goal.goal:g} was not reached in {len(stuck)} starts, though all "
+            f"the hard goal {goal.objective.name} ≤ {goal.goal:g} was not reached in {starts} starts, though all "
             f"limits were kept: the nearest motion has {value:.4g}; ease it, give it a weight, or take a longer period",
             goal.objective.name, lacking, "of the goal",
         )  # fmt: skip
@@ -137,7 +137,7 @@ def _nothing(problem: ExcitationProblem, stuck: list[Stuck]) -> NothingFeasible:
     row, column = np.unravel_index(np.argmax(values / worst.scale), values.shape)
     excess = float(values[row, column])
     return NothingFeasible(
-        f"no feasible motion in {len(stuck)} starts: the nearest one breaks the {worst.name} limit "
+        f"no feasible motion in {starts} starts: the nearest one breaks the {worst.name} limit "
         f"({worst.labels[column]}) by {max(excess, 0.0):.3g} {worst.unit} at t = {motion.times[row]:.3g} s; widen that "
         "limit, take a longer period, or allow more starts",
         worst.name, excess, worst.unit,
