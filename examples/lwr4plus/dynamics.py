@@ -78,14 +78,24 @@ class Data:
         ]
 
 
-def model(chain: Chain, kind: TorqueRows, gravity: np.ndarray | None = None) -> IdentificationModel:
-    """Return the study's model: seven links and a payload, seven drive terms each; the payload's move nothing."""
+def model(
+    chain: Chain, kind: TorqueRows, gravity: np.ndarray | None = None, v0: float = drives.V0
+) -> IdentificationModel:
+    """Return the study's model: seven links and a payload, seven drive terms each; the payload's move nothing.
+
+    The sign of Coulomb friction is smoothed over v0 [rad/s].
+    """
     bodies = with_payload(
         bodies_of(chain), pose(position=np.array([0.0, 0.0, known_robots.truth("lwr4plus")["payload"]["r"]]))
     )
     bodies = bodies if gravity is None else with_gravity(bodies, gravity)
-    terms = drives.standard([" ".join(known_robots.SIDED)] * chain.n)
+    terms = drives.standard([" ".join(known_robots.SIDED)] * chain.n, v0)
     return IdentificationModel(bodies, (*terms, *drives.without_effect(PAYLOAD)), kind)
+
+
+def calibrated_chain() -> Chain:
+    """Return the simulated arm: the calibrated column of Table 2 with the library's inertias."""
+    return replace(lwr4plus.arm(lwr4plus.table_2()[1]), inertias=lwr4plus.nominal_chain().inertias)
 
 
 def true_parameters(chain: Chain) -> np.ndarray:
@@ -177,24 +187,30 @@ def identify(chain: Chain, nominal: Chain, kind: TorqueRows, data: Data) -> Fit:
     """Estimate base and essential parameters: columns chosen on the nominal chain, regrouped on the one given."""
     own = model(chain, kind)
     base = bases.regroup(bases.find(model(nominal, kind)), own)
-    collected: Triangles = empty(base.names, base.units, own.rows)
-    for case in data.cases(kind):
-        rows = observe(own, base.kept, case, case.motion.decimator)
-        for row in range(own.rows):
-            collected = absorb(collected, rows.matrix[:, row], rows.target[:, row], row)
-    std = settled_std(collected)
-    tested = eliminate(collected, Rule.F, level=0.01, std=std)
+    rows = collected(own, base, data)
+    std = settled_std(rows)
+    tested = eliminate(rows, Rule.F, level=0.01, std=std)
     first = tested.essential.estimate
     poor = [name for name, rsd in zip(first.names, first.rsd) if rsd > POOR]
     good = [name for name in first.names if name not in poor]
     gone = [step.name for step in tested.steps]
-    supervised = eliminate(collected, Rule.F, level=0.01, keep=good, drop=[*gone, *poor], std=std)
+    supervised = eliminate(rows, Rule.F, level=0.01, keep=good, drop=[*gone, *poor], std=std)
     rules = {
-        f"RSD ratio < {RATIO:g}": len(eliminate(collected, Rule.RSD, ratio=RATIO, std=std).kept),
+        f"RSD ratio < {RATIO:g}": len(eliminate(rows, Rule.RSD, ratio=RATIO, std=std).kept),
         "F": len(tested.kept),
         f"F, RSD < {POOR:g} %": len(supervised.kept),
     }
-    return Fit(own, base, wls(collected, std), supervised, rules)
+    return Fit(own, base, wls(rows, std), supervised, rules)
+
+
+def collected(own: IdentificationModel, base: Base, data: Data) -> Triangles:
+    """Return the filtered and decimated rows of both loads, in one triangle per torque."""
+    result = empty(base.names, base.units, own.rows)
+    for case in data.cases(own.torque_rows):
+        rows = observe(own, base.kept, case, case.motion.decimator)
+        for row in range(own.rows):
+            result = absorb(result, rows.matrix[:, row], rows.target[:, row], row)
+    return result
 
 
 def values_of(found: Fit) -> np.ndarray:
@@ -280,8 +296,7 @@ def published(found: Fit) -> dict[str, dict[str, float]]:
 
 def run(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
     """Run the study; write and return the metrics."""
-    nominal = lwr4plus.nominal_chain()
-    calibrated = replace(lwr4plus.arm(lwr4plus.table_2()[1]), inertias=nominal.inertias)
+    nominal, calibrated = lwr4plus.nominal_chain(), calibrated_chain()
     training, other = choose_motion(nominal, quick, seed), fourier([seed, 1001])
     data, unseen = record(calibrated, training, [seed, 0]), record(calibrated, other, [seed, 1])
     metrics: dict[str, Any] = {"counts": counts(nominal), "counts_asked": COUNTS, "models": {}}
@@ -311,7 +326,7 @@ def run(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
 
 def _truth(found: Fit) -> np.ndarray:
     """Return the true base parameters of a model."""
-    chain = replace(lwr4plus.arm(lwr4plus.table_2()[1]), inertias=lwr4plus.nominal_chain().inertias)
+    chain = calibrated_chain()
     known = dict(zip(model(chain, BOTH).names, true_parameters(chain)))
     return found.base.transform @ np.array([known[name] for name in found.model.names])
 

@@ -1,33 +1,27 @@
-"""Pictures of the excitation study, after Figs 5 and 6 of Kolyubin, Shiriaev & Jubien (2019)."""
+"""Pictures of the excitation study, after Figs 5, 6 and 7 of Kolyubin, Shiriaev & Jubien (2019)."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
+from dynamics import TABLE_4
 from matplotlib.figure import Figure
 
-from calib.procedure.report.style import AFTER, BEFORE, MARK, QUIET, WIDE, sheet, styled
+from calib.procedure.report.style import AFTER, BEFORE, INK, MARK, QUIET, WIDE, sheet, styled
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
-from trajectories.basis import SampledMotion
-
-ESSENTIAL = (
-    "Ia1", "Fvm1", "Fcm1", "Ia2", "Fvm2", "Fcm2", "Ia3", "Fvm3", "Fcm3", "Fvm4", "Ia5", "Fvm5", "Fcm5", "Ia6", "Fvm6",
-    "Fcm6", "Ia7", "Fvm7", "Fcm7", "offm7", "Fcl1", "Fcl2", "offl2", "Fcl3", "Fcl4", "offl4", "Fcl5", "offl5", "Fcl7",
-    "offl7", "XX2R", "ZZ2R", "MY2R", "XX4R", "ZZ4R", "MY4R", "MY5R", "MY6R",
-)  # fmt: skip
-"""The paper's Table 4 without its payload."""
+from calib.simulation.loop.references import Reference
 
 
-def paths(chain: Chain, motions: dict[str, SampledMotion]) -> Figure:
-    """Draw the tool's path of every motion in space."""
+def paths(chain: Chain, motions: dict[str, Reference]) -> Figure:
+    """Draw the tool's path of every motion in space (Fig. 5)."""
     with styled():
         columns = min(len(motions), 3)
         figure = Figure(figsize=(WIDE, 2.6 * -(-len(motions) // columns)))
         for k, (name, motion) in enumerate(motions.items()):
             axis: Any = figure.add_subplot(-(-len(motions) // columns), columns, k + 1, projection="3d")
-            place = forward(chain, motion.q)[:, :3, 3]
+            place = forward(chain, motion.q[::20])[:, :3, 3]
             axis.plot(*place.T, color=AFTER, linewidth=0.7)
             axis.set_title(name)
             axis.set(xlim=(-0.9, 0.9), ylim=(-0.9, 0.9), zlim=(-0.3, 0.9), box_aspect=(1.5, 1.5, 1.0))
@@ -36,17 +30,44 @@ def paths(chain: Chain, motions: dict[str, SampledMotion]) -> Figure:
 
 
 def estimates(found: dict[str, Any]) -> Figure:
-    """Draw the identified error of the essential parameters: CAD and calibrated geometry, random path and optimised."""
-    names = [name for name in found["names"] if name in ESSENTIAL]
-    names = names or [name for name in found["names"] if name.rstrip("R") != name or name[:2] in ("Fv", "Fc", "Ia")]
-    index = [found["names"].index(name) for name in names]
-    colors = dict(zip(found["rows"], (BEFORE, QUIET, MARK, AFTER)))
+    """Draw the essential estimates over the truth, CAD and fitted geometry, RP and OT (Figs 6 and 7)."""
+    place, wide = np.arange(len(TABLE_4)), dict(zip(found, (BEFORE, MARK, QUIET, AFTER)))
     with styled():
-        figure, (axis,) = sheet(width=WIDE, height=3.2)
-        for k, (name, row) in enumerate(found["rows"].items()):
-            place = np.arange(len(index)) + 0.2 * (k - 1.5)
-            axis.bar(place, np.array(row["error"])[index], 0.2, color=colors[name], label=name)
-        axis.set(yscale="log", ylabel="error of the estimate [%]")
-        axis.set_xticks(range(len(index)), names, rotation=90, fontsize=6)
-        axis.legend(ncols=2, fontsize=7)
+        figure, (first, second) = sheet(2, 1, width=WIDE, height=5.6)
+        for k, (name, row) in enumerate(found.items()):
+            off = 100.0 * (np.array(row["estimate"]) / row["truth"] - 1.0)
+            first.plot(place + 0.15 * (k - 1.5), off, "o", markersize=2.5, color=wide[name], label=name)
+        first.axhline(0.0, color=INK, linewidth=0.5)
+        first.set(
+            ylabel="estimate over truth [%]", title="after Fig. 6: RP random waypoints, OT trajectory B, 44 columns"
+        )
+        first.set_yscale("symlog", linthresh=1.0)
+        first.legend(ncols=4, fontsize=7)
+        cad, own = (np.array(found[f"{name}, OT"]["estimate"]) for name in ("CAD", "ID"))
+        second.bar(place, 100.0 * np.abs(cad / own - 1.0), color=BEFORE)
+        second.set(yscale="log", ylabel="|CAD - ID| / |ID| [%]", title="after Fig. 7: what the geometry changes")
+        for axis in (first, second):
+            axis.set_xticks(place, TABLE_4, rotation=90, fontsize=6)
+    return figure
+
+
+def speeds(rows: dict[str, list[dict[str, Any]]], shares: tuple[float, ...]) -> Figure:
+    """Draw the plain moves' median RSD over that of B, and their true error in sigma, by speed; one dot per seed."""
+    own = rows["B, 44 columns"]
+    with styled():
+        figure, (left, right) = sheet(1, 2, width=WIDE, height=2.8)
+        for key, colour, words in (("102 fitted", AFTER, "all 102 fitted"), ("44 fitted", MARK, "the 44 fitted alone")):
+            runs = {share: rows[f"moves at {share:g}"] for share in shares if f"moves at {share:g}" in rows}
+            ratio = [[a[key]["median_rsd"] / b[key]["median_rsd"] for a, b in zip(x, own)] for x in runs.values()]
+            error = [[one[key]["error_in_sigma"] for one in x] for x in runs.values()]
+            for axis, values in ((left, ratio), (right, error)):
+                axis.plot(list(runs), np.median(values, axis=1), color=colour, label=words)
+                axis.plot(list(runs), values, ".", color=colour)
+            right.axhline(np.median([one[key]["error_in_sigma"] for one in own]), color=colour, linestyle=":")
+        left.axhline(2.0, color=INK, linewidth=0.5)
+        left.annotate("paper: twice", (shares[-1], 2.0), ha="right", va="bottom", fontsize=7)
+        left.set(xlabel="speed of the moves, share of the limits", ylabel="median RSD over B's", ylim=(0.0, None))
+        right.set(xlabel="speed of the moves, share of the limits", ylabel="true error [σ, rms]", yscale="log")
+        right.set_title("dotted: trajectory B", fontsize=7)
+        left.legend(fontsize=7)
     return figure

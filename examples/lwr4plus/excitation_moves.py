@@ -1,22 +1,20 @@
-"""Baselines of the excitation study: rest-to-rest moves between random poses, at the limits that the designs keep."""
+"""Motions one would take without designing any: rest-to-rest moves, and a spline, through random waypoints."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
-from trajectories.basis import SampledMotion
+from calib.simulation.loop.references import Reference
 
 SHARE = 0.9  # of the limits of position, velocity and torque
 INSIDE = np.linspace(0.0, 1.0, 60)
-
-
-def minimum_jerk(s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return place, speed and bend over s = 0 … 1; the speed peaks at 1.875."""
-    return 10 * s**3 - 15 * s**4 + 6 * s**5, 30 * s**2 * (1 - s) ** 2, 60 * s - 180 * s**2 + 120 * s**3
+ELBOW = np.deg2rad([0.0, 60.0, 0.0, -60.0, 0.0, 0.0, 0.0])  # well inside the workspace
+Torque = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 def trapezoidal(s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -26,36 +24,58 @@ def trapezoidal(s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return place, np.minimum(1.5, np.minimum(4.5 * s, 4.5 * (1 - s))), bend
 
 
-SHAPES = {"minimum jerk": minimum_jerk, "trapezoidal": trapezoidal}
-Torque = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+def moves(chain: Chain, torque: Torque, speed: float, seed: int, rate: float, seconds: float) -> Reference:
+    """Return trapezoidal moves, straight in joint space, through random waypoints of the workspace.
 
-
-def moves(
-    chain: Chain, torque: Torque, shape: str, seed: int, rate: float, period: float | None, count: int = 20
-) -> SampledMotion:
-    """Return moves through random waypoints of the workspace, straight in joint space, as fast as the limits allow.
+    Every move is first as fast as 0.9 of the limits of velocity and torque allow, and then takes 0.9 / speed times as
+    long: so `speed` is the share of the limits, the waypoints are the same for every share, and a log of given length
+    holds fewer of them.
 
     Args:
-        torque: (q, v, a), each (N, n), to (N, n); moves are slowed down until it keeps to its limits.
-        rate: of the samples [Hz]; period: where to cut [s]; None: at the end of `count` moves.
+        torque: (q, v, a), each (N, n), to the torques' moduli (N, n).
+        rate, seconds: of the samples [Hz], and of the whole [s].
     """
     rng = np.random.default_rng(seed)
-    velocity, effort = (
-        SHARE * np.array([getattr(joint, key) for joint in chain.joints]) for key in ("velocity", "effort")
-    )
     points, times = [_pose(chain, rng)], list[float]()
-    while len(times) < count or (period is not None and sum(times) < period):
+    while sum(times) < seconds:
         goal = _pose(chain, rng)
-        if not _clear(chain, points[-1] + INSIDE[:, None] * (goal - points[-1])):
-            continue
-        times.append(_fastest(torque, SHAPES[shape], points[-1], goal, velocity, effort))
-        points.append(goal)
+        if _clear(chain, points[-1] + INSIDE[:, None] * (goal - points[-1])):
+            times.append(SHARE / speed * _fastest(chain, torque, points[-1], goal))
+            points.append(goal)
     ends, q = np.concatenate([[0.0], np.cumsum(times)]), np.array(points)
-    t = np.arange(0.0, ends[-1] if period is None else period, 1.0 / rate)
+    t = np.arange(0.0, seconds, 1.0 / rate)
     k = np.searchsorted(ends, t, side="right") - 1
     width, step = np.array(times)[k][:, None], np.diff(q, axis=0)[k]
-    place, speed, bend = SHAPES[shape](((t - ends[k]) / width[:, 0])[:, None])
-    return SampledMotion(t, q[k] + step * place, step * speed / width, step * bend / width**2, np.zeros(step.shape))
+    place, pace, bend = trapezoidal(((t - ends[k]) / width[:, 0])[:, None])
+    return Reference(t, q[k] + step * place, step * pace / width, step * bend / width**2)
+
+
+def waypoint_spline(
+    chain: Chain, torque: Torque, seed: int, rate: float, period: float, count: int = 20
+) -> tuple[Reference, float]:
+    """Return one period of a closed cubic spline through random waypoints, evenly in time, at rest at both ends.
+
+    The waypoints are drawn about an elbow posture and drawn towards it until 0.9 of the limits and the workspace hold.
+
+    Returns:
+        The motion, and the share of the joints' ranges that its waypoints are spread over.
+    """
+    rng = np.random.default_rng(seed)
+    spread = SHARE * rng.uniform(chain.lower - ELBOW, chain.upper - ELBOW, (count, chain.n))
+    knots, t = np.linspace(0.0, period, count + 1), np.arange(0.0, period, 1.0 / rate)
+    velocity, effort = _limits(chain)
+    for share in 0.98 ** np.arange(200):
+        curve = CubicSpline(knots, ELBOW + share * np.vstack([spread, spread[:1]]), bc_type="clamped")
+        q, v, a = (curve(t, order) for order in range(3))
+        few = slice(None, None, 20)
+        inside = ((q >= SHARE * chain.lower) & (q <= SHARE * chain.upper)).all() and (np.abs(v) <= velocity).all()
+        if inside and _clear(chain, q[few]) and (torque(q[few], v[few], a[few]) <= effort).all():
+            return Reference(t, q, v, a), float(share)
+    raise RuntimeError("no spline about the elbow posture keeps the limits")
+
+
+def _limits(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
+    return tuple(SHARE * np.array([getattr(joint, key) for joint in chain.joints]) for key in ("velocity", "effort"))  # type: ignore[return-value]
 
 
 def _pose(chain: Chain, rng: np.random.Generator) -> np.ndarray:
@@ -71,14 +91,11 @@ def _clear(chain: Chain, q: np.ndarray) -> bool:
     return bool((np.hypot(place[:, 0], place[:, 1]) >= 0.3).all() and (place[:, 2] >= -0.2).all())
 
 
-def _fastest(
-    torque: Torque, shape: Callable, start: np.ndarray, goal: np.ndarray, velocity: np.ndarray, effort: np.ndarray
-) -> float:
+def _fastest(chain: Chain, torque: Torque, start: np.ndarray, goal: np.ndarray) -> float:
     """Return the shortest duration [s] of a move, to 2 %."""
-    place, speed, bend = shape(INSIDE[:, None])
-    step, width = goal - start, float((np.abs(goal - start) * shape(np.array([[0.5]]))[1].item() / velocity).max())
-    while True:
-        tau = torque(start + step * place, step * speed / width, step * bend / width**2)
-        if (np.abs(tau) <= effort).all():
-            return width
+    velocity, effort = _limits(chain)
+    place, pace, bend = trapezoidal(INSIDE[:, None])
+    step, width = goal - start, float((1.5 * np.abs(goal - start) / velocity).max())
+    while (torque(start + step * place, step * pace / width, step * bend / width**2) > effort).any():
         width *= 1.02
+    return width
