@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 import study_options
+import study_tables
 
 from calib import files
 from calib.data.recordings.recording import Recording
@@ -297,36 +298,6 @@ def run(out: Path, runs: int = 20, kind: str = "link", seed: int = 0, where: str
     return metrics
 
 
-def show(metrics: dict[str, Any]) -> None:
-    """Print both halves."""
-    print(f"rows: {metrics['kind']}; error against noise-free torque on unseen motion, bias in sigmas of torque noise")
-    for name, one in metrics["geometries"].items():
-        bias, worst = one["bias_in_sigma"], list(one["by_parameter"].items())[:4]
-        clean = one["torque_error_without_noise_percent"]
-        print(
-            f"{name:45} {one['torque_error_percent']:7.3f} % (no noise {clean:.4f} %)  "
-            f"bias rms {bias['rms']:.2f}, {bias['beyond_2']} beyond 2, most "
-            + ", ".join(f"{parameter} {size:.1f}" for parameter, size in worst)
-        )
-    for name, one in metrics["coverage"].items():
-        print(f"{name}: {one['runs']} calibrations, {one['parameters']} base parameters")
-        over, same, every = one["geometry_exceeds_torque"], one["unchanged"], one["pooled"]
-        print(f"  95 % intervals hold the truth, pooled: {_percent(every['with'])} with propagation, "
-              f"{_percent(every['without'])} without")  # fmt: skip
-        print(f"  geometry exceeds torque in {len(over['parameters'])}: {_percent(over['with'])} with, "
-              f"{_percent(over['without'])} without (best of them {_percent(over['largest_without'])}): "
-              f"{' '.join(over['parameters'])}")  # fmt: skip
-        print(f"  propagation changes nothing in {len(same['parameters'])}: {_percent(same['with'])} with, "
-              f"{_percent(same['without'])} without")  # fmt: skip
-        size = one["rms_error_in_sigma"]
-        print(f"  rms error in sigma {size['with']:.3f} with, {size['without']:.3f} without; "
-              f"{one['seconds_per_run']:.2f} s per run")  # fmt: skip
-
-
-def _percent(share: float | None) -> str:
-    return "-" if share is None else f"{100.0 * share:.1f} %"
-
-
 def main() -> None:
     options = study_options.read(
         __doc__,
@@ -334,7 +305,9 @@ def main() -> None:
         kind=(("link", "motor"), "joint torque sensors, or motor torques"),
         workers=(None, "number of processes, or a Dask scheduler's address"),
     )
-    show(run(options.out, options.runs, options.kind, options.seed, options.workers))
+    study_tables.show(
+        study_tables.consistency(run(options.out, options.runs, options.kind, options.seed, options.workers))
+    )
 
 
 if __name__ == "__main__":

@@ -22,6 +22,8 @@ from typing import Any
 
 import numpy as np
 import study_options
+import study_tables
+from matplotlib.figure import Figure
 
 from calib import files
 from calib.data.recordings.recording import Recording
@@ -37,6 +39,7 @@ from calib.estimation.linear import LinearFit, settled_std, wls
 from calib.estimation.triangles import Triangles, absorb, empty
 from calib.identification.cases import Case, make_case
 from calib.identification.rows import observe
+from calib.procedure.report.style import AFTER, INK, QUIET, WIDE, save, sheet, styled
 from calib.robot.chain import Chain
 from calib.simulation.cells import known_robots, lwr4plus
 from calib.simulation.loop.closed_loop import Plant, Sensing, inertia_diagonal, simulate
@@ -50,9 +53,9 @@ RATE = 1000.0
 REACH = 0.8 * np.deg2rad([170.0, 120.0, 170.0, 120.0, 170.0, 90.0, 170.0])
 SPEED = 0.8 * np.deg2rad([110.0, 110.0, 128.0, 128.0, 204.0, 184.0, 184.0])
 TORQUE = np.array([176.0, 176.0, 100.0, 100.0, 100.0, 38.0, 38.0])
+PAPER_JOINT_6 = 0.5  # [N m], within which Fig. 8's joint 6 stays "along most of the validation trajectory"
 RATIO, POOR = 30.0, 10.0  # r_σ of the paper's rule; RSD [%] above which a parameter goes
 FILTERS = FilterOptions(cutoff=10.0, band=2.0, clock="stamps")
-COUNTS = {"Model 1": 74, "Model 2": 102, "Model 3": 28, "one load case": 92, "motor torque only": 79, "tilted": 104}
 TABLE_4 = (
     "Ia1", "Fvm1", "Fcm1", "Ia2", "Fvm2", "Fcm2", "Ia3", "Fvm3", "Fcm3", "Fvm4", "Ia5", "Fvm5", "Fcm5", "Ia6", "Fvm6",
     "Fcm6", "Ia7", "Fvm7", "Fcm7", "offm7", "Fcl1", "Fcl2", "offl2", "Fcl3", "Fcl4", "offl4", "Fcl5", "offl5", "Fcl7",
@@ -299,7 +302,7 @@ def run(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
     nominal, calibrated = lwr4plus.nominal_chain(), calibrated_chain()
     training, other = choose_motion(nominal, quick, seed), fourier([seed, 1001])
     data, unseen = record(calibrated, training, [seed, 0]), record(calibrated, other, [seed, 1])
-    metrics: dict[str, Any] = {"counts": counts(nominal), "counts_asked": COUNTS, "models": {}}
+    metrics: dict[str, Any] = {"counts": counts(nominal), "models": {}}
     for number, kind in MODELS.items():
         found = identify(calibrated, nominal, kind, data)
         metrics["models"][f"Model {number}"] = {
@@ -320,6 +323,7 @@ def run(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
         "condition_number": {"raw": best.fit.condition, "normalised": best.fit.condition_normalised},
         "by_construction": ["motor inertias", "friction and its split", "offsets", "noise", "payload's shape"],
     }
+    save(torques(best, unseen), out / "plot_torques.png")
     files.write_json(out / "metrics.json", metrics)
     return metrics
 
@@ -331,34 +335,31 @@ def _truth(found: Fit) -> np.ndarray:
     return found.base.transform @ np.array([known[name] for name in found.model.names])
 
 
-def show(metrics: dict[str, Any]) -> None:
-    """Print what the study's figures and tables show."""
-    found = metrics["counts"]
-    print(f"{found['standard']} standard, {found['without effect']} without effect, {found['regrouped']} regrouped")
-    print("base parameters  " + ", ".join(f"{k}: {found[k]} (asked {n})" for k, n in metrics["counts_asked"].items()))
-    for name, one in metrics["models"].items():
-        print(f"{name}: {one['base']} base, essential {one['essential']}, cond {one['condition']:.3g}, "
-              f"errors {one['error_in_sigma']:.2f} sigma rms")  # fmt: skip
-    ours = metrics["essential"]
-    print(f"essential: {ours['count']}, {len(ours['both'])} of Table 4's {len(TABLE_4)}")
-    print(f"  only in Table 4: {' '.join(ours['only_table_4']) or 'none'}")
-    print(f"  only here: {' '.join(ours['only_here']) or 'none'}")
-    for geometry, parts in metrics["computed_torque"].items():
-        for part, errors in parts.items():
-            print(f"{geometry:11} {part:14} largest [N m] " + " ".join(f"{x:6.3f}" for x in errors["largest"])
-                  + "   rms " + " ".join(f"{x:6.3f}" for x in errors["rms"]))  # fmt: skip
-    for name, errors in metrics["tracking_mrad"].items():
-        print(f"tracking [mrad rms], {name:14} " + " ".join(f"{x:6.3f}" for x in errors))
-    apart = sorted(metrics["cad_against_calibrated_percent"].items(), key=lambda item: -item[1])
-    print("CAD against calibrated [%]: " + ", ".join(f"{name} {x:.2g}" for name, x in apart[:12]))
-    for name, one in metrics["published"].items():
-        apart_percent = f"{one['apart_percent']:.0f} % apart"
-        print(f"{name:11} here {one['here']:8.4f}, another unit {one['published']:8.4f}, {apart_percent}")
+def torques(found: Fit, data: Data) -> Figure:
+    """Draw the loaded sensors' torques below 2 Hz on other motion, measured and computed (Fig. 8)."""
+    case = data.cases(BOTH)[1]
+    rows = observe(found.model, found.base.kept, case, case.motion.decimator)
+    computed, t = rows.matrix @ values_of(found), np.linspace(case.motion.t[0], case.motion.t[-1], len(rows.target))
+    with styled():
+        figure, axes = sheet(4, 2, width=WIDE, height=6.4)
+        for joint, axis in enumerate(axes[:7]):
+            axis.plot(t, rows.target[:, joint], color=QUIET, linewidth=2.0, label="measured")
+            axis.plot(t, computed[:, joint], color=AFTER, linewidth=0.8, linestyle="--", label="computed")
+            axis.set_title(f"joint {joint + 1} [N m]", fontsize=7)
+        error = rows.target[:, 5] - computed[:, 5]
+        axes[7].plot(t, error, color=AFTER, linewidth=0.8)
+        for line in (-PAPER_JOINT_6, PAPER_JOINT_6):
+            axes[7].axhline(line, color=INK, linewidth=0.5)
+        axes[7].set_title("joint 6, error [N m], and the paper's 0.5 N m", fontsize=7)
+        axes[0].legend(fontsize=6, ncols=2, loc="upper right")
+        for axis in axes[6:]:
+            axis.set_xlabel("t [s]")
+    return figure
 
 
 def main() -> None:
     options = study_options.read(__doc__, quick="fewer candidate motions")
-    show(run(options.out, options.quick, options.seed))
+    study_tables.show(study_tables.dynamics(run(options.out, options.quick, options.seed)))
 
 
 if __name__ == "__main__":

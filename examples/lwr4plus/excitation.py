@@ -311,7 +311,7 @@ def study(
             )
     base = arm.observed[1]
     columns, now, true = table_4(base), base.transform @ arm.values, truth().observed[1].transform @ truth().values
-    off = 100.0 * np.abs(now / true - 1.0)[columns]
+    off = 100.0 * np.abs(now[columns] / true[columns] - 1.0)
     return {
         "seed": seed, "seeds": seeds, "columns": len(base.kept), "period": PERIOD, "seconds": SECONDS,
         "estimate_off_percent": {"median": float(np.median(off)), "largest": float(off.max())},

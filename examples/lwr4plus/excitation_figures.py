@@ -8,7 +8,7 @@ import numpy as np
 from dynamics import TABLE_4
 from matplotlib.figure import Figure
 
-from calib.procedure.report.style import AFTER, BEFORE, INK, MARK, QUIET, WIDE, sheet, styled
+from calib.procedure.report.style import AFTER, BEFORE, INK, MARK, QUIET, WIDE, label_ticks, log_axis, sheet, styled
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from calib.simulation.loop.references import Reference
@@ -17,37 +17,41 @@ from calib.simulation.loop.references import Reference
 def paths(chain: Chain, motions: dict[str, Reference]) -> Figure:
     """Draw the tool's path of every motion in space (Fig. 5)."""
     with styled():
-        columns = min(len(motions), 3)
-        figure = Figure(figsize=(WIDE, 2.6 * -(-len(motions) // columns)))
+        across, down = min(len(motions), 3), -(-len(motions) // 3)
+        figure = Figure(figsize=(WIDE, 2.5 * down))
         for k, (name, motion) in enumerate(motions.items()):
-            axis: Any = figure.add_subplot(-(-len(motions) // columns), columns, k + 1, projection="3d")
-            place = forward(chain, motion.q[::20])[:, :3, 3]
-            axis.plot(*place.T, color=AFTER, linewidth=0.7)
-            axis.set_title(name)
+            axis: Any = figure.add_subplot(down, across, k + 1, projection="3d")
+            axis.plot(*forward(chain, motion.q[::20])[:, :3, 3].T, color=AFTER, linewidth=0.7)
+            axis.set_title(name, y=0.98, fontsize=9)
             axis.set(xlim=(-0.9, 0.9), ylim=(-0.9, 0.9), zlim=(-0.3, 0.9), box_aspect=(1.5, 1.5, 1.0))
-            axis.tick_params(labelsize=5)
+            axis.set(xticks=(-0.8, 0.0, 0.8), yticks=(-0.8, 0.0, 0.8), zticks=(-0.2, 0.3, 0.8))
+            axis.tick_params(labelsize=5, pad=-2)
+        figure.subplots_adjust(left=0.01, right=0.97, bottom=0.03, top=0.95, wspace=0.05, hspace=0.08)
     return figure
 
 
 def estimates(found: dict[str, Any]) -> Figure:
-    """Draw the essential estimates over the truth, CAD and fitted geometry, RP and OT (Figs 6 and 7)."""
-    place, wide = np.arange(len(TABLE_4)), dict(zip(found, (BEFORE, MARK, QUIET, AFTER)))
+    """Draw the essential estimates' errors, CAD and fitted geometry, RP and OT (Figs 6 and 7)."""
+    place, colours = np.arange(len(TABLE_4)), dict(zip(found, (BEFORE, MARK, QUIET, AFTER)))
     with styled():
-        figure, (first, second) = sheet(2, 1, width=WIDE, height=5.6)
+        figure, (first, second) = sheet(2, 1, width=WIDE, height=5.8, bottom=0.55, between=0.95)
         for k, (name, row) in enumerate(found.items()):
-            off = 100.0 * (np.array(row["estimate"]) / row["truth"] - 1.0)
-            first.plot(place + 0.15 * (k - 1.5), off, "o", markersize=2.5, color=wide[name], label=name)
-        first.axhline(0.0, color=INK, linewidth=0.5)
-        first.set(
-            ylabel="estimate over truth [%]", title="after Fig. 6: RP random waypoints, OT trajectory B, 44 columns"
-        )
-        first.set_yscale("symlog", linthresh=1.0)
-        first.legend(ncols=4, fontsize=7)
+            off = 100.0 * np.abs(np.array(row["estimate"]) / row["truth"] - 1.0)
+            first.plot(
+                place + 0.15 * (k - 1.5), np.maximum(off, 0.002), "o", markersize=3, color=colours[name], label=name
+            )
         cad, own = (np.array(found[f"{name}, OT"]["estimate"]) for name in ("CAD", "ID"))
-        second.bar(place, 100.0 * np.abs(cad / own - 1.0), color=BEFORE)
-        second.set(yscale="log", ylabel="|CAD - ID| / |ID| [%]", title="after Fig. 7: what the geometry changes")
-        for axis in (first, second):
-            axis.set_xticks(place, TABLE_4, rotation=90, fontsize=6)
+        second.bar(place, np.maximum(100.0 * np.abs(cad / own - 1.0), 0.002), color=BEFORE, bottom=0.001)
+        second.set_title("After Fig. 7: what the geometry changes, OT")
+        for axis, words in ((first, "error of the estimate [%]"), (second, "|CAD - ID| / |ID| [%]")):
+            axis.set_ylabel(words)
+            log_axis(axis.yaxis, 0.0015, 300.0)
+            label_ticks(axis.xaxis, place, TABLE_4, 6, rotation=90)
+            axis.set_xlim(-1.0, len(place))
+        first.legend(ncols=4, fontsize=7, loc="lower left", bbox_to_anchor=(0.0, 0.98, 1.0, 0.1), mode="expand")
+        figure.text(
+            0.01, 0.985, "Error of the estimates, after Fig. 6: RP 20 random waypoints, OT trajectory B", fontsize=8
+        )
     return figure
 
 
@@ -55,7 +59,7 @@ def speeds(rows: dict[str, list[dict[str, Any]]], shares: tuple[float, ...]) -> 
     """Draw the plain moves' median RSD over that of B, and their true error in sigma, by speed; one dot per seed."""
     own = rows["B, 44 columns"]
     with styled():
-        figure, (left, right) = sheet(1, 2, width=WIDE, height=2.8)
+        figure, (left, right) = sheet(1, 2, width=WIDE, height=2.8, across=0.75)
         for key, colour, words in (("102 fitted", AFTER, "all 102 fitted"), ("44 fitted", MARK, "the 44 fitted alone")):
             runs = {share: rows[f"moves at {share:g}"] for share in shares if f"moves at {share:g}" in rows}
             ratio = [[a[key]["median_rsd"] / b[key]["median_rsd"] for a, b in zip(x, own)] for x in runs.values()]
@@ -65,9 +69,12 @@ def speeds(rows: dict[str, list[dict[str, Any]]], shares: tuple[float, ...]) -> 
                 axis.plot(list(runs), values, ".", color=colour)
             right.axhline(np.median([one[key]["error_in_sigma"] for one in own]), color=colour, linestyle=":")
         left.axhline(2.0, color=INK, linewidth=0.5)
-        left.annotate("paper: twice", (shares[-1], 2.0), ha="right", va="bottom", fontsize=7)
-        left.set(xlabel="speed of the moves, share of the limits", ylabel="median RSD over B's", ylim=(0.0, None))
-        right.set(xlabel="speed of the moves, share of the limits", ylabel="true error [σ, rms]", yscale="log")
-        right.set_title("dotted: trajectory B", fontsize=7)
-        left.legend(fontsize=7)
+        left.axhline(1.0, color=QUIET, linewidth=0.5, linestyle=":")
+        left.annotate("the paper's factor", (shares[-1], 2.03), ha="right", va="bottom", fontsize=7)
+        left.set(xlabel="speed of the moves, share of the limits", ylabel="median RSD over trajectory B's")
+        left.set_ylim(0.0)
+        right.set(xlabel="speed of the moves, share of the limits", ylabel="true error [σ, rms]")
+        log_axis(right.yaxis, 0.5, 15.0)
+        right.annotate("dotted: trajectory B", (shares[0], 2.5), fontsize=7)
+        left.legend(fontsize=7, loc="lower left")
     return figure

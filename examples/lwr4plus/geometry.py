@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import study_options
+import study_tables
 
 from calib import files
 from calib.geometry.accuracy import errors, summary
@@ -324,46 +325,6 @@ def base_leds(poses: np.ndarray, seed: int) -> dict[str, float]:
     return result
 
 
-def _selection(metrics: dict[str, Any]) -> list[str]:
-    lines = [
-        f"{'selection (17 poses, Table 1)':32}"
-        f"{'median':>10}{'worst':>10}{'best':>10}{'random':>10}{'gain':>7}{'evals':>9}"
-    ]
-    lines += [
-        f"{row['index'] + ', ' + row['method']:32}{row['median']:10.4g}{row['worst']:10.4g}{row['best']:10.4g}"
-        f"{row['best_of_1000_random']:10.4g}{row['gain_over_random']:7.2f}{row['evaluations']:9.0f}"
-        for row in metrics["selection"]
-    ]
-    most = metrics["ceiling"]
-    first = f"O1 of any 17 poses is at most {most['O1']:.5g} (no pose beyond it found in {most['climbs']} searches)"
-    if not most["climbs"]:
-        first = f"O1 of any 17 of the poses looked at is at most {most['O1']:.5g}"
-    return [*lines, first, f"the best set found has {100 * most['best_share_of_det']:.1f} % of its det^(1/p)"]
-
-
-def printed(metrics: dict[str, Any]) -> str:
-    """Return the study's tables as text."""
-    lines = _selection(metrics) if "selection" in metrics else []
-    lines += ["", f"{'errors, mean / max':52}{'position [mm]':>16}{'orientation [deg]':>20}"]
-    table = metrics["table_3"]
-    paper = {f"paper, {name}": entry for name, entry in table["paper"].items()}
-    ours = {f"nominal: {name}": entry for name, entry in table["nominal"].items()}
-    ours |= {name: entry for name, entry in table.items() if name.startswith("calibrated")}
-    for name, entry in (paper | ours).items():
-        position, turn = entry["position_mm"], entry["orientation_deg"]
-        lines.append(f"{name:52}{position['mean']:8.2f}{position['max']:8.2f}{turn['mean']:12.3f}{turn['max']:8.3f}")
-    two, equations = metrics["table_2"], metrics["eq_11_against_eq_12"]
-    lines += [
-        "",
-        f"{two['within_2_sigma']} of {metrics['parameters']} parameters within 2 sigma of Table 2 (hidden deflection); "
-        f"{two['within_2_sigma_rigid_truth_mean_of_10']:.1f} with a rigid truth, mean of 10",
-        "true error of a rigid arm's calibration, rms: "
-        + ", ".join(f"{value:.3f} mm measuring {name}" for name, value in metrics["base_leds"].items()),
-        f"eq. 11 and eq. 12 differ by {equations['largest_difference_in_sigmas']:.1e} sigma at most",
-    ]
-    return "\n".join(lines)
-
-
 def main() -> None:
     """Run the study from the command line."""
     given = study_options.read(
@@ -375,7 +336,7 @@ def main() -> None:
     )
     metrics = run(given.seed, given.quick, given.seeds, given.seconds, given.workers)
     files.write_json(given.out / "metrics.json", metrics)
-    print(printed(metrics))
+    study_tables.show(study_tables.geometry(metrics))
     print(f"\nwritten to {given.out / 'metrics.json'}")
 
 
