@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import sys
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Any
 
@@ -166,7 +166,9 @@ def problem(plan: Plan, arm: Arm) -> ExcitationProblem:
     chain = arm.chain
     _, base = arm.observed
     smooth, motor = (dynamics.model(chain, kind, v0=0.05) for kind in (BOTH, MOTOR))
-    both = BothLoads(smooth, base.kept)
+    essential = base.kept[table_4(base)]
+    alone = plan.columns == len(essential) and plan.which != "B"  # the torques of B's goals take all columns
+    both = BothLoads(smooth, np.sort(essential) if alone else base.kept)
     velocity = np.array([joint.velocity for joint in chain.joints])
     tool = Points(chain, (0,), np.zeros((1, 3)))
     torques = [
@@ -180,19 +182,20 @@ def problem(plan: Plan, arm: Arm) -> ExcitationProblem:
         *box_limits(chain.lower, chain.upper, velocity), *torques,
         Workspace(tool, tool.product, radius=0.3, lowest=-0.2),
     )  # fmt: skip
-    columns = None if plan.columns == len(base.kept) else table_4(base)
+    columns = table_4(base) if plan.columns == len(essential) and not alone else None
     sigmas = np.tile(NOISE * np.tile(arm.effort, 2), LOADS) if plan.which == "D" else None
     index = Excitation("logdet" if plan.which == "D" else "cond", "raw", sigmas=sigmas, columns=columns)
     spot = ExcitationProblem(
-        fourier_family(plan.harmonics, plan.period, chain.n, rate=RATE), both, both.product, ((index, 1.0),), limits
-    )
+        fourier_family(plan.harmonics, plan.period, chain.n, rate=RATE), both, both.product, ((index, 1.0),), limits,
+        samples=80 + 8 * plan.harmonics,
+    )  # fmt: skip
     if plan.which != "B":
         return spot
     values = base.transform @ arm.values
     rows = {j: tuple(7 + j + load * smooth.rows for load in range(LOADS)) for j in (5, 6)}  # motor torques, both loads
     slacks = [TorqueSlack(rows[j], values, np.tile(arm.effort, 2 * LOADS)) for j in rows]
     goals = (AttainmentGoal(index, 35.0), *(AttainmentGoal(slack, 0.9) for slack in slacks))
-    return ExcitationProblem(spot.family, both, both.product, (), limits, goals)
+    return replace(spot, goals=goals)
 
 
 def designed(plan: Plan, arm: Arm, starts: int, evaluations: int) -> Reference:
@@ -374,8 +377,8 @@ def main() -> None:
         evaluations=(250, "of each start; three times as many for D"),
         workers=(2, "local processes"),
     )
-    seeds, evaluations = (1, 60) if given.quick else (given.seeds, given.evaluations)
-    found, motions = study(given.seed, seeds, given.starts, evaluations, given.workers, given.quick)
+    seeds = 1 if given.quick else given.seeds
+    found, motions = study(given.seed, seeds, given.starts, given.evaluations, given.workers, given.quick)
     files.write_json(given.out / "metrics.json", found)
     shown = (
         "A, 102 columns",

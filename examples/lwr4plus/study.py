@@ -25,7 +25,7 @@ HERE = Path(__file__).parent
 PARTS: dict[str, tuple[list[str], list[str]]] = {  # options of the whole part, and of the quick one
     "geometry": ([], ["--quick"]),
     "dynamics": ([], ["--quick"]),
-    "consistency": (["--runs", "500"], ["--runs", "0"]),
+    "consistency": (["--runs", "40"], ["--runs", "0"]),
     "excitation": ([], ["--quick"]),
     "planning": ([], ["--paths", "3"]),
 }

@@ -1,4 +1,4 @@
-"""The scripted planning study runs: a plan on the identified model can be followed, one on CAD bodies alone cannot."""
+"""The scripted planning study runs: with a margin a plan on the identified model can be followed, one on CAD cannot."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def test_the_identified_model_plans_what_the_robot_can_follow(tmp_path):
     done = subprocess.run(words, capture_output=True, text=True, check=True)
     assert "true peak" in done.stdout
     found = json.loads((tmp_path / "metrics.json").read_text())["summary"]
-    assert found["CAD bodies"]["worst_peak"] > 1.1
+    assert found["CAD"]["peak"] > found["identified"]["peak"] and found["CAD"]["worst_peak"] > 1.05
     assert 1.0 < found["identified"]["worst_peak"] < 1.2  # noise: its own limits are not quite the robot's
     assert found["with margin"]["worst_peak"] <= 1.0
     assert found["truth"]["worst_peak"] <= 1.0 + 1e-9
