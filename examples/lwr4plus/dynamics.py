@@ -17,6 +17,7 @@ has an RSD above 10 % goes, and the paper's own ratio of RSDs is shown beside it
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -108,15 +109,22 @@ def true_parameters(chain: Chain) -> np.ndarray:
     return np.concatenate([standard_parameters(chain), known["payload"]["inertia"], sided, np.zeros(7)])
 
 
-def counts(chain: Chain) -> dict[str, int]:
+@cache
+def nominal_base(kind: TorqueRows) -> Base:
+    """Return the base columns of a model, chosen on the CAD geometry."""
+    return bases.find(model(lwr4plus.nominal_chain(), kind))
+
+
+def counts() -> dict[str, int]:
     """Return the numbers of base parameters of the models and their variants, on the CAD geometry."""
+    chain = lwr4plus.nominal_chain()
     both = model(chain, BOTH)
     tilted = model(chain, BOTH, 9.81 * np.array([0.3, 0.2, -np.sqrt(1 - 0.13)]))
-    whole = bases.find(both)
-    found = {f"Model {number}": bases.find(model(chain, kind)).b for number, kind in MODELS.items()}
+    whole = nominal_base(BOTH)
+    found = {f"Model {number}": nominal_base(kind).b for number, kind in MODELS.items()}
     found |= {
         "one load case": bases.find(both, loads=[None]).b,
-        "motor torque only": bases.find(model(chain, MOTOR)).b,
+        "motor torque only": nominal_base(MOTOR).b,
         "tilted": bases.find(tilted).b,
         "standard": both.p,
         "without effect": len(whole.without_effect),
@@ -128,7 +136,7 @@ def counts(chain: Chain) -> dict[str, int]:
 def choose_motion(chain: Chain, quick: bool, seed: int) -> Reference:
     """Return the best of a few random motions by the condition number of Model 2's base columns at unit norm."""
     both = model(chain, BOTH)
-    kept = bases.find(both).kept
+    kept = nominal_base(BOTH).kept
 
     def condition(reference: Reference) -> float:
         part = slice(None, None, 250)
@@ -186,10 +194,10 @@ class Fit:
     rules: dict[str, int]
 
 
-def identify(chain: Chain, nominal: Chain, kind: TorqueRows, data: Data) -> Fit:
-    """Estimate base and essential parameters: columns chosen on the nominal chain, regrouped on the one given."""
+def identify(chain: Chain, kind: TorqueRows, data: Data) -> Fit:
+    """Estimate base and essential parameters: columns chosen on the CAD geometry, regrouped on the one given."""
     own = model(chain, kind)
-    base = bases.regroup(bases.find(model(nominal, kind)), own)
+    base = bases.regroup(nominal_base(kind), own)
     rows = collected(own, base, data)
     std = settled_std(rows)
     tested = eliminate(rows, Rule.F, level=0.01, std=std)
@@ -302,14 +310,14 @@ def run(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
     nominal, calibrated = lwr4plus.nominal_chain(), calibrated_chain()
     training, other = choose_motion(nominal, quick, seed), fourier([seed, 1001])
     data, unseen = record(calibrated, training, [seed, 0]), record(calibrated, other, [seed, 1])
-    metrics: dict[str, Any] = {"counts": counts(nominal), "models": {}}
+    metrics: dict[str, Any] = {"counts": counts(), "models": {}}
     for number, kind in MODELS.items():
-        found = identify(calibrated, nominal, kind, data)
+        found = identify(calibrated, kind, data)
         metrics["models"][f"Model {number}"] = {
             "base": found.base.b, "essential": found.rules,
             "condition": found.fit.condition_normalised, "error_in_sigma": errors_in_sigma(found, _truth(found)),
         }  # fmt: skip
-    fits = {name: identify(chain, nominal, BOTH, data)
+    fits = {name: identify(chain, BOTH, data)
             for name, chain in (("cad", nominal), ("calibrated", calibrated))}  # fmt: skip
     best = fits["calibrated"]
     metrics |= {

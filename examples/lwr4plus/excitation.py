@@ -79,7 +79,7 @@ class Arm:
     def observed(self) -> tuple[IdentificationModel, Base]:
         """Model 2, sharp, and its base columns: chosen on the CAD geometry, regrouped on this one."""
         own = dynamics.model(self.chain, BOTH, v0=0.01)
-        return own, bases.regroup(bases.find(dynamics.model(lwr4plus.nominal_chain(), BOTH)), own)
+        return own, bases.regroup(dynamics.nominal_base(BOTH), own)
 
     @cached_property
     def without_payload(self) -> np.ndarray:
