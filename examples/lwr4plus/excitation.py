@@ -333,16 +333,15 @@ def compared(rows: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
         }
         for key in ("102 fitted", "44 fitted"):
             if key in runs[0]:
-                mean = lambda own, other, what: np.exp(np.mean(np.log(own[what]) - np.log(other[what])))  # noqa: E731
-                pairs = [(run[key], other[key]) for run, other in zip(runs, rows["B, 44 columns"])]
+                own, other = [run[key] for run in runs], [run[key] for run in rows["B, 44 columns"]]
+                level = np.median([one["median_rsd"] for one in other])
                 one[key] = {
-                    what: _spread([own[what] for own, _ in pairs])
+                    what: _spread([run[what] for run in own])
                     for what in ("median_rsd", "median_rsd_wrist", "error_in_sigma", "median_error")
-                } | {
-                    "ratio": _spread([own["median_rsd"] / other["median_rsd"] for own, other in pairs]),
-                    "size_ratio": _spread([mean(*pair, "size") for pair in pairs]),
-                    "separation_ratio": _spread([mean(*pair, "separation") for pair in pairs]),
-                }
+                } | {"ratio": _spread([run["median_rsd"] / level for run in own])}
+                for what in ("size", "separation"):
+                    logs = [np.mean(np.log([run[what] for run in some])) for some in (own, other)]
+                    one[key][f"{what}_ratio"] = float(np.exp(logs[0] - logs[1]))
         result[name] = one
     return result
 

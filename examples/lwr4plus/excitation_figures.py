@@ -62,7 +62,8 @@ def speeds(rows: dict[str, list[dict[str, Any]]], shares: tuple[float, ...]) -> 
         figure, (left, right) = sheet(1, 2, width=WIDE, height=2.8, across=0.75)
         for key, colour, words in (("102 fitted", AFTER, "all 102 fitted"), ("44 fitted", MARK, "the 44 fitted alone")):
             runs = {share: rows[f"moves at {share:g}"] for share in shares if f"moves at {share:g}" in rows}
-            ratio = [[a[key]["median_rsd"] / b[key]["median_rsd"] for a, b in zip(x, own)] for x in runs.values()]
+            level = np.median([one[key]["median_rsd"] for one in own])
+            ratio = [[one[key]["median_rsd"] / level for one in x] for x in runs.values()]
             error = [[one[key]["error_in_sigma"] for one in x] for x in runs.values()]
             for axis, values in ((left, ratio), (right, error)):
                 axis.plot(list(runs), np.median(values, axis=1), color=colour, label=words)

@@ -186,7 +186,7 @@ def excitation(found: dict[str, Any]) -> Tables:
     told = [
         (
             name, f"{whole['median_rsd'][0]:.3f}", f"{whole['median_rsd_wrist'][0]:.3f}", middle(whole["ratio"], ".2f"),
-            f"{whole['error_in_sigma'][0]:.2f}", f"{whole['size_ratio'][0]:.2f}, {whole['separation_ratio'][0]:.2f}",
+            f"{whole['error_in_sigma'][0]:.2f}", f"{whole['size_ratio']:.2f}, {whole['separation_ratio']:.2f}",
             f"{alone['median_rsd'][0]:.3f}", middle(alone["ratio"], ".2f"), f"{alone['error_in_sigma'][0]:.1f}",
         )
         for name, row in rows.items() if "102 fitted" in row
