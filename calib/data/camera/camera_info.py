@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from calib import files
+from calib.config_types import shown
 from calib.data.camera.lens import Lens
 from calib.errors import CalibError, MeasurementError, suggestion
 
@@ -58,7 +59,7 @@ def read_lens(path: str | Path) -> Lens:
 def _whole(found: dict[str, Any], keys: tuple[str, ...], path: str | Path) -> int:
     value = next((found[key] for key in keys if key in found), None)
     if not isinstance(value, int) or not 0 < value < 100_000:
-        raise MeasurementError(f"{keys[0]}: expected a number of pixels, found {value!r}", path)
+        raise MeasurementError(f"{keys[0]}: expected a number of pixels, found {shown(value)}", path)
     return value
 
 
@@ -67,10 +68,10 @@ def _numbers(found: dict[str, Any], keys: tuple[str, ...], path: str | Path) -> 
     value = value.get("data") if isinstance(value, dict) else value
     try:
         numbers = np.array(value, dtype=float).ravel()
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = np.array([np.nan])
     if value is None or not np.isfinite(numbers).all():
-        raise MeasurementError(f"{keys[0]}: expected data: [numbers], found {value!r}", path)
+        raise MeasurementError(f"{keys[0]}: expected data: [numbers], found {shown(value)}", path)
     return numbers
 
 
