@@ -17,7 +17,7 @@ Where innovations are larger than the filter says, the covariance is widened by 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from calib.identification.cases import Case
 from calib.identification.methods.believed import BelievedRobot, believed_robot, start_of
 from calib.identification.methods.instrumental import low_passed
 from calib.identification.methods.least_squares import WLS
-from calib.identification.methods.method import EstimateStatus, IdentificationProblem, MethodEstimate, attempted
+from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 from calib.identification.rows import segments
 from calib.simulation.loop.closed_loop import Stepper, forward_dynamics, stepper
 
@@ -41,33 +41,15 @@ LOST = 30.0  # times the stated mean square: innovations of a filter that has lo
 
 
 @dataclass(frozen=True)
-class KalmanFilter:
+class KalmanFilter(Method):
     """A method that carries parameters along as states; see the module.
 
     Attributes:
-        name, assumes: see `calib.identification.methods.method.Method`.
         kind: rule and form.
     """
 
-    name: str
-    assumes: str
+    needs_simulation: bool = field(default=True, kw_only=True)
     kind: Filter
-
-    @property
-    def takes_prior(self) -> bool:
-        return False
-
-    @property
-    def needs_controller(self) -> bool:
-        return False
-
-    @property
-    def needs_simulation(self) -> bool:
-        return True
-
-    @property
-    def takes_constraints(self) -> bool:
-        return False
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
         """Return the parameters after the last sample.

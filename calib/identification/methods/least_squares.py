@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -17,7 +17,7 @@ from calib.estimation.total import tls
 from calib.estimation.triangles import Triangles, combine, retriangulate
 from calib.identification.friction.passivity import driving
 from calib.identification.friction.time_folds import estimate
-from calib.identification.methods.method import EstimateStatus, IdentificationProblem, MethodEstimate, attempted
+from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 from calib.identification.parameter_constraints import Constraints, hold
 from calib.identification.prediction import Dynamics
 from calib.identification.prior import Prior, bounded, residual_inflation, weighing
@@ -31,32 +31,16 @@ class _Solve(Protocol):
 
 
 @dataclass(frozen=True)
-class LeastSquares:
+class LeastSquares(Method):
     """A method that solves the rows directly.
 
     Attributes:
-        name, assumes, takes_prior: see `calib.identification.methods.method.Method`.
         solve: the problem, (rows,) standard deviations and inflation to the fit.
         weighted: whether rows are weighed with their standard deviations.
     """
 
-    name: str
-    assumes: str
     solve: _Solve
-    takes_prior: bool = False
     weighted: bool = True
-
-    @property
-    def needs_controller(self) -> bool:
-        return False
-
-    @property
-    def needs_simulation(self) -> bool:
-        return False
-
-    @property
-    def takes_constraints(self) -> bool:
-        return False
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
         """Return the estimate of the problem's columns, with a covariance that knows of residuals correlated in time.
@@ -158,36 +142,18 @@ def _driving(problem: IdentificationProblem, values: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class ConstrainedLeastSquares:
+class ConstrainedLeastSquares(Method):
     """A method that solves the rows directly, under constraints: physically consistent least squares.
 
     Weights are those that the residuals of the free estimate tell; only IRLS weighs by those of the constrained one,
     as there a sample's weight hangs on it.
 
     Attributes:
-        name, assumes: see `calib.identification.methods.method.Method`.
         free: the method without constraints.
     """
 
-    name: str
-    assumes: str
+    takes_constraints: bool = field(default=True, kw_only=True)
     free: LeastSquares
-
-    @property
-    def takes_prior(self) -> bool:
-        return False
-
-    @property
-    def needs_controller(self) -> bool:
-        return False
-
-    @property
-    def needs_simulation(self) -> bool:
-        return False
-
-    @property
-    def takes_constraints(self) -> bool:
-        return True
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
         """Return the estimate under the problem's constraints; its covariance takes those that bind as equalities.

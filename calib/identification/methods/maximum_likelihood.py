@@ -31,7 +31,7 @@ from calib.estimation.correlated import scatter
 from calib.estimation.linear import LinearFit, wls
 from calib.estimation.triangles import condition_numbers
 from calib.identification.methods.least_squares import samples_of, weighed
-from calib.identification.methods.method import EstimateStatus, IdentificationProblem, MethodEstimate, attempted
+from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 from calib.identification.prior import residual_inflation
 
 LIMIT = 40
@@ -41,31 +41,8 @@ BLOCK = 1000  # samples at a time
 
 
 @dataclass(frozen=True)
-class MaximumLikelihood:
-    """Errors in variables; see the module.
-
-    Attributes:
-        name, assumes: see `calib.identification.methods.method.Method`.
-    """
-
-    name: str
-    assumes: str
-
-    @property
-    def takes_prior(self) -> bool:
-        return False
-
-    @property
-    def needs_controller(self) -> bool:
-        return False
-
-    @property
-    def needs_simulation(self) -> bool:
-        return False
-
-    @property
-    def takes_constraints(self) -> bool:
-        return False
+class MaximumLikelihood(Method):
+    """Errors in variables; see the module."""
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
         """Return the estimate of the problem's columns; weights beside it are the torques' noise.

@@ -7,11 +7,11 @@ that says what to do about it is in the estimate, for whoever wants it raised (`
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 
@@ -206,45 +206,31 @@ def _standing_for(estimate: Estimate) -> Triangles:
     )  # fmt: skip
 
 
-class Method(Protocol):
+@dataclass(frozen=True)
+class Method(ABC):
     """A way from a problem to an estimate.
 
     The steps around a method (prior, richer friction, stated noise, elimination) ask it what it accepts.
+
+    Attributes:
+        name: what options and files call it.
+        assumes: what its estimate rests on, for the user.
+        takes_prior: whether a prior, the ridges of richer friction and a stated noise of the rows have a place in it.
+        needs_controller: whether it simulates the closed loop that a recording came from.
+        needs_simulation: whether it needs a model whose motion can be computed from torques.
+        takes_constraints: whether its estimate satisfies what the options' [constraints] ask.
     """
 
-    @property
-    def name(self) -> str:
-        """What options and files call it."""
-        ...
+    name: str
+    assumes: str
+    takes_prior: bool = field(default=False, kw_only=True)
+    needs_controller: bool = field(default=False, kw_only=True)
+    needs_simulation: bool = field(default=False, kw_only=True)
+    takes_constraints: bool = field(default=False, kw_only=True)
 
-    @property
-    def assumes(self) -> str:
-        """What its estimate rests on, for the user."""
-        ...
-
-    @property
-    def takes_prior(self) -> bool:
-        """Whether a prior, the ridges of richer friction and a stated noise of the rows have a place in it."""
-        ...
-
-    @property
-    def needs_controller(self) -> bool:
-        """Whether it simulates the closed loop that a recording came from."""
-        ...
-
-    @property
-    def needs_simulation(self) -> bool:
-        """Whether it needs a model whose motion can be computed from torques."""
-        ...
-
-    @property
-    def takes_constraints(self) -> bool:
-        """Whether its estimate satisfies what the options' [constraints] ask."""
-        ...
-
+    @abstractmethod
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
         """Return the estimate of the problem's p columns, or the status that says why there is none."""
-        ...
 
 
 def attempted(

@@ -10,39 +10,20 @@ import numpy as np
 from calib.estimation.linear import LinearFit
 from calib.estimation.networks import adaline, hopfield
 from calib.identification.methods.least_squares import samples_of, weighed
-from calib.identification.methods.method import EstimateStatus, IdentificationProblem, MethodEstimate, attempted
+from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 
 Train = Callable[[IdentificationProblem, np.ndarray, np.ndarray], tuple[LinearFit, int]]
 
 
 @dataclass(frozen=True)
-class Network:
+class Network(Method):
     """A method that comes to rest at weighted least squares.
 
     Attributes:
-        name, assumes: see `calib.identification.methods.method.Method`.
         train: the problem, (rows,) standard deviations and inflation to the fit, and the number of rounds.
     """
 
-    name: str
-    assumes: str
     train: Train
-
-    @property
-    def takes_prior(self) -> bool:
-        return False
-
-    @property
-    def needs_controller(self) -> bool:
-        return False
-
-    @property
-    def needs_simulation(self) -> bool:
-        return False
-
-    @property
-    def takes_constraints(self) -> bool:
-        return False
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
         """Return the weights of the network at rest, with the covariance of least squares and that of the training."""

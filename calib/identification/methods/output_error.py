@@ -29,7 +29,7 @@ from calib.identification.loop.loop_recordings import ClosedLoops, close_loops
 from calib.identification.methods.believed import BelievedRobot, believed_robot, serial_arm, start_of
 from calib.identification.methods.instrumental import low_passed, simulated_samples
 from calib.identification.methods.least_squares import WLS
-from calib.identification.methods.method import EstimateStatus, IdentificationProblem, MethodEstimate, attempted
+from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 from calib.identification.rows import thinned
 from calib.simulation.loop.closed_loop import Sensing, inertia_diagonal, simulate, simulate_tangents
 from calib.simulation.loop.controllers import scaled
@@ -42,33 +42,16 @@ IMPOSSIBLE = 1e60  # residual of parameters that cannot be simulated: any step t
 
 
 @dataclass(frozen=True)
-class OutputError:
+class OutputError(Method):
     """A method that fits the simulated closed loop to the recorded one; see the module.
 
     Attributes:
-        name, assumes: see `calib.identification.methods.method.Method`.
         torques: whether torques are compared, and not positions.
     """
 
-    name: str
-    assumes: str
+    needs_controller: bool = field(default=True, kw_only=True)
+    needs_simulation: bool = field(default=True, kw_only=True)
     torques: bool
-
-    @property
-    def takes_prior(self) -> bool:
-        return False
-
-    @property
-    def needs_controller(self) -> bool:
-        return True
-
-    @property
-    def needs_simulation(self) -> bool:
-        return True
-
-    @property
-    def takes_constraints(self) -> bool:
-        return False
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
         """Return the estimate of the problem's columns; one simulation gives motion and tangents.

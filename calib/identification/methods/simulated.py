@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import UsageError
@@ -10,36 +10,21 @@ from calib.identification.loop.loop_recordings import ClosedLoops, close_loops
 from calib.identification.loop.loop_settings import LoopSettings, per_joint
 from calib.identification.methods.instrumental import identify_instrumental
 from calib.identification.methods.least_squares import WLS
-from calib.identification.methods.method import IdentificationProblem, MethodEstimate, attempted
+from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate, attempted
 
 
 @dataclass(frozen=True)
-class Simulated:
+class Simulated(Method):
     """A method that simulates.
 
     Attributes:
-        name, assumes: see `calib.identification.methods.method.Method`.
         instruments: what it makes of the simulated motion, see `calib.identification.methods.instrumental.ROUNDS`;
             "": what the loop's settings say.
-        takes_constraints: see `calib.identification.methods.method.Method`.
     """
 
-    name: str
-    assumes: str
+    needs_controller: bool = field(default=True, kw_only=True)
+    needs_simulation: bool = field(default=True, kw_only=True)
     instruments: str = ""
-    takes_constraints: bool = False
-
-    @property
-    def takes_prior(self) -> bool:
-        return False
-
-    @property
-    def needs_controller(self) -> bool:
-        return True
-
-    @property
-    def needs_simulation(self) -> bool:
-        return True
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
         """Return the estimate of the base columns; weights and inflation beside it are those of WLS.
