@@ -42,7 +42,7 @@ HOMES = {
     "cvxpy": ["calib.estimation.", "calib.dynamics.", "calib.identification.", "poses.", "trajectories."],
     "matplotlib": ["calib.procedure.", "calib.api."],
     "jinja2": ["calib.procedure."],
-    "pyarrow": ["calib.studies.rows"],
+    "pyarrow": ["calib.studies.store"],
     "dask": ["calib.workers.cluster"],
     "distributed": ["calib.workers.cluster"],
     "cloudpickle": ["calib.workers.cluster"],

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 from calib.errors import TaskLost
 from calib.studies.conditions import Study
-from calib.studies.rows import RowStore
+from calib.studies.store import RowStore
 from calib.studies.trial import Trials, grouped, run_trials
 from calib.workers import Workers
 

@@ -19,7 +19,7 @@ from math import comb
 import numpy as np
 
 from calib.studies.conditions import Condition, Study
-from calib.studies.trial import Row
+from calib.studies.trial import TrialRow
 
 RELIABLE, LEVEL, SLACK, ALIKE = 0.95, 0.05, 0.05, 2.0  # our choices
 LEAST = 6  # common data sets below which the sign test cannot tell at 5 %
@@ -30,7 +30,7 @@ FIGURES = (
 
 
 @dataclass(frozen=True)
-class Spread:
+class Quartiles:
     """Median and quartiles of a figure over runs; failures are infinite in errors, and left out elsewhere."""
 
     median: float
@@ -55,7 +55,7 @@ class MethodSummary:
     method: str
     trials: int
     failures: Mapping[str, int]
-    figures: Mapping[str, Spread]
+    figures: Mapping[str, Quartiles]
     rank: int = 0
     as_good: bool = False
     chosen: bool = False
@@ -84,9 +84,9 @@ class ConditionSummary:
         return next((one for one in self.methods if one.chosen), None)
 
 
-def summarise(study: Study, rows: Iterable[Row]) -> list[ConditionSummary]:
+def summarise(study: Study, rows: Iterable[TrialRow]) -> list[ConditionSummary]:
     """Return what rows say of a study's conditions; rows of others, and of methods not asked for, do not count."""
-    kept: dict[str, dict[str, list[Row]]] = {}
+    kept: dict[str, dict[str, list[TrialRow]]] = {}
     for row in rows:
         kept.setdefault(row.digest, {}).setdefault(row.method, []).append(row)
     result = []
@@ -96,7 +96,7 @@ def summarise(study: Study, rows: Iterable[Row]) -> list[ConditionSummary]:
     return result
 
 
-def _ranked(condition: Condition, rows: Mapping[str, Sequence[Row]]) -> ConditionSummary:
+def _ranked(condition: Condition, rows: Mapping[str, Sequence[TrialRow]]) -> ConditionSummary:
     errors = {name: {row.seed: _error(row) for row in own} for name, own in rows.items()}
     plain = [_summary(name, own) for name, own in rows.items()]
     plain.sort(key=lambda one: (not one.reliable, one.figures["torque_error"].median))
@@ -124,11 +124,11 @@ def _ratio(one: Mapping[int, float], other: Mapping[int, float]) -> float:
     return float(np.median([a / max(b, 1e-300) for a, b in both])) if both else float("inf")
 
 
-def _error(row: Row) -> float:
+def _error(row: TrialRow) -> float:
     return row.torque_error if row.found else float("inf")
 
 
-def _summary(name: str, rows: Sequence[Row]) -> MethodSummary:
+def _summary(name: str, rows: Sequence[TrialRow]) -> MethodSummary:
     failures: dict[str, int] = {}
     for row in rows:
         if not row.found:
@@ -142,14 +142,14 @@ def _summary(name: str, rows: Sequence[Row]) -> MethodSummary:
     return MethodSummary(name, len(rows), failures, figures)
 
 
-def spread(values: Sequence[float]) -> Spread:
+def spread(values: Sequence[float]) -> Quartiles:
     """Return median and quartiles of what is not NaN; of nothing, NaN."""
     found = np.sort([value for value in values if value == value])
     if not len(found):
-        return Spread(float("nan"), float("nan"), float("nan"), 0)
+        return Quartiles(float("nan"), float("nan"), float("nan"), 0)
     with np.errstate(invalid="ignore"):
         lower, median, upper = (float(x) for x in np.quantile(found, [0.25, 0.5, 0.75], method="nearest"))
-    return Spread(median, lower, upper, len(found))
+    return Quartiles(median, lower, upper, len(found))
 
 
 def sign_test(one: Mapping[int, float], other: Mapping[int, float]) -> float:

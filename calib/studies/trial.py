@@ -26,7 +26,7 @@ NAN = float("nan")
 
 
 @dataclass(frozen=True)
-class Row:
+class TrialRow:
     """One trial; NaN where there is no such number.
 
     Attributes:
@@ -86,7 +86,7 @@ class Row:
         return self.status == FOUND
 
 
-COLUMNS = tuple(one.name for one in fields(Row))
+COLUMNS = tuple(one.name for one in fields(TrialRow))
 
 
 @dataclass(frozen=True)
@@ -98,12 +98,12 @@ class Trials:
     seed: int
 
 
-def run_trials(trials: Trials) -> list[Row]:
+def run_trials(trials: Trials) -> list[TrialRow]:
     """Return the row of each method."""
     return [run_trial(trials.condition, method, trials.seed) for method in trials.methods]
 
 
-def run_trial(condition: Condition, method: str, seed: int) -> Row:
+def run_trial(condition: Condition, method: str, seed: int) -> TrialRow:
     """Return the row of a condition, a method and a seed: the same wherever and whenever it runs, but for the times."""
     known = {key: value for key, value in asdict(condition).items() if key not in ("name", "resimulated")}
     head = {"condition": condition.name, "digest": condition.digest, "method": method, "seed": seed, **known}
@@ -111,7 +111,7 @@ def run_trial(condition: Condition, method: str, seed: int) -> Row:
     try:
         data = make_experiment(condition, seed)
     except Exception as error:  # an unstable loop, a geometry that cannot be fitted: a finding, not an end
-        return Row(status=NOT_RECORDED, message=_said(error), version=_version(), **head)
+        return TrialRow(status=NOT_RECORDED, message=_said(error), version=_version(), **head)
     wall, cpu = time.perf_counter(), time.process_time()
     try:
         found, failure = own.estimate(data.problem), None
@@ -121,12 +121,12 @@ def run_trial(condition: Condition, method: str, seed: int) -> Row:
     if found is None or not found.found:
         status = FAILED if found is None else found.status.value
         why = failure if found is None else found.failure
-        return Row(status=status, message=_said(why), **head, **times)
+        return TrialRow(status=status, message=_said(why), **head, **times)
     values = found.estimate.values[: data.problem.base.b]
     if not np.isfinite(values).all():
-        return Row(status=EstimateStatus.DIVERGED.value, message="an estimate that is not finite", **head, **times)
+        return TrialRow(status=EstimateStatus.DIVERGED.value, message="an estimate that is not finite", **head, **times)
     merit = _merit(data, found, values) | {"survey_q": _resimulated(condition, data, values, seed)}
-    return Row(status=FOUND, message="", **head, **merit, **times)
+    return TrialRow(status=FOUND, message="", **head, **merit, **times)
 
 
 def _merit(data: Experiment, found: MethodEstimate, values: np.ndarray) -> dict[str, float]:

@@ -14,9 +14,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from calib.studies.conditions import read_study
-from calib.studies.rows import read_rows
+from calib.studies.store import read_rows
 from calib.studies.summary import ConditionSummary, MethodSummary, summarise
-from calib.studies.trial import Row
+from calib.studies.trial import TrialRow
 
 HERE = Path(__file__).parent
 STUDIES = ("MCS-*", "unfiltered", "wrong-beliefs")
@@ -72,7 +72,7 @@ def _figures(method: MethodSummary) -> list[str]:
     return [method.method, str(method.trials), failed, *(number(method.figures[key].median) for key in keys)]
 
 
-def pace(rows: Iterable[Row]) -> Iterator[str]:
+def pace(rows: Iterable[TrialRow]) -> Iterator[str]:
     """Yield mean processor time per trial of each method, and that of a condition with 100 runs of each."""
     spent: dict[str, list[float]] = {}
     for row in rows:

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from calib.studies.conditions import read_study
-from calib.studies.rows import read_rows
+from calib.studies.store import read_rows
 
 SURVEY = Path(__file__).parents[2] / "examples" / "survey"
 

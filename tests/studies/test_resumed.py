@@ -14,8 +14,8 @@ import dask_cluster
 import pytest
 
 from calib.procedure.study.outcome import run_study
-from calib.studies.rows import JOURNAL, read_rows
-from calib.studies.trial import Row
+from calib.studies.store import JOURNAL, read_rows
+from calib.studies.trial import TrialRow
 
 FILE = """
 name = "small"
@@ -38,7 +38,7 @@ def study(tmp_path: Path) -> Path:
     return path
 
 
-def timeless(rows: list[Row]) -> list[str]:
+def timeless(rows: list[TrialRow]) -> list[str]:
     return sorted(str({k: v for k, v in asdict(row).items() if k not in ("seconds", "cpu")}) for row in rows)
 
 

@@ -14,8 +14,8 @@ import numpy as np
 
 from calib.dynamics.bodies import Bodies, bodies_of, with_gravity
 from calib.identification.cases import Case
+from calib.identification.checks.motion_samples import MotionSamples, basis, left_share, take_samples
 from calib.identification.checks.recorded_motion import share_of_nominal
-from calib.identification.checks.samples import Samples, basis, left_share, take_samples
 from calib.identification.checks.whole_robot import ClockRatio, Exchange, clock_ratio, exchanged
 from calib.robot.chain import Chain
 
@@ -102,7 +102,7 @@ def speed_ratio(t: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
     return np.where(alike & (np.ptp(q, axis=0) > TRAVEL), (own * seen).sum(axis=0) / power, np.nan)
 
 
-def lag_of(samples: Samples, rate: float) -> Lag | None:
+def lag_of(samples: MotionSamples, rate: float) -> Lag | None:
     """Return the lag of the torques on which most joints agree; None where they do not.
 
     One joint alone may prefer a lag, since its friction is of another form than assumed; a clock is everybody's.

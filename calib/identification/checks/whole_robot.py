@@ -18,7 +18,7 @@ from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.rigid_body import inverse_dynamics
 from calib.estimation.whiteness import inflation
-from calib.identification.checks.samples import Samples, basis, drive_columns, left_share
+from calib.identification.checks.motion_samples import MotionSamples, basis, drive_columns, left_share
 from calib.identification.rods import rods
 from calib.robot.chain import Chain
 
@@ -49,7 +49,7 @@ class Exchange:
     factor: float
 
 
-def clock_ratio(samples: Samples, chain: Chain) -> ClockRatio | None:
+def clock_ratio(samples: MotionSamples, chain: Chain) -> ClockRatio | None:
     """Return how large inertias are beside masses; None where the motion does not tell both factors.
 
     Torques are τ = α τ_rods + free: α of the rods' torques of motion beside any torque of gravity, then α of their
@@ -84,7 +84,7 @@ def _factor(torque: np.ndarray, common: np.ndarray, free: np.ndarray) -> tuple[f
     return alpha, float(np.sqrt(np.sum(weight[:, None] ** 2 * own**2 * np.array(spread)[:, None]))) / power
 
 
-def exchanged(samples: Samples, chain: Chain) -> Exchange | None:
+def exchanged(samples: MotionSamples, chain: Chain) -> Exchange | None:
     """Return the two joints whose exchange lets the robot's own masses explain most more; None without such.
 
     Each joint's torque is that of gravity and that of motion, by the robot's masses, each times a factor, and a drive.
@@ -102,7 +102,7 @@ def exchanged(samples: Samples, chain: Chain) -> Exchange | None:
     return found
 
 
-def _left(samples: Samples, masses: np.ndarray, pair: tuple[int, int]) -> Iterator[float]:
+def _left(samples: MotionSamples, masses: np.ndarray, pair: tuple[int, int]) -> Iterator[float]:
     """Yield what is left of each recorded joint's torque where the columns of two joints are exchanged."""
     order = np.arange(samples.q.shape[1])
     order[list(pair)] = order[list(pair)[::-1]]

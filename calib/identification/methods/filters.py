@@ -23,8 +23,8 @@ import numpy as np
 
 from calib.data.signals.motion import velocity_noise
 from calib.errors import CalibError, CannotSimulate, Diverged
-from calib.estimation.kalman import Belief, Filter, believe, corrected, linearly_predicted, points, predicted
 from calib.estimation.linear import LinearFit
+from calib.estimation.sequential.kalman import Belief, Filter, believe, corrected, linearly_predicted, points, predicted
 from calib.identification.cases import Case
 from calib.identification.methods.believed import BelievedRobot, believed_robot, start_of
 from calib.identification.methods.instrumental import low_passed

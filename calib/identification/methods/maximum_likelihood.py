@@ -80,7 +80,7 @@ class MaximumLikelihood(Method):
 
 
 @dataclass(frozen=True, eq=False)
-class _Part:
+class _Recording:
     """One recording.
 
     Attributes:
@@ -100,7 +100,7 @@ class _Part:
 
 
 @dataclass(frozen=True, eq=False)
-class _Task:
+class _NoisyStates:
     """All samples: matrix (M, n, p), target and rows in use (M, n), recordings, and columns that have slopes."""
 
     model: IdentificationModel
@@ -109,10 +109,10 @@ class _Task:
     matrix: np.ndarray
     target: np.ndarray
     present: np.ndarray
-    parts: tuple[_Part, ...]
+    parts: tuple[_Recording, ...]
 
 
-def _noisy_states(problem: IdentificationProblem, model: IdentificationModel) -> _Task:
+def _noisy_states(problem: IdentificationProblem, model: IdentificationModel) -> _NoisyStates:
     """Return the samples with the covariance of their states' noise."""
     samples, own = samples_of(problem), problem.base.b
     extra = [one for one in problem.terms[own:] if one is not None]
@@ -127,9 +127,9 @@ def _noisy_states(problem: IdentificationProblem, model: IdentificationModel) ->
         noise = noise_of_states(motion, problem.decimator)
         part = slice(first, first + len(index))
         q, v, a = (x[index] for x in (motion.q, motion.v, motion.a))
-        parts.append(_Part(part, q, v, a, noise, case.carried, there[columns]))
+        parts.append(_Recording(part, q, v, a, noise, case.carried, there[columns]))
         first += len(index)
-    return _Task(model, columns, smooth, samples.matrix, samples.target, samples.present, tuple(parts))
+    return _NoisyStates(model, columns, smooth, samples.matrix, samples.target, samples.present, tuple(parts))
 
 
 def noise_of_states(motion: Motion, decimator: Decimator) -> np.ndarray:
@@ -149,7 +149,7 @@ def noise_of_states(motion: Motion, decimator: Decimator) -> np.ndarray:
     return result * (motion.cutoffs.noise**2)[:, None, None]
 
 
-def _slopes(task: _Task, part: _Part, values: np.ndarray) -> np.ndarray:
+def _slopes(task: _NoisyStates, part: _Recording, values: np.ndarray) -> np.ndarray:
     """Return B (M, n, 3, n): slopes of W β by q, v and a of every joint."""
     used = task.smooth & (part.present > 0.0)
     order = np.argsort(task.columns[used])
@@ -167,7 +167,7 @@ def _slopes(task: _Task, part: _Part, values: np.ndarray) -> np.ndarray:
     return out
 
 
-def _residuals(task: _Task, part: _Part, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _residuals(task: _NoisyStates, part: _Recording, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return r (M, n), G Bᵀ (M, 3, n, n) and B G Bᵀ (M, n, n) of a recording."""
     by_state = _slopes(task, part, values)
     spread = np.einsum("kxj,mrxj->mkjr", part.noise.transpose(1, 2, 0), by_state)
@@ -181,7 +181,7 @@ def _inverse(other: np.ndarray, noise: np.ndarray, used: np.ndarray) -> np.ndarr
     return np.where(both, np.linalg.inv(np.where(both, other + np.diag(noise), np.eye(len(noise)))), 0.0)
 
 
-def _torque_noise(task: _Task, values: np.ndarray, noise: np.ndarray, least: np.ndarray) -> np.ndarray:
+def _torque_noise(task: _NoisyStates, values: np.ndarray, noise: np.ndarray, least: np.ndarray) -> np.ndarray:
     """Return Σ_τ (n,) that maximises the likelihood beside the positions' noise, parameters held."""
     parts = [_residuals(task, part, values) for part in task.parts]
     residual, other = (np.concatenate(x) for x in zip(*((r, more) for r, _, more in parts)))
@@ -212,7 +212,7 @@ class _Round:
         return np.sqrt(sum(np.sum((own @ self.bread.T) ** 2, axis=(0, 1)) for own in self.white))
 
 
-def _step(task: _Task, values: np.ndarray, noise: np.ndarray) -> _Round:
+def _step(task: _NoisyStates, values: np.ndarray, noise: np.ndarray) -> _Round:
     """Return the next round from parameters and the torques' noise."""
     p = len(values)
     cross, score, white, left = np.zeros((p, p)), np.zeros(p), [], []
@@ -232,7 +232,7 @@ def _step(task: _Task, values: np.ndarray, noise: np.ndarray) -> _Round:
     return _Round(values + bread @ score, bread, tuple(white), tuple(left))
 
 
-def _change(task: _Task, part: _Part, error: np.ndarray) -> np.ndarray:
+def _change(task: _NoisyStates, part: _Recording, error: np.ndarray) -> np.ndarray:
     """Return W(x + error) - W(x) (M, n, p) at the kept samples, error (M, 3, n); zero for columns without slopes."""
     out = np.zeros_like(task.matrix[part.own])
     smooth = np.flatnonzero(task.smooth)

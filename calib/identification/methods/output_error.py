@@ -69,7 +69,7 @@ class OutputError(Method):
         return attempted(self.name, problem, lambda: self._estimate(problem, plain, loops), loops)
 
     def _estimate(self, problem: IdentificationProblem, plain: MethodEstimate, loops: ClosedLoops) -> MethodEstimate:
-        task = _Task(problem, believed_robot(problem, self.name), loops, self.torques)
+        task = _Comparison(problem, believed_robot(problem, self.name), loops, self.torques)
         with np.errstate(divide="ignore", invalid="ignore"):
             inertia = loops.controller.kd**2 / (2.0 * loops.controller.kp)
         inertia = np.where(np.isfinite(inertia) & (inertia > 0.0), inertia, 1.0)
@@ -94,7 +94,7 @@ class OutputError(Method):
 
 
 @dataclass(frozen=True, eq=False)
-class _Task:
+class _Comparison:
     """What is compared: recordings in their loops, positions or torques; `count` of simulations."""
 
     problem: IdentificationProblem
@@ -171,7 +171,12 @@ def _gradient(residual: np.ndarray, slopes: np.ndarray) -> np.ndarray:
 
 
 def _packed(
-    task: _Task, plain: MethodEstimate, values: np.ndarray, residual: np.ndarray, slopes: np.ndarray, std: np.ndarray
+    task: _Comparison,
+    plain: MethodEstimate,
+    values: np.ndarray,
+    residual: np.ndarray,
+    slopes: np.ndarray,
+    std: np.ndarray,
 ) -> LinearFit:
     """Return the fit with the covariance H⁻¹ S H⁻¹.
 

@@ -10,7 +10,7 @@ from calib.identification.methods.filters import CDKF, EKF, SRCDKF, SREKF, SRUKF
 from calib.identification.methods.least_squares import IRLS, OLS, PC_IRLS, PC_OLS, PC_WLS, TLS, WLS
 from calib.identification.methods.maximum_likelihood import ML
 from calib.identification.methods.method import Method
-from calib.identification.methods.networks import ADALINE, HOPFIELD
+from calib.identification.methods.neural_networks import ADALINE, HOPFIELD
 from calib.identification.methods.output_error import CLIE, CLOE
 from calib.identification.methods.simulated import DIDIM, IV, PC_DIDIM, PC_IV
 

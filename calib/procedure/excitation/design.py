@@ -16,7 +16,7 @@ from calib.procedure.excitation.inputs import ExcitationInputs, ExcitedModel, re
 from calib.procedure.excitation.limits import MotionLimits
 from calib.procedure.excitation.metrics import DesignCondition
 from calib.procedure.excitation.playback import Playback, check_playback, play
-from calib.procedure.excitation.prediction import Outlook, foretell
+from calib.procedure.excitation.prediction import MotionOutlook, foretell
 from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, HARMONICS, ExcitationSettings
 from calib.robot.calibrated import CalibratedChain
 from calib.workers.interrupts import finishing
@@ -64,7 +64,7 @@ class Designed:
     front: Front | None
     playback: Playback
     notes: tuple[str, ...]
-    outlook: Outlook | None = None
+    outlook: MotionOutlook | None = None
 
     @property
     def family(self) -> Family:
@@ -147,7 +147,7 @@ def _outlook(
     problem: ExcitationProblem,
     found: SearchResult,
     say: Progress,
-) -> Outlook | None:
+) -> MotionOutlook | None:
     """Return what a motion will tell, and what others of other periods would."""
 
     def problem_of(period: float) -> ExcitationProblem:

@@ -60,7 +60,7 @@ class MotionPrediction:
 
 
 @dataclass(frozen=True, eq=False)
-class Outlook:
+class MotionOutlook:
     """What a designed motion will tell, and what others of other lengths would.
 
     Attributes:
@@ -98,7 +98,7 @@ def foretell(
     problem_of: Callable[[float], ExcitationProblem],
     evaluations: int,
     seed: int,
-) -> Outlook | None:
+) -> MotionOutlook | None:
     """Return what a motion found will tell; None where a joint has no torque limit to take an error from.
 
     Args:
@@ -128,7 +128,7 @@ def foretell(
     kept = slice(None) if columns is None else columns
     values = np.full(len(model.exact.names), np.nan) if model.values is None else model.values
     units = tuple(np.array(model.exact.units)[kept])
-    return Outlook(given.columns.names, units, values[kept], sigmas, share, limits, own, tuple(others))
+    return MotionOutlook(given.columns.names, units, values[kept], sigmas, share, limits, own, tuple(others))
 
 
 def _task(given: ExcitationInputs, seed: int) -> np.ndarray:
@@ -192,7 +192,7 @@ def _shortened(
     return (other.family, run) if isinstance(run, SearchResult) else None
 
 
-def table(one: Outlook) -> dict[str, Any]:
+def table(one: MotionOutlook) -> dict[str, Any]:
     """Return the entry of ``metrics.json``."""
 
     def entry(each: MotionPrediction) -> dict[str, Any]:
@@ -207,7 +207,7 @@ def table(one: Outlook) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def write(one: Outlook, folder: Path) -> Path:
+def write(one: MotionOutlook, folder: Path) -> Path:
     """Write the parameters' predicted sigmas as CSV; values and rsd [%] are left out where nobody knows the value."""
     rows = []
     for name, unit, value, sigma in zip(one.names, one.units, one.values, one.own.sigmas):
@@ -220,7 +220,7 @@ def _percent(sigma: float, value: float, known: bool) -> float | None:
     return float(100.0 * sigma / abs(value)) if known else None
 
 
-def lines(one: Outlook) -> list[str]:
+def lines(one: MotionOutlook) -> list[str]:
     """Return the prediction in words: what this motion tells, and what other lengths would."""
     own, c = one.own, len(one.names)
     told = f"{one.told(own)} of {c} parameters to {TOLD:.0%} of their value, " if np.isfinite(one.values).all() else ""

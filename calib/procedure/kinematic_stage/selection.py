@@ -39,7 +39,7 @@ TYPICAL = 300  # poses all over the workspace, seen or not, at which the tool's 
 
 
 @dataclass(frozen=True, eq=False)
-class Outlook:
+class PoseOutlook:
     """What a selection will tell, before anything is moved.
 
     Attributes:
@@ -78,7 +78,7 @@ class Chosen:
     checked: tuple[str, ...]
     unchecked: tuple[str, ...]
     notes: tuple[str, ...]
-    outlook: Outlook
+    outlook: PoseOutlook
     run: Run
     driven: RunSettings
     by_images: bool
@@ -181,7 +181,7 @@ def _outlook(
     candidates: np.ndarray,
     before: np.ndarray | None,
     comparable: float,
-) -> Outlook:
+) -> PoseOutlook:
     """Return what chosen poses q (m, n) will tell, and what others would."""
     space, free = limits.space(seen), limits.space(seen, sight=False)
     typical = typical_poses(limits, seen, search.seed)
@@ -189,7 +189,7 @@ def _outlook(
     past = np.zeros((0, *rows.shape[1:])) if before is None else before
     blind = _blind(seen, free, typical, search, m, past) if limits.sight is not None else None
     others = by_count(seen, space.jacobian(candidates), typical, before)
-    return Outlook(foretold(seen, np.concatenate([rows, past]), typical, m), others, blind, comparable)
+    return PoseOutlook(foretold(seen, np.concatenate([rows, past]), typical, m), others, blind, comparable)
 
 
 def typical_poses(limits: Limits, seen: Seen, seed: int) -> np.ndarray:

@@ -23,12 +23,12 @@ from calib.procedure.report.style import (
     styled,
 )
 from calib.studies.summary import ConditionSummary
-from calib.studies.trial import Row
+from calib.studies.trial import TrialRow
 
 LINE = 0.21  # height of one method [in]
 
 
-def boxes(one: ConditionSummary, rows: Sequence[Row]) -> Picture:
+def boxes(one: ConditionSummary, rows: Sequence[TrialRow]) -> Picture:
     """Return the box plot of a condition."""
     series = [
         (

@@ -1,6 +1,6 @@
 """``calib study``: what is missing is run, what is there is summed up, and a report says what to take.
 
-rows.parquet, rows.csv   every trial (`calib.studies.rows`): more may be added by anyone, at any time
+rows.parquet, rows.csv   every trial (`calib.studies.store`): more may be added by anyone, at any time
 summary.csv              one line per condition and method: medians and quartiles of every figure
 report.html              tables, box plots, the decision rule; one file
 """
@@ -15,14 +15,15 @@ from calib import files
 from calib.errors import UsageError
 from calib.identification.methods.registry import LISTING
 from calib.procedure.study import report
-from calib.studies import rows, summary
+from calib.studies import summary
 from calib.studies.conditions import Study, read_study, shipped
 from calib.studies.run import Progress, run, span
+from calib.studies.store import JOURNAL, LOCK, WHOLE, opened
 from calib.studies.summary import ConditionSummary
 from calib.workers import workers
 
 SUMMARY, REPORT = "summary.csv", "report.html"
-OURS = (rows.JOURNAL, rows.WHOLE, rows.LOCK, SUMMARY, REPORT)
+OURS = (JOURNAL, WHOLE, LOCK, SUMMARY, REPORT)
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ def run_study(
     """
     study = read_study(named, methods, runs)
     _check_folder(out, named)
-    with rows.opened(out) as store:
+    with opened(out) as store:
         notes = [f"{store.dropped} half-written line was taken off: its trial is run again"] if store.dropped else []
         before = len(store.rows)
         progress = Progress(0)
@@ -105,7 +106,7 @@ def _check_folder(out: Path, named: Sequence[str | Path]) -> None:
         raise UsageError(f"{out} is a file; a study's rows go into a folder (--out)")
     files.check_not_input([out, *(out / name for name in OURS)], named)
     foreign = [name for name in (SUMMARY, REPORT) if (out / name).exists()]
-    if foreign and not any((out / name).exists() for name in (rows.JOURNAL, rows.WHOLE)):
+    if foreign and not any((out / name).exists() for name in (JOURNAL, WHOLE)):
         raise UsageError(f"{out} holds {', '.join(foreign)} which no study left there; choose another (--out)")
 
 

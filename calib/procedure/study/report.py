@@ -11,8 +11,18 @@ from importlib import metadata, resources
 from calib.procedure.report.page import Pictures, Section, Table, Text
 from calib.procedure.study import figures
 from calib.studies.conditions import Condition, Study
-from calib.studies.summary import ALIKE, FIGURES, LEAST, LEVEL, RELIABLE, SLACK, ConditionSummary, MethodSummary, Spread
-from calib.studies.trial import Row
+from calib.studies.summary import (
+    ALIKE,
+    FIGURES,
+    LEAST,
+    LEVEL,
+    RELIABLE,
+    SLACK,
+    ConditionSummary,
+    MethodSummary,
+    Quartiles,
+)
+from calib.studies.trial import TrialRow
 
 RULE = (
     f"Of the methods that give an estimate in at least {RELIABLE:.0%} of the trials, those are as good as the best "
@@ -96,7 +106,7 @@ def _short(value: float) -> str:
     return f"{value:.3g}" if abs(value) < 1e5 else f"{value:.1e}"
 
 
-def _quartiles(found: Spread) -> str:
+def _quartiles(found: Quartiles) -> str:
     return f"{_short(found.lower)}–{_short(found.upper)}"
 
 
@@ -114,12 +124,16 @@ def summary_table(conditions: Sequence[ConditionSummary]) -> tuple[list[str], li
     return header, lines
 
 
-def _parts(found: Spread) -> list[object]:
+def _parts(found: Quartiles) -> list[object]:
     return ["" if math.isnan(value) else value for value in (found.median, found.lower, found.upper)]
 
 
 def make_page(
-    study: Study, conditions: Sequence[ConditionSummary], rows: Sequence[Row], notes: Sequence[str], plots: bool = True
+    study: Study,
+    conditions: Sequence[ConditionSummary],
+    rows: Sequence[TrialRow],
+    notes: Sequence[str],
+    plots: bool = True,
 ) -> str:
     """Return the report as HTML.
 
@@ -153,9 +167,9 @@ def make_page(
     )  # fmt: skip
 
 
-def _failures(rows: Sequence[Row]) -> list[str]:
+def _failures(rows: Sequence[TrialRow]) -> list[str]:
     """Return the first message of each way in which a method failed, with how often."""
-    found: dict[tuple[str, str], list[Row]] = {}
+    found: dict[tuple[str, str], list[TrialRow]] = {}
     for row in rows:
         if not row.found:
             found.setdefault((row.method, row.status), []).append(row)

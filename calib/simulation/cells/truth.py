@@ -58,7 +58,7 @@ def _rms(arm: Installation, q: np.ndarray, points: np.ndarray) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class TorqueErrors:
+class TorqueComparison:
     """Errors of predicted torques against the noise-free truth on motion nobody has seen.
 
     Attributes:
@@ -74,7 +74,7 @@ class TorqueErrors:
 
 def torque_errors(
     cell: Cell, arm: MovingArm, model: IdentificationModel, values: np.ndarray, chain: Chain, seed: int = 4321
-) -> TorqueErrors:
+) -> TorqueComparison:
     """Compare a model's torques with the noise-free truth along a random motion of `SECONDS`.
 
     Args:
@@ -94,7 +94,7 @@ def torque_errors(
     friction = link - inverse_dynamics(arm.plant.bodies, arm.plant.parameters[: arm.plant.inertial], *states)
     nominal = inverse_dynamics(bodies_of(cell.nominal), standard_parameters(cell.nominal), *states) + friction
     error = predicted - true
-    return TorqueErrors(_percent(error, true), np.sqrt(np.mean(error**2, axis=0)), _percent(nominal - link, link))
+    return TorqueComparison(_percent(error, true), np.sqrt(np.mean(error**2, axis=0)), _percent(nominal - link, link))
 
 
 def _percent(error: np.ndarray, size: np.ndarray) -> float:

@@ -11,7 +11,16 @@ import small_arm
 
 from calib.dynamics.torque_rows import POWER
 from calib.errors import Diverged, UsageError
-from calib.estimation.kalman import RULES, Belief, Filter, believe, corrected, linearly_predicted, points, predicted
+from calib.estimation.sequential.kalman import (
+    RULES,
+    Belief,
+    Filter,
+    believe,
+    corrected,
+    linearly_predicted,
+    points,
+    predicted,
+)
 from calib.identification.methods.method import EstimateStatus
 from calib.identification.methods.registry import METHODS
 

@@ -13,7 +13,7 @@ from calib.data.signals.decimation import decimate
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics.torque_rows import POWER
 from calib.errors import NotConverged, UsageError
-from calib.estimation.networks import hopfield
+from calib.estimation.sequential.networks import hopfield
 from calib.estimation.triangles import collect
 from calib.identification.cases import make_case
 from calib.identification.identify import chain_states, common_decimator, find_base
@@ -89,7 +89,7 @@ def test_a_saturated_neuron_is_no_estimate():
 
 
 def test_networks_say_when_they_fail(problem, monkeypatch):
-    monkeypatch.setattr("calib.estimation.networks.EPOCHS", 1)
+    monkeypatch.setattr("calib.estimation.sequential.networks.EPOCHS", 1)
     found = METHODS["adaline"].estimate(problem)
     assert found.status is EstimateStatus.NOT_CONVERGED and "from rest after 1 epochs" in str(found.failure)
 

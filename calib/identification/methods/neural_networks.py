@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.estimation.linear import LinearFit
-from calib.estimation.networks import adaline, hopfield
+from calib.estimation.sequential.networks import adaline, hopfield
 from calib.identification.methods.least_squares import samples_of, weighed
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 

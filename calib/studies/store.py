@@ -24,13 +24,13 @@ from typing import IO, Any
 
 from calib import files
 from calib.errors import CalibError, UsageError
-from calib.studies.trial import COLUMNS, Row
+from calib.studies.trial import COLUMNS, TrialRow
 
 JOURNAL, WHOLE, LOCK = "rows.csv", "rows.parquet", "study.lock"
 FORMAT = 1  # of the store: first cell of every header
 _HEAD = (f"calib-study-{FORMAT}", *COLUMNS)
 _KINDS = {"int": int, "float": float, "str": str}
-_TYPES = [_KINDS[str(Row.__dataclass_fields__[name].type)] for name in COLUMNS]
+_TYPES = [_KINDS[str(TrialRow.__dataclass_fields__[name].type)] for name in COLUMNS]
 
 
 class RowStore:
@@ -49,7 +49,7 @@ class RowStore:
         self.rows.update((row.key, row) for row in journal)
         self._journal = _open_journal(folder / JOURNAL, good)
 
-    def append(self, rows: Sequence[Row]) -> None:
+    def append(self, rows: Sequence[TrialRow]) -> None:
         """Keep rows, on the disk before this returns.
 
         Raises:
@@ -127,7 +127,7 @@ def opened(folder: Path) -> Iterator[RowStore]:
         os.close(handle)
 
 
-def read_rows(folder: Path) -> list[Row]:
+def read_rows(folder: Path) -> list[TrialRow]:
     """Return all rows of a folder, while another command writes there, too."""
     found = {row.key: row for row in _read_whole(folder / WHOLE)}
     found.update((row.key, row) for row in _read_journal(folder / JOURNAL)[0])
@@ -145,7 +145,7 @@ def _open_journal(path: Path, size: int) -> IO[bytes]:
     return journal
 
 
-def _read_journal(path: Path) -> tuple[list[Row], int, int]:
+def _read_journal(path: Path) -> tuple[list[TrialRow], int, int]:
     """Return the rows, how many bytes of the file are good, and how many lines were half-written (0 or 1).
 
     Raises:
@@ -161,7 +161,7 @@ def _read_journal(path: Path) -> tuple[list[Row], int, int]:
     rows = []
     for number, cells in enumerate(csv.reader(lines[1:]), 2):
         try:
-            rows.append(Row(*(_value(kind, cell) for kind, cell in zip(_TYPES, cells[1:], strict=True))))
+            rows.append(TrialRow(*(_value(kind, cell) for kind, cell in zip(_TYPES, cells[1:], strict=True))))
         except ValueError as error:
             raise UsageError(
                 f"{path}: line {number} is damaged ({error}); delete that line, and its trial is run again"
@@ -193,7 +193,7 @@ def _value(kind: type, cell: str) -> Any:
     return math.nan if kind is float and not cell else kind(cell)
 
 
-def _parquet(rows: Iterable[Row]) -> bytes:
+def _parquet(rows: Iterable[TrialRow]) -> bytes:
     """Return rows as a Parquet file, sorted by their keys, so that the same rows give the same bytes."""
     import pyarrow
     from pyarrow import parquet
@@ -209,7 +209,7 @@ def _parquet(rows: Iterable[Row]) -> bytes:
     return sink.getvalue().to_pybytes()
 
 
-def _read_whole(path: Path) -> list[Row]:
+def _read_whole(path: Path) -> list[TrialRow]:
     if not path.exists():
         return []
     try:
@@ -223,4 +223,4 @@ def _read_whole(path: Path) -> list[Row]:
         raise UsageError(f"{path} is damaged: {error}; delete it, and its trials are run again") from error
     store = (table.schema.metadata or {}).get(b"store", b"").decode()
     _check_columns(path, [store, *table.column_names])
-    return [Row(**row) for row in table.to_pylist()]
+    return [TrialRow(**row) for row in table.to_pylist()]

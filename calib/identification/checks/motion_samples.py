@@ -18,7 +18,7 @@ SMOOTH = 0.02  # window of a moving average of the torques [s]: else a shift bet
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
+class MotionSamples:
     """N samples of a motion of n joints.
 
     Attributes:
@@ -60,7 +60,7 @@ class Samples:
         return found.reshape(m, n, -1)
 
 
-def take_samples(case: Case, bodies: Bodies, count: int) -> Samples | None:
+def take_samples(case: Case, bodies: Bodies, count: int) -> MotionSamples | None:
     """Return some `count` samples of a recording of the motors' torques; None where too few are left."""
     motion, n = case.motion, case.motion.n
     edge = int(EDGE * motion.rate)
@@ -70,7 +70,7 @@ def take_samples(case: Case, bodies: Bodies, count: int) -> Samples | None:
     index = inner[:: max(1, len(inner) // count)]
     effort = _smoothed(np.asarray(case.target), max(1, round(SMOOTH * motion.rate)))
     q, v, a = (np.ascontiguousarray(x[index]) for x in (motion.q, motion.v, motion.a))
-    return Samples(index, q, v, a, effort, bodies)
+    return MotionSamples(index, q, v, a, effort, bodies)
 
 
 def drive_columns(v: np.ndarray, a: np.ndarray) -> np.ndarray:
