@@ -138,7 +138,7 @@ def select(
     from calib.procedure.measuring.run import RunSettings
 
     named = beside(constraints).values() if constraints else ()
-    drawn = {name: out.with_name(f"{out.stem}_{name}.png") for name in ("predicted", "outlook") if plots}
+    drawn = {name: out.parent / f"{out.stem}_{name}.png" for name in ("predicted", "outlook") if plots}
     check_targets([out, *([run] if run else []), *drawn.values()], [robot, existing, constraints, *named])
     targets = tuple(tuple(numbers(text, 3, "--tool")) for text in tool or [])
     sigmas = None if sigma is None else numbers(sigma, 2, "--sigma")

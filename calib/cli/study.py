@@ -71,7 +71,7 @@ def compare(
     tip: Tip = None,
     seed: Seed = 0,
 ) -> None:
-    """Rank identification methods on recordings, by what they predict of other motion, with what they cost."""
+    """Rank identification methods on recordings of your robot. What counts is how well they predict other motion."""
     from calib import files
     from calib.identification.identify_options import read_options
     from calib.procedure.dynamic_stage import inputs

@@ -3,7 +3,8 @@
 A clock that runs s times too slow makes accelerations s² times too small, so that inertias come out s² times too large
 while masses, which gravity tells, stay as they are. How large inertias are beside masses, lengths alone say nearly: for
 rods between the joints their ratio is known up to 15 % on every recording at hand that tells it (Panda, LWR4+, TX40,
-14 of a UR10e), whatever the masses and the unit of the torques are. All thresholds are our choice.
+14 of a UR10e), whatever the masses and the unit of the torques are. All these have six joints or more; arms of two,
+whose last link no length tells, are not looked at: one gave 45. All thresholds are our choice.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from calib.identification.checks.motion_samples import MotionSamples, basis, dri
 from calib.identification.rods import rods
 from calib.robot.chain import Chain
 
+JOINTS = 3  # of the shortest arm that is looked at (our choice)
 ROUNDS = 3  # of weighing joints by what is left of them
 SURE = 5.0  # sigmas from which on a factor is told
 ALIKE = 0.3  # least rms speed of exchanged joints, of the fastest one's: one that hardly moves may have any column
@@ -50,11 +52,13 @@ class Exchange:
 
 
 def clock_ratio(samples: MotionSamples, chain: Chain) -> ClockRatio | None:
-    """Return how large inertias are beside masses; None where the motion does not tell both factors.
+    """Return how large inertias are beside masses; None where neither motion nor arm tell both.
 
     Torques are τ = α τ_rods + free: α of the rods' torques of motion beside any torque of gravity, then α of their
     gravity beside any torque of motion; drives free in both.
     """
+    if chain.n < JOINTS:
+        return None
     whole = np.asarray(rods(chain, IdentificationModel(bodies_of(chain), ()))).ravel()
     still, moving = samples.at_rest, samples.inertial - samples.at_rest
     inertia, own = _factor(samples.torque, moving @ whole, np.concatenate([still, samples.drives], axis=2))

@@ -33,6 +33,7 @@ on the border, a semidefinite program for cvxpy with Clarabel (`nearest`).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -53,6 +54,7 @@ LEAST = 20.0  # of γ with a CAD
 WEIGHTS = tuple(float(10.0 ** (k / 4)) for k in range(0, 19))  # γ tried, 1 to 30 000
 SMALLEST = 1e-3  # of γ, where the estimate asks for less CAD than the evidence does
 STEPS = 200
+RIDGES = (0.0, 1e-12, 1e-10, 1e-8, 1e-6)  # of a unit diagonal
 SETTLED = 1e-8  # Newton decrement²: the cost is within half of it of its least
 
 
@@ -246,9 +248,21 @@ def covariance(problem: BodyCost, gamma: float, values: np.ndarray) -> np.ndarra
 
 
 def _solved(curvature: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return curvature⁻¹ target, by Cholesky in units that make the diagonal one."""
+    """Return curvature⁻¹ target, by Cholesky in units that make the diagonal one.
+
+    What rounding leaves indefinite gets the least ridge of `RIDGES` that helps; a step by it still leads downhill.
+
+    Raises:
+        NotConverged: where none does.
+    """
     unit = np.sqrt(np.diag(curvature))
-    root = scipy.linalg.cho_factor(curvature / np.outer(unit, unit))
+    whole = curvature / np.outer(unit, unit)
+    for ridge in RIDGES:
+        with suppress(np.linalg.LinAlgError):
+            root = scipy.linalg.cho_factor(whole + ridge * np.eye(len(unit)))
+            break
+    else:
+        raise NotConverged("the consistent parameters cannot be told apart to within rounding", unit)
     scale = unit if target.ndim == 1 else unit[:, None]
     return scipy.linalg.cho_solve(root, target / scale) / scale
 

@@ -64,6 +64,7 @@ def test_a_covariance_that_is_none_is_told():
         _ = Belief(np.zeros(2), np.diag([1.0, -1.0]), False).deviations
 
 
+@pytest.mark.slow
 def test_six_filters_make_one_estimate_whose_sigma_covers():
     away, others = [], []
     for seed in range(3):
@@ -86,6 +87,7 @@ def test_a_filter_finds_back_from_a_start_that_is_off():
     assert np.abs((off.estimate.values - plain.estimate.values) / plain.estimate.sigma).max() < 1.0
 
 
+@pytest.mark.slow
 def test_what_a_filter_cannot_follow_is_a_status():
     problem = small_arm.problem(0)
     found = METHODS["ukf"].estimate(replace(problem, start=-small_arm.truth()))

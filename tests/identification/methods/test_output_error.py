@@ -13,6 +13,7 @@ from calib.identification.methods.method import EstimateStatus
 from calib.identification.methods.registry import METHODS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "noise"),
     [("clie", (0.0, 0.1)), ("cloe", (2e-5, 0.0)), pytest.param("clie", (2e-5, 0.05), marks=pytest.mark.slow)],
@@ -26,6 +27,7 @@ def test_the_stated_sigma_covers(name, noise):
     assert np.mean(np.abs(away) < 2.0) > 0.85
 
 
+@pytest.mark.slow
 def test_each_is_better_where_its_own_signal_is_clean():
     heard, seen = problem(0, 0.0, 0.1), problem(0, 2e-5, 0.0)
     error = {
@@ -36,6 +38,7 @@ def test_each_is_better_where_its_own_signal_is_clean():
     assert error["cloe", "seen"] < error["clie", "seen"]
 
 
+@pytest.mark.slow
 def test_a_loop_that_cannot_be_followed_is_a_status_not_an_exception():
     one = problem(0)
     wild = replace(one, loop=replace(LOOP, kp=(9e6, 6e6), kd=(4e5, 3e5)), start=truth())
@@ -45,6 +48,7 @@ def test_a_loop_that_cannot_be_followed_is_a_status_not_an_exception():
         assert "diverged" in str(found.failure)
 
 
+@pytest.mark.slow
 def test_a_start_that_no_robot_has_is_a_status():
     one = problem(0)
     found = METHODS["clie"].estimate(replace(one, start=-truth()))

@@ -20,7 +20,7 @@ from calib.procedure.session.folder import Session, open_session, verdict_of
 from calib.simulation.cells.truth import torque_errors
 from calib.simulation.cells.virtual_cells import virtual_cell
 
-QUICK = {"period": 6.0, "starts": 1, "evaluations": 40, "repeats": 2, "rate": 250.0}
+QUICK = {"period": 6.0, "harmonics": 5, "starts": 1, "evaluations": 100, "repeats": 2, "rate": 250.0}
 
 
 def kinds(session: Session) -> dict[str, str]:
@@ -222,7 +222,7 @@ def test_the_validation_motion_is_not_learnt_from_and_the_training_motion_no_pro
 
 def test_recordings_keep_the_plan_they_were_made_to(recorded: Session) -> None:
     before = recorded.path("6-excitation/training/trajectory.csv").read_text()
-    edit(recorded.path("session.toml"), "harmonics = 12", "harmonics = 4")
+    edit(recorded.path("session.toml"), "harmonics = 5", "harmonics = 4")
     assert kinds(recorded)["excite"] == steps.KEPT
     assert recorded.path("6-excitation/training/trajectory.csv").read_text() == before
 

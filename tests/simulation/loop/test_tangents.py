@@ -53,6 +53,7 @@ LOOPS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LOOPS)
 def test_tangents_are_the_derivative_of_the_simulation(name):
     plant, (controller, delay, cutoff) = odd(), LOOPS[name]
@@ -76,6 +77,7 @@ def test_tangents_are_the_derivative_of_the_simulation(name):
             assert away < 1e-5 * np.abs(expected).max() + 1e-6, (column, series)
 
 
+@pytest.mark.slow
 def test_gains_may_follow_the_parameters():
     bodies, reference, controller = bodies_of(motley_with_follower()), motion(5), LOOPS["saturated"][0]
     plant = Plant(bodies, (), np.tile([0.2, 0, 0, 0.3, 0, 0.25, 0.02, 0.01, 0.03, 2.0], bodies.count))
