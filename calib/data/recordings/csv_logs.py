@@ -10,6 +10,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -37,7 +38,7 @@ def read_log(
             message = f"{len(columns)} columns of {ours} ({', '.join(_called(table, columns))}) for {n} of q"
             raise MeasurementError(message, path)
     kind = "current" if "current" in found else "torque"
-    series = {
+    series: dict[str, Any] = {
         "effort" if ours == kind else ours: np.column_stack([_values(table, c, ours, options) for c in columns])
         for ours, columns in found.items()
         if ours not in ("t", "q")

@@ -161,7 +161,7 @@ class TorqueIntervals:
 
     def ways(self, joints: Sequence[str]) -> list[str]:
         """Say how the motion leaves what was learnt from: in which of q, v, a, and at which of the joints named."""
-        outside = self.extrapolated.any(axis=1)
+        outside = np.asarray(self.extrapolated.any(axis=1))
         return [
             f"{words} {', '.join(name for name, out in zip(joints, own.tolist()) if out)}"
             for words, own in zip(WAYS, outside)
@@ -250,9 +250,9 @@ def _samples(found: Identification, cases: Sequence[Case]) -> _Samples:
     states, errors, blocks, whole, parts = [], [], [], [], []
     for case, rows in zip(cases, found.rows):
         motion, index = case.motion, kept(case.motion.segment, decimator)
-        own = np.stack([motion.q[index], motion.v[index], motion.a[index]])
+        q, v, a = own = np.stack([motion.q[index], motion.v[index], motion.a[index]])
         memory = segmented_states(dynamics.model.columns, case)[:, index]
-        errors.append(case.target[index] - dynamics.model.torque(dynamics.values, *own, case.carried, memory))
+        errors.append(case.target[index] - dynamics.model.torque(dynamics.values, q, v, a, case.carried, memory))
         states.append(own)
         blocks.append(np.where(motion.weight[index] > 0.5, rows.block, -1))
         every = slice(None, None, max(1, decimator.factor // FINER))
@@ -305,7 +305,9 @@ def _estimate(found: Identification, data: Triangles, blocks: Sequence[int]) -> 
     return values, root
 
 
-def _left_out(found: Identification, samples: _Samples, run: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+def _left_out(
+    found: Identification, samples: _Samples, run: Sequence[int] | np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return errors (m, rows) on blocks that the parameters did not see, and what they may grow by, (m, rows, 3)."""
     inside = np.isin(samples.block, run)
     others = [k for k in range(samples.triangles.groups // samples.error.shape[1]) if k not in run]

@@ -70,9 +70,9 @@ def parameter_variances(
     root = unit[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
     for start in range(0, len(q), BLOCK):
         part = slice(start, start + BLOCK)
-        state = [np.ascontiguousarray(x[part]) for x in (q, v, a)]
-        load = model.transmitted(dynamics.values, *state, carried) if loaded else None
-        rows = model.regressor(*state, load, carried, states[:, part])[:, :, columns]
+        here, speed, change = (np.ascontiguousarray(x[part]) for x in (q, v, a))
+        load = model.transmitted(dynamics.values, here, speed, change, carried) if loaded else None
+        rows = model.regressor(here, speed, change, load, carried, states[:, part])[:, :, columns]
         result.append(np.sum((rows @ root) ** 2, axis=2))
     return np.concatenate(result)
 

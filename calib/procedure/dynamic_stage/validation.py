@@ -103,9 +103,10 @@ def assess(
         predictions[case.name] = predict(dynamics, case)
         scores[case.name] = score(case, predictions[case.name], inputs.options.slow, inputs.currents.own)
     expected: dict[str, TorqueIntervals] = {}
-    for case in (inputs.unseen or inputs.cases[:1]) if findings.errors is not None else ():
-        say(f"errors to expect of {case.name}")
-        expected[case.name] = intervals(findings.errors, dynamics, case, predictions[case.name])
+    if (errors := findings.errors) is not None:
+        for case in inputs.unseen or inputs.cases[:1]:
+            say(f"errors to expect of {case.name}")
+            expected[case.name] = intervals(errors, dynamics, case, predictions[case.name])
     say("judging")
     shares = {case.name: max(repeats(own.motion, case.motion) for own in inputs.cases) for case in inputs.unseen}
     repeated = {name: share for name, share in shares.items() if share >= REPEAT}

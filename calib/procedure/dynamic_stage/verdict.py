@@ -159,7 +159,7 @@ def with_intervals(verdict: Verdict, expected: Mapping[str, TorqueIntervals], ro
     """
     for name, one in expected.items():
         chance = 3.0 * np.sqrt((1.0 - COVERED) * COVERED / np.maximum(one.independent, 1.0))
-        low = [f"{rows[k]} ({100 * one.joints[k]:.0f} %)" for k in np.flatnonzero(one.joints < HOLDS - chance)]
+        low = [f"{rows[k]} ({100 * one.joints[k]:.0f} %)" for k in np.flatnonzero(one.joints < HOLDS - chance).tolist()]
         if not low and one.covered >= HOLDS - np.sqrt(np.sum(chance**2)) / len(chance):
             continue
         where = f", least at joint {', '.join(low)}" if low else ""

@@ -256,13 +256,13 @@ def _family(given: ExcitationInputs, settings: ExcitationSettings) -> tuple[Fami
     if settings.family == "fourier":
         full, few = (
             fourier_family(
-                np.minimum(counts, top), settings.period, held=fixed, resonance=resonance, rate=settings.rate
+                np.minimum(counts, top).tolist(), settings.period, held=fixed, resonance=resonance, rate=settings.rate
             )
             for top in (most, COARSE)
         )  # fmt: skip
         return full, few if most > COARSE else None
     if settings.family == "bspline":
-        return bspline_family(counts, settings.period, held=fixed, rate=settings.rate), None
+        return bspline_family(counts.tolist(), settings.period, held=fixed, rate=settings.rate), None
     raise UsageError(f"family '{settings.family}' is none of fourier, bspline")
 
 

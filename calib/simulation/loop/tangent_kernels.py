@@ -377,7 +377,7 @@ def advance_tangent(
                 if not accelerate(tree, body, linear, kinds, acts, memory, loads, *state):
                     return SINGULAR
             where = (at, rate, slopes[stage], work, own, more, ten, by_q, by_v, columns)
-            linearise(tree, body, linear, kinds, acts, *layout, memory, *where)
+            linearise(tree, body, linear, kinds, acts, *layout, memory, *where)  # pyright: ignore[reportCallIssue]
             _solve(matrix, by_q, by_v, columns, dat, drate, dtau, dslopes[stage])
         for j in range(n):
             first, inner, last = slopes[0, j], slopes[1, j] + slopes[2, j], slopes[3, j]
