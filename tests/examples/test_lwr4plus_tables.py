@@ -93,7 +93,7 @@ def test_a_fresh_design_and_fresh_logs_lie_in_the_readmes_ranges(fresh) -> None:
     for key, columns in (("excitation-designs", (0, 1)), ("excitation-rsd", (2, 6))):
         ours, theirs = rows(study_tables.excitation(found)[key]), rows(README[key])
         assert set(ours) <= set(theirs)
-        for row, cells in ours.items():
+        for row, cells in list(ours.items())[1:]:  # below the head
             for column in columns:
                 value, (_, least, most) = numbers(cells[column])[0], numbers(theirs[row][column])
                 assert 0.95 * least - 0.01 <= value <= 1.05 * most + 0.01, (key, row, column)
