@@ -17,6 +17,7 @@ HOMES = {
     "pinocchio": ["calib.dynamics.model", "calib.robot.collision", "calib.robot.formats.readback"],
     "coal": ["calib.robot.collision"],
     "numba": [
+        "calib.dynamics.gradient_kernels",
         "calib.dynamics.kernels",
         "calib.mechanism.closure_kernels",
         "calib.robot.capsule_kernels",

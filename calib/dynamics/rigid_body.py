@@ -86,12 +86,12 @@ def regressor_gradient(
         weights: (N, n, 10 B); rank one, ``weights[k] = outer(lambda_k, chi)``, gives the derivatives of
             Σ lambda · tau, so the gradient of any function of Y costs one call.
     """
-    from calib.dynamics import kernels
+    from calib.dynamics import gradient_kernels
 
     q, v, a = _states(bodies, q=q, v=v, a=a)
     weights = _plain(shaped(weights, (len(q), bodies.n, 10 * bodies.count), "weights of the regressor"))
     slopes = np.zeros((3, *q.shape))
-    kernels.regressor_gradient(
+    gradient_kernels.regressor_gradient(
         bodies.links, bodies.constants, bodies.order, *_placed(bodies, q), v, a, weights, *slopes
     )
     return slopes[0], slopes[1], slopes[2]
@@ -107,13 +107,13 @@ def torque_gradient(
     Args:
         parameters: (10 B,) standard parameters.
     """
-    from calib.dynamics import kernels
+    from calib.dynamics import gradient_kernels
 
     q, v, a = _states(bodies, q=q, v=v, a=a)
     weights = _plain(shaped(weights, q.shape, "weights of the torques"))
     chi = _plain(shaped(parameters, (10 * bodies.count,), "standard parameters")).reshape(1, 1, -1)
     slopes = np.zeros((3, *q.shape))
-    kernels.torque_gradient(
+    gradient_kernels.torque_gradient(
         bodies.links, bodies.constants, bodies.order, *_placed(bodies, q), v, a, chi, weights, *slopes
     )
     return slopes[0], slopes[1], slopes[2]

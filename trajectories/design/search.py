@@ -99,7 +99,7 @@ class Stuck:
     Attributes:
         x, factor: of the motion that broke the constraints least.
         excess: of its constraints over their scales, and of its hard goals over theirs.
-        evaluations: what the search cost; `reason`: why NLopt ended, where it says so.
+        evaluations: what the search cost; `reason`: why the optimiser ended, where it says so.
     """
 
     x: np.ndarray

@@ -69,7 +69,7 @@ class KalmanFilter(Method):
         start = start_of(problem, values, _inertia(problem), lambda x: _moves(robot, problem, x))
         wide = np.maximum(WIDE * sigma, np.abs(start - values))
         noise = plain.std / np.sqrt(np.sum(np.square(problem.decimator.taps)))  # of one sample of the torques
-        state = _State(robot, self.kind, start, np.diag(wide**2), [], [0])
+        state = _State(robot, self.kind, start, np.diag(wide**2), [], 0)
         for case in problem.cases:
             for first, last in segments(case.motion.segment):
                 state = _pass(state, case, slice(first, last), noise)
@@ -85,7 +85,7 @@ class KalmanFilter(Method):
         fit = LinearFit(estimate, plain.std, plain.fit.condition, plain.fit.condition_normalised)
         return replace(
             plain, method=self.name, status=EstimateStatus.FOUND, solution=fit, iterations=1,
-            simulations=state.count[0], beforehand=None, alone=True,
+            simulations=state.count, beforehand=None, alone=True,
         )  # fmt: skip
 
 
@@ -98,7 +98,7 @@ class _State:
     mean: np.ndarray
     covariance: np.ndarray
     sizes: list[float]
-    count: list[int]
+    count: int
 
 
 def _inertia(problem: IdentificationProblem) -> np.ndarray:
@@ -162,11 +162,10 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
         if not np.isfinite(size):
             raise Diverged("the filter's estimate is no longer finite", belief.mean)
         sizes.append(size / n)
-    before.count[0] += 1
     settled = sizes[len(sizes) // 4 :]
     return replace(
         before, mean=belief.mean[2 * n :], covariance=belief.covariance[2 * n :, 2 * n :],
-        sizes=[*before.sizes, *settled],
+        sizes=[*before.sizes, *settled], count=before.count + 1,
     )  # fmt: skip
 
 

@@ -167,7 +167,7 @@ def simulate_many(
 ) -> list[SimulatedRun | NotConverged]:  # fmt: skip
     """Let robots with these parameters follow one reference, each with noise of its own, side by side in threads.
 
-    The compiled loop holds no lock of the interpreter, so K robots take as long as K / threads.
+    The compiled loop holds no lock of the interpreter.
 
     Args:
         parameters: (K, p) of the plant.
