@@ -16,7 +16,7 @@ from calib.data.recordings.recording import Recording
 from calib.errors import UsageError
 from calib.estimation.estimate import Estimate
 from calib.identification.identify_options import IdentifyOptions, read_options
-from calib.procedure.dynamic_stage import folder, identify, inputs
+from calib.procedure.dynamic_stage import folder, identify, inputs, metric_tables
 from calib.procedure.findings import Verdict
 from calib.procedure.parallel_stage.robots import FoundRobot, recognised, refuse_links
 from calib.robot.calibrated import CalibratedChain
@@ -85,7 +85,7 @@ class DynamicsModel:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the metrics as ``metrics.json`` holds them."""
-        return folder.metrics(self.outcome)
+        return metric_tables.metrics(self.outcome)
 
     def to_dataframe(self) -> Any:
         """Return the base parameters as a pandas DataFrame: name, unit, value, sigma."""

@@ -69,15 +69,19 @@ def believed_robot(problem: IdentificationProblem, method: str) -> BelievedRobot
         UsageError: for a model that is no serial arm with motor torques.
         CannotSimulate: for friction that the simulator does not know, or an exact sign.
     """
-    model = serial_arm(problem, method)
-    extra = [one for one in problem.terms[problem.base.b :] if one is not None]
-    model = with_terms(model, *extra)
-    columns = np.array([*problem.base.kept, *range(model.p - len(extra), model.p)], dtype=int)
+    model, columns = with_friction(problem, serial_arm(problem, method))
     try:
         plant = Plant(model.bodies, model.terms, np.zeros(model.p))
     except CalibError as error:
         raise CannotSimulate(str(error)) from error
     return BelievedRobot(model, columns, plant)
+
+
+def with_friction(problem: IdentificationProblem, model: IdentificationModel) -> tuple[IdentificationModel, np.ndarray]:
+    """Return a problem's model with its richer friction, and the place (p,) of each of its columns there."""
+    extra = [one for one in problem.terms[problem.base.b :] if one is not None]
+    model = with_terms(model, *extra)
+    return model, np.array([*problem.base.kept, *range(model.p - len(extra), model.p)], dtype=int)
 
 
 def start_of(

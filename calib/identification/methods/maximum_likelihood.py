@@ -25,11 +25,12 @@ import numpy as np
 from calib.data.signals.decimation import Decimator, kept
 from calib.data.signals.filtering import curvature, low_pass, slope
 from calib.data.signals.motion import Motion
-from calib.dynamics.idim import IdentificationModel, with_terms
+from calib.dynamics.idim import IdentificationModel
 from calib.errors import Diverged, NotConverged, UsageError
 from calib.estimation.correlated import scatter
 from calib.estimation.linear import LinearFit, wls
 from calib.estimation.triangles import condition_numbers
+from calib.identification.methods.believed import with_friction
 from calib.identification.methods.least_squares import samples_of, weighed
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 from calib.identification.prior import residual_inflation
@@ -114,10 +115,7 @@ class _NoisyStates:
 
 def _noisy_states(problem: IdentificationProblem, model: IdentificationModel) -> _NoisyStates:
     """Return the samples with the covariance of their states' noise."""
-    samples, own = samples_of(problem), problem.base.b
-    extra = [one for one in problem.terms[own:] if one is not None]
-    model = with_terms(model, *extra)
-    columns = np.array([*problem.base.kept, *range(model.p - len(extra), model.p)], dtype=int)
+    samples, (model, columns) = samples_of(problem), with_friction(problem, model)
     smooth = np.array([one is None or one.form.slopes is not None for one in problem.terms], dtype=bool)
     parts, first = [], 0
     for case in problem.cases:

@@ -15,10 +15,11 @@ from calib.identification.loop.replay import DAMPING, FREQUENCY
 from calib.identification.methods.bias import SMALL
 from calib.identification.scores import relative_error_sigma
 from calib.procedure.dynamic_stage import geometry_tables
-from calib.procedure.dynamic_stage.folder import UNSEEN, IdentificationFolder
-from calib.procedure.dynamic_stage.folder import metrics as metrics_of
+from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
+from calib.procedure.dynamic_stage.metric_tables import UNSEEN
+from calib.procedure.dynamic_stage.metric_tables import metrics as metrics_of
 from calib.procedure.dynamic_stage.metrics import (
     GeometricEffect,
     IdentifiedParameter,

@@ -41,6 +41,10 @@ MEANING = (
     "All are medians over trials; runs are simulations of the robot; CPU is processor time of the method alone; p is "
     "the sign test's against the best.",
 )
+BESIDE = (  # figures in the order of the columns behind the quartiles
+    "torque_worst", "beta_error", "beta_sigma", "coverage", "survey_tau", "survey_q", "iterations", "simulations",
+    "cpu",
+)  # fmt: skip
 HEADER = (
     "method", "trials", "failed", "torque [%]", "quartiles", "worst joint [%]", "β [%]", "in σ", "covered [%]",
     "d_τ [%]", "d_q [%]", "rounds", "runs", "CPU [s]", "p", "",
@@ -86,15 +90,14 @@ def condition_table(one: ConditionSummary) -> Table:
 
 
 def _line(one: MethodSummary) -> tuple[str, ...]:
-    found = one.figures
+    def median(name: str) -> str:
+        return _short(one.figures[name].median)
+
     failed = ", ".join(f"{count} {status}" for status, count in one.failures.items())
     mark = "take" if one.chosen else "as good" if one.as_good else "" if one.enough else "few runs"
     return (
-        one.method, str(one.trials), failed or "0", _short(found["torque_error"].median),
-        _quartiles(found["torque_error"]), _short(found["torque_worst"].median), _short(found["beta_error"].median),
-        _short(found["beta_sigma"].median), _short(found["coverage"].median),
-        _short(found["survey_tau"].median), _short(found["survey_q"].median), _short(found["iterations"].median),
-        _short(found["simulations"].median), _short(found["cpu"].median), _short(one.p), mark,
+        one.method, str(one.trials), failed or "0", median("torque_error"), _quartiles(one.figures["torque_error"]),
+        *map(median, BESIDE), _short(one.p), mark,
     )  # fmt: skip
 
 

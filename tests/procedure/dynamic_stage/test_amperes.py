@@ -119,7 +119,7 @@ def test_a_regrouped_parameter_has_two_names(robot, tmp_path, name):
 
 
 def test_terms_the_ridge_switched_off_are_named_and_measured_ones_are_not():
-    from calib.procedure.dynamic_stage.folder import switched_off
+    from calib.procedure.dynamic_stage.metric_tables import switched_off
 
     sigma = np.array([1e-12, 0.1, 1e-12, 0.02])
     assert switched_off(("ZZ1R", "Fc1", "Fs1", "Fs2"), 2, sigma) == ("Fs1",)
