@@ -2,8 +2,8 @@
 
 A clock that runs s times too slow makes accelerations s² times too small, so that inertias come out s² times too large
 while masses, which gravity tells, stay as they are. How large inertias are beside masses, lengths alone say nearly: for
-rods between the joints their ratio is known up to 15 % on every recording at hand that tells it (Panda, LWR4+, TX40,
-14 of a UR10e), whatever the masses and the unit of the torques are. All these have six joints or more; arms of two,
+rods between the joints their ratio is known up to 17 % on every recording at hand that tells it (Panda, LWR4+, TX40,
+11 of a UR10e), whatever the masses and the unit of the torques are. All these have six joints or more; arms of two,
 whose last link no length tells, are not looked at: one gave 45. All thresholds are our choice.
 """
 
