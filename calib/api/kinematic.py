@@ -21,6 +21,7 @@ from calib.estimation.estimate import Estimate
 from calib.procedure.findings import Verdict
 from calib.procedure.kinematic_stage import compensation, compensation_file, fit, folder, inputs, selection
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSettings, SelectionSettings
+from calib.procedure.measuring import promise as promises
 from calib.procedure.measuring.run import write_run
 from calib.procedure.parallel_stage.robots import FoundRobot, recognised, refuse_links, refuse_parallel
 from calib.procedure.report.fit_report import fit_metrics
@@ -48,9 +49,18 @@ class PoseSelection:
         """(m, n) joint values [rad or m]."""
         return np.asarray(self.chosen.selection.q)
 
-    def save(self, path: str | Path) -> Path:
-        """Write the poses as CSV under the joints' names [rad or m]."""
-        return selection.write(self.chosen, Path(path))
+    def save(self, path: str | Path, *, plots: bool = True) -> Path:
+        """Write the poses as CSV under the joints' names [rad or m], and beside it what they will tell.
+
+        That is ``…_prediction.json``, which a fit's ``selection`` takes, and the figures of `plot`.
+        """
+        from calib.procedure.report.style import save
+
+        path = Path(path)
+        beside = selection.targets(path, plots)
+        for name, figure in self.plot().items() if plots else ():
+            save(figure, beside[name])
+        return selection.write(self.chosen, path)
 
     def save_run(self, path: str | Path) -> Path:
         """Write the run through the poses, in their order, as CSV: t [s], pose (0 for a via-point), joints."""
@@ -65,14 +75,13 @@ class PoseSelection:
         from calib.procedure.report.uncertainty_figures import outlook_figure
 
         look = self.chosen.outlook
-        if not np.isfinite(look.poses.rms):
-            return {}
         curve = [(float(one.poses), 1e3 * one.rms) for one in look.others]
         own = (float(look.poses.poses), 1e3 * look.poses.rms)
-        figures = {"predicted": predicted_map(look.poses.points, look.poses.spread)}
-        if curve:
-            figures["outlook"] = outlook_figure(curve, own, "poses", "σ of the tool's position [mm]")
-        return figures
+        drawn = {
+            "predicted": lambda: predicted_map(look.poses.points, look.poses.spread),
+            "outlook": lambda: outlook_figure(curve, own, "poses", "σ of the tool's position [mm]"),
+        }
+        return {name: drawn[name]() for name in self.chosen.figures}
 
     def to_dict(self) -> dict[str, Any]:
         """Return what the selection came to: index, its value, that of random sets, efficiency, seconds, notes."""
@@ -262,6 +271,7 @@ def fit_geometry(
     *,
     validate: Measured | Sequence[Measured] = (),
     options: FitOptions | str | Path | None = None,
+    poses: PoseSelection | str | Path | None = None,
     base: str | None = None,
     tip: str | None = None,
     on_read: Callable[[inputs.Inputs], None] | None = None,
@@ -277,6 +287,8 @@ def fit_geometry(
         settings: model, loss, folds, stations, tools, rows to hold out, tolerance, seed.
         validate: unseen poses, like `measured`.
         options: what the files' headers do not say, priors, fixed parameters (``calib formats options``).
+        poses: what was measured, as `select_poses` returned it, the CSV that it was saved as, or its folder: the
+            sigmas that it predicted are held against those that the fit states (``outcome.promised``).
         on_read: called with what was read, before the fit begins.
         progress: called with a few words now and then.
 
@@ -287,8 +299,11 @@ def fit_geometry(
     """
     chosen = options if isinstance(options, FitOptions) else read_options(optional(options))
     robot = recognised(robot)
+    promise = poses.chosen.promise if isinstance(poses, PoseSelection) else poses and promises.read(Path(poses))
     if isinstance(robot, FoundRobot):
         refuse_links(base, tip)
+        if poses is not None:
+            raise UsageError("poses of a parallel robot are not chosen here, so that nothing was predicted of its fit")
         return _of_parallel(robot, listed(measured), listed(validate), settings, chosen, progress)
     given = inputs.gather(
         robot, listed(measured), listed(validate), options=chosen, settings=settings, base=base, tip=tip
@@ -296,7 +311,7 @@ def fit_geometry(
     if on_read is not None:
         on_read(given)
     wanted = settings or FitSettings()
-    return GeometryFit(fit.run(given, chosen, wanted, progress), chosen, wanted)
+    return GeometryFit(fit.run(given, chosen, wanted, progress, promise or None), chosen, wanted)
 
 
 @checked

@@ -34,6 +34,10 @@ def fit(
         ),
     ] = None,
     loss: Annotated[str | None, typer.Option(help="auto, none, huber or cauchy")] = None,
+    selection: Annotated[
+        Path | None,
+        typer.Option(help="CSV of calib select, or its folder: what it predicted is held against what is found"),
+    ] = None,
     folds: Annotated[
         str,
         typer.Option(help="rows the ladder sets aside: transfer (stations, files, regions), regions, random or poses"),
@@ -76,8 +80,8 @@ def fit(
 
     with progress() as show:
         found = fit_geometry(
-            robot, measured, settings, validate=validate or (), options=options, base=base, tip=tip, on_read=read,
-            progress=show,
+            robot, measured, settings, validate=validate or (), options=options, poses=selection, base=base, tip=tip,
+            on_read=read, progress=show,
         )  # fmt: skip
         show("writing")
         found.save(out, plots=plots)
@@ -128,18 +132,19 @@ def select(
 ) -> None:
     """Choose the poses at which the geometry of ROBOT shows best.
 
-    Beside OUT.csv, OUT_predicted.png shows how well the tool will be known over the workspace, and OUT_outlook.png what
-    fewer and more poses would tell.
+    Beside OUT.csv, OUT_prediction.json holds what the poses will tell (calib fit --selection), OUT_predicted.png shows
+    how well the tool will be known over the workspace, and OUT_outlook.png what fewer and more poses would tell.
     """
     from calib.api.kinematic import select_poses
     from calib.files import check_targets
+    from calib.procedure.kinematic_stage.selection import targets as targets_of
     from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
     from calib.procedure.measuring.constraints_file import beside
     from calib.procedure.measuring.run import RunSettings
 
     named = beside(constraints).values() if constraints else ()
-    drawn = {name: out.parent / f"{out.stem}_{name}.png" for name in ("predicted", "outlook") if plots}
-    check_targets([out, *([run] if run else []), *drawn.values()], [robot, existing, constraints, *named])
+    beside_it = targets_of(out, plots)
+    check_targets([out, *([run] if run else []), *beside_it.values()], [robot, existing, constraints, *named])
     targets = tuple(tuple(numbers(text, 3, "--tool")) for text in tool or [])
     sigmas = None if sigma is None else numbers(sigma, 2, "--sigma")
     stated = None if sigmas is None else (sigmas[0], sigmas[1])
@@ -153,19 +158,12 @@ def select(
             progress=show,
         )  # fmt: skip
         show("writing")
-        figures = chosen.plot() if plots else {}
-    chosen.save(out)
+        chosen.save(out, plots=plots)
     if run:
         chosen.save_run(run)
         say(f"the run: {run}; calib view {run} --robot {robot}")
-    if figures:
-        from calib.procedure.report.style import save
-
-        for name, figure in figures.items():
-            save(figure, drawn[name])
-        say(f"drawn: {', '.join(str(drawn[name]) for name in figures)}")
     say(str(chosen))
-    say(f"{m} poses written to {out}")
+    say(f"{m} poses written to {out}, what they will tell to {', '.join(str(path) for path in beside_it.values())}")
 
 
 @app.command()

@@ -28,6 +28,7 @@ PARTS: dict[str, tuple[list[str], list[str]]] = {  # options of the whole part, 
     "consistency": (["--runs", "40"], ["--runs", "0"]),
     "excitation": ([], ["--quick"]),
     "planning": ([], ["--paths", "3"]),
+    "excitation_peers": ([], ["--quick"]),
 }
 FIGURES = HERE / "figures"
 

@@ -213,9 +213,50 @@ def excitation(found: dict[str, Any]) -> Tables:
     }
 
 
+def excitation_peers(found: dict[str, Any]) -> Tables:
+    """Return the default search over seeds, and every search in equal processor time."""
+    spread = lambda x, form: f"{np.median(x):{form}} ({min(x):{form}}–{max(x):{form}})"  # noqa: E731
+    seeds, peers = dict[str, list[Any]](), dict[str, list[Any]]()
+    for name, one in found.items():
+        if " seed " in name:
+            (seeds if name.startswith("default, ") else peers).setdefault(name.rpartition(", ")[0], []).append(one)
+    default = [
+        (
+            name.removeprefix("default, "), len(runs),
+            *(spread([run[key] for run in runs], form)
+              for key, form in (("raw", ".1f"), ("normalised", ".2f"), ("seconds", ".0f"), ("seconds_close", ".0f"))),
+        )
+        for name, runs in seeds.items()
+    ]  # fmt: skip
+    instants = [t for t in (1, 3, 10, 30) if t <= found["seconds"]]
+    compared = [
+        (
+            name, *(_both([_at(run["curve"], t) for run in runs], ".1f") for t in instants),
+            *(_both([(run["reached"] or {}).get(key) for run in runs], form)
+              for key, form in (("raw", ".1f"), ("normalised", ".2f"))),
+        )
+        for name, runs in peers.items()
+    ]  # fmt: skip
+    head = " | ".join(f"{t} s" for t in instants)
+    return {
+        "peers-seeds": table("T0 | seeds | raw | normalised | processor time [s] | within 5 % after [s]", default),
+        "peers-searches": table(f"search | {head} | raw | normalised", compared),
+    }
+
+
+def _at(curve: list[list[float]], seconds: float) -> float | None:
+    """Return √(raw · normalised) of the best motion after so many seconds; None where there was none."""
+    reached = [merit for when, merit in curve if when <= seconds]
+    return float(np.exp(min(reached))) if reached else None
+
+
+def _both(values: list[float | None], form: str) -> str:
+    return " / ".join("–" if value is None else f"{value:{form}}" for value in values)
+
+
 SHOW = {
     "geometry": geometry, "dynamics": dynamics, "consistency": consistency, "excitation": excitation,
-    "planning": planning,
+    "planning": planning, "excitation_peers": excitation_peers,
 }  # fmt: skip
 
 

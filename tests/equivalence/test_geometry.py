@@ -8,12 +8,17 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
+import planted_motion as planted
 import pytest
-from both_ways import Judgement, agree, command, go_on, read, session_with
+from both_ways import Judgement, agree, command, go_on, read, same, session_with
+from sessions import edit
 
 from calib.data.poses.plans import read_poses
 from calib.procedure.session.folder import open_session
 from calib.robot.load import load
+from calib.simulation.cells import measured_files
+from calib.simulation.cells.cell import measure
+from calib.simulation.cells.virtual_cells import perturbed_cell
 
 
 def by_command(robot: Path, out: Path, model: str, fit: Path, unseen: Path) -> Judgement:
@@ -128,6 +133,32 @@ def test_a_files_name_may_hold_commas_quotes_and_line_breaks(files: Path, tmp_pa
     assert not command("export", out, "--offsets", tmp_path / "offsets.csv")
     assert len((tmp_path / "q.csv").read_text().splitlines()) == 3
     assert load(out).n == 3
+
+
+def test_what_the_poses_promised_is_held_against_the_same_figures(fitted: Path, tmp_path: Path) -> None:
+    session = open_session(shutil.copytree(fitted, tmp_path / "cell"))
+    edit(session.path("session.toml"), "plan = false", "plan = true")
+    cell, names = perturbed_cell(planted.arm(), seed=1, hidden=0.0), planted.arm().joint_names
+    for plan, name in (("poses", "measured"), ("validation", "validation")):
+        q = read_poses(session.path(f"2-poses/{plan}.csv"), names)
+        measured_files.write(measure(cell, q, seed=2), session.path(f"3-measured/{name}.csv"))
+    assert not go_on(session)
+    robot, measured = session.path(session.settings.robot.file), session.path("3-measured/measured.csv")
+    words = ("fit", robot, measured, "--model", "geometry", "--out", tmp_path / "out")
+    for selection in (session.path("2-poses"), session.path("2-poses/poses.csv")):
+        assert not command(*words, "--selection", selection)
+        promised = read(tmp_path / "out/metrics.json")["promised"]
+        same(promised, read(session.path("4-fit/metrics.json"))["promised"])
+    assert [row["unit"] for row in promised] == ["mm", "mrad", "mm", "mrad", "mm"]
+    page = flat(html.unescape(session.path("certificate.html").read_text()))
+    notes = " ".join(read(session.path("state.json"))["steps"]["fit"]["notes"])
+    for row in promised:
+        assert flat(row["kind"]) in page and f"σ of {row['kind']}: {row['predicted']:.3g}" in notes
+        assert 0.8 < row["ratio"] < 1.25  # as many poses, and as noisy, as was said
+    foreign = session.path("2-poses/poses_prediction.json").read_text().replace("joint1", "axis1")
+    (tmp_path / "foreign_prediction.json").write_text(foreign)
+    assert "another robot" in command(*words, "--selection", tmp_path / "foreign.csv")
+    assert "no " in command(*words, "--selection", tmp_path / "nothing.csv")
 
 
 def test_the_same_poses_are_chosen(fitted: Path, files: Path, tmp_path: Path) -> None:

@@ -39,8 +39,8 @@ def design(
         problem: must pickle where `map` runs in other processes.
         starts: random ones, each from its own child of the seed, besides the guesses.
         evaluations: most per start.
-        method: "slsqp" (Kraft 1988), "auglag" (augmented Lagrangian, Birgin & Martínez 2008, over L-BFGS) or "mma"
-            (Svanberg 2002), the latter two of NLopt.
+        method: "slsqp" (Kraft 1988, of SciPy), or of NLopt "auglag" (augmented Lagrangian, Birgin & Martínez 2008,
+            over L-BFGS), "mma" or "ccsaq" (sequential convex separable approximations, Svanberg 2002).
         guesses: variables to start from, (p,) each.
         map: the builtin, or one that spreads the work; results in order.
         report: called with starts done, starts, and the best so far in words.

@@ -27,7 +27,7 @@ from trajectories.design.problem import (
 from trajectories.design.starts import random_start
 from trajectories.errors import NotExciting
 
-Method = Literal["slsqp", "auglag", "mma"]
+Method = Literal["slsqp", "auglag", "mma", "ccsaq"]
 
 
 class Stage(NamedTuple):
@@ -259,7 +259,8 @@ class StartSearch:
             self.scale = 1.0 / max(1.0, float(np.linalg.norm(slope)))
         if method == "slsqp":
             return self._by_scipy(start, last, tolerance * self.scale)[: len(y)]
-        solver = nlopt.opt({"auglag": nlopt.AUGLAG, "mma": nlopt.LD_MMA}[method], len(start))
+        named = {"auglag": nlopt.AUGLAG, "mma": nlopt.LD_MMA, "ccsaq": nlopt.LD_CCSAQ}
+        solver = nlopt.opt(named[method], len(start))
         if method == "auglag":
             inner = nlopt.opt(nlopt.LD_LBFGS, len(start))
             inner.set_ftol_rel(1e-5)

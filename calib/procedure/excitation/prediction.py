@@ -28,6 +28,7 @@ from calib.errors import UsageError
 from calib.folders import METRICS
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.excitation.inputs import ExcitationInputs
+from calib.procedure.promises import held
 from trajectories.basis import Family, SampledMotion
 from trajectories.design.problem import ExcitationProblem
 from trajectories.design.search import STAGES, SearchResult, one_start
@@ -269,7 +270,7 @@ def compared(folder: Path, names: Sequence[str], sigmas: np.ndarray, unexplained
     Raises:
         UsageError: where the folder holds no prediction, or one of other parameters.
     """
-    stated = {name: float(sigma) for name, sigma in zip(names, sigmas) if sigma > 0}
+    stated = {name: float(sigma) for name, sigma in zip(names, sigmas)}
     try:
         noise = float(json.loads((folder / METRICS).read_text(encoding="utf-8"))["prediction"]["noise_share"])
         with (folder / NAME).open(encoding="utf-8", newline="") as file:
@@ -278,18 +279,13 @@ def compared(folder: Path, names: Sequence[str], sigmas: np.ndarray, unexplained
         raise UsageError(
             f"{folder} holds no prediction: give the folder that calib excite wrote ({error!r})"
         ) from error
-    common = [name for name in promised if name in stated]
-    if not common:
+    found = held("parameters", "", promised, stated)
+    if found is None:
         raise UsageError(f"{folder} predicts none of the {len(stated)} parameters identified: it is of another robot")
-    ratios = np.array([stated[name] / promised[name] for name in common])
-    low, middle, high = np.quantile(ratios, [0.1, 0.5, 0.9])
-    result = [
-        f"sigmas stated over those predicted, {len(common)} parameters: {middle:.2g} in the median, {low:.2g} to "
-        f"{high:.2g} for eight in ten"
-    ]
+    result = [f"sigmas stated over those predicted, {found.count} {found.kind}: {found.words}"]
     if unexplained is not None:
         result.append(
             f"{unexplained:.2g} of the torque limits stayed unexplained, {noise:.2g} was taken: with that known "
-            f"before, the median would have been {middle * noise / max(unexplained, 1e-12):.2g}"
+            f"before, the median would have been {found.ratio * noise / max(unexplained, 1e-12):.2g}"
         )
     return result

@@ -34,6 +34,8 @@ from calib.procedure.kinematic_stage.remarks import Outlier, named_outliers, pla
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import Arms, Assessment, assess
 from calib.procedure.measuring.image_findings import image_notes
+from calib.procedure.measuring.promise import SelectionPromise, check_robot, kept
+from calib.procedure.promises import KeptPromise
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import stretched_length
 
@@ -56,6 +58,7 @@ class Outcome:
         seed: that reproduces it.
         tolerance: largest rms on unseen poses that is good enough [m]; None where none was given.
         expected: how far off the calibrated arm may be at any pose; None where no positions were measured.
+        promised: sigmas that were predicted when the poses were chosen, beside those that this fit states.
     """
 
     inputs: Inputs
@@ -68,6 +71,7 @@ class Outcome:
     seed: int = 0
     tolerance: float | None = None
     expected: ErrorModel | None = None
+    promised: tuple[KeptPromise, ...] = ()
 
     @property
     def calibrated(self) -> CalibratedChain:
@@ -101,6 +105,7 @@ def run(
     options: FitOptions | None = None,
     wanted: FitSettings | None = None,
     progress: Progress | None = None,
+    selection: SelectionPromise | None = None,
 ) -> Outcome:
     """Fit, compare on all rows, and judge.
 
@@ -109,6 +114,7 @@ def run(
         options: the fit options file's content.
         wanted: model, loss and folds of the ladder, tolerance, seed.
         progress: called with a few words at each stage.
+        selection: what was predicted when the poses were chosen, to be held against what the fit states.
 
     Raises:
         NotConverged: where the chosen model's fit did not come to an end.
@@ -116,6 +122,8 @@ def run(
     options, wanted, say = options or FitOptions(), wanted or FitSettings(), progress or (lambda words: None)
     settings = combine(Settings(), loss=wanted.loss or options.loss, loss_scale=options.loss_scale)
     asked, seed = wanted.model or options.model, wanted.seed
+    if selection is not None:
+        check_robot(selection, inputs.chain.joint_names)
     say("placing the instrument and the tool")
     start = install(inputs.chain, inputs.fit, inputs.known)
     torques = [gravity_of(inputs.chain, block) for block in inputs.fit]
@@ -156,7 +164,13 @@ def run(
         seed,
         wanted.tolerance,
         expected,
+        () if selection is None else _promised(selection, found.fit),
     )
+
+
+def _promised(selection: SelectionPromise, found: GeometricFit) -> tuple[KeptPromise, ...]:
+    typical = PoseMeasurements(np.array(selection.typical), selection.joints)
+    return kept(selection, found, gravity_of(found.cell.chain, typical))
 
 
 def assessed(outcome: Outcome, inputs: Inputs, options: FitOptions, wanted: FitSettings) -> Outcome:

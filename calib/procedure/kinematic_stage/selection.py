@@ -16,11 +16,13 @@ from calib.errors import UsageError
 from calib.geometry.observability import observation, targets_of
 from calib.procedure.kinematic_stage.inputs import joint_kinds, load_robot
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
-from calib.procedure.measuring.camera_view import ASSUMED, image_observation
+from calib.procedure.measuring.camera_view import ASSUMED, ImageObservation, image_observation
 from calib.procedure.measuring.pose_limits import Limits, read_limits
 from calib.procedure.measuring.prediction import Prediction, Seen, by_count
 from calib.procedure.measuring.prediction import predicted as foretold
 from calib.procedure.measuring.prediction import table as outlook_table
+from calib.procedure.measuring.promise import SelectionPromise, beside
+from calib.procedure.measuring.promise import write as write_promise
 from calib.procedure.measuring.run import Run, RunSettings, plan_run
 from calib.procedure.measuring.run import lines as ways
 from calib.robot.calibrated import CalibratedChain
@@ -33,7 +35,7 @@ from poses.space import SearchSpace, is_feasible
 
 Progress = Callable[[int, int, str], None]
 VIEWS = 600  # postures that see a camera's board, to choose from (our choice)
-
+FIGURES = ("predicted", "outlook")  # sigma of the tool over the workspace, and by the number of poses
 
 TYPICAL = 300  # poses all over the workspace, seen or not, at which the tool's sigma is predicted; our choice
 
@@ -44,12 +46,14 @@ class PoseOutlook:
 
     Attributes:
         poses: of the fit on the chosen poses.
+        typical: (s, n) poses at which the tool was looked at [rad or m].
         others: with other numbers of poses, chosen greedily.
         blind: index and prediction if no pose had to be seen; None where nothing is asked of the sight.
         comparable: the index of the chosen poses by the same choice as `blind`.
     """
 
     poses: Prediction
+    typical: np.ndarray
     others: tuple[Prediction, ...]
     blind: tuple[float, Prediction] | None
     comparable: float
@@ -67,6 +71,7 @@ class Chosen:
         checked, unchecked: what the poses were held against, and what they could not be, in words.
         notes: what else a user should know.
         outlook: what the poses will tell.
+        promise: the same, as it is kept beside the poses; None where they do not tell all parameters.
         by_images: whether the poses are those at which a camera sees its board.
         run, driven: the poses' order, in which `selection.q` is, and the ways between them; how they are driven.
     """
@@ -82,6 +87,12 @@ class Chosen:
     run: Run
     driven: RunSettings
     by_images: bool
+    promise: SelectionPromise | None
+
+    @property
+    def figures(self) -> tuple[str, ...]:
+        """The names of figures that there are of it; none where the poses do not tell all parameters."""
+        return () if self.promise is None else FIGURES if self.outlook.others else FIGURES[:1]
 
 
 def choose(
@@ -154,7 +165,7 @@ def choose(
     found = replace(found, q=q[run.order], indices=indices)
     return Chosen(
         chain, found, len(jacobian.free), value, limits.checked, limits.unchecked, tuple(notes), outlook, run,
-        settings.run, view is not None,
+        settings.run, view is not None, _promise(jacobian, outlook),
     )  # fmt: skip
 
 
@@ -189,7 +200,20 @@ def _outlook(
     past = np.zeros((0, *rows.shape[1:])) if before is None else before
     blind = _blind(seen, free, typical, search, m, past) if limits.sight is not None else None
     others = by_count(seen, space.jacobian(candidates), typical, before)
-    return PoseOutlook(foretold(seen, np.concatenate([rows, past]), typical, m), others, blind, comparable)
+    own = foretold(seen, np.concatenate([rows, past]), typical, m)
+    return PoseOutlook(own, typical, others, blind, comparable)
+
+
+def _promise(seen: Seen, outlook: PoseOutlook) -> SelectionPromise | None:
+    """Return what is kept of an outlook; None where the poses do not tell all parameters."""
+    own, by_images = outlook.poses, isinstance(seen, ImageObservation)
+    if not np.isfinite(own.rms):
+        return None
+    noise = {} if by_images else dict(zip(("position", "orientation"), seen.sigmas[: 1 + seen.full]))
+    return SelectionPromise(
+        seen.cell.chain.joint_names, own.poses, own.names, own.units, tuple(own.sigmas.tolist()),
+        tuple(map(tuple, outlook.typical.tolist())), tuple(own.spread.tolist()), noise, by_images,
+    )  # fmt: skip
 
 
 def typical_poses(limits: Limits, seen: Seen, seed: int) -> np.ndarray:
@@ -230,9 +254,16 @@ def same_turn(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray)
     return result
 
 
+def targets(out: Path, plots: bool) -> dict[str, Path]:
+    """Return the files of a selection beside its CSV: the prediction, and figures by name."""
+    return {"prediction": beside(out)} | {name: out.parent / f"{out.stem}_{name}.png" for name in FIGURES if plots}
+
+
 def write(chosen: Chosen, path: Path) -> Path:
-    """Write the chosen poses under the joints' names [rad or m]."""
+    """Write the chosen poses under the joints' names [rad or m], and beside them what they will tell."""
     assert chosen.selection.q is not None
+    if chosen.promise is not None:
+        write_promise(chosen.promise, path)
     return write_poses(path, chosen.selection.q, chosen.chain.joint_names, kinds=joint_kinds(chosen.chain))
 
 

@@ -3,7 +3,7 @@
 session.toml     what is to be calibrated, with what, how; written by `calib new`, edited by people
 1-robot/         the robot's description, copied, so that the folder can move
 2-poses/         poses.csv to measure and fit, in the order of least time, poses_run.csv the ways between them, and
-                 validation.csv to measure and never fit; predicted.png what they will tell of the tool's position
+                 validation.csv to measure and never fit; poses_prediction.json and predicted.png what they will tell
 3-measured/      what people bring: measured.csv (any name), files whose name starts with validation, and drift.csv,
                  some of the poses measured once more at the end (never fitted); columns: `calib formats measurements`
 4-fit/  5-validation/
@@ -51,6 +51,7 @@ MARK = "simulated.txt"
 SETTINGS, CHECKED = "session.toml", "checked.txt"
 SUMMARY, SELECTION, CUTS = "1-robot/summary.txt", "2-poses/selection.json", "7-recorded/cuts.json"
 PREDICTED = "2-poses/predicted.png"  # sigma of the tool over the workspace
+PROMISED = "2-poses/poses_prediction.json"  # what the poses will tell: calib fit --selection
 POSES, UNSEEN, WAYS = "poses.csv", "validation.csv", "poses_run.csv"  # as planned, in 2-poses
 POSES_CHECKED, MOTION_CHECKED = f"3-measured/{CHECKED}", f"7-recorded/{CHECKED}"
 

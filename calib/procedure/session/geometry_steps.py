@@ -25,6 +25,9 @@ from calib.procedure.kinematic_stage import inputs
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import assess
 from calib.procedure.measuring.image_findings import image_words
+from calib.procedure.measuring.promise import SelectionPromise, beside
+from calib.procedure.measuring.promise import read as read_promise
+from calib.procedure.measuring.promise import write as write_promise
 from calib.procedure.measuring.run import write_run
 from calib.procedure.report import certificate, fit_report
 from calib.procedure.session import arrival
@@ -118,6 +121,8 @@ def select(session: Session, say: Say) -> list[str]:
     names = chain.joint_names
     write_poses(session.path(f"2-poses/{POSES}"), chosen.fit, names, unit="deg", kinds=kinds)
     write_run(session.path(f"2-poses/{WAYS}"), chosen.run, chain)
+    if chosen.promise is not None:
+        write_promise(chosen.promise, session.path(f"2-poses/{POSES}"))
     notes = [f"{len(chosen.fit)} poses for the fit: {chosen.words}"]
     if wanted.validation:
         write_poses(session.path(f"2-poses/{UNSEEN}"), chosen.validation, names, unit="deg", kinds=kinds)
@@ -133,6 +138,12 @@ def planned(session: Session, chain: Chain, name: str) -> np.ndarray | None:
     if not session.settings.poses.plan or not path.exists():
         return None
     return read_poses(path, chain.joint_names, kinds=[joint.kind for joint in chain.joints])
+
+
+def promised(session: Session) -> SelectionPromise | None:
+    """Return what was predicted when the poses were chosen; None where they were not, or by an earlier version."""
+    path = session.path(f"2-poses/{POSES}")
+    return read_promise(path) if session.settings.poses.plan and beside(path).exists() else None
 
 
 def arrive(session: Session, say: Say) -> list[str]:
@@ -203,15 +214,16 @@ def _gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
 
 def fit(session: Session, say: Say) -> list[str]:
     """Fit the geometry to the measured files; validation files are not looked at."""
-    from calib.procedure.session.pose_plan import kept_promise
-
-    settings = session.settings
-    outcome = fitting.run(_gathered(session), _options_of(session), _fit_settings(session), say)
+    settings, selection = session.settings, promised(session)
+    outcome = fitting.run(_gathered(session), _options_of(session), _fit_settings(session), say, selection)
     outputs.write_folder(outcome, session.fit.path, partial(certificate.write_fit, plots=session.plots))
     count = len(outcome.selection.fit.free)
     notes = [f"model {outcome.selection.chosen}, {count} parameters on {outcome.fit.poses} poses", *outcome.warnings]
-    if promise := kept_promise(session, robot_file(session), chain_of(session)):
-        notes.append(promise)
+    notes += [
+        f"σ of {row.kind}: {row.predicted:.3g} {row.unit} predicted when the poses were chosen, {row.stated:.3g} "
+        f"{row.unit} stated"
+        for row in outcome.promised
+    ]
     if outcome.outliers:
         named = ", ".join(each.words for each in outcome.outliers[:3])
         advice = "" if settings.fit.loss != "none" else '; look at these rows, or set loss = "huber" in session.toml'

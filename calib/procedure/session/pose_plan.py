@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -11,15 +10,14 @@ from typing import Any
 import numpy as np
 
 from calib.data.poses.pixels import Pixels
-from calib.dynamics.gravity import gravity_torques
 from calib.geometry.observability import SIGMA_ORIENTATION, observation, targets_of
-from calib.geometry.uncertainty.spread import pose_sigmas
-from calib.procedure.kinematic_stage import compensation, selection
+from calib.procedure.kinematic_stage import selection
 from calib.procedure.kinematic_stage.settings import SelectionSettings
 from calib.procedure.measuring.camera_view import BLIND
 from calib.procedure.measuring.pose_limits import read_limits
+from calib.procedure.measuring.promise import SelectionPromise
 from calib.procedure.measuring.run import Run
-from calib.procedure.session.folder import PREDICTED, SELECTION, Session
+from calib.procedure.session.folder import PREDICTED, Session
 from calib.robot.chain import Chain
 from poses.candidates import draw_candidates
 from poses.space import is_feasible
@@ -29,7 +27,7 @@ HOW = "state [camera] in the limits file: calib formats constraints"
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Poses for the fit (m, n) and for validation (v, n) [rad or m], how they came about, and what they keep."""
+    """Poses for the fit (m, n) and for validation (v, n) [rad or m], how they came about, what they keep and tell."""
 
     fit: np.ndarray
     validation: np.ndarray
@@ -37,6 +35,7 @@ class Plan:
     kept: tuple[str, ...]
     record: dict[str, Any]
     run: Run
+    promise: SelectionPromise | None
 
 
 def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], None]) -> Plan:
@@ -75,7 +74,7 @@ def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], N
         save(predicted_map(promised.points, promised.spread), session.path(PREDICTED))
     unseen = _unseen(session, robot_file, chain, wanted.validation)
     kept = (*selection.kept(chosen), *(f"{words}: {number}" for words, number in selection.promised(chosen)))
-    return Plan(found.q, unseen, words, kept, record, chosen.run)
+    return Plan(found.q, unseen, words, kept, record, chosen.run, chosen.promise)
 
 
 def _sigmas(position: float, orientation: float) -> tuple[float, float] | None:
@@ -102,31 +101,3 @@ def _unseen(session: Session, robot_file: Any, chain: Chain, count: int) -> np.n
         return limits.camera.draw(count, partial(is_feasible, space), limits.lower, limits.upper, stream)
     q = draw_candidates(limits.lower, limits.upper, count, lambda q: is_feasible(space, q), seed=stream)
     return selection.same_turn(chain, q, limits.lower, limits.upper)
-
-
-def kept_promise(session: Session, robot_file: Any, chain: Chain) -> str:
-    """Say what the fit states of the tool's sigma, at the poses where it was predicted before anything was moved.
-
-    Returns:
-        A line; "" where nothing was predicted, or the poses were not ours.
-    """
-    path = session.path(SELECTION)
-    if not session.settings.poses.plan or not path.exists():
-        return ""
-    promised = json.loads(path.read_text()).get("tool_sigma")
-    instrument, name = session.settings.instrument, session.settings.poses.constraints
-    if promised is None:
-        return ""
-    cell, by_images = targets_of(chain, [instrument.tool]), instrument.measures == Pixels.kind
-    limits = read_limits(session.path(name) if name else None, cell, robot_file)
-    if by_images and limits.camera is None:
-        return ""
-    q = selection.typical_poses(limits, observation(cell, seen_as(instrument.measures)), session.settings.seed)
-    found = compensation.read(session.fit.path)
-    torque = gravity_torques(found.cell.chain, q) if chain.inertias is not None else None
-    stated = pose_sigmas(found.cell, q, found.free, found.covariance, torque, -1 if by_images else 0)[:, 0]
-    rms = float(np.sqrt(np.mean(stated**2)))
-    return (
-        f"σ of the tool's position: {1e3 * promised:.3g} mm rms were predicted when the poses were chosen, the fit "
-        f"states {1e3 * rms:.3g} mm (its own noise, and {len(found.free)} parameters)"
-    )

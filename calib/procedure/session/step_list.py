@@ -17,6 +17,7 @@ from calib.procedure.session.folder import (
     POSES,
     POSES_CHECKED,
     PREDICTED,
+    PROMISED,
     SELECTION,
     SUMMARY,
     UNSEEN,
@@ -151,7 +152,7 @@ STEPS = (
     SessionStep("describe", "read the robot", ("robot",), _robot, geometry_steps.describe, (SUMMARY,)),
     SessionStep(
         "select", "choose the poses to measure", ("robot", "instrument", "poses", "seed"), _plan, geometry_steps.select,
-        (f"2-poses/{POSES}", f"2-poses/{WAYS}", f"2-poses/{UNSEEN}", SELECTION, PREDICTED),
+        (f"2-poses/{POSES}", f"2-poses/{WAYS}", f"2-poses/{UNSEEN}", SELECTION, PREDICTED, PROMISED),
     ),
     SessionStep(
         "measure", "check what was measured", ("robot", "instrument", "poses", "fit"), _arrived, geometry_steps.arrive,

@@ -122,7 +122,12 @@ def test_answers_that_cannot_be(answers, words):
 def test_a_selection_is_drawn_beside_its_poses_never_onto_what_is_read(tmp_path, capsys):
     given = ["select", "lwr4plus", "-m", "12", "--candidates", "150", "--out"]
     assert run([*given, str(tmp_path / "a.csv")]) == 0
-    assert {path.name for path in tmp_path.iterdir()} == {"a.csv", "a_predicted.png", "a_outlook.png"}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "a.csv",
+        "a_prediction.json",
+        "a_predicted.png",
+        "a_outlook.png",
+    }
     assert run([*given, str(tmp_path / "b.csv"), "--no-plots"]) == 0 and not (tmp_path / "b_predicted.png").exists()
     (tmp_path / "a.csv").rename(tmp_path / "c_outlook.png")
     assert run([*given, str(tmp_path / "c.csv"), "--existing", str(tmp_path / "c_outlook.png")]) == 2
