@@ -20,7 +20,7 @@ def identify_dynamics(
     validate: Annotated[list[str] | None, typer.Option(help="recording of other motion; may be repeated")] = None,
     method: Annotated[str | None, typer.Option(help="wls and others: calib study --list-methods")] = None,
     friction: Annotated[
-        str | None, typer.Option(help="auto, standard, or one rung: load, presliding, stribeck, root, ...")
+        str | None, typer.Option(help="auto, standard, or one rung: load, presliding, cable, stribeck, ...")
     ] = None,
     options: Annotated[
         Path | None, typer.Option(help="TOML: drives, payloads, gains, filters, how to identify")

@@ -9,6 +9,7 @@ is not a special case. Joint numbers here count from 0, in names from 1.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -21,6 +22,7 @@ Motion = tuple[tuple[int, float], ...]
 STANDARD = {"Ia": "acceleration", "Fv": "velocity", "Fc": "sign", "off": "one"}
 LINK_SIDE = {"Fvl": "velocity", "Fcl": "sign", "offl": "one"}
 MOTOR_SIDE = {"Ia": "acceleration", "Fvm": "velocity", "Fcm": "sign", "offm": "one"}
+CABLE_ORDERS = 3  # half turns over a joint's travel: smooth, and no more (our choice)
 
 
 @dataclass(frozen=True)
@@ -260,6 +262,18 @@ def presliding(joint: int, widths: Sequence[float], v0: float = V0) -> tuple[Dri
     (our choice; columns z would span the same torques, and share Fc out among themselves).
     """
     return tuple(term(f"Fp{joint + 1}.{k + 1}", "presliding", joint, width, v0) for k, width in enumerate(widths))
+
+
+def cable(joint: int, travel: float) -> tuple[DriveTerm, ...]:
+    """Return ``Cs3.1 Cc3.1 …``: a torque that depends on the position, as of cables and hoses, on the link's side.
+
+    The lowest sines and cosines of a period of twice the travel [rad or m]: a smooth function on it.
+    """
+    return tuple(
+        term(f"{name}{joint + 1}.{k}", shape, joint, k * math.pi / travel, math.inf, side="link")
+        for k in range(1, CABLE_ORDERS + 1)
+        for name, shape in (("Cs", "sine"), ("Cc", "cosine"))
+    )
 
 
 def ripple(joint: int, orders: Sequence[float], speed: float = float("inf")) -> tuple[DriveTerm, ...]:

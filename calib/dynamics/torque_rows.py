@@ -109,6 +109,10 @@ class TorqueRows:
         """Return the rows per sample of n joints."""
         return n * len(self.blocks) if self.projection is None else len(self.projection.labels)
 
+    def of_side(self, side: str, joint: int, n: int) -> list[int]:
+        """Return the rows of one of n joints that see a drive term of the ``link`` or ``motor`` side."""
+        return [k * n + joint for k, block in enumerate(self.blocks) if side in block.sides]
+
     def labels(self, joints: Sequence[str]) -> tuple[str, ...]:
         """Return how tables call the rows, from labels of the joints."""
         if self.projection is not None:

@@ -170,7 +170,7 @@ def identify_model(
     friction, loads = _richer_friction(model, base, rows, cases, decimator, first, prior, settings, progress)
     own = [None if k < model.inertial else model.columns[k - model.inertial] for k in base.kept]
     full = tuple(
-        extend(part, friction.terms, observe_terms(friction.terms, case, decimator, load))
+        extend(part, friction.terms, observe_terms(friction.terms, case, decimator, load, model.torque_rows))
         for part, case, load in zip(rows, cases, loads)
     )
     if prior is not None and friction.terms:
@@ -187,7 +187,7 @@ def identify_model(
     if settings.loop is not None and not method.needs_controller:
         say("simulating the closed loop")
     bias = compare_with_loop(problem, found)
-    richer = with_terms(model, *friction.terms) if _joint_by_joint(model) else model
+    richer = with_terms(model, *friction.terms) if _sees_drives(model) else model
     dynamics = Dynamics(richer, np.concatenate([bases.to_standard(base, values[: base.b]), values[base.b :]]))
     dynamics, ripples = _with_ripple(dynamics, cases, settings, say)
     dynamics = _with_payloads(dynamics, cases, settings)
@@ -218,9 +218,14 @@ def _known_masses(chain: Chain) -> np.ndarray | None:
     return standard_parameters(chain) if known else None
 
 
+def _sees_drives(model: RegressorModel) -> TypeGuard[IdentificationModel]:
+    """Tell whether richer friction, which is of single joints' motors, has a place in a model."""
+    return isinstance(model, IdentificationModel) and model.torque_rows.with_motors
+
+
 def _joint_by_joint(model: RegressorModel) -> TypeGuard[IdentificationModel]:
-    """Tell whether richer friction and ripple, which are terms of single joints, have a place in a model."""
-    return isinstance(model, IdentificationModel) and model.torque_rows.motors_alone
+    """Tell whether ripple, which is sought in the motors' torques alone, has a place in a model."""
+    return _sees_drives(model) and model.torque_rows.motors_alone
 
 
 def _richer_friction(
@@ -229,14 +234,14 @@ def _richer_friction(
 ) -> tuple[FrictionSelection, Sequence[np.ndarray | None]]:  # fmt: skip
     """Return the friction terms that unseen time rewards, and the torques (N, n) that load-dependent ones feel."""
     nothing: list[np.ndarray | None] = [None] * len(cases)
-    if not _joint_by_joint(model):
+    if not _sees_drives(model):
         return FrictionSelection((), (), ()), nothing
     std, tau, values = first
     plain = Dynamics(model, bases.to_standard(base, values))
     loads = nothing if settings.friction in ("standard", "ripple") else [transmitted(plain, case) for case in cases]
     candidates = FrictionCandidates(
         cases, rows, loads, decimator, std, tau, np.array(per_joint(settings.v0, model.n, "v0")), model.prismatic,
-        None if prior is None else prior.rows, settings.apart,
+        None if prior is None else prior.rows, settings.apart, model.torque_rows,
     )  # fmt: skip
     return select_friction(candidates, settings.friction, progress), loads
 

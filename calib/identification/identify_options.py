@@ -3,7 +3,7 @@
 TOML; every key is optional, and a key that is none of these is refused. SI units; joints are counted from 1::
 
     friction = "auto"                # auto, standard, or a rung: load, presliding, stribeck, asymmetric, root, cubic,
-                                     # ripple
+                                     # ripple; with rows = "both" also cable
     method = "wls"                   # ols, wls, irls, tls, ml, adaline, hopfield; ekf, ukf, cdkf and their square-root
                                      # forms srekf …; iv, didim (called CLIE elsewhere), cloe, clie (the survey's)
                                      # simulate the closed loop, see [loop]; pc-ols, pc-wls, pc-irls, pc-iv, pc-didim:

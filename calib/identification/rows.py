@@ -14,7 +14,7 @@ from calib.data.signals.filtering import slope
 from calib.dynamics import drives
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.regressor_model import RegressorModel
-from calib.dynamics.torque_rows import POWER
+from calib.dynamics.torque_rows import MOTOR, POWER, TorqueRows
 from calib.errors import UsageError
 from calib.estimation.triangles import Triangles, absorb, empty, retriangulate
 from calib.identification.cases import Case
@@ -78,17 +78,18 @@ def observe(
 
 
 def observe_terms(
-    terms: Sequence[DriveTerm], case: Case, decimator: Decimator, load: np.ndarray | None = None
-) -> np.ndarray:
-    """Return the columns of drive terms alone, (M, n, k), filtered and thinned; for a model of kind ``motor``.
+    terms: Sequence[DriveTerm], case: Case, decimator: Decimator, load: np.ndarray | None = None,
+    torque_rows: TorqueRows = MOTOR,
+) -> np.ndarray:  # fmt: skip
+    """Return the columns of drive terms alone, (M, rows, k), filtered and thinned; rows without a projection.
 
     One column at a time at the full rate: an hour of all friction there is would fill 15 GB.
     """
-    segment = case.motion.segment
-    out = np.zeros((len(kept(segment, decimator)), case.motion.n, len(terms)))
+    segment, n = case.motion.segment, case.motion.n
+    out = np.zeros((len(kept(segment, decimator)), torque_rows.count(n), len(terms)))
     for k, one in enumerate(terms):
         for row, values in term_columns(one, case, load):
-            out[:, row, k] += decimate(values, decimator, segment)
+            out[:, torque_rows.of_side(one.side, row, n), k] += decimate(values, decimator, segment)[:, None]
     return out
 
 

@@ -1,11 +1,14 @@
 """A ladder of friction, a forward selection, joint by joint, as far as unseen time rewards it.
 
-    standard → + load → + presliding → + stribeck → + asymmetric → + root → + cubic → + ripple
+    standard → + load → + presliding (→ + cable) → + stribeck → + asymmetric → + root → + cubic → + ripple
 
 Every step is tried on top of those taken: all joints get its terms, every time block is predicted by a fit to the
 others, and the terms stay at the joints whose error on unseen time falls by `GAIN`, and does not grow where one half of
 the time predicts the other: neighbouring blocks judge what holds between them, not what holds elsewhere. Terms of a
 step have a ridge per joint, chosen by evidence, so that a rich step (ripple) may offer more than the data can tell.
+
+Cables are offered where sensors see them behind the gears, apart from friction; by name, anywhere. A term is judged by
+the rows that it acts on, each in units of its own residuals.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ import numpy as np
 from calib.data.signals.decimation import Decimator
 from calib.dynamics import drives
 from calib.dynamics.drives import DriveTerm
+from calib.dynamics.torque_rows import MOTOR, TorqueRows
 from calib.errors import UsageError
 from calib.identification.cases import Case
 from calib.identification.friction.time_folds import CrossValidation
@@ -26,7 +30,7 @@ from calib.identification.rows import ObservationRows, extend, observe_terms, tr
 GAIN = 0.02  # a step has to lower a joint's rms error on unseen time by this share (our choice)
 WIDTHS = (0.0005, 0.002, 0.008, 0.03)  # of presliding, shares of a joint's travel (our choice)
 WINS = 0.6  # and on this share of the blocks
-STEPS = ("load", "presliding", "stribeck", "asymmetric", "root", "cubic")
+STEPS = ("load", "presliding", "cable", "stribeck", "asymmetric", "root", "cubic")
 NAMES = ("auto", "standard", *STEPS, "ripple")
 
 Progress = Callable[[str], None]
@@ -84,6 +88,7 @@ class FrictionCandidates:
         linear: (n,) prismatic joints.
         apart: rows in a unit of their own, which no total holds.
         prior: (k, b + 1) what is known of the base parameters (`calib.identification.prior`); None for nothing.
+        torque_rows: which torques the rows are; those of the motors among them.
     """
 
     cases: Sequence[Case]
@@ -96,6 +101,7 @@ class FrictionCandidates:
     linear: np.ndarray
     prior: np.ndarray | None = None
     apart: tuple[int, ...] = ()
+    torque_rows: TorqueRows = MOTOR
 
     @property
     def n(self) -> int:
@@ -115,7 +121,9 @@ def select_friction(
     if wanted not in NAMES:
         raise UsageError(f"friction '{wanted}' is none of {', '.join(NAMES)}")
     say("friction: columns")
-    offered = {name: _terms(candidates, name) for name in STEPS if wanted in ("auto", name)}
+    sensed = candidates.torque_rows.sensed
+    steps_tried = [name for name in STEPS if wanted == name or (wanted == "auto" and (sensed or name != "cable"))]
+    offered = {name: _terms(candidates, name) for name in steps_tried}
     every = [one for terms in offered.values() for one in terms]
     validation, place = _cross_validation(candidates, offered, every)
     base = np.arange(validation.data.parameters - len(every))
@@ -130,7 +138,7 @@ def select_friction(
         for name in waiting:
             say(f"friction: {name}")
             columns = [k for k in place[name] if k not in taken]
-            found, new, at = _try(validation, base, taken, columns, every, error, wanted != "auto")
+            found, new, at = _try(validation, base, taken, columns, every, error, wanted != "auto", candidates)
             note = "" if at else "no better on unseen time: left out"
             shown = new if found else validation.errors(np.array([*base, *taken, *columns]))
             count = len(base) + len(taken) + len(found or columns)
@@ -154,10 +162,18 @@ def _try(
     every: list[DriveTerm],
     error: np.ndarray,
     forced: bool,
+    candidates: FrictionCandidates,
 ) -> tuple[list[int], np.ndarray, tuple[int, ...]]:
     """Return the columns that stay, the errors with them, and their joints."""
     joint = {k: every[k - len(base)].acts[0][0] for k in columns}
     everyone = tuple(sorted(set(joint.values())))
+    side = every[columns[0] - len(base)].side
+
+    def felt(squares: np.ndarray, j: int) -> np.ndarray:
+        """Return the squared errors (blocks,) of the rows that see the terms of a joint, in units of their own."""
+        rows = candidates.torque_rows.of_side(side, j, candidates.n)
+        return np.sum(squares[:, rows] / validation.std[rows] ** 2, axis=1)
+
     if forced:
         return columns, validation.errors(np.array([*base, *taken, *columns])), everyone
     half = validation.errors(np.array([*base, *taken]), 2)
@@ -165,7 +181,9 @@ def _try(
     for _ in range(2):  # with the joints left that it pays at, once more
         tried = np.array([*base, *taken, *some])
         new, other = validation.errors(tried), validation.errors(tried, 2)
-        at = tuple(j for j in at if _pays(error[:, j], new[:, j]) and _carries(half[:, j], other[:, j]))
+        at = tuple(
+            j for j in at if _pays(felt(error, j), felt(new, j)) and _carries(felt(half, j), felt(other, j))
+        )  # fmt: skip
         some, before = [k for k in some if joint[k] in at], some
         if not some:
             return [], error, ()
@@ -202,6 +220,7 @@ def _terms(candidates: FrictionCandidates, name: str) -> list[DriveTerm]:
         v0 = float(candidates.v0[j])
         terms = {
             "load": lambda: drives.load_dependent(j, v0, viscous=True),  # noqa: B023
+            "cable": lambda: drives.cable(j, travel),  # noqa: B023
             "presliding": lambda: drives.presliding(j, [travel * x for x in WIDTHS], v0),  # noqa: B023
             "stribeck": lambda: (
                 *drives.stribeck(j, 0.05 * peak, v0=v0),  # noqa: B023
@@ -220,7 +239,7 @@ def _cross_validation(
 ) -> tuple[CrossValidation, dict[str, list[int]]]:
     """Return the validation with all offered columns behind the base's, and where each step's stand."""
     rows = [
-        extend(part, every, observe_terms(every, case, candidates.decimator, load))
+        extend(part, every, observe_terms(every, case, candidates.decimator, load, candidates.torque_rows))
         for part, case, load in zip(candidates.rows, candidates.cases, candidates.loads)
     ]
     data = triangulate(rows)

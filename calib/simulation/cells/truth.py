@@ -114,10 +114,17 @@ def share_within(true: Mapping[str, float], estimate: StoredEstimate) -> tuple[f
 
 
 def true_base(model: IdentificationModel, cell: Cell, arm: MovingArm, seed: int) -> dict[str, float]:
-    """Return the true base parameters of a model by name: columns of the nominal arm, regrouped on the true one."""
+    """Return the true base parameters of a model by name: columns of the nominal arm, regrouped on the true one.
+
+    Friction is that of a warm arm in steady sliding: friction with memory, all of it slipping, is Coulomb friction.
+    """
     known = dict(zip((*arm.plant.bodies.names, *(one.name for one in arm.plant.terms)), arm.plant.parameters))
-    for j in range(arm.chain.n):  # whole drives, where the model does not part motor and link
-        for name in ("Fv", "Fc", "off"):
+    for j in range(arm.chain.n):
+        for name, more in (("Fv", 0.0), ("Fc", arm.unmodelled.memory)):
+            known[f"{name}m{j + 1}"] += (more - arm.unmodelled.warming) * (
+                known[f"{name}l{j + 1}"] + known[f"{name}m{j + 1}"]
+            )
+        for name in ("Fv", "Fc", "off"):  # whole drives, where the model does not part motor and link
             known[f"{name}{j + 1}"] = known[f"{name}l{j + 1}"] + known[f"{name}m{j + 1}"]
     names = tuple(name for name in model.names if name in known)
     terms = tuple(one for one in model.terms if one.name in names)
