@@ -40,6 +40,7 @@ HOMES = {
     "nlopt": ["poses.", "trajectories."],
     "toppra": ["trajectories."],
     "ruckig": ["trajectories."],
+    "clarabel": ["calib.estimation."],
     "cvxpy": ["calib.estimation.", "calib.dynamics.", "calib.identification.", "poses.", "trajectories."],
     "matplotlib": ["calib.procedure.", "calib.api."],
     "jinja2": ["calib.procedure."],

@@ -3,7 +3,7 @@
 A row is lower <= aᵀ β <= upper over the columns that are estimated. A standard parameter, or a weighted sum of several,
 is such a row where the torques depend on it alone: cᵀ χ = aᵀ β with c = Tᵀ a, T the regrouping of the base; any other
 has no effect, and a bound on it would say nothing of the estimate (Janot's slides on the TX40). Inertia matrices M(q)
-over random postures are curved: h(β) = λ_min(S M(q; β) S) - `LEAST`, S making the mean diagonal one, which is concave.
+over random postures are matrix inequalities: λ_min(S M(q; β) S) >= `LEAST`, S making the mean diagonal one.
 Bodies that can exist are a cone (`calib.identification.body_cone`), which M(q) > 0 follows from.
 """
 
@@ -23,13 +23,17 @@ from calib.dynamics.base import Base
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import NotConverged, UsageError, suggestion
-from calib.estimation.constrained import Constrained, Curved, contradicting, restricted, within
+from calib.estimation.constrained import within
+from calib.estimation.constraint_relations import contradicting, restricted
+from calib.estimation.definite import Definite
+from calib.estimation.interior_point import Constrained
 from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import Triangles, residual_squares
 from calib.identification.body_cone import BodyCone, cone_of
 
 POSTURES = 50  # at which M(q) must be positive definite (our choice)
 LEAST = 1e-3  # of the smallest eigenvalue of S M(q) S (our choice): what falls below moves at no torque at all
+RAISE, MOST = 10**0.5, 0.4  # factor and limit of the same where an estimate cannot be simulated (our choice)
 FAR = 3.0  # standard deviations by which the data speak against an equality that is told (our choice)
 
 
@@ -92,6 +96,8 @@ class Constraints:
         inertia: (K, n, n, p), M(q_k; β) = inertia[k] β.
         cone: of bodies that can exist; None where that is not asked.
         plane: name of the row that stands for the cone (`touched`); empty where none does.
+        least: of the smallest eigenvalue of S M(q) S, see `raised`.
+        likely: indices of the postures that held the estimate of a problem much like the next.
     """
 
     names: tuple[str, ...]
@@ -101,6 +107,8 @@ class Constraints:
     inertia: np.ndarray
     cone: BodyCone | None = None
     plane: str = ""
+    least: float = LEAST
+    likely: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         for key in ("matrix", "lower", "upper", "inertia"):
@@ -117,7 +125,8 @@ class Constraints:
         p = len(factor) - 1
         free = np.linalg.solve(factor[:p, :p], factor[:p, p])
         try:
-            return within(factor, self.matrix, self.lower, self.upper, _definite(self.inertia, free))
+            wanted = _definite(self.inertia, free, self.least, self.likely)
+            return within(factor, self.matrix, self.lower, self.upper, wanted)
         except NotConverged as error:
             raise NotConverged(
                 f"[constraints]: no estimate was found that satisfies {'; '.join(self.names) or 'them'}, with M(q) "
@@ -125,6 +134,14 @@ class Constraints:
                 f"({error})",
                 error.last,
             ) from error
+
+    def raised(self) -> Constraints | None:
+        """Return these with M(q) three times as far from singular, None where it already is by `MOST`.
+
+        A robot may have a definite inertia, and yet so little in a direction that a sampled controller cannot hold it.
+        """
+        least = self.least * RAISE
+        return replace(self, least=least) if len(self.inertia) and least <= MOST else None
 
     def touched(self, factor: np.ndarray) -> Constraints:
         """Return these constraints with the cone of bodies replaced by the plane that holds the optimum of `factor`.
@@ -180,17 +197,24 @@ class Held:
         names: of all constraints.
         solution: the optimum with its multipliers.
         binding: those that hold it.
-        postures: number of postures in which M(q) is on its bound.
+        tight: indices of the postures in which M(q) is on its bound.
         free: the free estimate.
         plane: name of the one that stands for bodies that can exist.
+        least: see `Constraints`.
     """
 
     names: tuple[str, ...]
     solution: Constrained
     binding: tuple[Binding, ...]
-    postures: int
+    tight: np.ndarray
     free: LinearFit
     plane: str = ""
+    least: float = LEAST
+
+    @property
+    def postures(self) -> int:
+        """Number of postures in which M(q) is on its bound."""
+        return len(self.tight)
 
     def lines(self) -> list[str]:
         """Return what a user should know of constraints that hold the estimate."""
@@ -214,6 +238,11 @@ class Held:
             told.append(
                 f"M(q) is held positive definite in {self.postures} postures: the data alone give a robot that cannot "
                 "be there; the motion is too poor, or the estimate is biased"
+            )
+        if self.postures and self.least > LEAST:
+            told.append(
+                f"M(q) is kept {self.least / LEAST:.0f} times as far from singular as asked: nearer, the controller "
+                "cannot hold the simulated robot"
             )
         return told
 
@@ -271,8 +300,8 @@ def make_constraints(
             "together; take one of them back"
         )
     cone = cone_of(model, base) if settings.bodies and model.inertial else None
-    curved = _inertia(settings if cone is None else replace(settings, inertia=0), model, base, p, seed)
-    return Constraints(tuple(told), matrix, low, high, curved, cone)
+    inertia = _inertia(settings if cone is None else replace(settings, inertia=0), model, base, p, seed)
+    return Constraints(tuple(told), matrix, low, high, inertia, cone)
 
 
 def signs(names: Sequence[str], positive: Sequence[str]) -> Constraints:
@@ -338,8 +367,8 @@ def _told(constraints: Constraints, found: Constrained, free: LinearFit) -> Held
             constraints.names[places[k]], float(found.multipliers[k]), float(row @ free.estimate.values),
             float(np.sqrt(max(row @ free.estimate.covariance @ row, 0.0))), float(bound), bool(same[places[k]]),
         ))  # fmt: skip
-    bent = int(np.sum(found.binding[places < 0]))
-    return Held(constraints.names, found, tuple(binding), bent, free, constraints.plane)
+    tight = frozen(np.flatnonzero(found.binding[places < 0]), int)
+    return Held(constraints.names, found, tuple(binding), tight, free, constraints.plane, constraints.least)
 
 
 def _words(name: str, low: float, high: float) -> str:
@@ -410,38 +439,10 @@ def _inertia(settings: ConstraintSettings, model: RegressorModel, base: Base, p:
     return 0.5 * (tensor + tensor.transpose(0, 2, 1, 3))
 
 
-def _definite(inertia: np.ndarray, free: np.ndarray) -> Curved | None:
-    """Return λ_min(S M(q) S) - `LEAST` over the postures, S from the size of the diagonal of the free estimate."""
+def _definite(inertia: np.ndarray, free: np.ndarray, least: float, likely: np.ndarray | None) -> Definite | None:
+    """Return S M(q) S over the postures, S from the size of the diagonal of the free estimate."""
     if not len(inertia):
         return None
     size = np.abs(np.einsum("kiip,p->ki", inertia, free)).mean(axis=0)
     scale = 1.0 / np.sqrt(np.maximum(size, 1e-6 * size.max()))
-    scaled = inertia * scale[:, None, None] * scale[None, :, None]
-
-    count, n, _, p = scaled.shape
-    flat, known = scaled.reshape(count, n * n, p), {}
-
-    def modes(b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        key = b.tobytes()
-        if key not in known:
-            known.clear()
-            known[key] = np.linalg.eigh((flat @ b).reshape(count, n, n))
-        return known[key]
-
-    def least(b: np.ndarray) -> np.ndarray:
-        return modes(b)[0][:, 0] - LEAST
-
-    def slopes(b: np.ndarray) -> np.ndarray:
-        first = modes(b)[1][:, :, 0]
-        pairs = first[:, :, None] * first[:, None, :]
-        return np.asarray((pairs.reshape(count, 1, n * n) @ flat)[:, 0])
-
-    def curvature(b: np.ndarray, mu: np.ndarray) -> np.ndarray:
-        values, vectors = modes(b)
-        pairs = vectors[:, :, None, 1:] * vectors[:, None, :, :1]
-        mixed = pairs.reshape(count, n * n, n - 1).transpose(0, 2, 1) @ flat
-        gap = np.maximum(values[:, 1:] - values[:, :1], 1e-9)
-        root = (np.sqrt(2.0 * mu[:, None] / gap)[:, :, None] * mixed).reshape(-1, p)
-        return -root.T @ root
-
-    return Curved(least, slopes, curvature)
+    return Definite(inertia * scale[:, None, None] * scale[None, :, None], least, likely)

@@ -6,13 +6,9 @@ import numpy as np
 import pytest
 
 from calib.errors import CalibError, NotConverged, Unidentifiable
-from calib.estimation.constrained import (
-    contradicting,
-    from_free,
-    minimise,
-    restricted,
-    within,
-)
+from calib.estimation.constrained import within
+from calib.estimation.constraint_relations import contradicting, from_free, restricted
+from calib.estimation.definite import Definite
 from calib.estimation.instrumental_variables import instrument, projected
 from calib.estimation.linear import ols
 from calib.estimation.triangles import collect, combine
@@ -80,29 +76,55 @@ def test_a_binding_parameter_has_no_variance_and_the_others_that_of_the_rest():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_positive_definite_matrix_as_a_curved_constraint_gives_the_optimum_of_cvxpy(seed):
-    """[[b0, b1], [b1, b2]] >= 0 as b0 > 0, b2 > 0 and the geometric mean √(b0 b2) - |b1| smoothed away: b2 - b1²/b0."""
+def test_a_positive_definite_matrix_gives_the_optimum_of_cvxpy_and_proves_it(seed):
+    """[[b0, b1], [b1, b2]] ⪰ 0.01 with 2 b0 >= 1.5 beside it, by another solver."""
     cvxpy = pytest.importorskip("cvxpy")
     rng = np.random.default_rng(seed)
     matrix = rng.normal(size=(60, 3))
     target = matrix @ [1.0, 1.8, 1.0] + rng.normal(size=60)
-
-    def h(b):
-        return np.array([b[0] - 1e-3, b[2] - b[1] ** 2 / b[0]])
-
-    def jacobian(b):
-        return np.array([[1.0, 0.0, 0.0], [b[1] ** 2 / b[0] ** 2, -2 * b[1] / b[0], 1.0]])
-
-    def curvature(b, mu):
-        v = np.array([b[1] / b[0], -1.0, 0.0])
-        return -2.0 * mu[1] / b[0] * np.outer(v, v)
-
-    found = minimise(combine(collect(matrix, target)), h, jacobian, np.array([1.0, 0.0, 1.0]), curvature)
+    triangle = combine(collect(matrix, target))
+    cone = np.array([[[1, 0, 0], [0, 1, 0]], [[0, 1, 0], [0, 0, 1]]], dtype=float)
+    bound = np.array([[2.0, 0.0, 0.0]])
+    found = within(triangle, bound, np.array([1.5]), np.array([np.inf]), Definite(cone[None], 0.01))
     b = cvxpy.Variable(3)
-    cone = cvxpy.bmat([[b[0], b[1]], [b[1], b[2]]]) >> 0
-    cvxpy.Problem(cvxpy.Minimize(cvxpy.sum_squares(target - matrix @ b)), [cone, b[0] >= 1e-3]).solve(solver="CLARABEL")
+    conditions = [cvxpy.bmat([[b[0] - 0.01, b[1]], [b[1], b[2] - 0.01]]) >> 0, 2.0 * b[0] >= 1.5]
+    cvxpy.Problem(cvxpy.Minimize(cvxpy.sum_squares(target - matrix @ b)), conditions).solve(solver="SCS", eps=1e-9)
     assert found.values == pytest.approx(b.value, abs=1e-5)
-    assert found.binding[1]
+    assert found.binding[1] and found.slack[1] == pytest.approx(0.0, abs=1e-6)
+    slope = matrix.T @ (matrix @ found.values - target)
+    assert found.normals.T @ found.multipliers == pytest.approx(slope, abs=1e-5 * np.abs(matrix.T @ target).max())
+    assert found.normals[found.binding] @ found.covariance == pytest.approx(0.0, abs=1e-12)
+
+
+def test_of_many_definite_matrices_those_that_matter_give_the_optimum_of_all():
+    """Twin eigenvalues on the bound and matrices that follow one another closely do not stop it; any start will do."""
+    rng = np.random.default_rng(1)
+    p, n, count = 12, 4, 400
+    matrix = rng.normal(size=(80, p))
+    triangle = combine(collect(matrix, matrix @ rng.normal(size=p) + rng.normal(size=80)))
+    ends = rng.normal(size=(2, n, n, p - 1))
+    ends = ends + ends.transpose(0, 2, 1, 3)
+    between = np.linspace(0.0, 1.0, count)[:, None, None, None]
+    bodies = np.concatenate([(1 - between) * ends[0] + between * ends[1], np.zeros((count, n, n, 1))], axis=3)
+    bodies[..., -1] = np.eye(n)
+    nothing = np.zeros((0, p)), np.zeros(0), np.zeros(0)
+    found = within(triangle, *nothing, Definite(bodies, 0.5))
+    again = within(triangle, *nothing, Definite(bodies, 0.5, np.arange(0, count, 37)))
+    assert np.linalg.eigvalsh(bodies @ found.values).min() > 0.5 * (1.0 - 2e-3)
+    slope = triangle[:p, :p].T @ (triangle[:p, :p] @ found.values - triangle[:p, p])
+    assert found.normals.T @ found.multipliers == pytest.approx(slope, abs=1e-6 * np.abs(matrix.T).sum(axis=1).max())
+    assert found.multipliers.min() >= 0.0 and 0 < found.binding.sum() < 20
+    assert again.values == pytest.approx(found.values, abs=1e-3 * np.abs(found.values).max())
+
+
+def test_matrices_that_no_point_makes_definite_are_refused():
+    matrix, target, _ = problem(5, p=3)
+    cone = np.array([[[1, 0, 0], [0, 1, 0]], [[0, 1, 0], [0, 0, 1]]], dtype=float)
+    with pytest.raises(NotConverged, match="Infeasible"):
+        within(
+            combine(collect(matrix, target)), np.eye(3)[:1], np.array([-np.inf]), np.array([-1.0]),
+            Definite(cone[None], 0.01),
+        )  # fmt: skip
 
 
 def test_contradicting_constraints_and_crossed_bounds_are_refused():

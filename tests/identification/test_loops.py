@@ -131,6 +131,15 @@ def test_constraints_hold_in_every_round_and_the_folder_stays_readable(robot, tm
     assert np.isfinite(read.factor).all() and read.best >= 0.0
 
 
+def test_an_estimate_pulled_to_where_no_controller_holds_it_ends_and_says_so(robot, tmp_path, capsys):
+    """M(q) barely definite is nothing that a sampled controller can hold: it is kept away from singular, and told."""
+    train = log(tmp_path, "train.csv", 1, noise=1e-3)
+    _, out = identify(robot, tmp_path, train, f"{GAINS}[constraints]\nbounds = {{ ZZ2R = [-inf, -0.1] }}", "pc-iv")
+    told = json.loads((out / "metrics.json").read_text())["constraints"]
+    assert told["postures_binding"] > 0 and "ZZ2R <= -0.1" in [one["name"] for one in told["binding"]]
+    assert "times as far from singular as asked" in capsys.readouterr().out.replace("\n", " ")
+
+
 def test_without_noise_in_the_positions_least_squares_stands(robot, tmp_path):
     """What the test still sees is small: no parameter is off by three sigma."""
     code, out = identify(robot, tmp_path, log(tmp_path, "train.csv", 1), GAINS, "wls")

@@ -14,6 +14,7 @@ choice). Constraints on base parameters, min ½ ‖P_Z (y - W x)‖² in every r
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -194,15 +195,15 @@ def identify_instrumental(
         raise CannotSimulate(str(error), error.last) from error
     for _ in range(limit):
         found = _estimate_round(task, runs, std, tau)
-        new = _with_values(plant, task.standard(found.fit.estimate.values))
+        task = task.after(found)
         rounds.append(Round(_change(before, found.fit), found.fit.estimate.residual_std, retreats))
         if (
             before is not None
             and retreats == 0
             and instrumental_variables.settled(before, found.fit, tolerance, tolerance)
         ):
-            return _result(task, found, ordinary, new, rounds, std, runs)
-        plant, runs, retreats = _simulate_new(plant, new, cases)
+            return _result(task, found, ordinary, task.plant(plant, found), rounds, std, runs)
+        task, found, plant, runs, retreats = _simulate_new(task, found, plant, std, tau)
         before, std, tau = found.fit, found.fit.group_std, found.tau
     kind = Diverged if len(rounds) > 2 and rounds[-1].change > rounds[1].change else NotConverged
     raise kind(
@@ -225,11 +226,21 @@ class _Fixed:
     estimator: RoundEstimator
     constraints: Constraints | None = None
 
+    def after(self, found: _Found) -> _Fixed:
+        """Return the task of the next round, which most likely is held in the same postures."""
+        if self.constraints is None or found.bound is None:
+            return self
+        return replace(self, constraints=replace(self.constraints, likely=found.bound.tight))
+
     def standard(self, values: np.ndarray) -> np.ndarray:
         """Return standard parameters with the values of those base parameters that are estimated."""
         whole = np.zeros(self.base.b)
         whole[self.kept] = values
         return bases.to_standard(self.base, whole)
+
+    def plant(self, old: Plant, found: _Found) -> Plant:
+        """Return the robot of a round's estimate."""
+        return _with_values(old, self.standard(found.fit.estimate.values))
 
 
 @dataclass(frozen=True, eq=False)
@@ -361,16 +372,30 @@ def _loaded(plant: Plant, case: Case) -> Plant:
     return with_parameters(plant, plant.parameters * np.append(there, np.ones(len(plant.terms))))
 
 
-def _simulate_new(old: Plant, new: Plant, cases: Sequence[tuple[Case, Loop]]) -> tuple[Plant, Runs, int]:
-    """Simulate the new parameters, or those on the way to them that can be (our choice)."""
-    for retreats in range(RETREATS):
-        share = 0.5**retreats
+def _simulate_new(
+    task: _Fixed, found: _Found, old: Plant, std: np.ndarray, tau: float
+) -> tuple[_Fixed, _Found, Plant, Runs, int]:
+    """Simulate the new parameters; where that fails those further from a singular inertia, if constraints hold them.
+
+    Then those on the way to them (our choice). A controller holds no robot of next to no inertia.
+    """
+    retreats = 0
+    while retreats < RETREATS:
+        share, new = 0.5**retreats, task.plant(old, found)
         tried = with_parameters(new, share * new.parameters + (1.0 - share) * old.parameters)
         try:
-            return tried, _runs(tried, cases), retreats
+            return task, found, tried, _runs(tried, task.cases), retreats
         except CalibError as error:
             problem = error
-    raise CannotSimulate(f"the estimate cannot be simulated, nor anything near: {problem}", new)
+        bound = task.constraints.raised() if task.constraints and found.bound and found.bound.postures else None
+        if bound is not None:
+            further = replace(task, constraints=bound)
+            with suppress(NotConverged):
+                fit, held = _held_fit(further, found.problem, std, tau)
+                task, found = further, replace(found, fit=fit, bound=held)
+                continue
+        retreats += 1
+    raise CannotSimulate(f"the estimate cannot be simulated, nor anything near: {problem}", task.plant(old, found))
 
 
 def _stack(observed: Sequence[ObservationRows], simulated: Sequence[np.ndarray]) -> Instruments:

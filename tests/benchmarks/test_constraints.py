@@ -1,0 +1,83 @@
+"""PC-IDIM-IV on a simulated TX40 beside unconstrained IV.
+
+python -m pytest tests/benchmarks/test_constraints.py -o addopts= -s
+Ten seconds at 5 kHz, 60 parameters; processor time. Janot's slides tell of 40 s for PC-IDIM-IV.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from calib.data.recordings.recording import Recording
+from calib.data.signals.motion import FilterOptions, make_motion
+from calib.dynamics import base as bases
+from calib.identification.cases import make_case
+from calib.identification.loop.loop_recordings import Loop
+from calib.identification.methods.instrumental import identify_instrumental
+from calib.identification.parameter_constraints import ConstraintSettings, make_constraints
+from calib.simulation.cells import known_robots
+from calib.simulation.loop.closed_loop import Sensing, simulate
+from calib.simulation.loop.references import random_fourier
+
+PLANT = known_robots.plant("tx40", coupled=True)
+MODEL = known_robots.model(PLANT)
+BASE = bases.find(MODEL)
+INERTIA = np.array(known_robots.truth("tx40")["drives"]["Ia"])
+ASKED = {
+    "three bounds that bind": {"bounds": {"Fv1": (8.3, np.inf), "ZZ1R": (1.4, np.inf), "Fc4": (-np.inf, 2.2)}},
+    "inertias pulled below zero, M(q) > 0 in 50 postures": {
+        "bounds": {"ZZ2R": (-np.inf, 0.2), "ZZ3R": (-np.inf, -0.05), "ZZ4R": (-np.inf, -0.02)}, "signs": False,
+    },
+    "the same in 2,000": {
+        "bounds": {"ZZ2R": (-np.inf, 0.2), "ZZ3R": (-np.inf, -0.05), "ZZ4R": (-np.inf, -0.02)}, "signs": False,
+        "inertia": 2000,
+    },
+    "ZZ2R <= -0.2, which no controller holds": {"bounds": {"ZZ2R": (-np.inf, -0.2)}, "signs": False},
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    reach, speed = np.array([2.8, 1.8, 2.0, 3.5, 1.9, 4.0]), np.deg2rad([230.0, 230.0, 340.0, 330.0, 250.0, 560.0])
+    reference = random_fourier(-reach, reach, speed, 10.0, 5000.0, 20, acceleration=40.0, seed=3)
+    controller = known_robots.controller("tx40")
+    run = simulate(PLANT, controller, reference, Sensing(np.deg2rad(1e-4), sigma_tau=0.05, every=5), 0)
+    recording = Recording(
+        run.t, run.measured, run.tau, "torque", tuple(f"joint_{j + 1}" for j in range(6)), file="tx40"
+    )
+    filters = FilterOptions(cutoff=50.0, band=20.0, clock="stamps")
+    return make_case("tx40", make_motion(recording, filters)), Loop(controller, reference, 5)
+
+
+def seconds(recorded, constraints, method="iv"):
+    began = time.process_time()
+    found = identify_instrumental(
+        MODEL,
+        BASE,
+        [recorded],
+        recorded[0].motion.decimator,
+        method=method,
+        inertia=INERTIA,
+        constraints=constraints,
+        limit=20,
+    )
+    return time.process_time() - began, found
+
+
+@pytest.mark.parametrize("method", ["iv", "didim"])
+@pytest.mark.parametrize("name", ASKED)
+def test_constrained_instruments(recorded, name, method):
+    terms = [MODEL.columns[k - MODEL.inertial] if k >= MODEL.inertial else None for k in BASE.kept]
+    seconds(recorded, None, method)  # compiles
+    free, before = seconds(recorded, None, method)
+    constraints = make_constraints(ConstraintSettings(**ASKED[name]), MODEL, BASE, BASE.names, terms)
+    held, found = seconds(recorded, constraints, method)
+    assert found.constrained is not None and found.constrained.binding
+    each = held / free * len(before.rounds) / len(found.rounds)
+    print(
+        f"\n{method}, {name}: {held:.2f} s of processor time in {len(found.rounds)} rounds, free {free:.2f} s in "
+        f"{len(before.rounds)}: {held / free:.2f} times, round by round {each:.2f}"
+    )
