@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from calib.errors import Unidentifiable
-from calib.estimation.constrained import minimise, within
+from calib.estimation.constrained import within
+from calib.estimation.definite import Definite
 from calib.estimation.instrumental_variables import (
     exogeneity,
     hausman,
@@ -216,12 +217,11 @@ def test_constraints_that_hold_change_nothing_and_bind_with_a_multiplier_where_t
     assert tight.values[u] == pytest.approx(moved, abs=1e-8)  # the slides' relation, in its two-stage form
 
 
-def test_a_curved_constraint_enters_iv_as_well():
+def test_a_definite_matrix_enters_iv_as_well():
     triangle = projected(instrument(*planted(11, 1.0)))
-    found = minimise(
-        triangle, lambda b: np.array([1.0 - b @ b]), lambda b: -2 * b[None], None, lambda b, mu: -2 * mu[0] * np.eye(3)
-    )
-    assert found.values @ found.values == pytest.approx(1.0, abs=1e-9)
+    arrow = np.array([[[1, 0, 0], [0, 1, 0]], [[0, 1, 0], [0, 0, 1]]], dtype=float)  # of the truth it is singular
+    found = within(triangle, np.zeros((0, 3)), np.zeros(0), np.zeros(0), Definite(arrow[None], 0.1))
+    assert np.linalg.eigvalsh(arrow @ found.values)[0] == pytest.approx(0.1, abs=1e-7) and found.binding.all()
     r, z = triangle[:3, :3], triangle[:3, 3]
     slope = r.T @ (r @ found.values - z)
-    assert slope == pytest.approx(-2 * found.multipliers[0] * found.values, abs=1e-7 * np.abs(r.T @ z).max())
+    assert slope == pytest.approx(found.multipliers @ found.normals, abs=1e-7 * np.abs(r.T @ z).max())
