@@ -213,7 +213,8 @@ def _load_lanes(kind, scale, amount, v, a, joint):
             joint[L + k], joint[k] = sincos(joint[2 * L + k])
             joint[2 * L + k] = 0.0
     else:
-        joint[:L], joint[L : 2 * L] = 1.0, 0.0
+        for k in range(L):
+            joint[k], joint[L + k] = 1.0, 0.0
 
 
 @njit(**OPTIONS)
@@ -231,7 +232,8 @@ def regressor(links, constants, order, amount, v, a, out):
     joint, turn, columns = np.zeros(5 * L), np.empty(12 * L), np.empty(10 * L)
     motion, twists = np.zeros((bodies + 1, 9 * L)), np.zeros((bodies + 1, n, 6 * L))
     for r in range(3):
-        motion[0, (6 + r) * L : (7 + r) * L] = -constants[bodies, r]
+        for lane in range((6 + r) * L, (7 + r) * L):
+            motion[0, lane] = -constants[bodies, r]
     for start in range(0, count, L):
         width = min(L, count - start)
         for i in range(bodies):
@@ -243,12 +245,14 @@ def regressor(links, constants, order, amount, v, a, out):
             _place_lanes(constants, i, joint, turn)
             _advance_lanes(turning, joint, turn, motion[p + 1], motion[i + 1])
             if c >= 0:
-                twists[i + 1, c, :] = 0.0
+                for lane in range(6 * L):
+                    twists[i + 1, c, lane] = 0.0
             for k in range(links[p, DEPTH] if p >= 0 else 0):
                 _carry_lanes(turn, twists[p + 1, links[p, PATH + k]], twists[i + 1, links[p, PATH + k]])
             if c >= 0:
                 first = (2 if links[i, KIND] == REVOLUTE else 5) * L
-                twists[i + 1, c, first : first + L] += constants[i, SCALE]
+                for lane in range(first, first + L):
+                    twists[i + 1, c, lane] += constants[i, SCALE]
             for k in range(links[i, DEPTH]):
                 j = links[i, PATH + k]
                 _project_lanes(motion[i + 1], twists[i + 1, j], columns)
@@ -309,9 +313,11 @@ def inverse_dynamics(links, constants, parameters, amount, cosine, sine, v, a, o
     bodies = amount.shape[1]
     frames, motion = np.empty((bodies, 12)), np.zeros((bodies + 1, 9))
     wrench, tau = np.empty((bodies, 6)), np.empty(v.shape[1])
-    motion[0, 6:] = -constants[bodies, :3]
+    for r in range(3):
+        motion[0, 6 + r] = -constants[bodies, r]
     for sample in range(v.shape[0]):
-        tau[:] = 0.0
+        for j in range(tau.shape[0]):
+            tau[j] = 0.0
         for i in range(bodies):
             c, scale = links[i, COORDINATE], constants[i, SCALE]
             place(links, constants, i, amount[sample, i], cosine[sample, i], sine[sample, i], frames)
@@ -319,7 +325,8 @@ def inverse_dynamics(links, constants, parameters, amount, cosine, sine, v, a, o
             _wrench(i, parameters, motion, wrench)
         for i in range(bodies - 1, -1, -1):
             _return(links, constants, i, frames, wrench, 1.0, tau)
-        out[sample] = tau
+        for j in range(tau.shape[0]):
+            out[sample, j] = tau[j]
 
 
 @njit(**OPTIONS)

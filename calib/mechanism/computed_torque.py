@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib.arrays import frozen
 from calib.dynamics import rigid_body
 from calib.dynamics.drives import added_inertia
 from calib.errors import CannotSimulate, UsageError
@@ -98,8 +99,7 @@ def simulate(
     omega = 2.0 * np.pi * controller.frequency
     state = (
         np.array(motion.posture.q[0]),
-        np.array(motion.posture.pose[0, :3, :3]),
-        np.array(motion.posture.pose[0, :3, 3]),
+        np.array(motion.posture.pose[0]),
     )
     left = closure_kernels.run(
         _compiled(model), _parameters(model, values, carried), *state, np.array(motion.rate[0]),
@@ -120,28 +120,36 @@ def _compiled(model: ParallelModel) -> tuple:
     """Return the robot as `closure_kernels.accelerate` reads it."""
     robot = model.known.robot
     legs = [compiled(leg) for leg in robot.legs]
+    kinds = [bodies.links for bodies, _ in legs], [bodies.constants for bodies, _ in legs], [tail for _, tail in legs]
+    links, constants, tails, attachments = map(_stacked, (*kinds, [leg.attachment for leg in robot.legs]))
     return (
-        tuple(bodies.links for bodies, _ in legs), tuple(bodies.constants for bodies, _ in legs),
-        tuple(tail for _, tail in legs), tuple(leg.attachment for leg in robot.legs), robot.starts,
-        np.array([leg.held for leg in robot.legs]), robot.selected, robot.actuated, robot.gravity,
-        model.known.fixed,
+        frozen(links, np.int64), frozen(constants), frozen(tails), frozen(attachments), robot.starts,
+        np.array([leg.held for leg in robot.legs]), robot.selected, robot.actuated, robot.gravity, model.known.fixed,
     )  # fmt: skip
+
+
+def _stacked(arrays: list[np.ndarray]) -> np.ndarray:
+    """Return arrays one above the other, each filled up with zeros to the largest shape."""
+    result = np.zeros((len(arrays), *np.max([array.shape for array in arrays], axis=0)))
+    for own, array in zip(result, arrays):
+        own[tuple(map(slice, array.shape))] = array
+    return result
 
 
 def _parameters(model: ParallelModel, values: np.ndarray, carried: Collection[str] | None) -> tuple:
     """Return parameters as `closure_kernels.accelerate` reads them."""
-    drives = np.zeros((5, int(model.known.robot.starts[-1])))
-    drives[4] = 1.0
+    drives = np.zeros((int(model.known.robot.starts[-1]), 5))
+    drives[:, 4] = 1.0
     for one, value in zip(model.terms, values[model.inertial :]):
         joint = one.joint
         if one.shape not in _SIMULATED or joint is None:
             raise UsageError(f"term '{one.name}' ({one.shape}) cannot be simulated on a parallel robot")
-        drives[_SIMULATED[one.shape], joint] += value
+        drives[joint, _SIMULATED[one.shape]] += value
         if one.shape == "sign":
-            drives[4, joint] = max(one.settings[0], 1e-9)
+            drives[joint, 4] = max(one.settings[0], 1e-9)
     legs = zip(model.leg_bodies, model.leg_parameters(values))
-    own = tuple(rigid_body.kernel_parameters(bodies, parameters) for bodies, parameters in legs)
-    return own, model.platform_parameters(values, carried), drives
+    own = [rigid_body.kernel_parameters(bodies, parameters) for bodies, parameters in legs]
+    return _stacked(own), model.platform_parameters(values, carried), drives
 
 
 _SIMULATED = {"acceleration": 0, "velocity": 1, "sign": 2, "one": 3}
