@@ -95,7 +95,7 @@ def instrument(
     instruments: np.ndarray,
     matrix: np.ndarray,
     target: np.ndarray,
-    group: np.ndarray | None = None,
+    group: np.ndarray | int = 0,
     names: Sequence[str] | None = None,
     units: Sequence[str] | None = None,
     before: Instruments | None = None,
@@ -106,7 +106,7 @@ def instrument(
         instruments: Z (r, p), one column for each of W.
         matrix: W (r, p).
         target: y (r,).
-        group: (r,) integers, as in `triangles.absorb`.
+        group: as in `triangles.absorb`.
         names, units: of W's columns.
         before: earlier rows of the same problem.
     """
@@ -114,11 +114,13 @@ def instrument(
     instruments = shaped(instruments, matrix.shape, "instruments Z")
     if before is None:
         own = tuple(names) if names is not None else tuple(f"x{k + 1}" for k in range(matrix.shape[1]))
-        given = tuple(units) if units is not None else ("",) * len(own)
-        count = 1 if group is None or len(group) == 0 else int(np.max(group)) + 1
-        before = Instruments(empty([*(f"Z {name}" for name in own), *own], given * 2, count))
-    rows = 0 if group is None else group
-    return replace(before, data=absorb(before.data, np.hstack([instruments, matrix]), target, rows))
+        before = unseen(own, units if units is not None else ("",) * len(own), int(np.max(group, initial=0)) + 1)
+    return replace(before, data=absorb(before.data, np.hstack([instruments, matrix]), target, group))
+
+
+def unseen(names: Sequence[str], units: Sequence[str], groups: int) -> Instruments:
+    """Return triangles of [Z W y] that have seen no rows, for columns of W with these names and units."""
+    return Instruments(empty([*(f"Z {name}" for name in names), *names], [*units, *units], groups))
 
 
 def least_squares(problem: Instruments) -> Triangles:

@@ -70,15 +70,17 @@ def absorb(data: Triangles, matrix: np.ndarray, target: np.ndarray, group: np.nd
     """
     matrix = shaped(matrix, (None, data.parameters), "observation matrix W")
     target = shaped(target, (len(matrix),), "target y")
-    index = np.broadcast_to(np.asarray(group, dtype=int), len(matrix))
-    if len(index) and not 0 <= index.min() <= index.max() < data.groups:
-        raise CalibError(f"rows belong to groups {index.min()} to {index.max()}, but there are {data.groups} groups")
+    index = np.asarray(group, dtype=int)
+    found = np.unique(index)
+    if len(matrix) and not 0 <= found[0] <= found[-1] < data.groups:
+        raise CalibError(f"rows belong to groups {found[0]} to {found[-1]}, but there are {data.groups} groups")
     factors, rows = np.array(data.factors), np.array(data.rows)
-    for g in np.flatnonzero(np.bincount(index)):
-        own = np.flatnonzero(index == g)
-        rows[g] += len(own)
-        for start in range(0, len(own), CHUNK):
-            part = own[start : start + CHUNK]
+    for g in found if len(matrix) else ():
+        own = np.flatnonzero(index == g) if index.ndim else None  # no copies of rows that are all of one group
+        count = len(matrix) if own is None else len(own)
+        rows[g] += count
+        for start in range(0, count, CHUNK):
+            part = slice(start, start + CHUNK) if own is None else own[start : start + CHUNK]
             factors[g] = _update(factors[g], matrix[part], target[part])
     return replace(data, factors=frozen(factors), rows=frozen(rows, int))
 

@@ -63,6 +63,10 @@ def observe(
     step, place = max(1, BLOCK // decimator.factor) * decimator.factor, 0
     for start, stop in segments(motion.segment):
         spans = [slice(i, min(i + step, stop)) for i in range(start, stop, step)]
+        if len(decimator.taps) == 1 and model.torque_rows is not POWER:
+            for part in spans:  # nothing to filter: no need to turn entries into series and back
+                matrix[part] = _regressor(model, case, part, load, states)[:, :, columns]
+            continue
         if model.torque_rows is POWER:
             blocks = (
                 _power_block(model, columns[column[own]], case, part, states, slice(start, stop)) for part in spans
@@ -187,10 +191,15 @@ def _block(
     states: np.ndarray,
 ) -> np.ndarray:
     """Return the entries (k, N_i) of the regressor in these columns and rows, each (k,), of a part of the samples."""
-    motion = case.motion
-    own = None if load is None else load[part]
-    full = model.regressor(motion.q[part], motion.v[part], motion.a[part], own, case.carried, states[:, part])
-    return full.transpose(2, 1, 0)[columns, rows]
+    return _regressor(model, case, part, load, states).transpose(2, 1, 0)[columns, rows]
+
+
+def _regressor(
+    model: RegressorModel, case: Case, part: slice, load: np.ndarray | None, states: np.ndarray
+) -> np.ndarray:  # fmt: skip
+    """Return the regressor (N_i, rows, p) of a part of the samples."""
+    motion, own = case.motion, None if load is None else load[part]
+    return model.regressor(motion.q[part], motion.v[part], motion.a[part], own, case.carried, states[:, part])
 
 
 def _power_block(

@@ -125,31 +125,18 @@ def spread(values: np.ndarray, decimator: Decimator, length: int) -> np.ndarray:
 def decimate_blocks(blocks: Iterable[np.ndarray], decimator: Decimator) -> Iterator[np.ndarray]:
     """Return, block by block, what `decimate` returns of the blocks (..., N_i) of one segment joined together.
 
-    The sample axis is the last one. Holds one block, and of those before it the sums that windows still need: every
-    sample is multiplied once, as products of r rows with all the windows that they take part in.
+    The sample axis is the last one. Holds one block, and of those before it the samples that windows still need.
     """
     r, taps = decimator.factor, decimator.taps
     if r == 1 and len(taps) == 1:
         yield from blocks
         return
-    phases = -(-len(taps) // r)
-    weights = np.zeros(phases * r)
-    weights[: len(taps)] = taps
-    turned = np.ascontiguousarray(weights.reshape(phases, r).T)
-    rest, sums, seen, done = None, None, 0, 0
+    rest = None
     for block in blocks:
-        seen += block.shape[-1]
         rest = block if rest is None or not rest.shape[-1] else np.concatenate([rest, block], axis=-1)
-        sums = _with_sums(sums, rest, turned)
-        rest = rest[..., rest.shape[-1] // r * r :]
-        if (count := sums.shape[-2] - phases + 1) > 0:
-            yield _windows(sums, count)
-            sums, done = sums[..., count:, :], done + count
-    if rest is None or (count := (seen - len(taps)) // r + 1 - done) <= 0:
-        return
-    padded = np.zeros((*rest.shape[:-1], r))  # the last window reaches into an incomplete group
-    padded[..., : rest.shape[-1]] = rest
-    yield _windows(_with_sums(sums, padded, turned), count)
+        if (count := (rest.shape[-1] - len(taps)) // r + 1) > 0:
+            yield _windows(rest, taps, r, count)
+            rest = rest[..., count * r :]
 
 
 def decimate_regressor(
@@ -171,18 +158,23 @@ def decimate_regressor(
         yield from (np.moveaxis(part, -1, 0) for part in decimate_blocks(blocks, decimator))
 
 
-def _with_sums(before: np.ndarray | None, values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the sums (..., g, phases) of the groups of r samples before and of those in `values` (..., N)."""
-    r, phases = weights.shape
-    groups = values.shape[-1] // r
-    whole = np.ascontiguousarray(values[..., : groups * r]).reshape(-1, r)
-    sums = (whole @ weights).reshape(*values.shape[:-1], groups, phases)
-    return sums if before is None else np.concatenate([before, sums], axis=-2)
+def _windows(values: np.ndarray, taps: np.ndarray, r: int, count: int) -> np.ndarray:
+    """Return the first `count` windows (..., count) of values (..., N), one every r samples.
 
-
-def _windows(sums: np.ndarray, count: int) -> np.ndarray:
-    """Return the first `count` windows (..., count): each phase's share from the group it falls into."""
-    return np.asarray(sum(sums[..., i : i + count, i] for i in range(sums.shape[-1])))
+    As many windows at a time as one is long, as a product with their band of taps: twice the multiplications, which
+    the processor's cache makes up for many times over.
+    """
+    flat = values.reshape(-1, values.shape[-1])
+    together = min(count, -(-len(taps) // r))
+    band = np.zeros(((together - 1) * r + len(taps), together))
+    for k in range(together):
+        band[k * r : k * r + len(taps), k] = taps
+    result = np.empty((len(flat), count))
+    for first in range(0, count, together):
+        width = min(together, count - first)
+        rows = (width - 1) * r + len(taps)
+        result[:, first : first + width] = flat[:, first * r : first * r + rows] @ band[:rows, :width]
+    return result.reshape(*values.shape[:-1], count)
 
 
 def _kaiser(factor: int) -> np.ndarray:

@@ -245,8 +245,10 @@ class _Fixed:
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """One round's estimate, the triangles it came from, and the inflation that its residuals show."""
+    """One round's rows and instruments, triangles of what it took of them, estimate, and the residuals' inflation."""
 
+    observed: Sequence[ObservationRows]
+    simulated: Sequence[np.ndarray]
     problem: Instruments
     fit: LinearFit
     tau: float
@@ -271,12 +273,17 @@ def _estimate_round(task: _Fixed, runs: Runs, std: np.ndarray, tau: float) -> _F
         for (case, loop), run in runs
     ]
     observed = [
-        replace(rows, matrix=np.where(_drowned_signs(task.model, columns, case), z, rows.matrix))
+        _with_signs(rows, z, _drowned_signs(task.model, columns, case))
         for rows, z, (case, _) in zip(task.observed, simulated, task.cases)
     ]
-    problem = _stack(observed, simulated)
+    problem = _stack(observed, simulated, task.estimator.measured)
     fit, bound = _held_fit(task, problem, std, tau)
-    return _Found(problem, fit, _inflation(observed, fit), bound)
+    return _Found(observed, simulated, problem, fit, _inflation(observed, fit), bound)
+
+
+def _with_signs(rows: ObservationRows, simulated: np.ndarray, drowned: np.ndarray) -> ObservationRows:
+    """Return rows with the simulated columns (M, rows, p) in place of those that are `drowned` (p,) in noise."""
+    return replace(rows, matrix=np.where(drowned, simulated, rows.matrix)) if drowned.any() else rows
 
 
 def _drowned_signs(model: IdentificationModel, columns: np.ndarray, case: Case) -> np.ndarray:
@@ -295,12 +302,13 @@ def _result(
     task: _Fixed, found: _Found, ordinary: LinearFit, plant: Plant, rounds: Sequence[Round], std: np.ndarray, runs: Runs
 ) -> Instrumental:  # fmt: skip
     """Return the last round, sigmas with its own inflation, with what the tests say of it."""
-    fit, bound = _held_fit(task, found.problem, std, found.tau)
-    verdict = instrumental_variables.exogeneity(found.problem, std, found.tau)
-    strength = instrumental_variables.strength(found.problem, std)
+    problem = found.problem if task.estimator.measured else _stack(found.observed, found.simulated)
+    fit, bound = _held_fit(task, problem, std, found.tau)
+    verdict = instrumental_variables.exogeneity(problem, std, found.tau)
+    strength = instrumental_variables.strength(problem, std)
     return Instrumental(
         fit, ordinary, frozen(task.kept, int), plant, tuple(rounds), strength, verdict, frozen(std), found.tau,
-        _distance(runs), bound, found.problem, task.estimator,
+        _distance(runs), bound, problem, task.estimator,
     )  # fmt: skip
 
 
@@ -398,17 +406,18 @@ def _simulate_new(
     raise CannotSimulate(f"the estimate cannot be simulated, nor anything near: {problem}", task.plant(old, found))
 
 
-def _stack(observed: Sequence[ObservationRows], simulated: Sequence[np.ndarray]) -> Instruments:
-    """Return the triangles of [Z W y], one group per torque row."""
-    problem: Instruments | None = None
+def _stack(
+    observed: Sequence[ObservationRows], simulated: Sequence[np.ndarray], measured: bool = True
+) -> Instruments:  # fmt: skip
+    """Return the triangles of [Z W y], one group per torque row; of [Z 0 y], at a quarter of the cost, or less."""
+    first, count = observed[0], observed[0].target.shape[1]
+    problem = instrumental_variables.unseen(first.names, first.units, count)
     for rows, z in zip(observed, simulated, strict=True):
-        samples, count, p = rows.matrix.shape
-        used = rows.present.T.ravel()
-        group = np.repeat(np.arange(count), samples)[used]
-        w, z = (x.transpose(1, 0, 2).reshape(-1, p)[used] for x in (rows.matrix, z))
-        target = rows.target.T.ravel()[used]
-        problem = instrumental_variables.instrument(z, w, target, group, rows.names, rows.units, problem)
-    assert problem is not None  # `cases` is not empty
+        for row in range(count):
+            used = slice(None) if rows.present[:, row].all() else rows.present[:, row]  # no copy of all
+            own = z[used, row]
+            w = rows.matrix[used, row] if measured else np.zeros_like(own)
+            problem = instrumental_variables.instrument(own, w, rows.target[used, row], row, before=problem)
     return problem
 
 
