@@ -276,7 +276,7 @@ def main() -> None:
     }  # fmt: skip
     todo |= {name: partial(elsewhere, name, seconds / 3.0, first) for name in others}
     kept = json.loads(place.read_text(encoding="utf-8")) if place.exists() else {}
-    found = kept if kept.get("seconds") == seconds else {"seconds": seconds}
+    found: dict[str, Any] = kept if kept.get("seconds") == seconds else {"seconds": seconds}
     for name, work in todo.items():
         if name not in found:
             found[name] = work()

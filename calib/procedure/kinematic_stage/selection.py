@@ -17,13 +17,14 @@ from calib.geometry.observability import observation, targets_of
 from calib.procedure.kinematic_stage.inputs import joint_kinds, load_robot
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
 from calib.procedure.measuring.camera_view import ASSUMED, ImageObservation, image_observation
+from calib.procedure.measuring.drivable import Drivable, Exchange, drivable
 from calib.procedure.measuring.pose_limits import Limits, read_limits
 from calib.procedure.measuring.prediction import Prediction, Seen, by_count
 from calib.procedure.measuring.prediction import predicted as foretold
 from calib.procedure.measuring.prediction import table as outlook_table
-from calib.procedure.measuring.promise import SelectionPromise, beside
+from calib.procedure.measuring.promise import NOISES, SelectionPromise, beside
 from calib.procedure.measuring.promise import write as write_promise
-from calib.procedure.measuring.run import Run, RunSettings, plan_run
+from calib.procedure.measuring.run import Run, RunSettings
 from calib.procedure.measuring.run import lines as ways
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
@@ -157,15 +158,31 @@ def choose(
     found = select_poses(None, m, search, q=candidates, space=space, existing=before, map=map, progress=progress)
     assert found.q is not None
     comparable = float(found.history[0]) if method == "polish" else found.value
-    outlook = _outlook(jacobian, limits, search, m, found.q, candidates, before, comparable)
     notes += [] if view is None else [ASSUMED]
-    q = same_turn(chain, found.q, limits.lower, limits.upper)
-    run = plan_run(chain, q, limits, settings.run, settings.seed, lambda words: progress and progress(0, 1, words))
-    indices = None if found.indices is None else found.indices[run.order]
-    found = replace(found, q=q[run.order], indices=indices)
+    driven = drivable(
+        chain, found.q, Exchange(space.jacobian, candidates, before, index), limits, settings.run, settings.seed,
+        lambda words: progress and progress(0, 1, words),
+    )  # fmt: skip
+    found, run = _driven(found, driven), driven.run
+    notes += [driven.words] if driven.replaced else []
+    outlook = _outlook(jacobian, limits, search, m, driven.q, candidates, before, comparable)
     return Chosen(
         chain, found, len(jacobian.free), value, limits.checked, limits.unchecked, tuple(notes), outlook, run,
         settings.run, view is not None, _promise(jacobian, outlook),
+    )  # fmt: skip
+
+
+def _driven(found: Selection, driven: Drivable) -> Selection:
+    """Return a selection in the order of its run, with what the poses that were replaced cost."""
+    indices, value = found.indices, driven.value[1] if driven.replaced else found.value
+    if indices is not None:
+        indices = indices.copy()
+        indices[list(driven.replaced)] = list(driven.replaced.values())
+        indices = indices[driven.run.order]
+    history = np.append(found.history, value) if driven.replaced else found.history
+    return replace(
+        found, q=driven.q[driven.run.order], indices=indices, value=value, history=history,
+        efficiency=found.efficiency * float(np.exp(driven.gain)),
     )  # fmt: skip
 
 
@@ -206,13 +223,16 @@ def _outlook(
 
 def _promise(seen: Seen, outlook: PoseOutlook) -> SelectionPromise | None:
     """Return what is kept of an outlook; None where the poses do not tell all parameters."""
-    own, by_images = outlook.poses, isinstance(seen, ImageObservation)
+    own = outlook.poses
     if not np.isfinite(own.rms):
         return None
-    noise = {} if by_images else dict(zip(("position", "orientation"), seen.sigmas[: 1 + seen.full]))
+    noise = dict[str, float]()
+    if not isinstance(seen, ImageObservation):
+        noise = dict(zip(list(NOISES)[: 1 + seen.full], seen.sigmas))
     return SelectionPromise(
         seen.cell.chain.joint_names, own.poses, own.names, own.units, tuple(own.sigmas.tolist()),
-        tuple(map(tuple, outlook.typical.tolist())), tuple(own.spread.tolist()), noise, by_images,
+        tuple(map(tuple, outlook.typical.tolist())), tuple(own.spread.tolist()), noise,
+        isinstance(seen, ImageObservation),
     )  # fmt: skip
 
 
@@ -231,27 +251,6 @@ def _blind(
     other = select_poses(None, m, quick, space=free, existing=past if len(past) else None)
     assert other.q is not None
     return other.value, foretold(seen, np.concatenate([free.jacobian(other.q), past]), typical, m)
-
-
-def same_turn(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Return the same poses (m, n) with each revolute joint on one turn, cut where the fewest poses are passed.
-
-    A joint with more than one turn can stand everywhere on two; the cut is the middle of the largest gap between the
-    poses' angles (where there is one of more than 30 degrees, else half a turn from the middle of the range), so that
-    moves between them need not go the long way round.
-    """
-    result, full = q.copy(), 2 * np.pi
-    for j, joint in enumerate(chain.joints):
-        if joint.kind != "revolute" or upper[j] - lower[j] <= full:
-            continue
-        middle, angles = (lower[j] + upper[j]) / 2, np.sort(np.mod(q[:, j], full))
-        gaps = np.diff(np.append(angles, angles[0] + full))
-        k = int(gaps.argmax())
-        cut = angles[k] + gaps[k] / 2 if gaps[k] > np.radians(30.0) else middle - np.pi
-        cut += full * np.round((middle - np.pi - cut) / full)
-        moved = cut + np.mod(q[:, j] - cut, full)
-        result[:, j] = np.where((moved >= lower[j]) & (moved <= upper[j]), moved, q[:, j])
-    return result
 
 
 def targets(out: Path, plots: bool) -> dict[str, Path]:

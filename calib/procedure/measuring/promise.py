@@ -53,7 +53,7 @@ class SelectionPromise:
 
 def beside(poses: Path) -> Path:
     """Return where the prediction of a CSV of chosen poses lies."""
-    return poses.with_name(poses.stem + SUFFIX)
+    return poses.parent / (poses.stem + SUFFIX)
 
 
 def write(promise: SelectionPromise, poses: Path) -> Path:
@@ -121,8 +121,8 @@ def _row(
     typical: Callable[[np.ndarray], float] = np.median,
 ) -> KeptPromise | None:  # fmt: skip
     factor, printed = SMALL[unit]
-    scaled = [{name: factor * sigma for name, sigma in each.items()} for each in (predicted, stated)]
-    return held(kind, printed, *scaled, typical)
+    before, after = ({name: factor * sigma for name, sigma in each.items()} for each in (predicted, stated))
+    return held(kind, printed, before, after, typical)
 
 
 def _numbered(sigmas: Sequence[float] | np.ndarray) -> dict[str, float]:

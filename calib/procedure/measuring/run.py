@@ -14,11 +14,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.sparse.csgraph import shortest_path
 
 from calib import files
 from calib.data.csv_table import read_table
@@ -35,8 +36,10 @@ RISE = 2.0  # acceleration [1/s] times the speed: half a second to get there; ou
 BLOCKED = 3.0  # times that a straight move which does not keep clear is taken to last; our choice
 PLACES = 8  # of a straight move that are looked at to guess whether it keeps clear
 ROUNDS, QUICK, PATIENT = 4, 250, 1000  # orders tried, and random places per way in them and in the last; our choice
+NEAR = 8  # turns of a pose, and poses to come from, that are tried to tell whether there is any way; our choice
 FORBIDDEN = 1e4  # [s] a move for which no way was found
 Progress = Callable[[str], None]
+Ways = dict[tuple[int, int], np.ndarray]  # by the numbers of two poses, the smaller one first
 
 
 @dataclass(frozen=True)
@@ -84,6 +87,22 @@ class Run:
     blocked: tuple[int, ...]
 
     @property
+    def found_ways(self) -> Ways:
+        """The clear ways, by the numbers of the poses as they came."""
+        pairs = enumerate(pairwise(self.order))
+        return {
+            _pair(one, two): self.ways[k] if one < two else self.ways[k][::-1]
+            for k, (one, two) in pairs if k not in self.blocked
+        }  # fmt: skip
+
+    @property
+    def cut_off(self) -> tuple[int, ...]:
+        """Numbers of the poses, as they came, that no clear way was found to from where most of them are."""
+        parts = np.split(self.order, np.array(self.blocked, dtype=int) + 1)
+        most = max(parts, key=len)
+        return tuple(sorted(int(k) for part in parts if part is not most for k in part))
+
+    @property
     def seconds(self) -> float:
         """The run's duration [s]."""
         return float(self.times.sum()) + self.dwell * len(self.order)
@@ -96,8 +115,12 @@ def plan_run(
     settings: RunSettings = DEFAULT_RUN,
     seed: int = 0,
     progress: Progress | None = None,
+    found: Ways | None = None,
 ) -> Run:
     """Order poses q (m, n) [rad or m], and find the ways between them.
+
+    Where an order is left with a pair that no clear way was found for, the ways found so far serve: from one pose to
+    another by way of third ones.
 
     Args:
         chain: the arm, for its speeds.
@@ -105,24 +128,30 @@ def plan_run(
         settings: speed and dwell.
         seed: of the search for ways around.
         progress: called with a few words now and then.
+        found: clear ways that are known already, see `Run.found_ways`; those between other places are left out.
     """
     say, (velocity, acceleration) = progress or (lambda words: None), _speeds(chain, settings.speed)
     seconds = partial(move_times, velocity=velocity, acceleration=acceleration)
     room = _room(chain, limits, velocity)
     say("which moves keep clear")
     cost = np.where(_clear_at_places(room, q), 1.0, BLOCKED) * seconds(q[:, None], q)
-    known: dict[tuple[int, int], np.ndarray | None] = {}
+    known = dict[tuple[int, int], np.ndarray | None]()
+    for (one, two), own in (found or {}).items():
+        if np.array_equal(own[[0, -1]], q[[one, two]]):
+            known[one, two] = own
+            cost[one, two] = cost[two, one] = seconds(own[:-1], own[1:]).sum()
     for tries in (*[QUICK] * ROUNDS, PATIENT):
         order = tour(cost)
         fresh = [pair for pair in map(_pair, order[:-1], order[1:]) if known.get(pair) is None]
         for number, (one, two) in enumerate(fresh, 1):
             say(f"way {number} of {len(fresh)}")
-            found = way(room, q[one], q[two], seed=seed + number, most=tries)
-            known[one, two] = found
-            spent = FORBIDDEN if found is None else float(seconds(found[:-1], found[1:]).sum())
-            cost[one, two] = cost[two, one] = spent
+            own = way(room, q[one], q[two], seed=seed + number, most=tries)
+            known[one, two] = own
+            cost[one, two] = cost[two, one] = FORBIDDEN if own is None else seconds(own[:-1], own[1:]).sum()
         if all(known[_pair(*pair)] is not None for pair in pairwise(order)):
             break
+    else:
+        order = _joined(known, cost)
     ways, blocked = [], []
     for number, (one, two) in enumerate(pairwise(order)):
         own = known[_pair(one, two)]
@@ -132,6 +161,76 @@ def plan_run(
     times = np.array([seconds(each[:-1], each[1:]).sum() for each in ways])
     before = float(seconds(q[:-1], q[1:]).sum()) + settings.dwell * len(q)
     return Run(order, tuple(ways), times, settings.dwell, before, sum(len(w) > 2 for w in ways), tuple(blocked))
+
+
+def same_turn(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Return the same poses (m, n) with each revolute joint on one turn, cut where the fewest poses are passed.
+
+    A joint with more than one turn can stand everywhere on two; the cut is the middle of the largest gap between the
+    poses' angles (where there is one of more than 30 degrees, else half a turn from the middle of the range), so that
+    moves between them need not go the long way round.
+    """
+    result, full = q.copy(), 2 * np.pi
+    for j, joint in enumerate(chain.joints):
+        if joint.kind != "revolute" or upper[j] - lower[j] <= full:
+            continue
+        middle, angles = (lower[j] + upper[j]) / 2, np.sort(np.mod(q[:, j], full))
+        gaps = np.diff(np.append(angles, angles[0] + full))
+        k = int(gaps.argmax())
+        cut = angles[k] + gaps[k] / 2 if gaps[k] > np.radians(30.0) else middle - np.pi
+        cut += full * np.round((middle - np.pi - cut) / full)
+        moved = cut + np.mod(q[:, j] - cut, full)
+        result[:, j] = np.where((moved >= lower[j]) & (moved <= upper[j]), moved, q[:, j])
+    return result
+
+
+def _joined(known: dict[tuple[int, int], np.ndarray | None], cost: np.ndarray) -> np.ndarray:
+    """Return the order of least time where ways may lead by third poses; those used are added to the known ones."""
+    direct = np.full(cost.shape, np.inf)
+    for (one, two), own in known.items():
+        if own is not None:
+            direct[one, two] = direct[two, one] = cost[one, two]
+    total, before = shortest_path(direct, directed=False, return_predecessors=True)
+    order = tour(np.where(np.isfinite(total), total, FORBIDDEN))
+    for one, two in (_pair(*pair) for pair in pairwise(order)):
+        stops = [two]
+        while stops[-1] != one and np.isfinite(total[one, two]):
+            stops.append(int(before[one, stops[-1]]))
+        legs = []
+        for late, early in pairwise(stops):
+            own = known[_pair(early, late)]
+            assert own is not None
+            legs.append(own if early < late else own[::-1])
+        known[one, two] = np.concatenate([legs[-1][:1], *(leg[1:] for leg in legs[::-1])]) if legs else None
+    return order
+
+
+def turns(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Return the postures (k, n) within limits that are that of q (n,), its revolute joints on all turns."""
+    values = []
+    for j, joint in enumerate(chain.joints):
+        other = q[j] + 2 * np.pi * np.arange(-3, 4) if joint.kind == "revolute" else q[j : j + 1]
+        values.append(other[(other >= lower[j]) & (other <= upper[j])])
+    return np.array(list(product(*values)))
+
+
+def way_to(
+    chain: Chain, limits: Any, settings: RunSettings, postures: np.ndarray, others: np.ndarray, *, straight: bool,
+    seed: int = 0,
+) -> tuple[int, np.ndarray] | None:  # fmt: skip
+    """Return a clear way (k, n) to one of some postures (p, n) from one of others (m, n), and from which; None: none.
+
+    The moves of least time are tried, for each of the `NEAR` nearest postures: straight ones from the `NEAR` nearest of
+    the others, or with via-points from the nearest.
+    """
+    velocity, acceleration = _speeds(chain, settings.speed)
+    room, times = _room(chain, limits, velocity), move_times(postures[:, None], others, velocity, acceleration)
+    for end in np.argsort(times.min(axis=1))[:NEAR]:
+        for start in np.argsort(times[end])[: NEAR if straight else 1]:
+            own = way(room, others[start], postures[end], seed=seed, most=0 if straight else QUICK)
+            if own is not None:
+                return int(start), own
+    return None
 
 
 def _pair(one: int, two: int) -> tuple[int, int]:

@@ -16,7 +16,7 @@ from calib.procedure.kinematic_stage.settings import SelectionSettings
 from calib.procedure.measuring.camera_view import BLIND
 from calib.procedure.measuring.pose_limits import read_limits
 from calib.procedure.measuring.promise import SelectionPromise
-from calib.procedure.measuring.run import Run
+from calib.procedure.measuring.run import Run, same_turn
 from calib.procedure.session.folder import PREDICTED, Session
 from calib.robot.chain import Chain
 from poses.candidates import draw_candidates
@@ -100,4 +100,4 @@ def _unseen(session: Session, robot_file: Any, chain: Chain, count: int) -> np.n
     if limits.camera is not None:
         return limits.camera.draw(count, partial(is_feasible, space), limits.lower, limits.upper, stream)
     q = draw_candidates(limits.lower, limits.upper, count, lambda q: is_feasible(space, q), seed=stream)
-    return selection.same_turn(chain, q, limits.lower, limits.upper)
+    return same_turn(chain, q, limits.lower, limits.upper)

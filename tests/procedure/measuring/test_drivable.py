@@ -1,0 +1,74 @@
+"""A pose that no clear way leads to is driven on another turn of its joints, or a candidate takes its place."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from calib.geometry.observability import observation, targets_of
+from calib.procedure.measuring.drivable import Exchange, drivable
+from calib.procedure.measuring.run import RunSettings, plan_run, turns
+from calib.robot.load import load
+
+CHAIN = load("ur5")
+FULL = 2 * np.pi
+
+
+class Barrier:
+    """A wall through the axis of the first joint, at one of its angles."""
+
+    def free(self, q: np.ndarray, clearance: float) -> np.ndarray:
+        return np.abs(np.angle(np.exp(1j * q[:, 0]))) > 0.1
+
+
+def limits(most: float) -> SimpleNamespace:
+    top = np.array([most, 2.0, 2.0, 2.0, 2.0, 2.0])
+    return SimpleNamespace(lower=-top, upper=top, collision=Barrier(), clearance=0.05)
+
+
+def poses(count: int, seed: int, side: float) -> np.ndarray:
+    q = np.random.default_rng(seed).uniform(-1.5, 1.5, (count, 6))
+    q[:, 0] = side * np.random.default_rng(seed + 1).uniform(0.2, 2.5, count)
+    return q
+
+
+@pytest.mark.parametrize("index", ["O1", "O3"])
+def test_poses_behind_a_wall_are_replaced_by_those_that_cost_least(index):
+    room, seen = limits(2.8), observation(targets_of(CHAIN))
+    q = np.concatenate([poses(9, 1, 1.0), poses(2, 2, -1.0)])
+    candidates = np.concatenate([poses(60, 3, 1.0), poses(60, 4, -1.0)])
+    assert plan_run(CHAIN, q, room).cut_off == (9, 10)
+    exchange = Exchange(seen, candidates, None, index)
+    found = drivable(CHAIN, q, exchange, room, RunSettings())
+    assert set(found.replaced) == {9, 10} and not found.run.blocked and np.array_equal(found.q[:9], q[:9])
+    assert all(number < 60 for number in found.replaced.values())  # on the side where the others are
+    trials = [exchange.value(np.concatenate([found.q[:10], one[None]]))[0] for one in candidates[:60]]
+    assert found.value[1] == pytest.approx(max(trials), rel=1e-9)
+    assert found.value == pytest.approx((exchange.value(q)[0], exchange.value(found.q)[0]))
+    named = [number for number, place in enumerate(found.run.order, 1) if place > 8]
+    assert found.words.startswith(f"poses {named[0]}, {named[1]} replaced")
+
+
+def test_the_same_pose_on_another_turn_is_kept():
+    room, seen = limits(6.0), observation(targets_of(CHAIN))
+    q = np.concatenate([poses(9, 1, 1.0), poses(2, 2, -1.0)])
+    found = drivable(CHAIN, q, Exchange(seen, poses(60, 3, 1.0), None, "O1"), room, RunSettings())
+    assert not found.replaced and not found.words and not found.run.blocked
+    assert np.abs(np.sin((found.q - q) / 2)).max() < 1e-9
+    assert found.value[0] == pytest.approx(found.value[1], rel=1e-9)
+
+
+def test_what_cannot_be_replaced_is_told():
+    room, seen = limits(2.8), observation(targets_of(CHAIN))
+    q = np.concatenate([poses(9, 1, 1.0), poses(1, 2, -1.0)])
+    found = drivable(CHAIN, q, Exchange(seen, poses(60, 4, -1.0), None, "O1"), room, RunSettings())
+    assert found.run.cut_off == (9,) and len(found.run.blocked) == 1 and not found.replaced
+
+
+def test_turns_are_the_same_posture_within_the_limits():
+    top = np.array([6.2, 2.0, 2.0, 2.0, 2.0, 9.0])
+    found = turns(CHAIN, np.full(6, 1.0), -top, top)
+    assert len(found) == 2 * 3 and (np.abs(found) <= top).all()
+    assert np.abs(np.sin((found - 1.0) / 2)).max() < 1e-12
