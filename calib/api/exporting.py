@@ -22,6 +22,7 @@ def export(
     into: str | Path,
     *,
     urdf: str | Path | None = None,
+    prior: str = "entropic",
 ) -> tuple[str, ...]:
     """Write a calibrated robot, with its dynamics where they were identified, for other programs.
 
@@ -33,6 +34,7 @@ def export(
         result: a fit, an identification, or the folder of one.
         into: folder for the files.
         urdf: description of the nominal robot to edit, everything else in it kept; by default the fit's own source.
+        prior: draws masses that the torques do not tell to the robot's own, ``entropic`` or ``euclidean``.
 
     Returns:
         What was written and what to know of it, in words.
@@ -46,7 +48,7 @@ def export(
         identified = is_identified(place)
         delivery.check_into(into, place, optional(urdf), dynamics.WRITTEN if identified else delivery.WRITTEN)
         if identified:
-            return tuple(dynamics.deliver_dynamics(place, optional(urdf), into))
+            return tuple(dynamics.deliver_dynamics(place, optional(urdf), into, prior))
         return tuple(delivery.deliver(place, _source_of(place) if urdf is None else Path(urdf), into))
 
 

@@ -181,6 +181,9 @@ def export(
     for_corrections: Annotated[
         bool, typer.Option("--for-corrections", help="the URDF that joint_corrections.csv belongs to, worse without it")
     ] = False,
+    prior: Annotated[
+        str, typer.Option(help="with --into: what draws masses that the torques do not tell, entropic or euclidean")
+    ] = "entropic",
 ) -> None:
     """Write the calibrated robot for other programs. With --into: in all forms, identified dynamics included."""
     from calib.errors import UsageError
@@ -195,7 +198,7 @@ def export(
             raise UsageError("--into writes all files into one folder; leave --out, --ur-kinematics and --offsets out")
         with progress() as show:
             show("all forms, and each file read back")
-            lines = export_all(folder, into, urdf=urdf)
+            lines = export_all(folder, into, urdf=urdf, prior=prior)
         say_written(lines, into)
         return
     if (urdf is None) != (out is None) or not (urdf or ur_kinematics or offsets):

@@ -10,6 +10,7 @@ from scipy.stats import chi2
 from calib.dynamics import base as bases
 from calib.dynamics import pseudo_inertia
 from calib.dynamics.idim import IdentificationModel, from_chain
+from calib.errors import UsageError
 from calib.identification.possible import solve
 from calib.identification.possible.information import Information, whitened
 from calib.identification.possible.nearest import nearest
@@ -122,6 +123,19 @@ def test_an_impossible_base_is_told_with_the_body_and_a_possible_one_is_not():
     assert any("body 2" in name or "body 3" in name for name, _ in found.blamed)
     assert found.blamed[0][1] < found.nearest
     assert (found.margins > 0.0).all(), "what is exported is possible all the same"
+
+
+def test_the_euclidean_prior_is_another_robot_as_near_to_the_data():
+    """They differ in what the torques do not tell; only the entropic one keeps off the border of what can exist."""
+    _, _, _, data = planted(3)
+    entropic, euclidean = (solve.find_possible(data, prior=prior) for prior in solve.PRIORS)
+    assert max(entropic.distance, euclidean.distance) < entropic.allowed == euclidean.allowed
+    assert np.abs(entropic.dynamics.values - euclidean.dynamics.values).max() > 1e-3
+    assert euclidean.prior == "euclidean" and euclidean.margins.min() < entropic.margins.min()
+    spread = np.sqrt(np.diag(euclidean.covariance))
+    assert np.isfinite(spread).all() and (spread[:10] > 0.0).all()
+    with pytest.raises(UsageError, match="prior 'euclid' is none of entropic, euclidean"):
+        solve.find_possible(data, prior="euclid")
 
 
 def test_without_a_cad_rods_of_a_mass_the_data_choose_stand_in():

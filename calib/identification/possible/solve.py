@@ -8,7 +8,8 @@ Fv, Fc (1×1 matrices of the same kind), the parameters are
     `calib.identification.possible.information`
 
 with the log-det divergence D (Lee, Wensing & Park 2020): convex, the same in any frame and any unit, and infinite at
-the border, so every body is possible with a margin. A Euclidean distance would need a weight between kg and kg m².
+the border, so every body is possible with a margin. A plain Euclidean distance would need a weight between kg and kg
+m²; that in the coordinates of P_i⁰ does not, and may be asked for (`calib.identification.possible.nearest`).
 
 How much the CAD counts. exp(-½ γ D) is, up to its norm, the Wishart density of a 4×4 matrix with mode P⁰ and γ + 5
 degrees of freedom (our observation), so γ has a marginal likelihood,
@@ -43,7 +44,7 @@ from scipy.special import multigammaln  # type: ignore[attr-defined]
 from calib.arrays import frozen
 from calib.dynamics import pseudo_inertia
 from calib.dynamics.idim import IdentificationModel
-from calib.errors import NotConverged, UsageError
+from calib.errors import NotConverged, UsageError, suggestion
 from calib.identification.possible import nearest as border
 from calib.identification.possible.information import Information
 from calib.identification.possible.prior_bodies import PriorBodies, find_prior_bodies
@@ -53,6 +54,7 @@ from calib.identification.prediction import Dynamics
 LEAST = 20.0  # of γ with a CAD
 WEIGHTS = tuple(float(10.0 ** (k / 4)) for k in range(0, 19))  # γ tried, 1 to 30 000
 SMALLEST = 1e-3  # of γ, where the estimate asks for less CAD than the evidence does
+PRIORS = ("entropic", "euclidean")
 STEPS = 200
 RIDGES = (0.0, 1e-12, 1e-10, 1e-8, 1e-6)  # of a unit diagonal
 SETTLED = 1e-8  # Newton decrement²: the cost is within half of it of its least
@@ -74,6 +76,7 @@ class PossibleBodies:
         blamed: labels of the bodies or names of the drive terms that cost most of `nearest`, worst first, and the
             distance without the demand on each; empty where it is within `allowed`.
         source: where P⁰ comes from, in words.
+        prior: one of `PRIORS`.
         notes: what the engineer should know.
     """
 
@@ -87,6 +90,7 @@ class PossibleBodies:
     allowed: float
     blamed: tuple[tuple[str, float], ...]
     source: str
+    prior: str
     notes: tuple[str, ...]
 
     def __post_init__(self) -> None:
@@ -99,18 +103,21 @@ class PossibleBodies:
         return self.nearest <= self.allowed
 
 
-def find_possible(information: Information, weight: float | None = None) -> PossibleBodies:
+def find_possible(information: Information, weight: float | None = None, prior: str = "entropic") -> PossibleBodies:
     """Return the full standard parameters of an identified model.
 
     Args:
         information: what was identified.
-        weight: γ; None: where the evidence is largest.
+        weight: γ; None: where the evidence of the entropic prior is largest, for both.
+        prior: ``entropic``, or ``euclidean``, its second order at P⁰, with which bodies may be on the border.
 
     Raises:
-        UsageError: for a model without bodies (motor side alone).
+        UsageError: for a model without bodies (motor side alone), or a prior that is none.
     """
     from scipy.special import chdtri
 
+    if prior not in PRIORS:
+        raise UsageError(f"prior '{prior}' is none of {', '.join(PRIORS)}{suggestion(prior, PRIORS)}")
     model = information.dynamics.model
     if not model.torque_rows.has_bodies:
         raise UsageError("the model holds drives alone (kind 'drive'): there are no bodies to make consistent")
@@ -131,13 +138,16 @@ def find_possible(information: Information, weight: float | None = None) -> Poss
     _, gamma, problem, values, references = max(
         (candidate for choice in choices for candidate in _candidates(*choice, weight, doubt)), key=lambda one: one[0]
     )
+    euclidean = prior == "euclidean"
+    values = border.nearest(problem, pull=gamma) if euclidean else values
     while weight is None and away <= allowed < information.distance(values) and gamma > SMALLEST:
         gamma /= 2.0
-        values = solve(problem, gamma)
+        values = border.nearest(problem, pull=gamma) if euclidean else solve(problem, gamma)
+    curved_at = _reference(problem) if euclidean else values
     return PossibleBodies(
-        Dynamics(model, values), covariance(problem, gamma, values), gamma, doubt,
+        Dynamics(model, values), covariance(problem, gamma, curved_at), gamma, doubt,
         np.array([pseudo_inertia.margin(body) for body in _bodies(problem, values)]),
-        information.distance(values), away, allowed, blamed, references.source,
+        information.distance(values), away, allowed, blamed, references.source, prior,
         (*references.notes, *_notes(model, information, problem, values, allowed)),
     )  # fmt: skip
 
@@ -162,12 +172,17 @@ def solve(problem: BodyCost, gamma: float) -> np.ndarray:
     Raises:
         NotConverged: with the last parameters.
     """
-    terms = np.where(problem.sizes > 0.0, np.where(problem.positive, problem.sizes, 0.0), problem.fixed)
-    values = np.concatenate([pseudo_inertia.to_standard(problem.references).ravel(), terms])
+    values = _reference(problem)
     rest = problem.factor[:, :-1] @ values - problem.factor[:, -1]
     for power in range(max(int(np.ceil(np.log10(1.0 + float(rest @ rest)))), 0), -1, -1):
         values = _descend(replace(problem, lift=10.0**power), gamma, values)
     return values
+
+
+def _reference(problem: BodyCost) -> np.ndarray:
+    """Return the standard parameters (p,) that the priors draw to."""
+    terms = np.where(problem.sizes > 0.0, np.where(problem.positive, problem.sizes, 0.0), problem.fixed)
+    return np.concatenate([pseudo_inertia.to_standard(problem.references).ravel(), terms])
 
 
 def _descend(problem: BodyCost, gamma: float, values: np.ndarray) -> np.ndarray:

@@ -12,7 +12,9 @@ joint_origins.yaml    with --urdf: origins as tesseract reads them, ``<calibrati
 parameters.json       names, units, values and covariances of geometry and dynamics, base and standard parameters, and
                       what consistency cost.
 
-Masses are those of bodies that can exist (`calib.identification.possible.solve`). A link to which others are fixed
+Masses are those of bodies that can exist (`calib.identification.possible.solve`). What the torques do not tell is drawn
+to the robot's own masses: by the entropic (log-det) prior, which keeps off the border of what can exist; with ``--prior
+euclidean`` by its second order, which does not, so that a body may come out thin. A link to which others are fixed
 (flange, covers, sensors) was identified with them as one body: the others keep the masses the source gives them, and
 the moving link takes the rest. Where that rest is no possible body, the moving link takes all and the others get mass
 zero. Links on joints that are not part of the arm (fingers) keep theirs, standing at zero. Payloads that were
@@ -40,13 +42,14 @@ TABLE = ("joint", "armature", "damping", "friction", "offset", "armature_unit", 
 WRITTEN = (URDF, MJCF, "drives.csv", "joint_origins.yaml", PARAMETERS)
 
 
-def deliver_dynamics(identified: Path, source: Path | None, out: Path) -> list[str]:
+def deliver_dynamics(identified: Path, source: Path | None, out: Path, prior: str = "entropic") -> list[str]:
     """Write the identified robot into `out`, in all forms (see the module).
 
     Args:
         identified: the folder of an identification.
         source: a URDF of the nominal robot; None: a URDF is written anew from the chain.
         out: folder for the files.
+        prior: that draws what the torques do not tell, see `calib.identification.possible.solve.PRIORS`.
 
     Returns:
         What was written, and what to know of it, in words.
@@ -54,7 +57,7 @@ def deliver_dynamics(identified: Path, source: Path | None, out: Path) -> list[s
     Raises:
         RobotError: where a file does not read back as the robot; nothing is written.
     """
-    given = read(identified)
+    given = read(identified, prior)
     content, encoding = (urdf_write.write_new(given.chain), "utf-8") if source is None else text(source)
     where = "the chain's own URDF" if source is None else str(source)
     edited, notes = as_urdf(given, content, where, given.chain if source is None else nominal_of(given.robot))

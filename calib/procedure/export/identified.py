@@ -51,11 +51,11 @@ def is_identified(folder: Path) -> bool:
     return (folder / MODEL).is_file()
 
 
-def read(folder: Path) -> IdentifiedRobot:
-    """Return what an identification left, with all parameters made those of possible bodies."""
+def read(folder: Path, prior: str = "entropic") -> IdentifiedRobot:
+    """Return what an identification left, all parameters made those of possible bodies by a prior (`find_possible`)."""
     refuse_currents(folder, "an export of masses")
     information = read_information(folder)
-    found = find_possible(information)
+    found = find_possible(information, prior=prior)
     own = bodies_of(information.chain).count
     bodies = found.dynamics.values[: 10 * own].reshape(own, 10)
     return IdentifiedRobot(geometry.read(folder), information, found, bodies, drive_table(found.dynamics))
@@ -66,7 +66,7 @@ def consistency_lines(found: PossibleBodies, b: int) -> list[str]:
     lines = [
         f"masses of possible bodies: thinnest {1e3 * float(found.margins.min()):.3g} mm (as a standard deviation), "
         f"{found.distance:.3g} sigmas from the estimate of {b} parameters (95 %: {found.allowed:.3g}); drawn to "
-        f"{found.source}, weight {found.weight:.3g} by the evidence"
+        f"{found.source}, weight {found.weight:.3g} by the evidence, {found.prior} prior"
     ]
     if not found.possible:
         blamed = ", ".join(f"{name} (without it {left:.3g})" for name, left in found.blamed)

@@ -44,6 +44,7 @@ def parameters(given: IdentifiedRobot) -> dict[str, Any]:
                 "allowed": found.allowed,
                 "margins_m": dict(zip(model.bodies.labels, found.margins.tolist())),
                 "weight": found.weight,
+                "prior": found.prior,
                 "sigmas_widened_by": found.doubt,
                 "drawn_to": found.source,
                 "blamed": dict(found.blamed),
