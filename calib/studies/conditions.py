@@ -49,7 +49,7 @@ from calib.identification.methods.registry import METHODS, method_named
 
 ROBOTS = ("tx40", "rv2sq")
 MISMATCHES = ("none", "geometry", "calibrated", "controller", "friction", "payload", "clock")
-TRIAL = 2  # raised whenever a trial of the same condition comes out otherwise: rows from before then do not count
+TRIAL = 1  # raised whenever a trial of the same condition comes out otherwise: rows from before then do not count
 
 _Few = Spread(words="a value, or a list of them")
 Robots = Annotated[tuple[Annotated[str, OneOf(ROBOTS)], ...], _Few]
