@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterable, Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from math import isfinite
+from math import inf, isfinite
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -62,12 +63,32 @@ def progress() -> Iterator[Any]:
         yield lambda words: status.update(str(words))
 
 
+def _now_and_then(every: float) -> Callable[[str], None]:
+    """Return a function that prints its words on stderr, at most once in so many seconds."""
+    due = time.monotonic() + every
+
+    def say_if_due(words: str) -> None:
+        nonlocal due
+        if (now := time.monotonic()) >= due:
+            due = now + every
+            print(words, file=sys.stderr, flush=True)
+
+    return say_if_due
+
+
 @contextmanager
-def reporting() -> Iterator[tuple[Any, Any]]:
-    """Yield two functions: for lines that stay, and for words that show while work goes on."""
+def reporting(logged: float = inf) -> Iterator[tuple[Any, Any]]:
+    """Yield two functions: for lines that stay, and for words that show while work goes on.
+
+    Args:
+        logged: seconds between such words on stderr where the output is no terminal, but a file or a job's log.
+    """
     from rich.markup import escape
 
     console = make_console()
+    if not console.is_terminal and logged < inf:
+        yield partial(say, console=console), _now_and_then(logged)
+        return
     with console.status("") as status:
         yield partial(say, console=console), lambda words: status.update(escape(words))
 

@@ -11,6 +11,7 @@ from calib.cli.shared import Base, Plots, Robot, Seed, Tip, reporting, say
 
 app = typer.Typer()
 SHOWN = 3  # conditions whose tables are printed in full
+LOGGED = 30.0  # [s] between two lines on progress where the output is no terminal
 
 
 @app.command()
@@ -44,13 +45,15 @@ def study(
     if out is None and (len(studies) > 1 or any(mark in studies[0] for mark in "*?[")):
         raise UsageError("several studies together need a folder: --out DIR")
     folder = out or Path(f"{Path(studies[0]).stem}-study")
-    with reporting() as (_, progress):
+    with reporting(LOGGED) as (_, progress):
         found = outcome.run_study(
             studies, folder, methods=_names(methods), runs=runs, where=workers, report_only=report_only, plots=plots,
             say=progress,
         )  # fmt: skip
     tables = [report.condition_table(one) for one in found.conditions if one.methods]
-    say(*console.rendered(tables if len(tables) <= SHOWN else [report.overview(found.conditions)]))
+    if len(tables) > SHOWN:
+        tables = [report.overview(found.conditions), report.torque_table(found.conditions)]
+    say(*console.rendered(tables))
     say(*outcome.described(found), f"written to {folder}: {outcome.REPORT} shows it")
 
 
@@ -75,7 +78,7 @@ def compare(
     from calib import files
     from calib.identification.identify_options import read_options
     from calib.procedure.dynamic_stage import inputs
-    from calib.procedure.dynamic_stage.method_comparison import compare_methods, write_table
+    from calib.procedure.dynamic_stage.method_comparison import caveats, compare_methods, write_table
     from calib.procedure.report import console
     from calib.procedure.study import method_table
 
@@ -90,9 +93,11 @@ def compare(
         found = compare_methods(
             given, chosen, friction, progress, lambda one: say_now(method_table.line(one))
         )  # fmt: skip
-    say(*console.rendered(method_table.blocks(found)))
+    say(*console.rendered(method_table.blocks(found)), *(f"note: {line}" for line in caveats(given, found)))
     if out is not None:
         say(f"written to {write_table(found, out)}")
+    if all(one.failure for one in found):
+        raise typer.Exit(3)
 
 
 def _names(text: str | None) -> list[str] | None:

@@ -4,14 +4,15 @@ TOML; SI units. Every combination of robot, noise, decimation, cutoff and mismat
 
     name = "small"
     about = "what it is for"
-    robot = ["tx40", "rv2sq"]        # robots with a known truth
+    robot = ["tx40", "rv2sq"]        # those two: their true inertias, friction and controller are known
     decimation = [1, 4]              # one sample in so many is kept, behind the parallel low-pass
     cutoff = 50.0                    # of the positions' zero-phase Butterworth filter [Hz], or a list; 0: none to speak
                                      # of (0.8 of the Nyquist frequency)
-    mismatch = "none"                # or a list: geometry (the robot is not what its drawing says), calibrated (the
-                                     # same, its geometry fitted first to 40 measured poses), controller (gains believed
-                                     # 30 % off), friction (a Stribeck peak that the model lacks), payload (1 kg nobody
-                                     # was told of), clock (torques logged 2 ms late)
+    mismatch = "none"                # or a list: geometry (the robot is off its drawing, 0.9 mm, 1.5 mrad and
+                                     # 9 mrad of joint offset rms), calibrated (the same, its geometry fitted first to
+                                     # 40 measured poses), controller (gains believed 30 % off), friction (a Stribeck
+                                     # peak of half Fc that the model lacks), payload (1 kg nobody was told of), clock
+                                     # (torques logged 2 ms late)
     methods = ["wls", "iv"]          # or "all": calib study --list-methods
     runs = 20                        # data sets per condition, each with noise of its own
     runs_loop = 10                   # of methods that simulate the closed loop; default: runs
@@ -176,11 +177,32 @@ def read_study(
     conditions = [condition for _, condition in found]
     names = [condition.name for condition in conditions]
     if twice := next((name for name in names if names.count(name) > 1), ""):
-        raise UsageError(f"there are two conditions '{twice}': give the files' studies names of their own")
+        raise UsageError(
+            f"there are two conditions '{twice}': name a value once in its list, and give noises (and studies of "
+            "several files) names of their own"
+        )
+    _check_cutoffs(conditions)
     counts = tuple(_counts(one, methods, runs) for one, _ in found)
     name = read[0].name if len(read) == 1 else f"{len(read)} studies"
     about = read[0].about if len(read) == 1 else ", ".join(one.name for one in read)
     return Study(name, about, tuple(conditions), counts, tuple(one.seed for one, _ in found))
+
+
+def _check_cutoffs(conditions: Sequence[Condition]) -> None:
+    """Refuse what no data set could be filtered with.
+
+    Raises:
+        UsageError: for a cut-off that the robot's log is sampled too slowly for.
+    """
+    from calib.simulation.cells import known_robots  # slow to load
+
+    for one in conditions:
+        most = 0.5 * float(known_robots.truth(one.robot)["control"]["sampling"])
+        if one.cutoff >= most:
+            raise UsageError(
+                f"{one.name}: cutoff: expected less than {most:g} Hz, half the rate of the {one.robot}'s log, found "
+                f"{one.cutoff:g}; 0 is unfiltered"
+            )
 
 
 def _paths(files: Sequence[str | Path]) -> list[Path]:

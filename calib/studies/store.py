@@ -129,8 +129,8 @@ def opened(folder: Path) -> Iterator[RowStore]:
 
 def read_rows(folder: Path) -> list[TrialRow]:
     """Return all rows of a folder, while another command writes there, too."""
-    found = {row.key: row for row in _read_whole(folder / WHOLE)}
-    found.update((row.key, row) for row in _read_journal(folder / JOURNAL)[0])
+    journal = _read_journal(folder / JOURNAL)[0]  # first: what is emptied into the other meanwhile, is read there
+    found = {row.key: row for row in (*_read_whole(folder / WHOLE), *journal)}
     return list(found.values())
 
 

@@ -67,6 +67,11 @@ class MethodSummary:
         return self.trials >= LEAST
 
     @property
+    def estimates(self) -> bool:
+        """Whether its median torque error is of estimates, not of failures."""
+        return bool(np.isfinite(self.figures["torque_error"].median))
+
+    @property
     def reliable(self) -> bool:
         return sum(self.failures.values()) <= (1.0 - RELIABLE) * self.trials
 
@@ -83,16 +88,33 @@ class ConditionSummary:
         """The method to take; None where none is reliable."""
         return next((one for one in self.methods if one.chosen), None)
 
+    @property
+    def best(self) -> MethodSummary | None:
+        """The first in rank of those with runs enough and an estimate; None without any."""
+        return next((one for one in self.methods if one.enough and one.estimates), None)
+
+    @property
+    def why_none(self) -> str:
+        """Why there is no method to take; "" where there is one, or no row."""
+        if self.chosen or not self.methods:
+            return ""
+        if not any(one.enough for one in self.methods):
+            return f"fewer than {LEAST} runs of any method tell nothing apart: --runs {LEAST} or more"
+        return f"no method of {LEAST} runs or more gives an estimate in {RELIABLE:.0%} of its trials"
+
 
 def summarise(study: Study, rows: Iterable[TrialRow]) -> list[ConditionSummary]:
-    """Return what rows say of a study's conditions; rows of others, and of methods not asked for, do not count."""
+    """Return what rows say of a study's conditions, all methods that have any; rows of other conditions do not count.
+
+    What a study asks for is what is to be run; what is there stays in sight when a method is added or taken out.
+    """
     kept: dict[str, dict[str, list[TrialRow]]] = {}
     for row in rows:
         kept.setdefault(row.digest, {}).setdefault(row.method, []).append(row)
     result = []
     for condition, runs in zip(study.conditions, study.runs):
-        own = {name: kept.get(condition.digest, {}).get(name, []) for name in runs}
-        result.append(_ranked(condition, {name: found for name, found in own.items() if found}))
+        own = kept.get(condition.digest, {})
+        result.append(_ranked(condition, {name: own[name] for name in dict.fromkeys((*runs, *own)) if name in own}))
     return result
 
 
@@ -106,7 +128,7 @@ def _ranked(condition: Condition, rows: Mapping[str, Sequence[TrialRow]]) -> Con
     judged = []
     for rank, one in enumerate(plain, 1):
         if best is None or one is best or not one.enough:
-            good = one is best and one.reliable and bool(np.isfinite(one.figures["torque_error"].median))
+            good = one is best and one.reliable and one.estimates
             judged.append(replace(one, rank=rank, as_good=good))
             continue
         p = sign_test(errors[one.method], errors[best.method])

@@ -58,7 +58,7 @@ class _Cluster:
             error = found
         raise CalibError(
             f"the Dask scheduler at {self.address} is gone, with {len(self.under_way)} tasks under way; results that "
-            "were handed back are good"
+            "were handed back are good: start it again, and give the same command"
         ) from error
 
     def pickled(self, call: tuple[Callable, tuple]) -> bytes:

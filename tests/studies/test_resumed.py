@@ -7,14 +7,17 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import dask_cluster
 import pytest
+from study_rows import ROW
 
+from calib.errors import UsageError
 from calib.procedure.study.outcome import run_study
-from calib.studies.store import JOURNAL, read_rows
+from calib.studies.conditions import read_study
+from calib.studies.store import JOURNAL, opened, read_rows
 from calib.studies.trial import TrialRow
 
 FILE = """
@@ -54,6 +57,21 @@ def test_rows_that_are_there_are_not_run_again(study: Path, tmp_path: Path):
     assert third.conditions[0].methods[0].trials == 1
     study.write_text(FILE)
     assert run_study([study], tmp_path / "out", runs=2, plots=False).progress.done == 0
+
+
+def test_a_study_that_runs_may_be_looked_at(study: Path, tmp_path: Path):
+    """A report alone takes no lock and leaves the rows; where there are none it makes no folder."""
+    with pytest.raises(UsageError, match="nothing to report"):
+        run_study([study], tmp_path / "out", report_only=True)
+    assert not (tmp_path / "out").exists()
+    row = replace(ROW, digest=read_study([study]).conditions[0].digest)
+    with opened(tmp_path / "out") as store:
+        store.append([row])
+        before = (tmp_path / "out" / JOURNAL).read_bytes()
+        found = run_study([study], tmp_path / "out", report_only=True)
+        assert (tmp_path / "out" / JOURNAL).read_bytes() == before
+    assert [one.trials for one in found.conditions[0].methods] == [1]
+    assert "fewer than" in " ".join(found.notes)
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from study_rows import ROW
 from calib.errors import UsageError
 from calib.studies.conditions import Condition, read_study, shipped
 from calib.studies.experiment import make_experiment
-from calib.studies.summary import sign_test, summarise
+from calib.studies.summary import LEAST, sign_test, summarise
 from calib.studies.trial import FOUND, NOT_RECORDED, run_trial
 
 FILE = """
@@ -70,6 +70,8 @@ def test_what_a_condition_is_called_is_no_part_of_what_it_is():
         ("[[noise]]", "[noise]", "noise"),
         ('"1e-4 deg"', "30.0", "at most 0.1"),
         ('"rv2sq"', '"rv2"', "did you mean 'rv2sq'"),
+        ("duration", "cutoff = 70\nduration", "expected less than 70 Hz, half the rate of the rv2sq's log"),
+        ("[[noise]]", '[[noise]]\nname = "1"\nsigma_q = 0\nsigma_tau = 0\n[[noise]]', "two conditions 'small-1'"),
     ],
 )
 def test_a_file_that_is_no_study_is_told_why(tmp_path: Path, old: str, new: str, said: str):
@@ -134,6 +136,28 @@ def test_of_methods_as_good_as_each_other_the_cheap_one_is_taken(tmp_path: Path)
     found = [replace(row, torque_error=1.2 * row.torque_error) if row.method == "wls" else row for row in found]
     (one,) = summarise(study, found)
     assert one.chosen is not None and one.chosen.method == "iv"  # always larger by a fifth: told apart
+
+
+def test_what_is_there_stays_in_sight_of_a_study_that_asks_for_less(tmp_path: Path):
+    """A method that was added alone, or taken out of the file, leaves the others' rows in the summary."""
+    study = read_study([written(tmp_path)], ["tls"])
+    found = [
+        replace(ROW, digest=study.conditions[0].digest, method=name, seed=k) for name in ("tls", "wls") for k in (0, 1)
+    ]
+    (one,) = summarise(study, found)
+    assert {method.method for method in one.methods} == {"tls", "wls"}
+
+
+def test_where_none_is_taken_it_is_said_why(tmp_path: Path):
+    study = read_study([written(tmp_path)])
+    digest = study.conditions[0].digest
+    few = [replace(ROW, digest=digest, seed=k) for k in range(LEAST - 1)]
+    (one,) = summarise(study, few)
+    assert one.best is None and f"--runs {LEAST}" in one.why_none
+    (one,) = summarise(study, [replace(row, status="diverged") for row in [*few, replace(few[0], seed=99)]])
+    assert one.best is None and "gives an estimate" in one.why_none
+    (one,) = summarise(study, [*few, replace(few[0], seed=99)])
+    assert one.best is one.chosen and not one.why_none
 
 
 def test_the_sign_test_is_the_binomial_one():

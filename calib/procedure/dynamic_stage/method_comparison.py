@@ -5,7 +5,8 @@ All estimate the same columns (base parameters and standard friction, unless ano
 identification band, over all unseen recordings together; their standard errors, and those of differences between
 methods, come from a jackknife over blocks of time (Künsch 1989), since residuals are not white. Methods within `APART`
 standard errors of the best, or within `SLACK` of its error, are as good; of these one is taken that is fast: at most
-`ALIKE` times the time of the fastest, the first in rank.
+`QUICK` seconds, or `ALIKE` times the time of the fastest, the first in rank. None is taken where the best predicts no
+better than no model does (100 %), or where all recordings repeat the training motion; one that does is left out.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
+from os.path import realpath
 from pathlib import Path
 
 import numpy as np
@@ -27,9 +30,13 @@ from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.prediction import predict
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
+from calib.procedure.dynamic_stage.validation import repeated_motion
+from calib.procedure.dynamic_stage.verdict import motion_warnings
 
 BLOCKS = 10  # of time in each recording
-APART, SLACK, ALIKE = 2.0, 0.05, 2.0  # our choices
+APART, SLACK, ALIKE, QUICK = 2.0, 0.05, 2.0, 1.0  # our choices; the last in seconds
+LOOP = "needs the closed loop: state it in the options file, [loop] (calib formats identify-options)"
+USELESS = 100.0  # error [%] of predicting no torque at all
 
 
 @dataclass(frozen=True)
@@ -93,17 +100,24 @@ def compare_methods(
         each: called with every method when it is done, not yet ranked.
 
     Raises:
-        UsageError: where no recording is unseen, or a name is none of a method.
+        UsageError: where no recording is unseen, or one shares time with those learnt from; where a name is none of
+            a method.
     """
     if not inputs.unseen:
         raise UsageError("methods are ranked by motion that none has seen: give some with --validate")
+    _check_apart(inputs.cases, inputs.unseen)
+    repeated = repeated_motion(inputs.cases, inputs.unseen)
+    proofs = tuple(case for case in inputs.unseen if case.name not in repeated)
+    inputs = replace(inputs, unseen=proofs or inputs.unseen)
     chosen = {name: method_named(name) for name in methods or METHODS}
+    if inputs.options.settings.loop is None and all(method.needs_controller for method in chosen.values()):
+        raise UsageError(f"{', '.join(chosen)}: {LOOP}")
     done: list[tuple[ComparedMethod, _Sums]] = []
     failed: list[ComparedMethod] = []
     alike = ~np.isin(np.arange(inputs.cases[0].target.shape[1]), inputs.currents.own)
     for name, method in chosen.items():
         if method.needs_controller and inputs.options.settings.loop is None:
-            failed.append(ComparedMethod(name, "needs the closed loop: state it in the options, [loop]"))
+            failed.append(ComparedMethod(name, LOOP))
             continue
         say(name)
         try:
@@ -113,7 +127,34 @@ def compare_methods(
         except CalibError as error:
             failed.append(ComparedMethod(name, " ".join(str(error).split())))
             each(failed[-1])
-    return [*_ranked(done, alike), *failed]
+    return [*_ranked(done, alike, bool(proofs)), *failed]
+
+
+def caveats(inputs: IdentificationInputs, found: Sequence[ComparedMethod]) -> list[str]:
+    """Return what a user should know of a ranking, and why none is to be taken where none is."""
+    repeated = repeated_motion(inputs.cases, inputs.unseen)
+    told = motion_warnings({}, repeated, {})
+    if len(repeated) == len(inputs.unseen):
+        told.append("none to take: give motion that is no repeat with --validate")
+    elif repeated:
+        told.append(f"left out of the ranking: {', '.join(repeated)}")
+    if found and found[0].unseen >= USELESS:
+        told.append(
+            f"none to take: the best is off by {found[0].unseen:.3g} % on unseen motion, no model by {USELESS:g} %: "
+            "learn from more motion"
+        )
+    return told
+
+
+def _check_apart(cases: Sequence[Case], unseen: Sequence[Case]) -> None:
+    """Refuse to rank by samples that were learnt from."""
+    for case, own in product(unseen, cases):
+        first, last = max(case.motion.t[0], own.motion.t[0]), min(case.motion.t[-1], own.motion.t[-1])
+        if own.motion.file and realpath(case.motion.file) == realpath(own.motion.file) and first < last:
+            raise UsageError(
+                f"{case.name} is to be unseen, yet {first:.3g} s to {last:.3g} s of it are learnt from, too "
+                f"({own.name}): cut them apart, log.npz@0:20 and log.npz@20:30"
+            )
 
 
 def _said(say: Callable[[str], None], name: str, words: str) -> None:
@@ -178,7 +219,7 @@ def _jackknife(each: np.ndarray) -> float:
     return float(np.sqrt((len(each) - 1) / len(each) * np.sum((each - each.mean()) ** 2)))
 
 
-def _ranked(done: Sequence[tuple[ComparedMethod, _Sums]], alike: np.ndarray) -> list[ComparedMethod]:
+def _ranked(done: Sequence[tuple[ComparedMethod, _Sums]], alike: np.ndarray, proven: bool) -> list[ComparedMethod]:
     if not done:
         return []
     order = sorted(done, key=lambda pair: pair[0].unseen)
@@ -190,7 +231,8 @@ def _ranked(done: Sequence[tuple[ComparedMethod, _Sums]], alike: np.ndarray) -> 
         good = behind <= max(APART * sigma, SLACK * best.unseen)
         result.append(replace(one, rank=rank, behind=behind, behind_sigma=sigma, good=bool(good)))
     least = min(one.seconds for one in result if one.good)
-    taken = next(one for one in result if one.good and one.seconds <= ALIKE * least)
+    fast = (one for one in result if one.good and one.seconds <= max(QUICK, ALIKE * least))
+    taken = next(fast) if proven and best.unseen < USELESS else None
     return [replace(one, chosen=one is taken) for one in result]
 
 

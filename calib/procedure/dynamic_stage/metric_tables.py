@@ -90,7 +90,7 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
             for name, found_score in outcome.validation.items()
         },
         "parameters": {
-            "standard": found.dynamics.model.p,
+            "standard": len(found.base.standard),
             "base": found.base.b + len(found.friction.terms),
             "essential": essential,
         },

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from calib.data.signals.persistency import ExcitationReport, repeats, report_excitation
+from calib.identification.cases import Case
 from calib.identification.checks.recording_sizes import compare_sizes
 from calib.identification.friction.passivity import driven
 from calib.identification.prediction import Dynamics, predict
@@ -78,6 +79,12 @@ class Assessment:
     intervals: Mapping[str, TorqueIntervals] = field(default_factory=dict)
 
 
+def repeated_motion(cases: Sequence[Case], unseen: Sequence[Case]) -> dict[str, float]:
+    """Return the unseen recordings that are no evidence: name → share of the states that training has been in."""
+    shares = {case.name: max(repeats(own.motion, case.motion) for own in cases) for case in unseen}
+    return {name: share for name, share in shares.items() if share >= REPEAT}
+
+
 def assess(
     inputs: IdentificationInputs,
     dynamics: Dynamics,
@@ -108,8 +115,7 @@ def assess(
             say(f"errors to expect of {case.name}")
             expected[case.name] = intervals(errors, dynamics, case, predictions[case.name])
     say("judging")
-    shares = {case.name: max(repeats(own.motion, case.motion) for own in inputs.cases) for case in inputs.unseen}
-    repeated = {name: share for name, share in shares.items() if share >= REPEAT}
+    repeated = repeated_motion(inputs.cases, inputs.unseen)
     excitation = {case.name: report_excitation(case.motion) for case in inputs.cases}
     fit = {case.name: scores[case.name] for case in inputs.cases}
     validation = {case.name: scores[case.name] for case in inputs.unseen}

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from calib.data.recordings.recording import Joints, Recording
-from calib.data.signals.persistency import ExcitationReport, repeats, report_excitation
+from calib.data.signals.persistency import ExcitationReport, report_excitation
 from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import MeasurementError, UsageError
 from calib.identification.cases import Case, case_names, make_case
@@ -25,7 +25,7 @@ from calib.mechanism.closure import NoPosture, locate
 from calib.mechanism.parallel_model import PLATFORM, ParallelModel, make_parallel_model, rows_named
 from calib.mechanism.parallel_robot import ParallelRobot
 from calib.procedure.dynamic_stage.inputs import read_motion
-from calib.procedure.dynamic_stage.validation import REPEAT
+from calib.procedure.dynamic_stage.validation import repeated_motion
 from calib.procedure.dynamic_stage.verdict import (
     judge,
     motion_warnings,
@@ -164,8 +164,7 @@ def _assessed(
     """Return the outcome: every recording predicted, and the verdict that follows."""
     scores = {case.name: score(case, predict(found.dynamics, case)) for case in (*cases, *unseen)}
     fit, validation = ({case.name: scores[case.name] for case in part} for part in (cases, unseen))
-    shares = {case.name: max(repeats(own.motion, case.motion) for own in cases) for case in unseen}
-    repeated = {name: share for name, share in shares.items() if share >= REPEAT}
+    repeated = repeated_motion(cases, unseen)
     excitation = {case.name: report_excitation(case.motion) for case in cases}
     proofs = {name: one for name, one in validation.items() if name not in repeated}
     notes = (

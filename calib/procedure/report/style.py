@@ -29,7 +29,7 @@ from matplotlib.figure import Figure
 from matplotlib.font_manager import findfont, get_font
 from matplotlib.path import Path as Strokes
 from matplotlib.text import Text
-from matplotlib.ticker import FixedFormatter, FixedLocator, NullLocator
+from matplotlib.ticker import FixedFormatter, FixedLocator, MaxNLocator, NullLocator
 from matplotlib.transforms import IdentityTransform
 from PIL import Image
 
@@ -130,6 +130,9 @@ def log_axis(axis: XAxis | YAxis, low: float, high: float, most: int = 7) -> Non
     powers = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1.0)
     ticks = (powers[:, None] * ([1.0, 2.0, 5.0] if high < 100.0 * low else [1.0])).ravel()
     ticks = ticks[(low <= ticks) & (ticks <= high)]
+    if len(ticks) < 2:  # within less than a factor of about two: even steps
+        ticks = MaxNLocator(min(most, 5)).tick_values(low, high)
+        ticks = ticks[(low <= ticks) & (ticks <= high)]
     ticks = ticks[:: max(1, -(-len(ticks) // most))]
     label_ticks(axis, ticks, [number(tick) for tick in ticks])
     axis.set_minor_locator(NullLocator())

@@ -22,7 +22,7 @@ from calib.procedure.report.style import (
     sheet,
     styled,
 )
-from calib.studies.summary import ConditionSummary
+from calib.studies.summary import LEAST, ConditionSummary
 from calib.studies.trial import TrialRow
 
 LINE = 0.21  # height of one method [in]
@@ -39,7 +39,8 @@ def boxes(one: ConditionSummary, rows: Sequence[TrialRow]) -> Picture:
     ]  # fmt: skip
     words = (
         "Torque error on unseen motion, noise-free: boxes from quartile to quartile with the median, lines to the 5th "
-        "and 95th percentile, points beyond. Dark: as good as the best. Trials without an estimate stand at the right."
+        f"and 95th percentile, points beyond; fewer than {LEAST} as points. Dark: as good as the best. Trials without "
+        "an estimate stand at the right."
     )
     return picture(partial(_draw, series), words, True)
 
@@ -70,7 +71,10 @@ def _draw(series: Sequence[tuple[str, bool, int, tuple[float, ...]]]) -> Figure:
 
 
 def _box(axes, place: int, values: np.ndarray, colour: str) -> None:
-    least, lower, middle, upper, most = np.quantile(values, [0.05, 0.25, 0.5, 0.75, 0.95])
+    if len(values) < LEAST:
+        axes.plot(values, np.full(len(values), place), "o", color=colour, markersize=4.0, zorder=3)
+        return
+    least, lower, middle, upper, most = np.quantile(values, [0.05, 0.25, 0.5, 0.75, 0.95], method="nearest")
     axes.plot([least, most], [place, place], color=QUIET, linewidth=0.9, zorder=2)
     axes.barh(place, upper - lower, 0.56, lower, color=colour, zorder=3)
     axes.plot([middle, middle], [place - 0.34, place + 0.34], color="white", linewidth=1.4, zorder=4)

@@ -1,6 +1,7 @@
 """``calib study``: what is missing is run, what is there is summed up, and a report says what to take.
 
-rows.parquet, rows.csv   every trial (`calib.studies.store`): more may be added by anyone, at any time
+rows.parquet, rows.csv   every trial (`calib.studies.store`): more may be added by anyone, at any time. While a command
+                         runs its rows go to rows.csv, which is emptied into rows.parquet at the end
 summary.csv              one line per condition and method: medians and quartiles of every figure
 report.html              tables, box plots, the decision rule; one file
 """
@@ -18,7 +19,7 @@ from calib.procedure.study import report
 from calib.studies import summary
 from calib.studies.conditions import Study, read_study, shipped
 from calib.studies.run import Progress, run, span
-from calib.studies.store import JOURNAL, LOCK, WHOLE, opened
+from calib.studies.store import JOURNAL, LOCK, WHOLE, opened, read_rows
 from calib.studies.summary import ConditionSummary
 from calib.workers import workers
 
@@ -63,7 +64,7 @@ def run_study(
         out: the folder of its rows; those that are there count.
         methods, runs: in place of the files'.
         where: the tasks run, see `calib.workers.workers`.
-        report_only: run nothing.
+        report_only: run nothing, and leave the rows as they are, also while another command adds to them.
         plots: whether the report has figures.
         say: called with words on progress.
 
@@ -73,26 +74,36 @@ def run_study(
     """
     study = read_study(named, methods, runs)
     _check_folder(out, named)
-    with opened(out) as store:
-        notes = [f"{store.dropped} half-written line was taken off: its trial is run again"] if store.dropped else []
-        before = len(store.rows)
-        progress = Progress(0)
-        if not report_only:
-            say(f"{before} rows are there")
+    notes: list[str] = []
+    progress = Progress(0)
+    if report_only:
+        kept = read_rows(out)  # takes no lock: a study that runs there may be looked at
+    else:
+        with opened(out) as store:
+            if store.dropped:
+                notes.append(f"{store.dropped} half-written line was taken off: its trial is run again")
+            say(f"{len(store.rows)} rows are there")
             with workers(where) as crew:
                 progress = run(study, store, crew, lambda found: say(str(found)))
-        say("writing")
-        store.settle()
-        kept = list(store.rows.values())
+            say("writing")
+            store.settle()
+            kept = list(store.rows.values())
     own = {condition.digest for condition in study.conditions}
     others = sum(row.digest not in own for row in kept)
     if others:
         notes.append(f"{others} rows are of conditions that are not of this study: kept, and not counted")
+    if not progress.lost and not any(row.digest in own for row in kept):
+        told = f"{len(kept)} rows, none of them of this study's conditions" if kept else "no rows"
+        raise UsageError(
+            f"nothing to report: {out} holds {told}; "
+            + ("run the study first, or name its folder (--out)" if report_only else "ask for runs (--runs, runs)")
+        )
     if versions := sorted({row.version for row in kept if row.digest in own}):
         notes += [f"rows were made by several versions: {', '.join(versions)}"] if len(versions) > 1 else []
     if progress.lost:
         notes.append(f"{progress.lost} trials were lost with their workers: the same command runs them again")
     conditions = tuple(summary.summarise(study, kept))
+    notes += report.reasons(conditions)
     header, lines = report.summary_table(conditions)
     files.write_table(out / SUMMARY, header, lines)
     page = report.make_page(study, conditions, [row for row in kept if row.digest in own], notes, plots)

@@ -38,8 +38,7 @@ MEANING = (
     "these tell the error); covered: share within 1.96 σ (95 % where they do).",
     "d_τ, d_q: the survey's figures, on the data set itself. d_τ compares with noisy torque, and has a floor that no "
     "method goes below: it cannot rank.",
-    "All are medians over trials; runs are simulations of the robot; CPU is processor time of the method alone; p is "
-    "the sign test's against the best.",
+    "All are medians over trials; CPU is processor time of the method alone; p is the sign test's against the best.",
 )
 BESIDE = (  # figures in the order of the columns behind the quartiles
     "torque_worst", "beta_error", "beta_sigma", "coverage", "survey_tau", "survey_q", "iterations", "simulations",
@@ -47,7 +46,7 @@ BESIDE = (  # figures in the order of the columns behind the quartiles
 )  # fmt: skip
 HEADER = (
     "method", "trials", "failed", "torque [%]", "quartiles", "worst joint [%]", "β [%]", "in σ", "covered [%]",
-    "d_τ [%]", "d_q [%]", "rounds", "runs", "CPU [s]", "p", "",
+    "d_τ [%]", "d_q [%]", "rounds", "simulations", "CPU [s]", "p", "",
 )  # fmt: skip
 
 
@@ -58,18 +57,52 @@ def overview(conditions: Sequence[ConditionSummary]) -> Table:
         if not one.methods:
             lines.append((one.condition.name, described(one.condition), "no rows yet", "", "", "", ""))
             continue
-        best, chosen = one.methods[0], one.chosen
+        best, chosen = one.best, one.chosen
         failed = ", ".join(f"{m.method} {sum(m.failures.values())}/{m.trials}" for m in one.methods if m.failures)
         lines.append(
             (
                 one.condition.name, described(one.condition), chosen.method if chosen else "none",
                 _short(chosen.figures["torque_error"].median) if chosen else "",
-                f"{best.method} {_short(best.figures['torque_error'].median)}",
+                f"{best.method} {_short(best.figures['torque_error'].median)}" if best else "",
                 ", ".join(m.method for m in one.methods if m.as_good and m is not chosen), failed,
             )
         )  # fmt: skip
     header = ("condition", "", "take", "torque [%]", "best [%]", "as good", "without an estimate")
     return Table("What to take", header, lines, numbers=(3,))
+
+
+def torque_table(conditions: Sequence[ConditionSummary]) -> Table:
+    """Return the median torque error of every method on every condition."""
+    names = list(dict.fromkeys(method.method for one in conditions for method in one.methods))
+    lines = []
+    for one in conditions:
+        own = {method.method: method for method in one.methods}
+        lines.append((one.condition.name, *(_median_cell(own.get(name)) for name in names)))
+    note = (
+        f"Median over trials [%]; a trial without an estimate counts as ∞. * the one to take; (n) of fewer than "
+        f"{LEAST} runs."
+    )
+    return Table("Torque error on unseen motion", ("condition", *names), lines, note, numbers=range(1, len(names) + 1))
+
+
+def _median_cell(one: MethodSummary | None) -> str:
+    if one is None:
+        return ""
+    return _short(one.figures["torque_error"].median) + (
+        "*" if one.chosen else "" if one.enough else f" ({one.trials})"
+    )
+
+
+def reasons(conditions: Sequence[ConditionSummary]) -> list[str]:
+    """Return why there is no method to take, and on which conditions."""
+    found: dict[str, list[str]] = {}
+    for one in conditions:
+        if why := one.why_none:
+            found.setdefault(why, []).append(one.condition.name)
+    return [
+        f"none to take on {'all' if 1 < len(names) == len(conditions) else ', '.join(names)}: {why}"
+        for why, names in found.items()
+    ]
 
 
 def described(one: Condition) -> str:
@@ -146,9 +179,8 @@ def make_page(
     """
     import jinja2  # slow to load
 
-    sections = [
-        Section("", [overview(conditions), Text("How that was decided", RULE), Text("Figures", MEANING)]),
-    ]  # fmt: skip
+    head = [overview(conditions), *([torque_table(conditions)] if len(conditions) > 1 else [])]
+    sections = [Section("", [*head, Text("How that was decided", RULE), Text("Figures", MEANING)])]
     for one in conditions:
         if not one.methods:
             continue
