@@ -19,7 +19,7 @@ masses are not in the library, so its torque is not limited).
 
     python examples/lwr4plus/excitation_peers.py --out lwr4plus-peers [--seconds 30] [--quick] [--seed 0]
 
-Some quarter of an hour of processor time; what the folder holds already is not run again. --quick: two seconds per
+Some quarter of an hour of processor time; what rows.json holds already is not run again. --quick: two seconds per
 peer, one seed, no other robots.
 """
 
@@ -263,7 +263,7 @@ def main() -> None:
     chosen = study_options.read(
         __doc__, seconds=(30.0, "of processor time per peer"), quick="two seconds per peer, one seed"
     )
-    chain, first, place = load("lwr4plus"), chosen.seed, chosen.out / "metrics.json"
+    chain, first, place = load("lwr4plus"), chosen.seed, chosen.out / "rows.json"
     seconds, two, five = (2.0, 1, 1) if chosen.quick else (chosen.seconds, 2, 5)
     periods, others = ((10.0,), ()) if chosen.quick else ((20.0, 10.0), ("panda", "tx40"))
     todo: dict[str, Callable[[], dict[str, Any]]] = {
@@ -284,6 +284,7 @@ def main() -> None:
             print(name, {key: value for key, value in found[name].items() if key != "curve"}, flush=True)
     curves = {name: found[f"{name}, seed {first}"]["curve"] for name in PEERS}
     save(picture(curves, seconds), chosen.out / "plot_peers.png")
+    files.write_json(chosen.out / "metrics.json", found)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
 """The whole reproduction of Kolyubin, Shiriaev & Jubien (2019, IJAMT 101): their tables beside ours, and the figures.
 
 Runs the scripts beside this one, each into a folder of its own, and prints their tables from metrics.json; they are
-written to tables.md too. Without --all, a part whose metrics are there is not run again, so that an interrupted study
-goes on where it stopped. --readme puts the tables and figures into README.md here: nothing there is typed by hand.
+written to tables.md too. Without --all, a part whose metrics are there and come from the same code is not run again, so
+that an interrupted study goes on where it stopped. --readme puts the tables and figures into README.md here: nothing
+there is typed by hand.
 
     python examples/lwr4plus/study.py --all --out lwr4plus-study [--quick] [--readme] [--only geometry dynamics …]
 """
@@ -10,6 +11,7 @@ goes on where it stopped. --readme puts the tables and figures into README.md he
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import shutil
 import subprocess
@@ -31,11 +33,32 @@ PARTS: dict[str, tuple[list[str], list[str]]] = {  # options of the whole part, 
     "excitation_peers": ([], ["--quick"]),
 }
 FIGURES = HERE / "figures"
+METRICS, ROWS, MARK = "metrics.json", "rows.json", "code.txt"  # of a part: whole, as it goes on, what made it
+
+
+def code_of(name: str, quick: bool) -> str:
+    """Return a mark of all that a part's metrics come from: the toolkit, the scripts here, and its options."""
+    digest, root = hashlib.sha256(" ".join([name, *PARTS[name][quick]]).encode()), HERE.parents[1]
+    tools = [path for room in ("calib", "poses", "trajectories") for path in (root / room).rglob("*.py")]
+    scripts = [path for path in HERE.glob("*.py") if path.name not in ("study.py", "study_tables.py")]
+    for path in sorted([*tools, *scripts]):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def is_made(name: str, out: Path, quick: bool) -> bool:
+    """Tell whether a part was run by this code, to its end."""
+    mark = out / MARK
+    return (out / METRICS).exists() and mark.exists() and mark.read_text() == code_of(name, quick)
 
 
 def run(name: str, out: Path, quick: bool) -> None:
-    """Run one part."""
-    started = time.perf_counter()
+    """Run one part; what code before this one left of it goes."""
+    started, code, mark = time.perf_counter(), code_of(name, quick), out / MARK
+    if not mark.exists() or mark.read_text() != code:
+        for left in (METRICS, ROWS):
+            (out / left).unlink(missing_ok=True)
+        files.write(mark, code)
     command = [sys.executable, str(HERE / f"{name}.py"), "--out", str(out), *PARTS[name][quick]]
     print(f"\n== {name}: {' '.join(command[1:])}", file=sys.stderr, flush=True)
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
@@ -44,7 +67,7 @@ def run(name: str, out: Path, quick: bool) -> None:
 
 def tables_of(name: str, out: Path) -> study_tables.Tables:
     """Return the tables of a part that was run."""
-    return study_tables.SHOW[name](json.loads((out / "metrics.json").read_text(encoding="utf-8")))
+    return study_tables.SHOW[name](json.loads((out / METRICS).read_text(encoding="utf-8")))
 
 
 def main() -> None:
@@ -61,7 +84,7 @@ def main() -> None:
     tables: study_tables.Tables = {}
     for name in given.only:
         out = given.out / name
-        if given.all or not (out / "metrics.json").exists():
+        if given.all or not is_made(name, out, given.quick):
             run(name, out, given.quick)
         tables |= tables_of(name, out)
     study_tables.show(tables)
