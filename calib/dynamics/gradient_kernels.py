@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from calib.arrays import frozen
 from calib.dynamics.kernels import (
     COORDINATE,
     DEPTH,
@@ -26,8 +27,8 @@ from calib.dynamics.kernels import (
 
 
 @njit(**OPTIONS)
-def _share(links, order, i, sample, weights, motion, twists, slopes, bars):
-    """Add body i's own part of the reverse pass: slopes of Σ_j S_j · wrench_i(g_j), g_j = weights[sample, j, body i].
+def _share(links, order, i, weights, motion, twists, slopes, bars):
+    """Add body i's own part of the reverse pass: slopes of Σ_j S_j · wrench_i(g_j), g_j = weights[j, body i].
 
     ``slopes`` (B + 1, 9) belongs to w, dw, a; ``bars`` (B + 1, n, 6) to the twists.
     """
@@ -42,10 +43,10 @@ def _share(links, order, i, sample, weights, motion, twists, slopes, bars):
         j = links[i, PATH + k]
         ux, uy, uz = twists[h, j, 0], twists[h, j, 1], twists[h, j, 2]
         sx, sy, sz = twists[h, j, 3], twists[h, j, 4], twists[h, j, 5]
-        xx, xy, xz = weights[sample, j, first + k0], weights[sample, j, first + k1], weights[sample, j, first + k2]
-        yy, yz, zz = weights[sample, j, first + k3], weights[sample, j, first + k4], weights[sample, j, first + k5]
-        hx, hy, hz = weights[sample, j, first + k6], weights[sample, j, first + k7], weights[sample, j, first + k8]
-        mass = weights[sample, j, first + 9]
+        xx, xy, xz = weights[j, first + k0], weights[j, first + k1], weights[j, first + k2]
+        yy, yz, zz = weights[j, first + k3], weights[j, first + k4], weights[j, first + k5]
+        hx, hy, hz = weights[j, first + k6], weights[j, first + k7], weights[j, first + k8]
+        mass = weights[j, first + 9]
         px, py, pz = xx * wx + xy * wy + xz * wz, xy * wx + yy * wy + yz * wz, xz * wx + yz * wy + zz * wz
         dot = wx * hx + wy * hy + wz * hz
         bars[h, j, 0] += xx * ex + xy * ey + xz * ez + wy * pz - wz * py + hy * az - hz * ay
@@ -176,7 +177,8 @@ def regressor_gradient(links, constants, order, amount, cosine, sine, v, a, weig
     bodies, n = amount.shape[1], v.shape[1]
     frames, motion, twists = np.empty((bodies, 12)), np.zeros((bodies + 1, 9)), np.zeros((bodies + 1, n, 6))
     slopes, bars = np.zeros((bodies + 1, 9)), np.zeros((bodies + 1, n, 6))
-    motion[0, 6:] = -constants[bodies, :3]
+    for r in range(3):
+        motion[0, 6 + r] = -constants[bodies, r]
     for sample in range(v.shape[0]):
         slopes[:] = 0.0
         bars[:] = 0.0
@@ -185,26 +187,32 @@ def regressor_gradient(links, constants, order, amount, cosine, sine, v, a, weig
             place(links, constants, i, amount[sample, i], cosine[sample, i], sine[sample, i], frames)
             advance(links, i, scale * v[sample, c], scale * a[sample, c], frames, motion)
             carry(links, constants, i, frames, twists)
-            _share(links, order, i, sample, weights, motion, twists, slopes, bars)
+            _share(links, order, i, weights[sample], motion, twists, slopes, bars)
         _back(
             links, links, constants, v[sample], frames, motion, twists, slopes, bars, gq[sample], gv[sample], ga[sample]
         )
 
 
+def hung_on_one(links: np.ndarray) -> np.ndarray:
+    """Return links (B, 4 + n) whose bodies all hang on one virtual joint without coordinate, for `torque_gradient`."""
+    chain = links.copy()
+    chain[:, DEPTH], chain[:, PATH], chain[:, COORDINATE] = 1, 0, -1
+    return frozen(chain, np.int64)
+
+
 @njit(**OPTIONS)
-def torque_gradient(links, constants, order, amount, cosine, sine, v, a, parameters, weights, gq, gv, ga):
+def torque_gradient(links, chain, constants, order, amount, cosine, sine, v, a, parameters, weights, gq, gv, ga):
     """Add the slopes of Σ weights · tau(q, v, a), weights (N, n), by q, v and a to gq, gv, ga (N, n), zero on entry.
 
     `regressor_gradient` for weights of rank one: the joints' twists enter only as their weighted sum, so one virtual
-    joint, which every body hangs on, does for all of them: O(B) per sample. ``parameters`` (1, 1, 10 B).
+    joint, which every body hangs on (``chain``, `hung_on_one`), does for all of them: O(B) per sample. ``parameters``
+    (1, 10 B).
     """
     bodies = amount.shape[1]
-    chain = links.copy()
-    for i in range(bodies):
-        chain[i, DEPTH], chain[i, PATH], chain[i, COORDINATE] = 1, 0, -1
     frames, motion, twists = np.empty((bodies, 12)), np.zeros((bodies + 1, 9)), np.zeros((bodies + 1, 1, 6))
     slopes, bars = np.zeros((bodies + 1, 9)), np.zeros((bodies + 1, 1, 6))
-    motion[0, 6:] = -constants[bodies, :3]
+    for r in range(3):
+        motion[0, 6 + r] = -constants[bodies, r]
     for sample in range(v.shape[0]):
         slopes[:] = 0.0
         bars[:] = 0.0
@@ -216,7 +224,7 @@ def torque_gradient(links, constants, order, amount, cosine, sine, v, a, paramet
             carry(chain, constants, i, frames, twists)
             if c >= 0:
                 twists[i + 1, 0, 2 if links[i, KIND] == REVOLUTE else 5] += scale * weights[sample, c]
-            _share(chain, order, i, 0, parameters, motion, twists, slopes, bars)
+            _share(chain, order, i, parameters, motion, twists, slopes, bars)
         _back(
             links, chain, constants, v[sample], frames, motion, twists, slopes, bars, gq[sample], gv[sample], ga[sample]
         )

@@ -111,10 +111,11 @@ def torque_gradient(
 
     q, v, a = _states(bodies, q=q, v=v, a=a)
     weights = _plain(shaped(weights, q.shape, "weights of the torques"))
-    chi = _plain(shaped(parameters, (10 * bodies.count,), "standard parameters")).reshape(1, 1, -1)
+    chi = _plain(shaped(parameters, (10 * bodies.count,), "standard parameters")).reshape(1, -1)
     slopes = np.zeros((3, *q.shape))
+    links = bodies.links, gradient_kernels.hung_on_one(bodies.links)
     gradient_kernels.torque_gradient(
-        bodies.links, bodies.constants, bodies.order, *_placed(bodies, q), v, a, chi, weights, *slopes
+        *links, bodies.constants, bodies.order, *_placed(bodies, q), v, a, chi, weights, *slopes
     )
     return slopes[0], slopes[1], slopes[2]
 

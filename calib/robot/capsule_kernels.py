@@ -53,8 +53,8 @@ def clear(q, form, place, stand, targets, own, radii, faces, margin):
 @njit(**OPTIONS)
 def _lines(q, form, place, stand, targets, lines):
     """Write the capsules' lines: of the base, of each moving body, of each target."""
-    r, x = np.eye(3), np.zeros(3)
-    turned = np.empty((3, 3))
+    r, x, turned = np.zeros((3, 3)), np.zeros(3), np.empty((3, 3))
+    r[0, 0] = r[1, 1] = r[2, 2] = 1.0
     lines[0] = 0.0
     lines[0, 2] = stand
     body = 0
@@ -65,34 +65,43 @@ def _lines(q, form, place, stand, targets, lines):
         for a in range(3):
             for b in range(3):
                 turned[a, b] = r[a, 0] * fixed[b] + r[a, 1] * fixed[3 + b] + r[a, 2] * fixed[6 + b]
-        r[:] = turned
+        for a in range(3):
+            for b in range(3):
+                r[a, b] = turned[a, b]
         if k == len(form):
             break
         axis, sign, joint = int(form[k, 0]) % 3, form[k, 1], int(form[k, 4])
         way = form[k, 2]
         if joint >= 0:
             way += form[k, 3] * q[joint]
-            lines[body, 3:] = x
+            _put(x, lines, body, 3)
             body += 1
-            lines[body, :3] = x
+            _put(x, lines, body, 0)
         if form[k, 0] < 3:
             for a in range(3):
                 x[a] += sign * way * r[a, axis]
             if joint >= 0:
-                lines[body, :3] = x
+                _put(x, lines, body, 0)
         else:
             co, si = cos(sign * way), sin(sign * way)
             one, two = (axis + 1) % 3, (axis + 2) % 3
             for a in range(3):
                 u, v = r[a, one], r[a, two]
                 r[a, one], r[a, two] = co * u + si * v, co * v - si * u
-    lines[body, 3:] = x
+    _put(x, lines, body, 3)
     for t in range(len(targets)):
         for a in range(3):
             lines[body + 1 + t, a] = x[a]
             lines[body + 1 + t, 3 + a] = (
                 x[a] + r[a, 0] * targets[t, 0] + r[a, 1] * targets[t, 1] + r[a, 2] * targets[t, 2]
             )
+
+
+@njit(**OPTIONS)
+def _put(x, lines, row, first):
+    """Write x (3,) into a row from column `first` on; numba takes seconds to compile an assignment to a slice."""
+    for a in range(3):
+        lines[row, first + a] = x[a]
 
 
 @njit(**OPTIONS)

@@ -600,7 +600,8 @@ def closed_loop(
                 at[j] = tau[j]
         if not accelerate(tree, body, linear, kinds, acts, memory, loads, q, v, at, work, matrix, slopes[0]):
             return SINGULAR, k
-        wish[:] = at
+        for j in range(n):
+            wish[j] = at[j]
         while sample < out.shape[1] and sample * every < k + 1 - 1e-9:
             part = sample * every - k
             if part < 1e-9:

@@ -463,7 +463,9 @@ def _command_tangent(
                 inertia = matrix[max(j, k), min(j, k)]
                 for m in range(c):
                     dat[j, m] += inertia * dwish[k, m] + by_q[j, k] * dread[k, m] + by_v[j, k] * dspeed[k, m]
-        dwish[:] = dat
+        for j in range(n):
+            for m in range(c):
+                dwish[j, m] = dat[j, m]
         for e in range(entries.shape[0]):  # the controller's model has the drives' inertias of the plant
             if entries[e, 1] < n and find[entries[e, 2]] >= 0:
                 dwish[entries[e, 0], find[entries[e, 2]]] += shares[e] * at[entries[e, 1]]
@@ -538,8 +540,11 @@ def closed_loop_tangent(
                 status = advance_tangent(plant, layout, memory, loads, *state)
                 if status != FINE:
                     return status, k
-            out[0, sample], out[1, sample], out[2, sample] = here, fast, tau
-            dout[0, sample], dout[1, sample], dout[2, sample] = dhere, dfast, dtau
+            for j in range(n):
+                out[0, sample, j], out[1, sample, j], out[2, sample, j] = here[j], fast[j], tau[j]
+                for m in range(c):
+                    one, other, last = dhere[j, m], dfast[j, m], dtau[j, m]
+                    dout[0, sample, j, m], dout[1, sample, j, m], dout[2, sample, j, m] = one, other, last
             sample += 1
         if k + 1 < count:
             state = (q, v, dq, dv, acting, dtau, period, slopes, dslopes, work, matrix, rooms)
