@@ -62,9 +62,10 @@ def problem(period: float, harmonics: int, samples: int = 200, constrained: bool
 
 
 def value(spot: ExcitationProblem, basis, x: np.ndarray) -> float:
+    """Return log cond, which the search minimises."""
     motion = basis.motion(x)
     Y = spot.regressor(motion.q, motion.v, motion.a)
-    return Excitation().evaluate(motion, Y).value
+    return float(np.log(Excitation().evaluate(motion, Y).value))
 
 
 def processor_time(call: Callable, rounds: int = 15) -> float:
@@ -90,6 +91,7 @@ def test_value_and_gradient_of_cond_against_differences(benchmark, harmonics, sa
         differences.append((value(spot, basis, x + h) - value(spot, basis, x - h)) / 2e-6)
     taken = time.process_time() - began
     error = np.abs(np.array(differences) - found.slopes[0]).max() / np.abs(found.slopes[0]).max()
+    assert error < 1e-4
     exact = processor_time(lambda: evaluate(spot, basis, x, (np.inf, 1.0)))
     print(
         f"\nn_f {harmonics}, {samples} samples, {len(x)} variables: {1e3 * exact:.1f} ms exact, {1e3 * taken:.0f} ms "

@@ -151,10 +151,11 @@ def plan_run(
         if all(known[_pair(*pair)] is not None for pair in pairwise(order)):
             break
     else:
-        order = _joined(known, cost)
+        order, through = _joined({pair: own for pair, own in known.items() if own is not None}, cost)
+        known = dict.fromkeys(known) | through
     ways, blocked = [], []
     for number, (one, two) in enumerate(pairwise(order)):
-        own = known[_pair(one, two)]
+        own = known.get(_pair(one, two))
         if own is None:
             blocked.append(number)
         ways.append(q[[one, two]] if own is None else own if one < two else own[::-1])
@@ -184,25 +185,22 @@ def same_turn(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray)
     return result
 
 
-def _joined(known: dict[tuple[int, int], np.ndarray | None], cost: np.ndarray) -> np.ndarray:
-    """Return the order of least time where ways may lead by third poses; those used are added to the known ones."""
+def _joined(clear: Ways, cost: np.ndarray) -> tuple[np.ndarray, Ways]:
+    """Return the order of least time where ways may lead by third poses, and its ways; pairs that none joins lack."""
     direct = np.full(cost.shape, np.inf)
-    for (one, two), own in known.items():
-        if own is not None:
-            direct[one, two] = direct[two, one] = cost[one, two]
+    for one, two in clear:
+        direct[one, two] = direct[two, one] = cost[one, two]
     total, before = shortest_path(direct, directed=False, return_predecessors=True)
-    order = tour(np.where(np.isfinite(total), total, FORBIDDEN))
+    order, ways = tour(np.where(np.isfinite(total), total, FORBIDDEN)), Ways()
     for one, two in (_pair(*pair) for pair in pairwise(order)):
+        if not np.isfinite(total[one, two]):
+            continue
         stops = [two]
-        while stops[-1] != one and np.isfinite(total[one, two]):
+        while stops[-1] != one:
             stops.append(int(before[one, stops[-1]]))
-        legs = []
-        for late, early in pairwise(stops):
-            own = known[_pair(early, late)]
-            assert own is not None
-            legs.append(own if early < late else own[::-1])
-        known[one, two] = np.concatenate([legs[-1][:1], *(leg[1:] for leg in legs[::-1])]) if legs else None
-    return order
+        legs = [clear[_pair(*leg)][:: 1 if leg[0] < leg[1] else -1] for leg in pairwise(stops[::-1])]
+        ways[one, two] = np.concatenate([legs[0][:1], *(leg[1:] for leg in legs)])
+    return order, ways
 
 
 def turns(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from calib.geometry.observability import observation, targets_of
+from calib.procedure.measuring import run as measuring
 from calib.procedure.measuring.drivable import Exchange, drivable
 from calib.procedure.measuring.run import RunSettings, plan_run, turns
 from calib.robot.load import load
@@ -72,3 +73,21 @@ def test_turns_are_the_same_posture_within_the_limits():
     found = turns(CHAIN, np.full(6, 1.0), -top, top)
     assert len(found) == 2 * 3 and (np.abs(found) <= top).all()
     assert np.abs(np.sin((found - 1.0) / 2)).max() < 1e-12
+
+
+def test_ways_found_lead_by_third_poses_where_no_other_way_is_found(monkeypatch):
+    """Of a star only the middle is joined with each: the run comes back to it, and leaves nothing out."""
+    room, q = limits(2.8), poses(5, 1, 1.0)
+
+    def only_the_middle(room, start, goal, **_):
+        ends = [start, goal]
+        return np.array(ends) if any(np.array_equal(end, q[0]) for end in ends) else None
+
+    monkeypatch.setattr(measuring, "way", only_the_middle)
+    found = drivable(CHAIN, q, Exchange(observation(targets_of(CHAIN)), q, None, "O1"), room, RunSettings())
+    run = found.run
+    assert not found.replaced and np.array_equal(found.q, q)
+    assert not run.blocked and not run.cut_off and sorted(run.order) == list(range(5)) and run.around >= 2
+    for (one, two), way in run.found_ways.items():
+        assert np.array_equal(way[[0, -1]], q[[one, two]])
+        assert len(way) == 2 or np.array_equal(way[1], q[0])
