@@ -42,7 +42,7 @@ def test_tx40_least_squares_fails_on_degraded_data_and_instruments_do_not(study)
     ours, right, least = (
         sum(one["torque_error"][name]) for one, name in ((wrong, "IV"), (degraded, "IV"), (degraded, "LS"))
     )
-    assert 3.0 * right < ours < 0.6 * least  # the sign of the speed is simulated, too: measured 38, 8 and 75 %
+    assert right < ours < 2.0 * right and ours < 0.4 * least  # measured, quick: see the README for the whole
 
 
 @pytest.mark.slow

@@ -215,12 +215,15 @@ def standstill(motion: Motion, slow: float | Sequence[float] = SLOW) -> np.ndarr
     return np.asarray(~moving(motion, slow).any(axis=1))
 
 
-def velocity_noise(motion: Motion) -> np.ndarray:
+def velocity_noise(motion: Motion, cutoff: float | None = None) -> np.ndarray:
     """Return (n,) the standard deviation of white position noise in the filtered velocities [rad/s or m/s].
+
+    With `cutoff` [Hz], in those of positions filtered to less than the motion's.
 
     σ_v² = σ_q² (2/f_s) ∫ (2πf)² |H(f)|⁴ df with |H|² of the two passes, about σ_q² (2/f_s) (2π)² f_q³/3.
     """
-    return motion.cutoffs.noise * 2 * np.pi * np.sqrt(2 * motion.cutoff**3 / (3 * motion.rate))
+    at = motion.cutoff if cutoff is None else cutoff
+    return motion.cutoffs.noise * 2 * np.pi * np.sqrt(2 * at**3 / (3 * motion.rate))
 
 
 def _derive(

@@ -6,7 +6,8 @@
 and not its noise, so Z is uncorrelated with the noise that the feedback brings into W. It starts from a regular robot:
 inertia diag(J), no gravity, no friction. DIDIM (Gautier, Janot & Vandanjon 2013) estimates from the simulated W alone,
 x_{k+1} = W_s⁺ y. A Coulomb sign whose measured speed is noisier than the width of its smoothing is no true column plus
-noise: no instrument helps there, and the simulated column, which rests on the reference, takes its place in W (our
+noise: no instrument helps there, and the simulated sign, which rests on the reference, takes its place in W; or that of
+the measured speed in half the band where the simulation does not follow the motion, as with a wrong controller (our
 choice). Constraints on base parameters, min ½ ‖P_Z (y - W x)‖² in every round, make it PC-IDIM-IV
 (`calib.identification.parameter_constraints`); they do not cure a bias.
 """
@@ -41,6 +42,7 @@ from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, iner
 from calib.simulation.loop.controllers import scaled
 
 LIMIT = 10  # iterations; 3 to 6 are usual
+FOLLOWED = 1.25  # times the speed's noise, by which the simulated motion may be off the measured one (our choice)
 RETREATS = 6  # halvings of a step to parameters that cannot be simulated
 
 
@@ -268,22 +270,37 @@ def _task(
 def _estimate_round(task: _Fixed, runs: Runs, std: np.ndarray, tau: float) -> _Found:
     """Return the estimate with the instruments of these runs; its sigmas with the inflation `tau` of the last."""
     columns = task.base.kept[task.kept]
-    simulated = [
-        observe(task.model, columns, simulated_case(case, run, loop), task.decimator).matrix
-        for (case, loop), run in runs
-    ]
+    moved = [simulated_case(case, run, loop) for (case, loop), run in runs]
+    simulated = [observe(task.model, columns, case, task.decimator).matrix for case in moved]
     observed = [
-        _with_signs(rows, z, _drowned_signs(task.model, columns, case))
-        for rows, z, (case, _) in zip(task.observed, simulated, task.cases)
+        _with_signs(task, columns, *one) for one in zip(task.observed, simulated, (c for c, _ in task.cases), moved)
     ]
     problem = _stack(observed, simulated, task.estimator.measured)
     fit, bound = _held_fit(task, problem, std, tau)
     return _Found(observed, simulated, problem, fit, _inflation(observed, fit), bound)
 
 
-def _with_signs(rows: ObservationRows, simulated: np.ndarray, drowned: np.ndarray) -> ObservationRows:
-    """Return rows with the simulated columns (M, rows, p) in place of those that are `drowned` (p,) in noise."""
-    return replace(rows, matrix=np.where(drowned, simulated, rows.matrix)) if drowned.any() else rows
+def _with_signs(
+    task: _Fixed, columns: np.ndarray, rows: ObservationRows, simulated: np.ndarray, case: Case, moved: Case
+) -> ObservationRows:
+    """Return rows with Coulomb signs that are drowned in noise replaced (the module says by what).
+
+    Args:
+        simulated: (M, rows, p) of `moved`, the case as it was simulated.
+    """
+    drowned = _drowned_signs(task.model, columns, case)
+    if not drowned.any():
+        return rows
+    motion, band = case.motion, 0.5 * case.motion.band
+    measured, expected = (slope(low_pass(one.motion.q, motion.rate, band), motion.rate) for one in (case, moved))
+    away = np.sqrt(np.nanmean((measured - expected) ** 2, axis=0))
+    followed = away <= FOLLOWED * velocity_noise(motion, band)
+    if not followed.all():
+        speed = np.where(followed | np.isnan(measured), moved.motion.v, measured)
+        seen = observe(task.model, columns[drowned], replace(case, motion=replace(motion, v=speed)), task.decimator)
+        simulated = simulated.copy()
+        simulated[:, :, drowned] = seen.matrix
+    return replace(rows, matrix=np.where(drowned, simulated, rows.matrix))
 
 
 def _drowned_signs(model: IdentificationModel, columns: np.ndarray, case: Case) -> np.ndarray:
