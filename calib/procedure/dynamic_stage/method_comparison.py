@@ -127,6 +127,9 @@ def compare_methods(
         except CalibError as error:
             failed.append(ComparedMethod(name, " ".join(str(error).split())))
             each(failed[-1])
+        except Exception as error:  # of one method: the others' results are not lost by it
+            failed.append(ComparedMethod(name, f"an error that nobody foresaw: {type(error).__name__}: {error}"))
+            each(failed[-1])
     return [*_ranked(done, alike, bool(proofs)), *failed]
 
 

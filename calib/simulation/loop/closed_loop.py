@@ -30,6 +30,11 @@ _CODES = {name: code for code, name in enumerate(_ACTS)}  # as in `loop_kernels`
 _SMOOTHED = ("sign", "stribeck", "root", "dead", "presliding", "load")  # whose last setting must be above zero
 Packed = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 SIMULATED = ("acceleration", "velocity", "one", *_ACTS)
+_LOWER = (
+    "these gains do not hold this robot at this rate; lower kp and kd (are they in the unit of the torque?), or the "
+    "delay"
+)
+GROWN = 1e20  # slope of the last sample by a parameter, in SI units, from which on the loop is unstable (our choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,6 +258,11 @@ def simulate_tangents(
     )  # fmt: skip
     if status != loop_kernels.FINE:
         raise _failure(status, reached * reference.period)
+    if not np.abs(slopes[:, -1]).max(initial=0.0) < GROWN:  # saturated torques keep the motion finite, not its slopes
+        raise Diverged(
+            f"the loop is unstable, its slopes grow without bounds: {_LOWER}",
+            None,
+        )
     t = reference.t[0] + tick * reference.period
     return Sensitivities(t, *(frozen(x) for x in out), *(frozen(x) for x in slopes))
 
@@ -451,7 +461,6 @@ def _failure(status: int, time: float, where: str | None = None) -> NotConverged
             "smooth the sign over a larger velocity, or give the joint its motor inertia"
         )
     return Diverged(
-        f"the loop diverged at {time:.4g} s: these gains do not hold this robot at this rate; lower kp and kd "
-        "(are they in the unit of the torque?), or the delay",
+        f"the loop diverged at {time:.4g} s: {_LOWER}",
         None,
     )

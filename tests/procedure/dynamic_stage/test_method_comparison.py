@@ -68,6 +68,22 @@ def test_none_is_taken_that_predicts_no_better_than_no_model(robot: Path, tmp_pa
     assert "learn from more motion" in caveats(given, [found])[-1]
 
 
+def test_one_methods_error_costs_no_other_result(robot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    from calib.procedure.dynamic_stage import method_comparison
+
+    def broken(robot, cases, settings, say):
+        if settings.method == "tls":
+            raise ValueError("array must not contain infs")
+        return identify(robot, cases, settings, say)
+
+    identify = method_comparison.identify
+    monkeypatch.setattr(method_comparison, "identify", broken)
+    train, other = recorded(tmp_path)
+    found = compare_methods(gather(robot, [train], [other]), ["tls", "ols"])
+    assert [one.name for one in found] == ["ols", "tls"]
+    assert "array must not contain infs" in found[1].failure
+
+
 def test_without_unseen_motion_there_is_no_ranking(robot: Path, tmp_path: Path):
     with pytest.raises(UsageError, match="--validate"):
         compare_methods(gather(robot, [recorded(tmp_path)[0]]))

@@ -102,3 +102,14 @@ def test_what_has_no_tangents_says_so():
         simulate_tangents(held, controller, reference, np.array([0]))
     with pytest.raises(NotConverged, match="diverged"):
         simulate_tangents(plant, controllers.scaled(controller, 300.0), reference, np.array([5]))
+
+
+def test_a_loop_that_saturation_alone_keeps_finite_is_said_to_be_unstable():
+    """Its simulation ends; its slopes grow without bounds, and no method may be given them."""
+    plant, controller = known_robots.plant("rv2sq"), known_robots.controller("rv2sq")
+    rate = 5000.0
+    reference = references.random_fourier(-np.ones(6), np.ones(6), np.ones(6), 1.0, rate, acceleration=20.0, seed=0)
+    wild = replace(controller, kp=60.0 * controller.kp, kd=1e-4 * controller.kd)
+    simulate(plant, wild, reference, Sensing(every=10))
+    with pytest.raises(NotConverged, match="these gains do not hold"):
+        simulate_tangents(plant, wild, reference, np.arange(len(plant.parameters)), 10.0)
