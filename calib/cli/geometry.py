@@ -143,8 +143,8 @@ def select(
     from calib.procedure.measuring.run import RunSettings
 
     named = beside(constraints).values() if constraints else ()
-    beside_it = targets_of(out, plots)
-    check_targets([out, *([run] if run else []), *beside_it.values()], [robot, existing, constraints, *named])
+    planned = [out, *([run] if run else []), *targets_of(out, plots).values()]
+    check_targets(planned, [robot, existing, constraints, *named])
     targets = tuple(tuple(numbers(text, 3, "--tool")) for text in tool or [])
     sigmas = None if sigma is None else numbers(sigma, 2, "--sigma")
     stated = None if sigmas is None else (sigmas[0], sigmas[1])
@@ -163,7 +163,9 @@ def select(
         chosen.save_run(run)
         say(f"the run: {run}; calib view {run} --robot {robot}")
     say(str(chosen))
-    say(f"{m} poses written to {out}, what they will tell to {', '.join(str(path) for path in beside_it.values())}")
+    if told := targets_of(out, plots, chosen.chosen):
+        say(f"what they will tell: {', '.join(str(path) for path in told.values())}")
+    say(f"{m} poses written to {out}")
 
 
 @app.command()

@@ -253,9 +253,11 @@ def _blind(
     return other.value, foretold(seen, np.concatenate([free.jacobian(other.q), past]), typical, m)
 
 
-def targets(out: Path, plots: bool) -> dict[str, Path]:
-    """Return the files of a selection beside its CSV: the prediction, and figures by name."""
-    return {"prediction": beside(out)} | {name: out.parent / f"{out.stem}_{name}.png" for name in FIGURES if plots}
+def targets(out: Path, plots: bool, chosen: Chosen | None = None) -> dict[str, Path]:
+    """Return the files of a selection beside its CSV, of any or of a given one: the prediction, and figures by name."""
+    figures = () if not plots else FIGURES if chosen is None else chosen.figures
+    told = {} if chosen is not None and chosen.promise is None else {"prediction": beside(out)}
+    return told | {name: out.parent / f"{out.stem}_{name}.png" for name in figures}
 
 
 def write(chosen: Chosen, path: Path) -> Path:
@@ -263,6 +265,8 @@ def write(chosen: Chosen, path: Path) -> Path:
     assert chosen.selection.q is not None
     if chosen.promise is not None:
         write_promise(chosen.promise, path)
+    else:
+        beside(path).unlink(missing_ok=True)  # an earlier selection's
     return write_poses(path, chosen.selection.q, chosen.chain.joint_names, kinds=joint_kinds(chosen.chain))
 
 
