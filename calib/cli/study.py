@@ -50,7 +50,7 @@ def study(
             studies, folder, methods=_names(methods), runs=runs, where=workers, report_only=report_only, plots=plots,
             say=progress,
         )  # fmt: skip
-    tables = [report.condition_table(one) for one in found.conditions if one.methods]
+    tables = [report.console_table(one) for one in found.conditions if one.methods]
     if len(tables) > SHOWN:
         tables = [report.overview(found.conditions), report.torque_table(found.conditions)]
     say(*console.rendered(tables))

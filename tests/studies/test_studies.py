@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 from study_rows import ROW
 
 from calib.errors import UsageError
+from calib.procedure.report.console import rendered
+from calib.procedure.study.report import console_table
 from calib.studies.conditions import Condition, read_study, shipped
 from calib.studies.experiment import make_experiment
 from calib.studies.summary import LEAST, sign_test, summarise
@@ -158,6 +162,14 @@ def test_where_none_is_taken_it_is_said_why(tmp_path: Path):
     assert one.best is None and "gives an estimate" in one.why_none
     (one,) = summarise(study, [*few, replace(few[0], seed=99)])
     assert one.best is one.chosen and not one.why_none
+
+
+def test_a_terminal_shows_figures_whole(tmp_path: Path):
+    study = read_study([written(tmp_path)])
+    found = [replace(ROW, digest=study.conditions[0].digest, seed=k, torque_error=0.00123 * (k + 1)) for k in range(9)]
+    text = StringIO()
+    Console(width=100, file=text).print(*rendered([console_table(summarise(study, found)[0])]))
+    assert "0.00369–0.00861" in text.getvalue()
 
 
 def test_the_sign_test_is_the_binomial_one():

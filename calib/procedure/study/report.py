@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import datetime
 from importlib import metadata, resources
 
@@ -48,6 +49,10 @@ HEADER = (
     "method", "trials", "failed", "torque [%]", "quartiles", "worst joint [%]", "β [%]", "in σ", "covered [%]",
     "d_τ [%]", "d_q [%]", "rounds", "simulations", "CPU [s]", "p", "",
 )  # fmt: skip
+ON_CONSOLE = tuple(
+    HEADER.index(name)
+    for name in ("method", "trials", "failed", "torque [%]", "quartiles", "covered [%]", "CPU [s]", "")
+)
 
 
 def overview(conditions: Sequence[ConditionSummary]) -> Table:
@@ -120,6 +125,14 @@ def condition_table(one: ConditionSummary) -> Table:
     return Table(
         f"Methods on {one.condition.name}", HEADER, rows, described(one.condition), strong, range(1, len(HEADER) - 1)
     )
+
+
+def console_table(one: ConditionSummary) -> Table:
+    """Return the columns of a condition's table that a terminal has room for."""
+    whole = condition_table(one)
+    rows = [tuple(row[k] for k in ON_CONSOLE) for row in whole.rows]
+    header = tuple(HEADER[k] for k in ON_CONSOLE)
+    return replace(whole, header=header, rows=rows, numbers=range(1, len(header) - 1))
 
 
 def _line(one: MethodSummary) -> tuple[str, ...]:
