@@ -14,8 +14,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import product
-from os.path import realpath
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +28,7 @@ from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.prediction import predict
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
-from calib.procedure.dynamic_stage.validation import repeated_motion
+from calib.procedure.dynamic_stage.validation import overlaps, repeated_motion
 from calib.procedure.dynamic_stage.verdict import motion_warnings
 
 BLOCKS = 10  # of time in each recording
@@ -105,7 +103,8 @@ def compare_methods(
     """
     if not inputs.unseen:
         raise UsageError("methods are ranked by motion that none has seen: give some with --validate")
-    _check_apart(inputs.cases, inputs.unseen)
+    if shared := overlaps(inputs.cases, inputs.unseen):
+        raise UsageError(f"{shared[0]}: cut them apart, log.npz@0:20 and log.npz@20:30")
     repeated = repeated_motion(inputs.cases, inputs.unseen)
     proofs = tuple(case for case in inputs.unseen if case.name not in repeated)
     inputs = replace(inputs, unseen=proofs or inputs.unseen)
@@ -147,17 +146,6 @@ def caveats(inputs: IdentificationInputs, found: Sequence[ComparedMethod]) -> li
             "learn from more motion"
         )
     return told
-
-
-def _check_apart(cases: Sequence[Case], unseen: Sequence[Case]) -> None:
-    """Refuse to rank by samples that were learnt from."""
-    for case, own in product(unseen, cases):
-        first, last = max(case.motion.t[0], own.motion.t[0]), min(case.motion.t[-1], own.motion.t[-1])
-        if own.motion.file and realpath(case.motion.file) == realpath(own.motion.file) and first < last:
-            raise UsageError(
-                f"{case.name} is to be unseen, yet {first:.3g} s to {last:.3g} s of it are learnt from, too "
-                f"({own.name}): cut them apart, log.npz@0:20 and log.npz@20:30"
-            )
 
 
 def _said(say: Callable[[str], None], name: str, words: str) -> None:

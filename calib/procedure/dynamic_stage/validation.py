@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
+from os.path import realpath
 
 import numpy as np
 
@@ -85,6 +87,17 @@ def repeated_motion(cases: Sequence[Case], unseen: Sequence[Case]) -> dict[str, 
     return {name: share for name, share in shares.items() if share >= REPEAT}
 
 
+def overlaps(cases: Sequence[Case], unseen: Sequence[Case]) -> list[str]:
+    """Return which samples of files are to be unseen and yet learnt from, in words."""
+    told = []
+    for case, own in product(unseen, cases):
+        first, last = max(case.motion.t[0], own.motion.t[0]), min(case.motion.t[-1], own.motion.t[-1])
+        if own.motion.file and realpath(case.motion.file) == realpath(own.motion.file) and first < last:
+            span = f"{first:.3g} s to {last:.3g} s"
+            told.append(f"{case.name} is to be unseen, yet {span} of it are learnt from, too ({own.name})")
+    return told
+
+
 def assess(
     inputs: IdentificationInputs,
     dynamics: Dynamics,
@@ -135,7 +148,7 @@ def assess(
     )  # fmt: skip
     verdict = _with_replays(verdict, tracking)
     said = (
-        *amperes, *(one.told for one in odd),
+        *amperes, *(one.told for one in odd), *overlaps(inputs.cases, inputs.unseen),
         *warnings(inputs.cases, inputs.unseen, validation, repeated, excitation, inputs.chain),
         *(line for name in validation if name in expected for line in extrapolates(name, expected[name])),
         *findings.notes,

@@ -13,6 +13,7 @@ from calib.cli import run
 from calib.errors import UsageError
 from calib.procedure.dynamic_stage.inputs import gather
 from calib.procedure.dynamic_stage.method_comparison import QUICK, caveats, compare_methods
+from calib.procedure.dynamic_stage.validation import overlaps
 
 
 def recorded(folder: Path) -> tuple[Path, Path]:
@@ -46,8 +47,12 @@ def test_motion_that_was_learnt_from_ranks_nothing(robot: Path, tmp_path: Path):
     """Samples in both are refused; a copy of the motion under another name, here of other noise, is no evidence."""
     train, other = recorded(tmp_path)
     end = float(np.load(train)["t"][-1])
+    shared, apart = (
+        gather(robot, [f"{train}@0:{part * end:.2f}"], [f"{train}@{0.5 * end:.2f}:"]) for part in (0.6, 0.5)
+    )
+    assert not overlaps(apart.cases, apart.unseen)
     with pytest.raises(UsageError, match="are learnt from, too"):
-        compare_methods(gather(robot, [f"{train}@0:{0.6 * end:.2f}"], [f"{train}@{0.5 * end:.2f}:"]), ["ols"])
+        compare_methods(shared, ["ols"])
     np.savez(tmp_path / "copy.npz", **(dict(np.load(train)) | {"tau": planted.series(0, noise=0.1)["tau"]}))
     alone, beside = (gather(robot, [train], [tmp_path / "copy.npz", *more]) for more in ([], [other]))
     (found,) = compare_methods(alone, ["ols"])
