@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
@@ -49,7 +49,9 @@ class Relevance:
     noise: float
 
 
-def relevance(data: Gram, groups: np.ndarray, start: np.ndarray, iterations: int = 15) -> Relevance:
+def relevance(
+    data: Gram, groups: np.ndarray, start: np.ndarray, iterations: int = 15, settled: float = 0.0
+) -> Relevance:
     """Estimate x with prior x_g ~ N(0, 1/λ_g) per group, every λ and the noise at their most probable.
 
     MacKay's fixed point (1992; Tipping 2001, eq. 16–18): λ_g = γ_g / ‖x_g‖² with γ_g = Σ_{i in g} (1 - λ_g Σ_ii), and
@@ -59,9 +61,16 @@ def relevance(data: Gram, groups: np.ndarray, start: np.ndarray, iterations: int
     Args:
         data: statistics of all rows.
         groups: (p,) group of each column; -1 for no ridge.
-        start: (p,) first guess of each column's prior standard deviation; read where there is a ridge.
-        iterations: of the fixed point.
+        start: (p,) first guess of each column's prior standard deviation; read where there is a ridge. Within a group
+            their ratios stay.
+        iterations: of the fixed point, at most.
+        settled: it ends where values move by less than this share of their standard deviations, rms; 0: never before.
     """
+    profile = _profile(groups, start)
+    if np.ptp(profile) > 1e-9:  # in units of the profile a group's columns are alike
+        inner = Gram(data.square * np.outer(profile, profile), data.cross * profile, data.total, data.rows)
+        found = relevance(inner, groups, start / profile, iterations, settled)
+        return replace(found, values=found.values * profile, ridge=found.ridge * profile)
     ridged = groups >= 0
     count = int(groups.max(initial=-1)) + 1
     family = np.where(ridged, groups, count)  # columns without a ridge form the last family, with precision 0
@@ -70,7 +79,7 @@ def relevance(data: Gram, groups: np.ndarray, start: np.ndarray, iterations: int
     information = np.bincount(family, np.diag(data.square), count + 1) / members
     beta, alive = 1.0, np.ones(count + 1, dtype=bool)
     index, solution, effective = np.arange(len(groups)), np.zeros(len(groups)), 0.0
-    square = data.square
+    square, last = data.square, np.full(len(groups), np.inf)
     for _ in range(iterations):
         inside = np.flatnonzero(alive[family[index]])
         if len(inside) < len(index):
@@ -87,11 +96,25 @@ def relevance(data: Gram, groups: np.ndarray, start: np.ndarray, iterations: int
         misfit += solution @ square @ solution
         least = EXACT**2 * max(data.total, 1e-300)  # what rounding leaves of a perfect fit
         beta = max(data.rows - effective - int((~ridged).sum()), 1.0) / max(float(misfit), least)
+        if settled > 0.0 and np.mean((solution - last[index]) ** 2 / variance) < settled**2:
+            break
+        last[index] = solution
     values, ridge = np.zeros(len(groups)), np.where(ridged, 0.0, np.inf)
     values[index] = solution
     kept = index[ridged[index]]
     ridge[kept] = 1.0 / np.sqrt(lam[groups[kept]])
     return Relevance(values, ridge, effective, float(1.0 / np.sqrt(beta)))
+
+
+def _profile(groups: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Return each column's first guess over its group's geometric mean (p,); 1 without a ridge."""
+    ridged = groups >= 0
+    result = np.ones(len(groups))
+    if ridged.any():
+        logs, own = np.log(start[ridged]), groups[ridged]
+        mean = np.bincount(own, logs) / np.maximum(np.bincount(own), 1)
+        result[ridged] = np.exp(logs - mean[own])
+    return result
 
 
 def _posterior(

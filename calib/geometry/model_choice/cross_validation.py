@@ -28,6 +28,7 @@ from calib.robot.deflection import Deflection, Term
 CHUNK = 1000  # poses observed at once
 BLIND = 3.0  # error by covariance alone, over the nominal residuals, from which on a fold says nothing (our choice)
 LOOSE = 1.0  # how far a frame may be from where it is [m, rad] (our choice)
+SETTLED = 0.02  # share of the parameters' sigmas that the search of ridges may leave (our choice)
 METRES = ("position", "consistency", "distance", "plane", "pixel")
 
 
@@ -91,9 +92,11 @@ class FoldStatistics:
     def error(self, terms: np.ndarray) -> UnseenErrors:
         """Return the error on held-out rows of geometry + terms."""
         index = np.concatenate([np.arange(self.rigid), self.rigid + terms])
-        squares = []
+        squares, chosen = [], self.ridges(terms)
         for fold, held in enumerate(self.held_out):
-            x = relevance(*self.problem(terms, fold), iterations=8).values
+            data, groups, sizes = self.problem(terms, fold)
+            sizes[self.rigid :] = np.where(chosen > 0.0, chosen, sizes[self.rigid :])  # where the search begins
+            x = relevance(data, groups, sizes, iterations=8, settled=SETTLED).values
             square = held.square.take(index, 0).take(index, 1)
             squares.append(held.total - 2.0 * x @ held.cross[index] + x @ square @ x)
         return UnseenErrors(np.array(squares), self.rows)
@@ -106,7 +109,7 @@ class FoldStatistics:
         """Return the prior standard deviation of each term that all rows choose; 0 where they switch it off."""
         key = terms.tobytes()
         if key not in self._chosen:
-            self._chosen[key] = relevance(*self.problem(terms)).ridge[self.rigid :]
+            self._chosen[key] = relevance(*self.problem(terms), settled=SETTLED).ridge[self.rigid :]
         return self._chosen[key]
 
     def alive(self, terms: np.ndarray) -> int:

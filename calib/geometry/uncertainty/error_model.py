@@ -4,8 +4,10 @@
 
 with Σ the parameters' covariance, d the distance of q from the nearest pose that was learnt from and g that from the
 ranges of single joints that were, every joint counting by its lever [m]. κ and v are the most probable ones of errors
-on rows left out: at random (near), by regions or stations, and by the ends of every joint's range (far). The radius
-that holds 95 % is the quantile of the same rows' errors in units of that sigma: nothing is said of their distribution.
+on rows left out: at random (near), by regions or stations, and by the ends of every joint's range (far); both kinds
+count alike. The radius that holds 95 % is the quantile of the same rows' errors in units of that sigma: nothing is said
+of their distribution. It goes from that of the near rows to that of the far ones as d² + g² goes from the median of the
+ones to that of the others; sigmas are stated in units of the larger radius.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.linalg
 from scipy.spatial import KDTree
 
 from calib.data.poses.measurements import PoseMeasurements, Positions, take
@@ -37,6 +40,7 @@ SOME = 0.02  # share of the poses (our choice)
 END = 0.2  # share of the poses at each end of a joint's range that is left out (our choice)
 FEWEST = 20  # poses from which errors on rows left out are worth a model (our choice)
 MOST = 1500  # poses that folds are judged by (our choice)
+SETTLED = 0.02  # share of the parameters' sigmas that the search of ridges may leave (our choice)
 UNTOLD = 1.0  # what is known beforehand of a parameter that a fold does not tell [m, rad] (our choice)
 
 
@@ -49,7 +53,8 @@ class Discrepancy:
         floor: v_0 [m²], what remains among the poses learnt from, the instrument's noise included.
         far: v_1 [m²/m²], per squared distance from the nearest of them.
         beyond: v_2 [m²/m²], per squared distance from the ranges of their joints.
-        radius: sigmas within which 95 % of the errors on rows left out were.
+        radii: sigmas within which 95 % of the errors on rows left out were, near and far.
+        reach: median of d² + g² of the near rows, and of the far ones [m²].
         levers: (n,) by how much the tool moves with each joint [m/rad or 1], rms over the poses.
     """
 
@@ -57,8 +62,14 @@ class Discrepancy:
     floor: float
     far: float
     beyond: float
-    radius: float
+    radii: tuple[float, float]
+    reach: tuple[float, float]
     levers: tuple[float, ...]
+
+    @property
+    def radius(self) -> float:
+        """Sigmas, as stated, that hold 95 % of the errors."""
+        return max(self.radii)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +134,8 @@ class ErrorModel:
     def _sigma(self, own: np.ndarray, q: np.ndarray) -> np.ndarray:
         """Return that sigma (m,) [m], where the parameters' share is known: trace J Σ Jᵀ (m,) [m²]."""
         found, parts = self.discrepancy, distances(q, self.learnt, np.array(self.discrepancy.levers))
-        return np.sqrt(found.parameters * own + found.floor + found.far * parts[0] + found.beyond * parts[1])
+        plain = np.sqrt(found.parameters * own + found.floor + found.far * parts[0] + found.beyond * parts[1])
+        return plain * np.interp(parts[0] + parts[1], found.reach, found.radii) / found.radius
 
     def beyond(self, q: np.ndarray) -> np.ndarray:
         """Return which joints (m, n) stand outside the range that was learnt from: there a prediction extrapolates."""
@@ -185,11 +197,14 @@ def learn_errors(
     near = np.concatenate([*rows.left_out(random_folds(measured, 5, seed), levers)])
     groups = [selected.folds, *_range_folds(measured)]
     far = np.concatenate([errors for each in groups for errors in rows.left_out(each, levers)])
-    scale = _most_probable(np.concatenate([near, far]))
-    radius = max(_radius(near, scale), _radius(far, scale))
+    times = max(1, round(len(far) / len(near)))
+    scale = _most_probable(np.concatenate([np.repeat(near, times, axis=0), far]))
+    radii = _radius(near, scale), _radius(far, scale)
+    low, high = (float(np.median(rows[:, 2:].sum(axis=1))) for rows in (near, far))
+    reach = low, max(high, low * (1.0 + 1e-9) + 1e-12)
     q = np.concatenate([block.q for block in measured])
     kappa, floor, far, beyond = scale.tolist()
-    known = Discrepancy(kappa, floor, far, beyond, radius, tuple(levers.tolist()))
+    known = Discrepancy(kappa, floor, far, beyond, radii, reach, tuple(levers.tolist()))
     return ErrorModel(found.cell, found.free, found.estimate.covariance, q, known)
 
 
@@ -259,7 +274,7 @@ class _Rows:
 
     def left_out(self, folds: Folds, levers: np.ndarray) -> Iterator[np.ndarray]:
         """Yield per fold of its rows (rows, 4): |e|², trace J Σ Jᵀ, squared distances from the rest."""
-        free = np.arange(len(self.prior))
+        free, sizes = np.arange(len(self.prior)), self.sizes
         for fold in range(folds.count):
             inside = [np.flatnonzero(members[rows] == fold) for members, rows in zip(folds.members, self.chosen)]
             if not 0 < sum(map(len, inside)) < sum(map(len, self.measured)):
@@ -273,12 +288,14 @@ class _Rows:
                     )
             square = data.square.copy()
             square[free, free] += 1.0 / self.prior**2
-            found = relevance(replace(data, square=square), self.groups, self.sizes, iterations=8)
+            found = relevance(replace(data, square=square), self.groups, sizes, iterations=8, settled=SETTLED)
+            own = np.isfinite(found.ridge) & (found.ridge > 0.0)
+            sizes = np.where(own, found.ridge, self.sizes)  # where the next fold's search begins
             alive = np.flatnonzero(found.ridge > 0.0)
             precision = square[np.ix_(alive, alive)] / found.noise**2 + np.diag(found.ridge[alive] ** -2.0)
             scale = 1.0 / np.sqrt(np.diag(precision))
-            values, vectors = np.linalg.eigh(precision * np.outer(scale, scale))
-            root = scale[:, None] * vectors / np.sqrt(np.maximum(values, 1e-12))
+            factor = np.linalg.cholesky(precision * np.outer(scale, scale) + 1e-12 * np.eye(len(scale)))
+            root = scale[:, None] * scipy.linalg.solve_triangular(factor, np.eye(len(scale)), lower=True).T
             learnt = np.concatenate([np.delete(b.q, rows, axis=0) for b, rows in zip(self.measured, inside)])
             stays = {b.station for b, rows in zip(self.measured, inside) if len(rows) < len(b)}
             for number, rows in enumerate(inside):
