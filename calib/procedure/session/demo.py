@@ -29,7 +29,7 @@ from calib.robot.load import load
 from calib.simulation.cells import camera_files, measured_files
 from calib.simulation.cells.cell import Cell, measure, wandering
 from calib.simulation.cells.truth import TRUTH, position_errors, share_within, torque_errors, true_base
-from calib.simulation.cells.virtual_arm import MovingArm, moving_arm, play, record
+from calib.simulation.cells.virtual_arm import REST, MovingArm, moving_arm, play, record
 from calib.simulation.cells.virtual_cells import virtual_cell
 
 Say = Callable[[str], None]
@@ -164,7 +164,9 @@ def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, 
         arm = arm_of(session, cell)
         chain, dynamics = read_dynamics(session.identification.path)
         torques = torque_errors(cell, arm, dynamics.model, dynamics.values, chain)
-        true = true_base(dynamics.model, cell, arm, session.settings.seed)
+        motion = dynamics_steps.designed_motions(session)[LOGS[0][0]]
+        middle = LOGS[0][2] + REST + motion.period * motion.repeat / 2.0
+        true = true_base(dynamics.model, cell, arm, session.settings.seed, middle)
         within, count = share_within(true, read_estimate(session.identification.path))
         notes.append(arm.note)
         lines.append(

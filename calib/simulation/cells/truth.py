@@ -20,6 +20,7 @@ from calib.geometry.installation import Installation, see
 from calib.robot.chain import Chain, random_joints, sampling_limits
 from calib.robot.deflection import evaluate
 from calib.simulation.cells.cell import Cell, true_poses
+from calib.simulation.cells.unmodelled import WARM_TIME
 from calib.simulation.cells.virtual_arm import MovingArm, link_torque, true_torque
 from calib.simulation.loop.references import random_fourier
 from calib.transforms import to_quaternion
@@ -113,17 +114,19 @@ def share_within(true: Mapping[str, float], estimate: StoredEstimate) -> tuple[f
     return (float(np.mean(inside)) if inside else 0.0), len(inside)
 
 
-def true_base(model: IdentificationModel, cell: Cell, arm: MovingArm, seed: int) -> dict[str, float]:
+def true_base(
+    model: IdentificationModel, cell: Cell, arm: MovingArm, seed: int, running: float = np.inf
+) -> dict[str, float]:
     """Return the true base parameters of a model by name: columns of the nominal arm, regrouped on the true one.
 
-    Friction is that of a warm arm in steady sliding: friction with memory, all of it slipping, is Coulomb friction.
+    Friction is that of an arm in steady sliding that has moved for the time `running` [s], infinite for a warm one:
+    friction with memory, all of it slipping, is Coulomb friction.
     """
+    fallen = arm.unmodelled.warming * (1.0 - np.exp(-running / WARM_TIME))
     known = dict(zip((*arm.plant.bodies.names, *(one.name for one in arm.plant.terms)), arm.plant.parameters))
     for j in range(arm.chain.n):
         for name, more in (("Fv", 0.0), ("Fc", arm.unmodelled.memory)):
-            known[f"{name}m{j + 1}"] += (more - arm.unmodelled.warming) * (
-                known[f"{name}l{j + 1}"] + known[f"{name}m{j + 1}"]
-            )
+            known[f"{name}m{j + 1}"] += (more - fallen) * (known[f"{name}l{j + 1}"] + known[f"{name}m{j + 1}"])
         for name in ("Fv", "Fc", "off"):  # whole drives, where the model does not part motor and link
             known[f"{name}{j + 1}"] = known[f"{name}l{j + 1}"] + known[f"{name}m{j + 1}"]
     names = tuple(name for name in model.names if name in known)
