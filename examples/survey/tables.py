@@ -1,7 +1,7 @@
-"""The tables of `README.md`, from the rows that are kept beside it.
+"""The tables of `README.md`, from the rows and the tables of recordings that are kept beside it.
 
     calib study 'MCS-*' --out examples/survey/rows        # runs what is missing; more runs: --runs 300
-    python examples/survey/tables.py                      # prints the tables
+    python examples/survey/tables.py --readme             # writes the tables into the README; without: prints them
 
 Both go on from what is there.
 """
@@ -9,10 +9,13 @@ Both go on from what is there.
 from __future__ import annotations
 
 import argparse
+import csv
 import math
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
+from calib.identification.methods.registry import METHODS
 from calib.studies.conditions import read_study
 from calib.studies.store import read_rows
 from calib.studies.summary import ConditionSummary, MethodSummary, summarise
@@ -72,32 +75,106 @@ def _figures(method: MethodSummary) -> list[str]:
     return [method.method, str(method.trials), failed, *(number(method.figures[key].median) for key in keys)]
 
 
-def pace(rows: Iterable[TrialRow]) -> Iterator[str]:
-    """Yield mean processor time per trial of each method, and that of a condition with 100 runs of each."""
-    spent: dict[str, list[float]] = {}
-    for row in rows:
-        if row.mismatch == "none" and not math.isnan(row.cpu):
-            spent.setdefault(row.method, []).append(row.cpu)
-    means = {name: sum(own) / len(own) for name, own in spent.items()}
-    yield ", ".join(f"{name} {mean:.2g} s" for name, mean in sorted(means.items(), key=lambda item: item[1]))
-    yield f"{len(means)} methods, 100 runs each, one condition: {100 * sum(means.values()) / 60:.0f} CPU min of methods"
+def coverage_table(conditions: Sequence[ConditionSummary], names: Sequence[str]) -> Iterator[str]:
+    """Yield the share [%] of parameters within the stated 95 % interval, median over runs: a column per condition."""
+    chosen = [one for name in names for one in conditions if one.condition.name == f"MCS-{name}"]
+    yield f"| method | {' | '.join(names)} |"
+    yield f"|---|{'---:|' * len(names)}"
+    for name in METHODS:
+        found = [next((method for method in one.methods if method.method == name), None) for one in chosen]
+        cells = ["" if own is None else number(own.figures["coverage"].median) for own in found]
+        if any(cells):
+            yield f"| {name} | {' | '.join(cells)} |"
+
+
+GROUPS = {"RV2SQ": ("rv2sq", 1), "TX40": ("tx40", 1), "TX40, decimated": ("tx40", 4)}
+
+
+def cost_table(rows: Iterable[TrialRow]) -> Iterator[str]:
+    """Yield mean processor time per trial of each method; runs and failures over the 15 conditions."""
+    own = [row for row in rows if row.condition.startswith("MCS-")]
+    yield f"| method | runs | without an estimate | {' | '.join(f'{name} [CPU s]' for name in GROUPS)} |"
+    yield f"|---|{'---:|' * (2 + len(GROUPS))}"
+    total = dict.fromkeys(GROUPS, 0.0)
+    for name in METHODS:
+        mine = [row for row in own if row.method == name]
+        counts = [sum(row.digest == digest for row in mine) for digest in {row.digest for row in own}]
+        failed, cells = sum(not row.found for row in mine), []
+        for group, (robot, factor) in GROUPS.items():
+            times = [row.cpu for row in mine if (row.robot, row.decimation) == (robot, factor) and row.cpu == row.cpu]
+            total[group] += sum(times) / len(times) if times else float("nan")
+            cells.append(number(sum(times) / len(times)) if times else "")
+        span = "–".join(map(str, dict.fromkeys((min(counts), max(counts)))))
+        yield f"| {name} | {span} | {failed} of {len(mine)} | {' | '.join(cells)} |"
+    minutes = [number(100 * value / 60) for value in total.values()]
+    yield f"| all, 100 runs each [CPU min] | | | {' | '.join(minutes)} |"
+
+
+def recordings_table(folder: Path) -> Iterator[str]:
+    """Yield errors on unseen motion [%] of each method on real recordings, with its seconds; bold: the one to take."""
+    tables = {path.stem: list(csv.DictReader(path.read_text().splitlines())) for path in sorted(folder.glob("*.csv"))}
+    yield f"| method | {' | '.join(tables)} |"
+    yield f"|---|{'---:|' * len(tables)}"
+    for name in METHODS:
+        found = [next((row for row in own if row["method"] == name), None) for own in tables.values()]
+        cells = ["" if row is None else _recorded(row) for row in found]
+        if any(cells):
+            yield f"| {name} | {' | '.join(cells)} |"
+
+
+def _recorded(row: dict[str, str]) -> str:
+    if row["failure"]:
+        return "" if "[loop]" in row["failure"] else "no estimate"
+    text = f"{float(row['unseen_percent']):.3g} ± {float(row['sigma']):.2g}"
+    text = f"**{text}**" if row["take"] == "yes" else f"{text} ·" if row["as_good"] == "yes" else text
+    return f"{text} ({float(row['seconds']):.2g} s)"
+
+
+def sections(rows: Sequence[TrialRow], recordings: Path) -> dict[str, list[str]]:
+    """Return the lines of each table by the name that its place in the README has."""
+    made: dict[str, list[str]] = {}
+    for name in STUDIES:
+        conditions = summarise(read_study([name]), rows)
+        lines = made.setdefault(name.removesuffix("-*"), [])
+        for part in range(0, len(conditions), 5):
+            lines += [*torque_table(conditions[part : part + 5]), ""]
+        if name == "MCS-*":
+            shown = ("TX40-1-1", "TX40-1-2", "TX40-1-3", "TX40-4-1", "TX40-4-2", "RV2SQ-1-1", "RV2SQ-1-2")
+            made["coverage"] = list(coverage_table(conditions, shown))
+    made["cost"] = list(cost_table(rows))
+    made["recordings"] = list(recordings_table(recordings))
+    return made
+
+
+def written(text: str, made: dict[str, list[str]]) -> str:
+    """Return the README with each table in its place, between <!-- NAME --> and <!-- end -->."""
+    for name, lines in made.items():
+        block = "\n".join([f"<!-- {name} -->", *lines, "<!-- end -->"])
+        text, count = re.subn(rf"<!-- {name} -->.*?<!-- end -->", lambda _, own=block: own, text, flags=re.DOTALL)
+        if count != 1:
+            raise SystemExit(f"README.md has {count} places for the table '{name}', <!-- {name} --> … <!-- end -->")
+    return text
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--rows", type=Path, default=HERE / "rows")
     parser.add_argument("--full", default="", help="all figures of this condition")
+    parser.add_argument("--readme", action="store_true", help="write the tables into README.md")
     given = parser.parse_args()
     rows = read_rows(given.rows)
-    for name in STUDIES:
-        conditions = summarise(read_study([name]), rows)
-        if given.full:
-            chosen = [one for one in conditions if one.condition.name == given.full]
-            print("\n".join(line for one in chosen for line in merit_table(one)))
-            continue
-        for part in range(0, len(conditions), 5):
-            print("\n".join([*torque_table(conditions[part : part + 5]), ""]))
-    print("\n".join(pace(rows)))
+    if given.full:
+        conditions = [one for name in STUDIES for one in summarise(read_study([name]), rows)]
+        chosen = [one for one in conditions if one.condition.name == given.full]
+        print("\n".join(line for one in chosen for line in merit_table(one)))
+        return
+    made = sections(rows, HERE / "recordings")
+    if given.readme:
+        readme = HERE / "README.md"
+        readme.write_text(written(readme.read_text(), made))
+        return
+    for name, lines in made.items():
+        print("\n".join([f"## {name}", "", *lines, ""]))
 
 
 if __name__ == "__main__":
