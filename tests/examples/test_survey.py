@@ -21,6 +21,8 @@ def test_kept_rows_count():
 
 
 def test_tables_are_those_of_the_readme():
+    """Every line of every table that the kept rows and recordings give stands in the README."""
     done = subprocess.run([sys.executable, SURVEY / "tables.py"], capture_output=True, text=True, check=True)
-    printed = [line for line in done.stdout.splitlines() if line.startswith("| wls ")]
-    assert printed and all(line in (SURVEY / "README.md").read_text() for line in printed)
+    printed = [line for line in done.stdout.splitlines() if line.startswith("|")]
+    readme = set((SURVEY / "README.md").read_text().splitlines())
+    assert len(printed) > 100 and [line for line in printed if line not in readme] == []
