@@ -78,9 +78,9 @@ def compare(
     from calib import files
     from calib.identification.identify_options import read_options
     from calib.procedure.dynamic_stage import inputs
-    from calib.procedure.dynamic_stage.method_comparison import caveats, compare_methods, write_table
     from calib.procedure.report import console
     from calib.procedure.study import method_table
+    from calib.procedure.study.method_comparison import caveats, compare_methods, write_table
 
     if out is not None:
         files.check_target(out, [robot, *recordings, *(validate or []), options], (".csv",))

@@ -131,8 +131,8 @@ def _compiled(model: ParallelModel) -> tuple:
 def _stacked(arrays: list[np.ndarray]) -> np.ndarray:
     """Return arrays one above the other, each filled up with zeros to the largest shape."""
     result = np.zeros((len(arrays), *np.max([array.shape for array in arrays], axis=0)))
-    for own, array in zip(result, arrays):
-        own[tuple(map(slice, array.shape))] = array
+    for k, array in enumerate(arrays):
+        result[(k, *map(slice, array.shape))] = array
     return result
 
 

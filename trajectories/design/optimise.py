@@ -123,13 +123,14 @@ def _nothing(problem: ExcitationProblem, stuck: list[Stuck], starts: int) -> Not
     motion = stretched(problem.basis().motion(best.x), best.factor)
     if best.excess[0] <= 0.0 and problem.goals:
         values = exact_values(problem, motion, problem.regressor(motion.q, motion.v, motion.a))
-        lacking, goal, value = unmet(problem, values)
-        assert goal is not None  # the search kept every limit, so a hard goal stood in its way
-        return NothingFeasible(
-            f"the hard goal {goal.objective.name} ≤ {goal.goal:g} was not reached in {starts} starts, though all "
-            f"limits were kept: the nearest motion has {value:.4g}; ease it, give it a weight, or take a longer period",
-            goal.objective.name, lacking, "of the goal",
-        )  # fmt: skip
+        if (missed := unmet(problem, values)) is not None:  # every limit was kept, so a hard goal stood in the way
+            lacking, goal, value = missed
+            return NothingFeasible(
+                f"the hard goal {goal.objective.name} ≤ {goal.goal:g} was not reached in {starts} starts, though all "
+                f"limits were kept: the nearest motion has {value:.4g}; ease it, give it a weight, or take a longer "
+                "period",
+                goal.objective.name, lacking, "of the goal",
+            )  # fmt: skip
     worst = max(problem.constraints, key=lambda c: float((c.values(motion) / c.scale).max()), default=None)
     if worst is None:
         raise NotExciting(f"no motion could be evaluated: {best.reason}")

@@ -215,12 +215,12 @@ def merit(problem: ExcitationProblem, values: np.ndarray) -> float:
     return _summed(problem, list(values))[0]
 
 
-def unmet(problem: ExcitationProblem, values: np.ndarray) -> tuple[float, AttainmentGoal | None, float]:
-    """Return by how much the worst hard goal is missed, as a share of it, that goal, and its value; or zeros."""
-    worst: tuple[float, AttainmentGoal | None, float] = (0.0, None, 0.0)
+def unmet(problem: ExcitationProblem, values: np.ndarray) -> tuple[float, AttainmentGoal, float] | None:
+    """Return by how much the worst hard goal is missed, as a share of it, that goal, and its value; None: none is."""
+    worst = None
     for goal, value in zip(problem.goals, values):
         lacking = (value - goal.goal) / max(abs(goal.goal), 1e-3)
-        if goal.share == 0 and lacking > worst[0]:
+        if goal.share == 0 and lacking > (worst[0] if worst else 0.0):
             worst = (float(lacking), goal, float(value))
     return worst
 

@@ -134,7 +134,7 @@ def one_start(
     try:
         for number, stage in enumerate(chosen):
             if number:
-                run, y = run.continued(*_at_stage(problem, stage))
+                run, y = run.continued(y, *_at_stage(problem, stage))
             run.sharpness = stage.sharpness
             y = run.solve(run.repaired(y), max(2, round(evaluations * stage.share)), method, stage.tolerance)
             y = run.repaired(y, REPAIR)  # SLSQP travels outside, and may have ended there
@@ -143,7 +143,7 @@ def one_start(
             raise
         run.interrupted = True
     if run.problem.family is not problem.family:  # interrupted before the whole family was looked at
-        run, y = run.continued(problem, problem.basis())
+        run, y = run.continued(y, problem, problem.basis())
         run.repaired(y)
     return run.result(y, time.perf_counter() - began, int(start) if drawn else -1)
 
@@ -176,10 +176,13 @@ class StartSearch:
         self._evaluation: Evaluation | None = None
         self._tried = np.zeros(0)
 
-    def continued(self, problem: ExcitationProblem, basis: Basis) -> tuple[StartSearch, np.ndarray]:
+    def _reached(self, last: np.ndarray) -> np.ndarray:
+        """Return the best point, the nearest to the limits where none keeps them, or the last where none was tried."""
+        return self.best if self.best is not None else self.nearest if self.nearest is not None else last
+
+    def continued(self, last: np.ndarray, problem: ExcitationProblem, basis: Basis) -> tuple[StartSearch, np.ndarray]:
         """Return the search of another problem that goes on from here, and the point where it begins."""
-        y = self.best if self.best is not None else self.nearest
-        assert y is not None
+        y = self._reached(last)
         if problem.family is not self.problem.family:
             p = self.basis.p
             path = self.problem.family.basis(basis.times).motion(y[:p])
@@ -192,7 +195,7 @@ class StartSearch:
     def result(self, y: np.ndarray, seconds: float, seed: int) -> SearchResult | Stuck:
         """Return what the search came to; y: its last point."""
         p, stretch = self.basis.p, self.problem.stretch
-        best = self.best if self.best is not None else self.nearest if self.nearest is not None else y
+        best = self._reached(y)
         factor = float(best[p]) if self.problem.free_period else stretch[0]
         if self.best is None:
             return Stuck(best[:p], factor, self.least, self.count, self.reason)
@@ -216,7 +219,8 @@ class StartSearch:
         return self._evaluation
 
     def _remember(self, y: np.ndarray, found: Evaluation) -> None:
-        lacking = (max(found.excess, 0.0), unmet(self.problem, found.values)[0])
+        missed = unmet(self.problem, found.values)
+        lacking = (max(found.excess, 0.0), missed[0] if missed else 0.0)
         if lacking < self.least:
             self.least, self.nearest = lacking, y
         if found.excess > 1e-7:

@@ -85,22 +85,27 @@ def with_friction(problem: IdentificationProblem, model: IdentificationModel) ->
 
 
 def start_of(
-    problem: IdentificationProblem, plain: np.ndarray, inertia: np.ndarray, simulated: Callable[[np.ndarray], object]
+    problem: IdentificationProblem,
+    method: str,
+    plain: np.ndarray,
+    inertia: np.ndarray,
+    simulated: Callable[[np.ndarray], object],
 ) -> np.ndarray:
     """Return values (p,) to start from: those stated, or those nearest to least squares that can be simulated.
 
     Args:
+        method: name of the one that simulates.
         plain: (p,) of weighted least squares.
         inertia: (n,) of a regular robot, which nothing couples [kg m² or kg].
         simulated: raises `CalibError` where values cannot be simulated.
 
     Raises:
         CannotSimulate: where none can be.
+        UsageError: for a model that is no serial arm with motor torques.
     """
     if problem.start is not None:
         return np.array(problem.start, dtype=float)
-    model, own = problem.model, problem.base.b
-    assert isinstance(model, IdentificationModel)  # `believed_robot` asks first
+    model, own = serial_arm(problem, method), problem.base.b
     standard = np.zeros(model.p)
     for k, one in enumerate(model.columns):
         if one.shape == "acceleration" and one.joint is not None:

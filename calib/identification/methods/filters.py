@@ -66,7 +66,7 @@ class KalmanFilter(Method):
 
     def _estimate(self, problem: IdentificationProblem, plain: MethodEstimate, robot: BelievedRobot) -> MethodEstimate:
         values, sigma = plain.estimate.values, plain.estimate.sigma
-        start = start_of(problem, values, _inertia(problem), lambda x: _moves(robot, problem, x))
+        start = start_of(problem, self.name, values, _inertia(problem), lambda x: _moves(robot, problem, x))
         wide = np.maximum(WIDE * sigma, np.abs(start - values))
         noise = plain.std / np.sqrt(np.sum(np.square(problem.decimator.taps)))  # of one sample of the torques
         state = _State(robot, self.kind, start, np.diag(wide**2), [], 0)

@@ -73,7 +73,7 @@ class OutputError(Method):
         with np.errstate(divide="ignore", invalid="ignore"):
             inertia = loops.controller.kd**2 / (2.0 * loops.controller.kp)
         inertia = np.where(np.isfinite(inertia) & (inertia > 0.0), inertia, 1.0)
-        values = start_of(problem, plain.estimate.values, inertia, task.simulated)
+        values = start_of(problem, self.name, plain.estimate.values, inertia, task.simulated)
         first, _ = task.linearised(values)
         std, count = task.spread(first, 0), 1
         for _ in range(ROUNDS):

@@ -20,7 +20,7 @@ import numpy as np
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.data.poses.pixels import Pixels
 from calib.geometry.accuracy import errors
-from calib.geometry.checks.plausible import Scale, length_factor, mirrored_rms, scale_of
+from calib.geometry.checks.instrument_scale import Scale, length_factor, mirrored_rms, scale_of
 from calib.geometry.images.camera_guess import pnp_poses
 from calib.geometry.installation import Installation
 from calib.geometry.result import GeometricFit

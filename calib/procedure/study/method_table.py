@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from calib.procedure.dynamic_stage.method_comparison import APART, SLACK, ComparedMethod
 from calib.procedure.report.page import Block, Table, Text
+from calib.procedure.study.method_comparison import APART, SLACK, ComparedMethod
 
 HEADER = (
     "", "method", "unseen [%]", "behind the best", "raw [%]", "training [%]", "worst joint", "parameters", "rounds",

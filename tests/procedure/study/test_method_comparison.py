@@ -12,8 +12,8 @@ import pytest
 from calib.cli import run
 from calib.errors import UsageError
 from calib.procedure.dynamic_stage.inputs import gather
-from calib.procedure.dynamic_stage.method_comparison import QUICK, caveats, compare_methods
 from calib.procedure.dynamic_stage.validation import overlaps
+from calib.procedure.study.method_comparison import QUICK, caveats, compare_methods
 
 
 def recorded(folder: Path) -> tuple[Path, Path]:
