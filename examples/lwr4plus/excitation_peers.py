@@ -209,11 +209,13 @@ def picture(curves: dict[str, Curve], seconds: float) -> Figure:
             axis.step(t, np.exp(merit), where="post", color=color, linestyle=dash, linewidth=1.2, label=name)
         axis.set(
             xlabel="processor time [s]",
-            ylabel="√(cond raw · cond normalised)",
+            ylabel="√(raw · normalised)",
             xscale="log",
             yscale="log",
             xlim=(min(0.1, seconds / 10), seconds),
         )
+        for side in (axis.xaxis, axis.yaxis):
+            side.set_major_formatter("{x:g}")
         axis.legend(fontsize=7)
     return figure
 
