@@ -118,6 +118,12 @@ def _evaluated(node: ast.expr) -> float:
     raise ValueError(ast.dump(node))
 
 
+def _not_nan(value: float) -> float:
+    if value != value:
+        raise ValueError("nan")
+    return value
+
+
 @dataclass(frozen=True)
 class Real:
     """A finite number, made a float.
@@ -146,6 +152,8 @@ class Real:
         if not self.words and self.least is not None:
             words = f"{self.least:g} or more"
         inner = core.float_schema(strict=True, gt=self.above, ge=self.least, allow_inf_nan=self.infinite)
+        if self.infinite:
+            inner = core.no_info_after_validator_function(_not_nan, inner)
         result = core.custom_error_schema(inner, "expected", custom_error_message=words)
         if self.most is not None:
             hint = " (are these mm, or degrees?)" if self.unit in ("m", "rad") else ""

@@ -181,6 +181,8 @@ def test_the_options_file_says_them_and_other_methods_refuse_them():
         identify(planted.arm(), [planted.case("a", 0)], replace(settings, method="wls"))
     with pytest.raises(UsageError, match="lower bound 2 is above the upper 1"):
         parse_options({"constraints": {"bounds": {"Fv1": [2.0, 1.0]}}})
+    with pytest.raises(UsageError, match="Fv1: expected two numbers"):
+        parse_options({"constraints": {"bounds": {"Fv1": [float("nan"), 1.0]}}})
 
 
 def test_definite_inertia_gives_the_optimum_of_cvxpy(problem):
