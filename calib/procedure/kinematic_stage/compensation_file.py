@@ -50,10 +50,11 @@ def lines(commands: Commands, targets: Targets, fitted: Fitted) -> list[str]:
     result += [f"ignored columns of {targets.file}: {', '.join(targets.ignored)}"] if targets.ignored else []
     result += [f"not reached: target {k + 1}: {commands.reason[k]}" for k in np.flatnonzero(~good)[:SHOWN]]
     result += [f"not reached: {int((~good).sum()) - SHOWN} more"] if (~good).sum() > SHOWN else []
-    rms = {name: np.sqrt(np.mean(getattr(commands, name)[good] ** 2, axis=0)) for name in ("before", "left", "sigma")}
+    errors = (commands.before, commands.left, commands.sigma)
+    before, left, sigma = (_pair(np.sqrt(np.mean(each[good] ** 2, axis=0))) for each in errors)
     result += [
-        f"by the calibrated model, rms over {int(good.sum())} targets: {_pair(rms['before'])} without compensation, "
-        f"{_pair(rms['left'])} with it; sigma of the model {_pair(rms['sigma'])}"
+        f"by the calibrated model, rms over {int(good.sum())} targets: {before} without compensation, "
+        f"{left} with it; sigma of the model {sigma}"
     ]
     if fitted.unseen is not None:
         result.append(f"what to expect of the real arm: {1e3 * fitted.unseen:.3g} mm rms, as on poses not fitted")

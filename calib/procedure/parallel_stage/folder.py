@@ -60,10 +60,12 @@ def write_identified(outcome: ParallelOutcome, out: Path, plots: bool = True) ->
         write_estimate(folder, header, listed)
         write_covariance(folder / COVARIANCE, found.names, estimate.covariance)
         values = dict(zip(outcome.model.names, map(float, found.dynamics.values)))
-        table = {"robot": ROBOT, "kind": outcome.model.torque_rows.name, "payloads": list(outcome.model.payloads)}
-        table["v0"] = outcome.found.settings.v0[0]
-        base = dict(zip(found.names, words))
-        files.write_json(folder / MODEL, table | {"values": values, "base": base, "covariance": COVARIANCE})
+        model = {
+            "robot": ROBOT, "kind": outcome.model.torque_rows.name, "payloads": list(outcome.model.payloads),
+            "v0": outcome.found.settings.v0[0], "values": values, "base": dict(zip(found.names, words)),
+            "covariance": COVARIANCE,
+        }  # fmt: skip
+        files.write_json(folder / MODEL, model)
         files.write_json(folder / METRICS, metrics(outcome))
         case = (*outcome.unseen, *outcome.cases)[0]
         _write_torques(case, predict(found.dynamics, case), folder / "torques_1.csv")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from calib.errors import UsageError
-from calib.procedure.session.cell_answers import CAMERA, UNKNOWN, cell_tables
+from calib.procedure.measuring.cell_answers import CAMERA, UNKNOWN, cell_tables
 from calib.procedure.session.settings import TORQUES
 from calib.robot import library
 from calib.robot.load import resolve

@@ -22,8 +22,8 @@ from calib.procedure.kinematic_stage import selection
 from calib.procedure.kinematic_stage.settings import SelectionSettings
 from calib.procedure.measuring.boards import make
 from calib.procedure.measuring.camera_view import image_observation
+from calib.procedure.measuring.cell_answers import cell_tables
 from calib.procedure.measuring.pose_limits import read_limits
-from calib.procedure.session.cell_answers import cell_tables
 from calib.procedure.session.commands import NewSession, begin, go_on
 from calib.procedure.session.folder import open_session
 from calib.robot.deflection import Deflection

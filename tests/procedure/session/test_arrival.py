@@ -11,8 +11,8 @@ from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.measurements import take
 from calib.errors import MeasurementError, UsageError
 from calib.procedure.kinematic_stage import inputs
+from calib.procedure.measuring.cell_answers import CAMERA
 from calib.procedure.session import arrival
-from calib.procedure.session.cell_answers import CAMERA
 from calib.procedure.session.commands import NewSession, begin
 from calib.procedure.session.dynamics_steps import options_of
 from calib.procedure.session.folder import Session

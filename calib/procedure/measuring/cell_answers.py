@@ -52,29 +52,29 @@ def cell_tables(
     Raises:
         UsageError: for an answer that cannot be one, with what can.
     """
-    found: dict[str, Any] = {}
     without = [name for name, text in (("instrument", instrument_at), ("box", box)) if _plain(text) == NONE]
+    instrument, target, collision = dict[str, Any](), dict[str, Any](), dict[str, Any]()
     if (place := _known(instrument_at)) is not None:
-        table: dict[str, Any] = {"xyz": _numbers("--instrument-at", place, 3, "x,y,z in metres", FAR)}
-        found["instrument"] = table
+        instrument = {"xyz": _numbers("--instrument-at", place, 3, "x,y,z in metres", FAR)}
     if (angle := _known(cone)) is not None:
-        if "instrument" not in found:
+        if not instrument:
             raise UsageError(f"--cone {angle}: say where the instrument stands, too (--instrument-at x,y,z)")
-        found["instrument"]["sight"] = _cone(angle)
+        instrument |= {"sight": _cone(angle)}
     if (direction := _known(facing)) is not None:
-        found["target"] = {"facing": _direction("--facing", direction)}
+        target = {"facing": _direction("--facing", direction)}
     if (walls := _known(box)) is not None:
         sides = _numbers("--box", walls, 6, "x,x,y,y,z,z in metres, the smaller one first", WIDE)
-        found["collision"] = {"box": [sides[k : k + 2] for k in (0, 2, 4)]}
-        if any(low >= high for low, high in found["collision"]["box"]):
+        ranges = [sides[k : k + 2] for k in (0, 2, 4)]
+        if any(low >= high for low, high in ranges):
             raise UsageError(f"--box {walls}: expected x,x,y,y,z,z in metres, the smaller one first")
-        _check_inside(found["collision"]["box"], walls)
+        _check_inside(ranges, walls)
+        collision = {"box": ranges}
     stated = [text for each in obstacles or () for text in each.split(";") if _plain(text) not in UNKNOWN]
     without += ["obstacles"] if [_plain(text) for text in stated] == [NONE] else []
     things = [_obstacle(text) for text in stated if _plain(text) != NONE]
-    found |= {"obstacle": things} if things else {}
-    found |= {"camera": _camera(**camera)} if any(_known(text) for text in camera.values()) else {}
-    return {**({"without": without} if without else {}), **found}
+    seen = _camera(**camera) if any(_known(text) for text in camera.values()) else {}
+    tables = {"without": without, "instrument": instrument, "target": target, "collision": collision}
+    return {name: table for name, table in (tables | {"obstacle": things, "camera": seen}).items() if table}
 
 
 def _plain(text: str | None) -> str:
@@ -130,19 +130,20 @@ def _camera(
         stands: the same of the other, in the base's frame.
     """
     found: dict[str, Any] = dict.fromkeys(CAMERA, UNKNOWN[1])
+    held = ""
     if (how := _known(mounting)) is not None:
-        words = how.lower().replace("-", " ").replace("_", " ")
-        if words not in (IN_HAND, TO_HAND):
+        held = how.lower().replace("-", " ").replace("_", " ")
+        if held not in (IN_HAND, TO_HAND):
             raise UsageError(f"--mounting {how}: expected {IN_HAND} (the arm carries the camera), {TO_HAND} or unknown")
-        found["mounting"] = words
+        found |= {"mounting": held}
     for name, text in (("lens", lens), ("board", board)):
         if (file := _known(text)) is not None:
             found[name] = _file(name, Path(file).expanduser())
     for name, text, most in (("carried", carried, HELD), ("stands", stands, FAR)):
         if (place := _known(text)) is not None:
-            if found["mounting"] == UNKNOWN[1]:
+            if not held:
                 raise UsageError(f"--{name} {place}: of the camera or of the board? Say --mounting, too")
-            looks = (found["mounting"] == IN_HAND) == (name == "carried")
+            looks = (held == IN_HAND) == (name == "carried")
             found[name] = _turned(f"--{name}", place, most, looks)
     return found
 
