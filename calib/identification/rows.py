@@ -58,7 +58,8 @@ def observe(
     column, row = _live(model, columns)
     source = model.torque_rows.repeated(motion.n)  # rows that repeat others are copied, not filtered anew
     own, again = source[row] == row, source[row] != row
-    matrix = np.zeros((len(kept(motion.segment, decimator)), model.rows, len(columns)))
+    size = len(kept(motion.segment, decimator))
+    matrix = np.zeros((model.rows, len(columns), size)).transpose(2, 0, 1)  # whoever reads it takes a row's columns
     states = segmented_states(model.columns, case)
     step, place = max(1, BLOCK // decimator.factor) * decimator.factor, 0
     for start, stop in segments(motion.segment):
