@@ -23,10 +23,10 @@ from calib.dynamics.base import Base
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import NotConverged, UsageError, suggestion
-from calib.estimation.constrained import within
-from calib.estimation.constraint_relations import contradicting, restricted
-from calib.estimation.definite import Definite
-from calib.estimation.interior_point import Constrained
+from calib.estimation.convex.constrained import within
+from calib.estimation.convex.constraint_relations import contradicting, restricted
+from calib.estimation.convex.definite import Definite
+from calib.estimation.convex.interior_point import Constrained
 from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import Triangles, residual_squares
 from calib.identification.body_cone import BodyCone, cone_of
@@ -115,7 +115,7 @@ class Constraints:
             object.__setattr__(self, key, frozen(getattr(self, key)))
 
     def solve(self, factor: np.ndarray) -> Constrained:
-        """Return argmin ½ ‖R β - z‖² under these constraints, see `calib.estimation.constrained.within`.
+        """Return argmin ½ ‖R β - z‖² under these constraints, see `calib.estimation.convex.constrained.within`.
 
         Raises:
             NotConverged: with the last β, where no robot of definite inertia satisfies the others.

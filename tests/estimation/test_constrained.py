@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from calib.errors import CalibError, NotConverged, Unidentifiable
-from calib.estimation.constrained import within
-from calib.estimation.constraint_relations import contradicting, from_free, restricted
-from calib.estimation.definite import Definite
+from calib.estimation.convex.constrained import within
+from calib.estimation.convex.constraint_relations import contradicting, from_free, restricted
+from calib.estimation.convex.definite import Definite
 from calib.estimation.instrumental_variables import instrument, projected
 from calib.estimation.linear import ols
 from calib.estimation.triangles import collect, combine

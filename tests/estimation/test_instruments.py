@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from calib.errors import Unidentifiable
-from calib.estimation.constrained import within
-from calib.estimation.definite import Definite
+from calib.estimation.convex.constrained import within
+from calib.estimation.convex.definite import Definite
 from calib.estimation.instrumental_variables import (
     exogeneity,
     hausman,

@@ -16,10 +16,10 @@ import scipy.linalg
 
 from calib.arrays import frozen, shaped
 from calib.errors import CalibError
-from calib.estimation import definite
-from calib.estimation.constraint_relations import from_free
-from calib.estimation.definite import Definite
-from calib.estimation.interior_point import Constrained, minimise
+from calib.estimation.convex import definite
+from calib.estimation.convex.constraint_relations import from_free
+from calib.estimation.convex.definite import Definite
+from calib.estimation.convex.interior_point import Constrained, minimise
 from calib.estimation.triangles import retriangulate
 
 

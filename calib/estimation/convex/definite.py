@@ -14,7 +14,7 @@ import numpy as np
 
 from calib.arrays import frozen
 from calib.errors import NotConverged
-from calib.estimation.interior_point import Constrained, Scaled, scale, spread
+from calib.estimation.convex.interior_point import Constrained, Scaled, scale, spread
 
 ENTER = 8  # matrices that enter at once, the most indefinite (our choice)
 SLACK = 1e-3  # of the least eigenvalue, by which a matrix that did not enter may miss it (our choice)
