@@ -14,7 +14,8 @@ Torques at the motor of joint j besides the drives that a model can have,
         - w (1 - exp(-t / t_0)) (Fv_j v_j + Fc_j sign v_j)      friction falls as the gears warm up
         + r τ_j sin(N q_j)                            ripple of the gear that grows with the torque
 
-with z_k' = v_j while |z_k| < s_k (Iwan 1966), and on the link's side the spring of a cable, c_j tanh(q_j / 0.5 rad).
+with z_k' = v_j while |z_k| < s_k (Iwan 1966; the friction ladder's stops are of the same kind, their widths shares of
+the travel), and on the link's side the spring of a cable, c_j tanh(q_j / 0.5 rad).
 """
 
 from __future__ import annotations
