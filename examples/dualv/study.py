@@ -184,7 +184,7 @@ def report(robot: Robot, designs: list[ParallelDesign], results: dict[str, Metho
     print(f"{'':8}{'a priori':>10}{'IDIM':>18}{'papers':>18}{'PIM':>18}{'papers':>18}{'PIM case 2':>18}{'papers':>18}")
     for name in NINE:
         cells = [f"{A_PRIORI[name] or truth[name]:>10.4g}"]
-        for key in ("idim", "pim", "pim_case2"):
+        for key in PAPERS:
             cells += [_cell(*_of(tables[key], name)), _cell(*PAPERS[key][name])]
         print(f"{name:8}" + "".join(cells))
     cross = metrics["cross_validation"]
@@ -206,7 +206,7 @@ def readme_rows(metrics: dict) -> list[str]:
     ]
     for name in NINE:
         cells = [f"{metrics['truth'][name]:.4g}"]
-        for key in ("idim", "pim", "pim_case2"):
+        for key in PAPERS:
             own = metrics["methods"][key]
             if name in own["values"]:
                 cells.append(f"{own['values'][name]:.4g} ({own['sigma_percent'][name]:.1f})")
@@ -218,6 +218,13 @@ def readme_rows(metrics: dict) -> list[str]:
     rows += ["", "| relative error on another loaded motion | x | y | rz |", "|---|---|---|---|"]
     for words, values in (("IDIM", cross["idim"]), ("paper", cross["papers"])):
         rows.append(f"| {words} | {' | '.join(f'{x:.3f}' for x in values)} |")
+    rows += ["", "| | IDIM | PIM | PIM, equal legs |", "|---|---|---|---|"]
+    for words, names in (("leg inertias", LEGS), ("the others", NINE[4:])):
+        own = ([metrics["methods"][key]["error_in_sigma"].get(name, 0.0) for name in names] for key in PAPERS)
+        rows.append(f"| largest error of {words} [σ] | {' | '.join(f'{max(map(abs, each)):.1f}' for each in own)} |")
+    kept = [len(metrics["methods"][f"{name}_free"]["values"]) for name in ("idim", "pim")]
+    rows.append(f"| parameters that elimination keeps | {kept[0]} | {kept[1]} | |")
+    rows.append(f"| of the power, relative error | | {cross['pim'][0]:.3f} | {cross['pim_case2'][0]:.3f} |")
     return rows
 
 
