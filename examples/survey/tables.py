@@ -92,13 +92,14 @@ GROUPS = {"RV2SQ": ("rv2sq", 1), "TX40": ("tx40", 1), "TX40, decimated": ("tx40"
 
 def cost_table(rows: Iterable[TrialRow]) -> Iterator[str]:
     """Yield mean processor time per trial of each method; runs and failures over the 15 conditions."""
-    own = [row for row in rows if row.condition.startswith("MCS-")]
+    digests = [one.digest for one in read_study(["MCS-*"]).conditions]
+    own = [row for row in rows if row.digest in digests]
     yield f"| method | runs | without an estimate | {' | '.join(f'{name} [CPU s]' for name in GROUPS)} |"
     yield f"|---|{'---:|' * (2 + len(GROUPS))}"
     total = dict.fromkeys(GROUPS, 0.0)
     for name in METHODS:
         mine = [row for row in own if row.method == name]
-        counts = [sum(row.digest == digest for row in mine) for digest in {row.digest for row in own}]
+        counts = [sum(row.digest == digest for row in mine) for digest in digests]
         failed, cells = sum(not row.found for row in mine), []
         for group, (robot, factor) in GROUPS.items():
             times = [row.cpu for row in mine if (row.robot, row.decimation) == (robot, factor) and row.cpu == row.cpu]
