@@ -21,7 +21,7 @@ from calib.estimation.estimate import Estimate
 from calib.procedure.findings import Verdict
 from calib.procedure.kinematic_stage import compensation, compensation_file, fit, folder, inputs, selection
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSettings, SelectionSettings
-from calib.procedure.measuring import promise as promises
+from calib.procedure.measuring import selection_prediction
 from calib.procedure.measuring.run import write_run
 from calib.procedure.parallel_stage.robots import FoundRobot, recognised, refuse_links, refuse_parallel
 from calib.procedure.report.fit_report import fit_metrics
@@ -288,7 +288,7 @@ def fit_geometry(
         validate: unseen poses, like `measured`.
         options: what the files' headers do not say, priors, fixed parameters (``calib formats options``).
         poses: what was measured, as `select_poses` returned it, the CSV that it was saved as, or its folder: the
-            sigmas that it predicted are held against those that the fit states (``outcome.promised``).
+            sigmas that it predicted are held against those that the fit states (``outcome.predicted_sigmas``).
         on_read: called with what was read, before the fit begins.
         progress: called with a few words now and then.
 
@@ -299,7 +299,11 @@ def fit_geometry(
     """
     chosen = options if isinstance(options, FitOptions) else read_options(optional(options))
     robot = recognised(robot)
-    promise = poses.chosen.promise if isinstance(poses, PoseSelection) else poses and promises.read(Path(poses))
+    prediction = (
+        poses.chosen.prediction
+        if isinstance(poses, PoseSelection)
+        else poses and selection_prediction.read(Path(poses))
+    )
     if isinstance(robot, FoundRobot):
         refuse_links(base, tip)
         if poses is not None:
@@ -311,7 +315,7 @@ def fit_geometry(
     if on_read is not None:
         on_read(given)
     wanted = settings or FitSettings()
-    return GeometryFit(fit.run(given, chosen, wanted, progress, promise or None), chosen, wanted)
+    return GeometryFit(fit.run(given, chosen, wanted, progress, prediction or None), chosen, wanted)
 
 
 @checked

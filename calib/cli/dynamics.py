@@ -58,5 +58,5 @@ def identify_dynamics(
         )  # fmt: skip
         show("writing")
         found.save(out, plots=plots)
-    promises = [] if excitation is None else prediction.kept_promise(excitation, found.outcome)
-    say_written([*found.renderables(), *promises], out, found.verdict.level)
+    compared = [] if excitation is None else prediction.compared_with_identification(excitation, found.outcome)
+    say_written([*found.renderables(), *compared], out, found.verdict.level)

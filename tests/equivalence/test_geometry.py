@@ -147,8 +147,8 @@ def test_what_the_poses_promised_is_held_against_the_same_figures(fitted: Path, 
     words = ("fit", robot, measured, "--model", "geometry", "--out", tmp_path / "out")
     for selection in (session.path("2-poses"), session.path("2-poses/poses.csv")):
         assert not command(*words, "--selection", selection)
-        promised = read(tmp_path / "out/metrics.json")["promised"]
-        same(promised, read(session.path("4-fit/metrics.json"))["promised"])
+        promised = read(tmp_path / "out/metrics.json")["predicted_sigmas"]
+        same(promised, read(session.path("4-fit/metrics.json"))["predicted_sigmas"])
     assert [row["unit"] for row in promised] == ["mm", "mrad", "mm", "mrad", "mm"]
     page = flat(html.unescape(session.path("certificate.html").read_text()))
     notes = " ".join(read(session.path("state.json"))["steps"]["fit"]["notes"])

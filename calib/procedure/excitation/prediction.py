@@ -28,7 +28,7 @@ from calib.errors import UsageError
 from calib.folders import METRICS
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.excitation.inputs import ExcitationInputs
-from calib.procedure.promises import held
+from calib.procedure.sigma_comparison import compare_sigmas
 from trajectories.basis import Family, SampledMotion
 from trajectories.design.problem import ExcitationProblem
 from trajectories.design.search import STAGES, SearchResult, one_start
@@ -246,7 +246,7 @@ def check_folder(folder: Path) -> None:
         raise UsageError(f"{folder} holds no {NAME}: give the folder that calib excite wrote")
 
 
-def kept_promise(folder: Path, outcome: IdentificationOutcome) -> list[str]:
+def compared_with_identification(folder: Path, outcome: IdentificationOutcome) -> list[str]:
     """Return lines that hold what an excitation's folder predicted against what an identification states.
 
     Raises:
@@ -274,12 +274,12 @@ def compared(folder: Path, names: Sequence[str], sigmas: np.ndarray, unexplained
     try:
         noise = float(json.loads((folder / METRICS).read_text(encoding="utf-8"))["prediction"]["noise_share"])
         with (folder / NAME).open(encoding="utf-8", newline="") as file:
-            promised = {row["name"]: float(row["sigma"]) for row in csv.DictReader(file)}
+            predicted = {row["name"]: float(row["sigma"]) for row in csv.DictReader(file)}
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise UsageError(
             f"{folder} holds no prediction: give the folder that calib excite wrote ({error!r})"
         ) from error
-    found = held("parameters", "", promised, stated)
+    found = compare_sigmas("parameters", "", predicted, stated)
     if found is None:
         raise UsageError(f"{folder} predicts none of the {len(stated)} parameters identified: it is of another robot")
     result = [f"sigmas stated over those predicted, {found.count} {found.kind}: {found.words}"]

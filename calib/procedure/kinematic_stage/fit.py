@@ -34,8 +34,8 @@ from calib.procedure.kinematic_stage.remarks import Outlier, named_outliers, pla
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import Arms, Assessment, assess
 from calib.procedure.measuring.image_findings import image_notes
-from calib.procedure.measuring.promise import SelectionPromise, check_robot, kept
-from calib.procedure.promises import KeptPromise
+from calib.procedure.measuring.selection_prediction import SelectionPrediction, check_robot, compared_with_fit
+from calib.procedure.sigma_comparison import SigmaComparison
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import stretched_length
 
@@ -58,7 +58,7 @@ class Outcome:
         seed: that reproduces it.
         tolerance: largest rms on unseen poses that is good enough [m]; None where none was given.
         expected: how far off the calibrated arm may be at any pose; None where no positions were measured.
-        promised: sigmas that were predicted when the poses were chosen, beside those that this fit states.
+        predicted_sigmas: sigmas that were predicted when the poses were chosen, beside those that this fit states.
     """
 
     inputs: Inputs
@@ -71,7 +71,7 @@ class Outcome:
     seed: int = 0
     tolerance: float | None = None
     expected: ErrorModel | None = None
-    promised: tuple[KeptPromise, ...] = ()
+    predicted_sigmas: tuple[SigmaComparison, ...] = ()
 
     @property
     def calibrated(self) -> CalibratedChain:
@@ -105,7 +105,7 @@ def run(
     options: FitOptions | None = None,
     wanted: FitSettings | None = None,
     progress: Progress | None = None,
-    selection: SelectionPromise | None = None,
+    selection: SelectionPrediction | None = None,
 ) -> Outcome:
     """Fit, compare on all rows, and judge.
 
@@ -164,13 +164,13 @@ def run(
         seed,
         wanted.tolerance,
         expected,
-        () if selection is None else _promised(selection, found.fit),
+        () if selection is None else _compared(selection, found.fit),
     )
 
 
-def _promised(selection: SelectionPromise, found: GeometricFit) -> tuple[KeptPromise, ...]:
+def _compared(selection: SelectionPrediction, found: GeometricFit) -> tuple[SigmaComparison, ...]:
     typical = PoseMeasurements(np.array(selection.typical), selection.joints)
-    return kept(selection, found, gravity_of(found.cell.chain, typical))
+    return compared_with_fit(selection, found, gravity_of(found.cell.chain, typical))
 
 
 def assessed(outcome: Outcome, inputs: Inputs, options: FitOptions, wanted: FitSettings) -> Outcome:

@@ -261,7 +261,7 @@ def metrics(outcome: Outcome) -> dict[str, object]:
             for each in outcome.outliers
         ],
         "findings": asdict(outcome.findings),
-        "promised": [asdict(each) for each in outcome.promised],
+        "predicted_sigmas": [asdict(each) for each in outcome.predicted_sigmas],
     }
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from calib.geometry.uncertainty.error_model import Discrepancy
 from calib.procedure.findings import Finding
-from calib.procedure.promises import KeptPromise
+from calib.procedure.sigma_comparison import SigmaComparison
 
 
 @dataclass(frozen=True)
@@ -194,7 +194,7 @@ class FitMetrics:
     not_identifiable: tuple[str, ...]
     outliers: tuple[OutlierRow, ...]
     findings: Findings | None = None
-    promised: tuple[KeptPromise, ...] = ()
+    predicted_sigmas: tuple[SigmaComparison, ...] = ()
     schema: int = 1
 
     @property

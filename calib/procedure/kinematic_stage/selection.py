@@ -22,10 +22,10 @@ from calib.procedure.measuring.pose_limits import Limits, read_limits
 from calib.procedure.measuring.prediction import Prediction, Seen, by_count
 from calib.procedure.measuring.prediction import predicted as foretold
 from calib.procedure.measuring.prediction import table as outlook_table
-from calib.procedure.measuring.promise import NOISES, SelectionPromise, beside
-from calib.procedure.measuring.promise import write as write_promise
 from calib.procedure.measuring.run import Run, RunSettings
 from calib.procedure.measuring.run import lines as ways
+from calib.procedure.measuring.selection_prediction import NOISES, SelectionPrediction, beside
+from calib.procedure.measuring.selection_prediction import write as write_prediction
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
 from poses.candidates import draw_candidates
@@ -72,7 +72,7 @@ class Chosen:
         checked, unchecked: what the poses were held against, and what they could not be, in words.
         notes: what else a user should know.
         outlook: what the poses will tell.
-        promise: the same, as it is kept beside the poses; None where they do not tell all parameters.
+        prediction: the same, as it is kept beside the poses; None where they do not tell all parameters.
         by_images: whether the poses are those at which a camera sees its board.
         run, driven: the poses' order, in which `selection.q` is, and the ways between them; how they are driven.
     """
@@ -88,12 +88,12 @@ class Chosen:
     run: Run
     driven: RunSettings
     by_images: bool
-    promise: SelectionPromise | None
+    prediction: SelectionPrediction | None
 
     @property
     def figures(self) -> tuple[str, ...]:
         """The names of figures that there are of it; none where the poses do not tell all parameters."""
-        return () if self.promise is None else FIGURES if self.outlook.others else FIGURES[:1]
+        return () if self.prediction is None else FIGURES if self.outlook.others else FIGURES[:1]
 
 
 def choose(
@@ -168,7 +168,7 @@ def choose(
     outlook = _outlook(jacobian, limits, search, m, driven.q, candidates, before, comparable)
     return Chosen(
         chain, found, len(jacobian.free), value, limits.checked, limits.unchecked, tuple(notes), outlook, run,
-        settings.run, view is not None, _promise(jacobian, outlook),
+        settings.run, view is not None, _prediction(jacobian, outlook),
     )  # fmt: skip
 
 
@@ -221,7 +221,7 @@ def _outlook(
     return PoseOutlook(own, typical, others, blind, comparable)
 
 
-def _promise(seen: Seen, outlook: PoseOutlook) -> SelectionPromise | None:
+def _prediction(seen: Seen, outlook: PoseOutlook) -> SelectionPrediction | None:
     """Return what is kept of an outlook; None where the poses do not tell all parameters."""
     own = outlook.poses
     if not np.isfinite(own.rms):
@@ -229,7 +229,7 @@ def _promise(seen: Seen, outlook: PoseOutlook) -> SelectionPromise | None:
     noise = dict[str, float]()
     if not isinstance(seen, ImageObservation):
         noise = dict(zip(list(NOISES)[: 1 + seen.full], seen.sigmas))
-    return SelectionPromise(
+    return SelectionPrediction(
         seen.cell.chain.joint_names, own.poses, own.names, own.units, tuple(own.sigmas.tolist()),
         tuple(map(tuple, outlook.typical.tolist())), tuple(own.spread.tolist()), noise,
         isinstance(seen, ImageObservation),
@@ -256,15 +256,15 @@ def _blind(
 def targets(out: Path, plots: bool, chosen: Chosen | None = None) -> dict[str, Path]:
     """Return the files of a selection beside its CSV, of any or of a given one: the prediction, and figures by name."""
     figures = () if not plots else FIGURES if chosen is None else chosen.figures
-    told = {} if chosen is not None and chosen.promise is None else {"prediction": beside(out)}
+    told = {} if chosen is not None and chosen.prediction is None else {"prediction": beside(out)}
     return told | {name: out.parent / f"{out.stem}_{name}.png" for name in figures}
 
 
 def write(chosen: Chosen, path: Path) -> Path:
     """Write the chosen poses under the joints' names [rad or m], and beside them what they will tell."""
     assert chosen.selection.q is not None
-    if chosen.promise is not None:
-        write_promise(chosen.promise, path)
+    if chosen.prediction is not None:
+        write_prediction(chosen.prediction, path)
     else:
         beside(path).unlink(missing_ok=True)  # an earlier selection's
     return write_poses(path, chosen.selection.q, chosen.chain.joint_names, kinds=joint_kinds(chosen.chain))
@@ -323,10 +323,10 @@ def table(chosen: Chosen) -> list[tuple[str, str]]:
         ("efficiency against the convex bound", f"{found.efficiency:.4f} (det^(1/p); {bound_words(found)})"),
         ("seconds", f"{found.seconds:.2f}"),
     ]
-    return [*rows, *promised(chosen)]
+    return [*rows, *predicted_rows(chosen)]
 
 
-def promised(chosen: Chosen) -> list[tuple[str, str]]:
+def predicted_rows(chosen: Chosen) -> list[tuple[str, str]]:
     """Return what the poses will tell, and what it costs that the instrument has to see them where that is asked."""
     rows = outlook_table(chosen.outlook.poses, chosen.outlook.others)
     if chosen.outlook.blind is None:

@@ -36,7 +36,7 @@ ALONE_NOTE = (
     "A URDF cannot hold the joint corrections of the chosen model: robot.urdf is the best geometry without them, and "
     "its errors stand beside; robot_for_corrections.urdf with joint_corrections.csv has those of the calibrated arm."
 )
-PROMISE_NOTE = (
+PREDICTION_NOTE = (
     "Medians, of the tool's position the rms. The fit weighs by its own noise, adds effects, and may have seen other "
     "poses, too: each moves the ratio."
 )
@@ -61,7 +61,7 @@ def outcome_section(metrics: FitMetrics) -> Section:
     """Return what a fit came to as the console says it: ladder, errors, repeated poses, what to know, verdict."""
     blocks: list[Block] = [_ladder_table(metrics), _error_table(metrics)]
     blocks += [Text("", _repeated_sentences(metrics)), Text("", metrics.not_identifiable, "identifiability")]
-    blocks += _promise_tables(metrics)
+    blocks += _sigma_tables(metrics)
     blocks += [Text("", metrics.warnings, "note"), Text("", _outlier_sentences(metrics), "outliers")]
     return Section("Geometry", blocks, metrics.verdict, metrics.reason)
 
@@ -81,7 +81,7 @@ def certificate_section(report: Report, drawn: Mapping[str, Picture]) -> Section
         blocks += [_ladder_table(metrics), _pictures("", drawn, ("ladder",))]
     blocks.append(Text("What the poses can tell", identifiability(report)))
     blocks.append(_pictures("Parameters", drawn, ("parameters", "singular_values", "correlations")))
-    blocks += [_parameter_table(report), *_promise_tables(metrics)]
+    blocks += [_parameter_table(report), *_sigma_tables(metrics)]
     if metrics.outliers:
         blocks.append(_outlier_table(metrics))
     blocks.append(Text("Notes", metrics.warnings))
@@ -187,17 +187,17 @@ def _parameter_table(report: Report) -> Table:
     return Table("Fitted parameters", header, rows, note.strip(), numbers=range(2, 7))
 
 
-def _promise_tables(metrics: FitMetrics) -> list[Table]:
+def _sigma_tables(metrics: FitMetrics) -> list[Table]:
     """Return what was predicted when the poses were chosen beside what the fit states; nothing without a prediction."""
-    if not metrics.promised:
+    if not metrics.predicted_sigmas:
         return []
     rows = [
         (row.kind, row.unit, str(row.count), f"{row.predicted:.3g}", f"{row.stated:.3g}", f"{row.ratio:.2f}",
          f"{row.low:.2f} to {row.high:.2f}" if row.count > 1 else "")
-        for row in metrics.promised
+        for row in metrics.predicted_sigmas
     ]  # fmt: skip
     header = ("σ of", "unit", "how many", "predicted", "stated", "ratio", "eight in ten")
-    return [Table("Predicted when the poses were chosen, and stated by the fit", header, rows, PROMISE_NOTE,
+    return [Table("Predicted when the poses were chosen, and stated by the fit", header, rows, PREDICTION_NOTE,
                   numbers=range(2, 7))]  # fmt: skip
 
 

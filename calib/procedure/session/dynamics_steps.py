@@ -191,7 +191,7 @@ def identify(session: Session, say: Say) -> list[str]:
     ]
     designed = session.path("6-excitation/training")
     if session.settings.dynamics.plan and (designed / prediction.NAME).is_file():
-        notes += prediction.kept_promise(designed, outcome)
+        notes += prediction.compared_with_identification(designed, outcome)
     return [*notes, *outcome.warnings]
 
 

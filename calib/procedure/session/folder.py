@@ -51,7 +51,7 @@ MARK = "simulated.txt"
 SETTINGS, CHECKED = "session.toml", "checked.txt"
 SUMMARY, SELECTION, CUTS = "1-robot/summary.txt", "2-poses/selection.json", "7-recorded/cuts.json"
 PREDICTED = "2-poses/predicted.png"  # sigma of the tool over the workspace
-PROMISED = "2-poses/poses_prediction.json"  # what the poses will tell: calib fit --selection
+PREDICTION = "2-poses/poses_prediction.json"  # what the poses will tell: calib fit --selection
 POSES, UNSEEN, WAYS = "poses.csv", "validation.csv", "poses_run.csv"  # as planned, in 2-poses
 POSES_CHECKED, MOTION_CHECKED = f"3-measured/{CHECKED}", f"7-recorded/{CHECKED}"
 

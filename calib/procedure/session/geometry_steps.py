@@ -25,10 +25,10 @@ from calib.procedure.kinematic_stage import inputs
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import assess
 from calib.procedure.measuring.image_findings import image_words
-from calib.procedure.measuring.promise import SelectionPromise, beside
-from calib.procedure.measuring.promise import read as read_promise
-from calib.procedure.measuring.promise import write as write_promise
 from calib.procedure.measuring.run import write_run
+from calib.procedure.measuring.selection_prediction import SelectionPrediction, beside
+from calib.procedure.measuring.selection_prediction import read as read_prediction
+from calib.procedure.measuring.selection_prediction import write as write_prediction
 from calib.procedure.report import certificate, fit_report
 from calib.procedure.session import arrival
 from calib.procedure.session.folder import POSES, POSES_CHECKED, SELECTION, SUMMARY, UNSEEN, WAYS, Session, verdicts
@@ -121,8 +121,8 @@ def select(session: Session, say: Say) -> list[str]:
     names = chain.joint_names
     write_poses(session.path(f"2-poses/{POSES}"), chosen.fit, names, unit="deg", kinds=kinds)
     write_run(session.path(f"2-poses/{WAYS}"), chosen.run, chain)
-    if chosen.promise is not None:
-        write_promise(chosen.promise, session.path(f"2-poses/{POSES}"))
+    if chosen.prediction is not None:
+        write_prediction(chosen.prediction, session.path(f"2-poses/{POSES}"))
     notes = [f"{len(chosen.fit)} poses for the fit: {chosen.words}"]
     if wanted.validation:
         write_poses(session.path(f"2-poses/{UNSEEN}"), chosen.validation, names, unit="deg", kinds=kinds)
@@ -140,10 +140,10 @@ def planned(session: Session, chain: Chain, name: str) -> np.ndarray | None:
     return read_poses(path, chain.joint_names, kinds=[joint.kind for joint in chain.joints])
 
 
-def promised(session: Session) -> SelectionPromise | None:
+def selection_prediction(session: Session) -> SelectionPrediction | None:
     """Return what was predicted when the poses were chosen; None where they were not, or by an earlier version."""
     path = session.path(f"2-poses/{POSES}")
-    return read_promise(path) if session.settings.poses.plan and beside(path).exists() else None
+    return read_prediction(path) if session.settings.poses.plan and beside(path).exists() else None
 
 
 def arrive(session: Session, say: Say) -> list[str]:
@@ -214,7 +214,7 @@ def _gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
 
 def fit(session: Session, say: Say) -> list[str]:
     """Fit the geometry to the measured files; validation files are not looked at."""
-    settings, selection = session.settings, promised(session)
+    settings, selection = session.settings, selection_prediction(session)
     outcome = fitting.run(_gathered(session), _options_of(session), _fit_settings(session), say, selection)
     outputs.write_folder(outcome, session.fit.path, partial(certificate.write_fit, plots=session.plots))
     count = len(outcome.selection.fit.free)
@@ -222,7 +222,7 @@ def fit(session: Session, say: Say) -> list[str]:
     notes += [
         f"σ of {row.kind}: {row.predicted:.3g} {row.unit} predicted when the poses were chosen, {row.stated:.3g} "
         f"{row.unit} stated"
-        for row in outcome.promised
+        for row in outcome.predicted_sigmas
     ]
     if outcome.outliers:
         named = ", ".join(each.words for each in outcome.outliers[:3])

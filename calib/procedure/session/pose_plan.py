@@ -15,8 +15,8 @@ from calib.procedure.kinematic_stage import selection
 from calib.procedure.kinematic_stage.settings import SelectionSettings
 from calib.procedure.measuring.camera_view import BLIND
 from calib.procedure.measuring.pose_limits import read_limits
-from calib.procedure.measuring.promise import SelectionPromise
 from calib.procedure.measuring.run import Run, same_turn
+from calib.procedure.measuring.selection_prediction import SelectionPrediction
 from calib.procedure.session.folder import PREDICTED, Session
 from calib.robot.chain import Chain
 from poses.candidates import draw_candidates
@@ -35,7 +35,7 @@ class Plan:
     kept: tuple[str, ...]
     record: dict[str, Any]
     run: Run
-    promise: SelectionPromise | None
+    prediction: SelectionPrediction | None
 
 
 def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], None]) -> Plan:
@@ -66,15 +66,15 @@ def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], N
         f"random sets, {100 * found.efficiency:.1f} % of the convex bound ({selection.bound_words(found)})"
     )
     record = {"words": words, **selection.record(chosen), "seed": settings.seed}
-    promised = chosen.outlook.poses
-    if session.plots and np.isfinite(promised.rms):
+    outlook = chosen.outlook.poses
+    if session.plots and np.isfinite(outlook.rms):
         from calib.procedure.report.geometry_figures import predicted_map
         from calib.procedure.report.style import save
 
-        save(predicted_map(promised.points, promised.spread), session.path(PREDICTED))
+        save(predicted_map(outlook.points, outlook.spread), session.path(PREDICTED))
     unseen = _unseen(session, robot_file, chain, wanted.validation)
-    kept = (*selection.kept(chosen), *(f"{words}: {number}" for words, number in selection.promised(chosen)))
-    return Plan(found.q, unseen, words, kept, record, chosen.run, chosen.promise)
+    kept = (*selection.kept(chosen), *(f"{words}: {number}" for words, number in selection.predicted_rows(chosen)))
+    return Plan(found.q, unseen, words, kept, record, chosen.run, chosen.prediction)
 
 
 def _sigmas(position: float, orientation: float) -> tuple[float, float] | None:

@@ -17,7 +17,7 @@ from calib.procedure.session.folder import (
     POSES,
     POSES_CHECKED,
     PREDICTED,
-    PROMISED,
+    PREDICTION,
     SELECTION,
     SUMMARY,
     UNSEEN,
@@ -152,7 +152,7 @@ STEPS = (
     SessionStep("describe", "read the robot", ("robot",), _robot, geometry_steps.describe, (SUMMARY,)),
     SessionStep(
         "select", "choose the poses to measure", ("robot", "instrument", "poses", "seed"), _plan, geometry_steps.select,
-        (f"2-poses/{POSES}", f"2-poses/{WAYS}", f"2-poses/{UNSEEN}", SELECTION, PREDICTED, PROMISED),
+        (f"2-poses/{POSES}", f"2-poses/{WAYS}", f"2-poses/{UNSEEN}", SELECTION, PREDICTED, PREDICTION),
     ),
     SessionStep(
         "measure", "check what was measured", ("robot", "instrument", "poses", "fit"), _arrived, geometry_steps.arrive,

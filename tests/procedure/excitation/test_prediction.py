@@ -56,7 +56,7 @@ def test_sigmas_stated_are_those_predicted_within_a_factor(motion, outcome):
     ratios = [sigma / promised[name] for name, sigma in zip(found.names, found.fitted.estimate.sigma)]
     assert 0.85 < np.median(ratios) < 1.2
     assert np.quantile(ratios, 0.05) > 0.7 and np.quantile(ratios, 0.95) < 1.4
-    first, second = prediction.kept_promise(motion, outcome)
+    first, second = prediction.compared_with_identification(motion, outcome)
     assert f"{len(found.names)} parameters: {np.median(ratios):.2g} in the median" in first
     assert "0.01 was taken" in second
 

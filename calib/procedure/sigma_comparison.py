@@ -9,7 +9,7 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class KeptPromise:
+class SigmaComparison:
     """Sigmas of one kind of quantity, predicted and stated.
 
     Attributes:
@@ -36,17 +36,17 @@ class KeptPromise:
         return f"{self.ratio:.2g} in the median, {self.low:.2g} to {self.high:.2g} for eight in ten"
 
 
-def held(
+def compare_sigmas(
     kind: str,
     unit: str,
     predicted: Mapping[str, float],
     stated: Mapping[str, float],
     typical: Callable[[np.ndarray], float] = lambda sigmas: float(np.median(sigmas)),
-) -> KeptPromise | None:
+) -> SigmaComparison | None:
     """Return how sigmas predicted and stated, by name, compare; None where they have no name in common."""
     common = [name for name in predicted if stated.get(name, 0.0) > 0.0 and predicted[name] > 0.0]
     if not common:
         return None
     before, after = (np.array([one[name] for name in common]) for one in (predicted, stated))
     low, middle, high = (float(x) for x in np.quantile(after / before, [0.1, 0.5, 0.9]))
-    return KeptPromise(kind, unit, len(common), typical(before), typical(after), middle, low, high)
+    return SigmaComparison(kind, unit, len(common), typical(before), typical(after), middle, low, high)

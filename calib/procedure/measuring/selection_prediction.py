@@ -19,7 +19,7 @@ from calib.errors import UsageError
 from calib.geometry.parameters import layout
 from calib.geometry.result import GeometricFit, used_sigmas
 from calib.geometry.uncertainty.spread import pose_sigmas
-from calib.procedure.promises import KeptPromise, held
+from calib.procedure.sigma_comparison import SigmaComparison, compare_sigmas
 from calib.records import read_record
 from calib.units import SMALL
 
@@ -28,7 +28,7 @@ NOISES = {"position": "m", "orientation": "rad"}
 
 
 @dataclass(frozen=True)
-class SelectionPromise:
+class SelectionPrediction:
     """What a selection predicts.
 
     Attributes:
@@ -56,12 +56,12 @@ def beside(poses: Path) -> Path:
     return poses.parent / (poses.stem + SUFFIX)
 
 
-def write(promise: SelectionPromise, poses: Path) -> Path:
+def write(prediction: SelectionPrediction, poses: Path) -> Path:
     """Write what a selection predicts beside its CSV."""
-    return files.write_json(beside(poses), asdict(promise))
+    return files.write_json(beside(poses), asdict(prediction))
 
 
-def read(selection: Path) -> SelectionPromise:
+def read(selection: Path) -> SelectionPrediction:
     """Read what a selection predicts.
 
     Args:
@@ -83,46 +83,48 @@ def read(selection: Path) -> SelectionPromise:
             f"there is no {path}: give the CSV that calib select wrote, its prediction beside it, or their folder"
         )
     try:
-        return read_record(SelectionPromise, json.loads(path.read_text(encoding="utf-8")))
+        return read_record(SelectionPrediction, json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError) as error:
         raise UsageError(f"{path} cannot be read ({error}); choose the poses again") from error
 
 
-def check_robot(promise: SelectionPromise, joints: Sequence[str]) -> None:
+def check_robot(prediction: SelectionPrediction, joints: Sequence[str]) -> None:
     """Refuse, before any work is done, the selection of another robot."""
-    if promise.joints != tuple(joints):
-        ours, theirs = ", ".join(joints), ", ".join(promise.joints)
+    if prediction.joints != tuple(joints):
+        ours, theirs = ", ".join(joints), ", ".join(prediction.joints)
         raise UsageError(f"the selection is one of another robot: its joints are {theirs}, here they are {ours}")
 
 
-def kept(promise: SelectionPromise, fit: GeometricFit, torque: np.ndarray | None = None) -> tuple[KeptPromise, ...]:
+def compared_with_fit(
+    prediction: SelectionPrediction, fit: GeometricFit, torque: np.ndarray | None = None
+) -> tuple[SigmaComparison, ...]:
     """Return what a fit states beside what was predicted: noise, lengths, angles, and the tool's position.
 
     Args:
-        promise: of the selection whose poses were measured.
+        prediction: of the selection whose poses were measured.
         fit: of their measurements, and of others perhaps.
         torque: (s, n) gravity torques at the typical poses [N m], for compliance terms.
     """
     names, covariance = layout(fit.cell).names, fit.estimate.covariance
     stated = {names[k]: float(sigma) for k, sigma in zip(fit.free, np.sqrt(np.diag(covariance)))}
-    station = -1 if promise.by_images else 0
-    spread = pose_sigmas(fit.cell, np.array(promise.typical), fit.free, covariance, torque, station)[:, 0]
-    rows = [_row(f"a measured {label}, its noise", NOISES[label], {label: promise.noise[label]}, {label: size})
-            for label, size in _noise(fit).items() if label in promise.noise]  # fmt: skip
+    station = -1 if prediction.by_images else 0
+    spread = pose_sigmas(fit.cell, np.array(prediction.typical), fit.free, covariance, torque, station)[:, 0]
+    rows = [_row(f"a measured {label}, its noise", NOISES[label], {label: prediction.noise[label]}, {label: size})
+            for label, size in _noise(fit).items() if label in prediction.noise]  # fmt: skip
     for words, unit in (("lengths", "m"), ("angles", "rad")):
-        own = {name: s for name, s, each in zip(promise.names, promise.sigmas, promise.units) if each == unit}
+        own = {name: s for name, s, each in zip(prediction.names, prediction.sigmas, prediction.units) if each == unit}
         rows.append(_row(f"{words} of the arm", unit, own, stated))
-    rows.append(_row("tool's position, typical poses", "m", _numbered(promise.spread), _numbered(spread), _rms))
+    rows.append(_row("tool's position, typical poses", "m", _numbered(prediction.spread), _numbered(spread), _rms))
     return tuple(row for row in rows if row is not None)
 
 
 def _row(
     kind: str, unit: str, predicted: Mapping[str, float], stated: Mapping[str, float],
     typical: Callable[[np.ndarray], float] = np.median,
-) -> KeptPromise | None:  # fmt: skip
+) -> SigmaComparison | None:  # fmt: skip
     factor, printed = SMALL[unit]
     before, after = ({name: factor * sigma for name, sigma in each.items()} for each in (predicted, stated))
-    return held(kind, printed, before, after, typical)
+    return compare_sigmas(kind, printed, before, after, typical)
 
 
 def _numbered(sigmas: Sequence[float] | np.ndarray) -> dict[str, float]:
