@@ -74,7 +74,7 @@ def test_none_is_taken_that_predicts_no_better_than_no_model(robot: Path, tmp_pa
 
 
 def test_one_methods_error_costs_no_other_result(robot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    from calib.procedure.dynamic_stage import method_comparison
+    from calib.procedure.study import method_comparison
 
     def broken(robot, cases, settings, say):
         if settings.method == "tls":
