@@ -125,6 +125,9 @@ def named_outliers(found: GeometricFit) -> list[Outlier]:
 def plateau(found: ModelSelection, reach: float) -> str:
     """Say that no rigid geometry explains the measurements, where the full one leaves more than `FLOOR` of the reach.
 
+    On rows left out, and on those fitted, degrees of freedom counted: few poses predict each other badly under any
+    model, which says nothing against this one.
+
     Args:
         found: the selection of models, judged on rows left out.
         reach: of the arm [m].
@@ -136,13 +139,23 @@ def plateau(found: ModelSelection, reach: float) -> str:
     if not rigid or rigid[-1].model != "geometry":
         return ""
     best = min(rigid, key=lambda rung: rung.cross_validated)
-    if best.cross_validated <= FLOOR * reach:
+    if min(best.cross_validated, _left(found.rigid)) <= FLOOR * reach:
         return ""
     return (
         f"no rigid geometry explains these measurements: on rows left out {1e3 * best.cross_validated:.2f} mm rms "
         f"remain with the best one ({best.model}, {best.parameters} parameters), where a sound arm of {reach:.1f} m "
         f"reach leaves less than {1e3 * FLOOR * reach:.2f} mm"
     )
+
+
+def _left(found: GeometricFit) -> float:
+    """Return the rms position error of a fit on its own rows [m], as if it had not used up degrees of freedom."""
+    parts = [piece.part for piece in found.pieces]
+    sizes = [part.sizes() for part in parts if NATURE[part.label] == "position"]
+    rows, used = sum(part.height for part in parts), len(found.free) + sum(part.nuisances for part in parts)
+    if not sizes or rows <= used:
+        return np.inf
+    return float(np.sqrt(np.mean(np.concatenate(sizes) ** 2) * rows / (rows - used)))
 
 
 def remains(found: ModelSelection, reach: float) -> bool:
