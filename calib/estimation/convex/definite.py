@@ -5,6 +5,8 @@ min ½ ‖R b - z‖² under A b + c >= 0, E b = d and M_k(b) = Σ_j A_kj b_j �
 since the least misfit rises from one set to the next and none comes back (our choice).
 """
 
+# pyright: reportAttributeAccessIssue=false
+# clarabel is a compiled extension without stubs
 from __future__ import annotations
 
 from dataclasses import dataclass

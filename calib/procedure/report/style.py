@@ -131,7 +131,7 @@ def log_axis(axis: XAxis | YAxis, low: float, high: float, most: int = 7) -> Non
     ticks = (powers[:, None] * ([1.0, 2.0, 5.0] if high < 100.0 * low else [1.0])).ravel()
     ticks = ticks[(low <= ticks) & (ticks <= high)]
     if len(ticks) < 2:  # within less than a factor of about two: even steps
-        ticks = MaxNLocator(min(most, 5)).tick_values(low, high)
+        ticks = np.asarray(MaxNLocator(min(most, 5)).tick_values(low, high))
         ticks = ticks[(low <= ticks) & (ticks <= high)]
     ticks = ticks[:: max(1, -(-len(ticks) // most))]
     label_ticks(axis, ticks, [number(tick) for tick in ticks])
