@@ -58,12 +58,12 @@ def judge(
     3. the tolerance, where one was given, is exceeded on some unseen file: fail;
     4. only frames were asked for: pass, with nothing claimed of the arm;
     5. frames were chosen, so that no model of the arm is better than the nominal one: pass where what remains is below
-       `calib.procedure.kinematic_stage.outliers.FLOOR` of the reach (there is nothing to gain), else fail; where not
+       `calib.procedure.kinematic_stage.remarks.FLOOR` of the reach (there is nothing to gain), else fail; where not
        every station could be left out as a whole, the choice itself is in doubt: marginal in place of pass;
     6. on some unseen file the calibrated arm is worse than the nominal one: fail. By cross-validation alone, where both
        leave less than `FLOOR` of the reach: marginal, since the nominal arm may have been fitted to these very rows;
     7. no unseen rows and no cross-validation: marginal;
-    8. no rigid geometry explains the measurements (`calib.procedure.kinematic_stage.outliers.plateau`), and what else
+    8. no rigid geometry explains the measurements (`calib.procedure.kinematic_stage.remarks.plateau`), and what else
        the chosen model holds does not explain them either (`remains`): marginal at best;
     9. unseen errors above `TRANSFER` times the fit's own: marginal;
     10. the 95 % intervals that the fit states hold less than `HOLDS` of the errors on some unseen file, beyond chance:
