@@ -9,6 +9,7 @@ import scipy.linalg
 from scipy.linalg.lapack import dtrtri  # type: ignore[attr-defined]
 
 EXACT = 1e-7  # ‖y - W x‖ relative to ‖y‖ below which a fit counts as perfect: WᵀW knows no better
+SETTLED = 0.02  # share of the parameters' sigmas that a search among many may leave open (our choice)
 OUTWEIGHED = 2.0  # a group is out once its prior is this many times as precise as the data on its columns (our choice)
 
 
@@ -64,7 +65,8 @@ def relevance(
         start: (p,) first guess of each column's prior standard deviation; read where there is a ridge. Within a group
             their ratios stay.
         iterations: of the fixed point, at most.
-        settled: it ends where values move by less than this share of their standard deviations, rms; 0: never before.
+        settled: it ends where values move by less than this share of their standard deviations, rms (`SETTLED`);
+            0: never before.
     """
     profile = _profile(groups, start)
     if np.ptp(profile) > 1e-9:  # in units of the profile a group's columns are alike

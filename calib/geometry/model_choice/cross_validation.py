@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements, take
-from calib.estimation.relevance import Gram, gram, relevance
+from calib.estimation.relevance import SETTLED, Gram, gram, relevance
 from calib.geometry.fit import plausible_deviation
 from calib.geometry.images.image_noise import ImageNoise
 from calib.geometry.installation import Installation
@@ -28,7 +28,6 @@ from calib.robot.deflection import Deflection, Term
 CHUNK = 1000  # poses observed at once
 BLIND = 3.0  # error by covariance alone, over the nominal residuals, from which on a fold says nothing (our choice)
 LOOSE = 1.0  # how far a frame may be from where it is [m, rad] (our choice)
-SETTLED = 0.02  # share of the parameters' sigmas that the search of ridges may leave (our choice)
 METRES = ("position", "consistency", "distance", "plane", "pixel")
 
 

@@ -20,7 +20,7 @@ import scipy.linalg
 from scipy.spatial import KDTree
 
 from calib.data.poses.measurements import PoseMeasurements, Positions, take
-from calib.estimation.relevance import Gram, gram, relevance
+from calib.estimation.relevance import SETTLED, Gram, gram, relevance
 from calib.estimation.variances import variance_weights
 from calib.geometry.fit import plausible_deviation
 from calib.geometry.installation import Installation
@@ -40,7 +40,6 @@ SOME = 0.02  # share of the poses (our choice)
 END = 0.2  # share of the poses at each end of a joint's range that is left out (our choice)
 FEWEST = 20  # poses from which errors on rows left out are worth a model (our choice)
 MOST = 1500  # poses that folds are judged by (our choice)
-SETTLED = 0.02  # share of the parameters' sigmas that the search of ridges may leave (our choice)
 UNTOLD = 1.0  # what is known beforehand of a parameter that a fold does not tell [m, rad] (our choice)
 
 
