@@ -31,7 +31,7 @@ from calib.simulation.cells.virtual_arm import MovingArm, moving_arm, record
 from calib.simulation.cells.virtual_cells import virtual_cell
 from calib.simulation.loop.references import random_fourier
 
-DATA = Path(os.environ.get("CALIB_DATA", "data"))
+DATA = Path(os.environ.get("CALIB_DATA", "../shared/data"))
 UR10, UR5, MOTOMAN = DATA / "ur10_ipa", DATA / "ur5_gts3800", DATA / "motoman_leica"
 RECORDINGS = {
     "UR5": (UR5 / "model.urdf", UR5 / "grid_800.csv", 0.25),

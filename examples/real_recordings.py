@@ -18,7 +18,7 @@ from calib.procedure.dynamic_stage import inputs as recordings
 from calib.procedure.kinematic_stage import fit, inputs
 from calib.procedure.kinematic_stage.settings import FitSettings
 
-DATA = Path(os.environ.get("CALIB_DATA", "data"))
+DATA = Path(os.environ.get("CALIB_DATA", "../shared/data"))
 WRIST = {"coupling": [{"joints": [5, 6], "label": "6"}]}
 
 

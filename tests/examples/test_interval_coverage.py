@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from recordings import DATA
 
 ROOT = Path(__file__).parents[2]
 TABLE = (ROOT / "examples/real_recordings.md").read_text()
@@ -21,7 +22,7 @@ def rows(said: str) -> dict[tuple[str, str], tuple[float, float]]:
 
 
 def run(part: str) -> str:
-    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), "CALIB_DATA": str(DATA)}
     command = [sys.executable, str(ROOT / "examples/interval_coverage.py"), part]
     return subprocess.run(command, capture_output=True, text=True, env=environment, check=True).stdout
 

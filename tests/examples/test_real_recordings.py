@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import re
 import sys
 from pathlib import Path
@@ -25,7 +24,8 @@ def script() -> ModuleType:
     return module
 
 
-ROWS = script().ROWS
+SCRIPT = script()
+ROWS = SCRIPT.ROWS
 
 
 def stated(row) -> list[tuple[float, float]]:
@@ -42,9 +42,9 @@ def test_every_row_of_the_command_stands_in_the_document(row) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif("CALIB_DATA" not in os.environ, reason="needs the folder of recordings")
 @pytest.mark.parametrize("row", ROWS, ids=[row.document for row in ROWS])
-def test_the_document_states_what_a_fresh_run_gives(row) -> None:
+def test_the_document_states_what_a_fresh_run_gives(row, data, monkeypatch) -> None:
+    monkeypatch.setattr(SCRIPT, "DATA", data)
     fresh = row.run()
     for value, (told, digit) in zip(fresh, stated(row)):
         assert abs(value - told) <= NEAR * told + digit, (value, told)
