@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
@@ -10,6 +10,7 @@ from scipy.linalg.lapack import dtrtri  # type: ignore[attr-defined]
 
 EXACT = 1e-7  # ‖y - W x‖ relative to ‖y‖ below which a fit counts as perfect: WᵀW knows no better
 SETTLED = 0.02  # share of the parameters' sigmas that a search among many may leave open (our choice)
+UNSEEN = 1e-12  # of a group's largest information, below which a direction is rounding
 OUTWEIGHED = 2.0  # a group is out once its prior is this many times as precise as the data on its columns (our choice)
 
 
@@ -25,6 +26,11 @@ class Gram:
     def __add__(self, other: Gram) -> Gram:
         return Gram(
             self.square + other.square, self.cross + other.cross, self.total + other.total, self.rows + other.rows
+        )
+
+    def __sub__(self, other: Gram) -> Gram:
+        return Gram(
+            self.square - other.square, self.cross - other.cross, self.total - other.total, self.rows - other.rows
         )
 
 
@@ -50,8 +56,71 @@ class Relevance:
     noise: float
 
 
+@dataclass(frozen=True, eq=False)
+class Condensed:
+    """Coordinates z (r,) of the columns x (p,), r ≤ p, in which all that data tell of every group is told.
+
+    Harmonics of a joint that turns by less than a whole turn are linear combinations of fewer of them, to within
+    rounding: their evidence costs r³, not p³.
+
+    Attributes:
+        groups: (r,) group of each coordinate, ascending; -1 for no ridge.
+        sizes: (r,) first guess of its prior standard deviation, one per group.
+        counts: (r,) how many columns of x it stands for.
+        blocks: columns of x, and what they are in the coordinates that follow one another (columns, coordinates).
+    """
+
+    groups: np.ndarray
+    sizes: np.ndarray
+    counts: np.ndarray
+    blocks: tuple[tuple[np.ndarray, np.ndarray], ...]
+
+    def columns(self, matrix: np.ndarray) -> np.ndarray:
+        """Return Wᵀ in these coordinates (r, ...) from that in x (p, ...)."""
+        flat = matrix.reshape(len(matrix), -1)
+        return np.concatenate([basis.T @ flat[own] for own, basis in self.blocks]).reshape(-1, *matrix.shape[1:])
+
+    def gram(self, data: Gram) -> Gram:
+        """Return statistics in these coordinates."""
+        square = self.columns(self.columns(data.square).T)
+        return Gram(square, self.columns(data.cross), data.total, data.rows)
+
+
+def condensed(square: np.ndarray, groups: np.ndarray, start: np.ndarray) -> Condensed:
+    """Return coordinates of the columns with statistics WᵀW `square` (p, p), in which those of a group are alike.
+
+    Args:
+        square: of all rows that will ever be used.
+        groups: (p,) group of each column; -1 for no ridge.
+        start: (p,) first guess of each column's prior standard deviation; within a group their ratios stay.
+    """
+    blocks, sizes = [], []
+    for group in np.unique(groups):
+        own = np.flatnonzero(groups == group)
+        if group < 0:
+            blocks.append((own, np.eye(len(own))))
+            sizes.append(1.0)
+            continue
+        sizes.append(float(np.exp(np.log(start[own]).mean())))
+        profile = start[own] / sizes[-1]
+        seen, basis = np.linalg.eigh(square[np.ix_(own, own)] * np.outer(profile, profile))
+        kept = seen > UNSEEN * seen[-1]
+        kept[-1] = True
+        blocks.append((own, profile[:, None] * basis[:, kept]))
+    widths = [basis.shape[1] for _, basis in blocks]
+    counts = [len(own) / width for (own, _), width in zip(blocks, widths)]
+    return Condensed(
+        np.repeat(np.unique(groups), widths), np.repeat(sizes, widths), np.repeat(counts, widths), tuple(blocks)
+    )
+
+
 def relevance(
-    data: Gram, groups: np.ndarray, start: np.ndarray, iterations: int = 15, settled: float = 0.0
+    data: Gram,
+    groups: np.ndarray,
+    start: np.ndarray,
+    iterations: int = 15,
+    settled: float = 0.0,
+    counts: np.ndarray | None = None,
 ) -> Relevance:
     """Estimate x with prior x_g ~ N(0, 1/λ_g) per group, every λ and the noise at their most probable.
 
@@ -62,22 +131,19 @@ def relevance(
     Args:
         data: statistics of all rows.
         groups: (p,) group of each column; -1 for no ridge.
-        start: (p,) first guess of each column's prior standard deviation; read where there is a ridge. Within a group
-            their ratios stay.
+        start: (p,) first guess of each column's prior standard deviation, one per group (`condensed` for others); read
+            where there is a ridge.
         iterations: of the fixed point, at most.
         settled: it ends where values move by less than this share of their standard deviations, rms (`SETTLED`);
             0: never before.
+        counts: (p,) how many columns each stands for (`Condensed`); None for one.
     """
-    profile = _profile(groups, start)
-    if np.ptp(profile) > 1e-9:  # in units of the profile a group's columns are alike
-        inner = Gram(data.square * np.outer(profile, profile), data.cross * profile, data.total, data.rows)
-        found = relevance(inner, groups, start / profile, iterations, settled)
-        return replace(found, values=found.values * profile, ridge=found.ridge * profile)
+    counts = np.ones(len(groups)) if counts is None else counts
     ridged = groups >= 0
     count = int(groups.max(initial=-1)) + 1
     family = np.where(ridged, groups, count)  # columns without a ridge form the last family, with precision 0
-    members = np.maximum(np.bincount(family, minlength=count + 1), 1)
-    lam = np.bincount(family, np.where(ridged, start, np.inf) ** -2.0, count + 1) / members
+    members = np.maximum(np.bincount(family, counts, count + 1), 1.0)
+    lam = np.bincount(family, counts * np.where(ridged, start, np.inf) ** -2.0, count + 1) / members
     information = np.bincount(family, np.diag(data.square), count + 1) / members
     beta, alive = 1.0, np.ones(count + 1, dtype=bool)
     index, solution, effective = np.arange(len(groups)), np.zeros(len(groups)), 0.0
@@ -98,7 +164,7 @@ def relevance(
         misfit += solution @ square @ solution
         least = EXACT**2 * max(data.total, 1e-300)  # what rounding leaves of a perfect fit
         beta = max(data.rows - effective - int((~ridged).sum()), 1.0) / max(float(misfit), least)
-        if settled > 0.0 and np.mean((solution - last[index]) ** 2 / variance) < settled**2:
+        if settled > 0.0 and np.sum((solution - last[index]) ** 2 / variance) < settled**2 * counts[index].sum():
             break
         last[index] = solution
     values, ridge = np.zeros(len(groups)), np.where(ridged, 0.0, np.inf)
@@ -106,17 +172,6 @@ def relevance(
     kept = index[ridged[index]]
     ridge[kept] = 1.0 / np.sqrt(lam[groups[kept]])
     return Relevance(values, ridge, effective, float(1.0 / np.sqrt(beta)))
-
-
-def _profile(groups: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Return each column's first guess over its group's geometric mean (p,); 1 without a ridge."""
-    ridged = groups >= 0
-    result = np.ones(len(groups))
-    if ridged.any():
-        logs, own = np.log(start[ridged]), groups[ridged]
-        mean = np.bincount(own, logs) / np.maximum(np.bincount(own), 1)
-        result[ridged] = np.exp(logs - mean[own])
-    return result
 
 
 def _posterior(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.estimation.relevance import Gram, gram, relevance
+from calib.estimation.relevance import Gram, condensed, gram, relevance
 
 NOISE = 0.05
 
@@ -107,3 +107,26 @@ def test_statistics_add_up():
     assert isinstance(parts, Gram) and parts.rows == whole.rows
     for name in ("square", "cross", "total"):
         assert getattr(parts, name) == pytest.approx(getattr(whole, name), abs=1e-9)
+
+
+def test_condensed_coordinates_give_what_all_columns_give_in_half_of_them():
+    """Harmonics of two joints that turn by a third of a turn, beside three free columns; the prior falls with order."""
+    rng = np.random.default_rng(8)
+    order = np.arange(1, 31)
+    turns = [
+        np.concatenate([np.cos(q[:, None] * order), np.sin(q[:, None] * order)], 1)
+        for q in rng.uniform(-1, 1, (2, 400))
+    ]
+    matrix = np.concatenate([rng.normal(size=(400, 3)), *turns], axis=1)
+    groups = np.repeat([-1, 0, 1], [3, 60, 60])
+    fall = np.concatenate([np.ones(3), np.tile(1.0 / order, 4)])
+    y = matrix @ (fall * rng.normal(size=123)) + NOISE * rng.normal(size=400)
+    data, size = gram(y, matrix), np.exp(np.log(1.0 / order).mean())
+    few = condensed(data.square, groups, fall)
+    found = relevance(few.gram(data), few.groups, few.sizes, 30, counts=few.counts)
+    profile = np.where(groups < 0, 1.0, fall / size)
+    every = relevance(gram(y, matrix * profile), groups, np.full(123, size), 30)
+    assert len(few.groups) <= 0.5 * len(groups)
+    assert found.effective == pytest.approx(every.effective, rel=1e-6)
+    assert found.noise == pytest.approx(every.noise, rel=1e-6)
+    assert few.columns(matrix.T).T @ found.values == pytest.approx(matrix @ (profile * every.values), abs=1e-6)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements, take
-from calib.estimation.relevance import SETTLED, Gram, gram, relevance
+from calib.estimation.relevance import SETTLED, Condensed, Gram, Relevance, condensed, gram, relevance
 from calib.geometry.fit import plausible_deviation
 from calib.geometry.images.image_noise import ImageNoise
 from calib.geometry.installation import Installation
@@ -55,21 +55,24 @@ class UnseenErrors:
 
 @dataclass(frozen=True, eq=False)
 class FoldStatistics:
-    """Statistics of every fold for the columns [free geometry, terms].
+    """Statistics of every fold for the columns [free geometry, terms], the latter condensed.
 
     Attributes:
-        rigid: number of geometry columns.
+        rigid: number of geometry columns, which come first.
         groups: (E,) ridge group of each term.
         sizes: (E,) first guess of each coefficient.
+        coordinates: of geometry and terms, in which the statistics are.
         plausible: (rigid,) wide prior on the geometry, so that what a fold cannot tell stays at the optimum.
         training: per fold, statistics of the other folds' rows, whitened.
         held_out: per fold, statistics of its rows [m], and how many.
         rows: per fold.
+        total: statistics of all rows, whitened.
     """
 
     rigid: int
     groups: np.ndarray
     sizes: np.ndarray
+    coordinates: Condensed
     plausible: np.ndarray
     training: list[Gram]
     held_out: list[Gram]
@@ -77,25 +80,13 @@ class FoldStatistics:
     total: Gram
     _chosen: dict[bytes, np.ndarray] = field(default_factory=dict, init=False)
 
-    def problem(self, terms: np.ndarray, fold: int | None = None) -> tuple[Gram, np.ndarray, np.ndarray]:
-        """Return statistics, ridge groups and first sizes for geometry and terms: of all rows, or without a fold."""
-        data = self.total if fold is None else self.training[fold]
-        index = np.concatenate([np.arange(self.rigid), self.rigid + terms])
-        square = data.square.take(index, 0).take(index, 1)
-        square[np.arange(self.rigid), np.arange(self.rigid)] += 1.0 / self.plausible**2
-        _, groups = np.unique(self.groups[terms], return_inverse=True) if len(terms) else (None, np.array([], int))
-        groups = np.concatenate([np.full(self.rigid, -1), groups])
-        sizes = np.concatenate([np.ones(self.rigid), self.sizes[terms]])
-        return Gram(square, data.cross[index], data.total, data.rows), groups, sizes
-
     def error(self, terms: np.ndarray) -> UnseenErrors:
-        """Return the error on held-out rows of geometry + terms."""
-        index = np.concatenate([np.arange(self.rigid), self.rigid + terms])
-        squares, chosen = [], self.ridges(terms)
-        for fold, held in enumerate(self.held_out):
-            data, groups, sizes = self.problem(terms, fold)
-            sizes[self.rigid :] = np.where(chosen > 0.0, chosen, sizes[self.rigid :])  # where the search begins
-            x = relevance(data, groups, sizes, iterations=8, settled=SETTLED).values
+        """Return the error on held-out rows of geometry + terms, whole groups of them."""
+        index, chosen = self._columns(terms), self._widths(terms)
+        begin = np.where(chosen > 0.0, chosen, self.coordinates.sizes[index])  # where the search begins
+        squares = []
+        for training, held in zip(self.training, self.held_out):
+            x = self._search(training, index, begin, 8).values
             square = held.square.take(index, 0).take(index, 1)
             squares.append(held.total - 2.0 * x @ held.cross[index] + x @ square @ x)
         return UnseenErrors(np.array(squares), self.rows)
@@ -106,14 +97,34 @@ class FoldStatistics:
 
     def ridges(self, terms: np.ndarray) -> np.ndarray:
         """Return the prior standard deviation of each term that all rows choose; 0 where they switch it off."""
-        key = terms.tobytes()
-        if key not in self._chosen:
-            self._chosen[key] = relevance(*self.problem(terms), settled=SETTLED).ridge[self.rigid :]
-        return self._chosen[key]
+        width = np.ones(int(self.groups.max(initial=-1)) + 1)
+        own = self.coordinates.groups[self._columns(terms)[self.rigid :]]
+        width[own] = (self._widths(terms) / self.coordinates.sizes[self._columns(terms)])[self.rigid :]
+        return width[self.groups[terms]] * self.sizes[terms]
 
     def alive(self, terms: np.ndarray) -> int:
         """Return how many of the terms the data keep."""
         return int(np.sum(self.ridges(terms) > 0.0))
+
+    def _columns(self, terms: np.ndarray) -> np.ndarray:
+        return np.flatnonzero(np.isin(self.coordinates.groups, [-1, *self.groups[terms]]))
+
+    def _widths(self, terms: np.ndarray) -> np.ndarray:
+        """Return the prior standard deviation of each coordinate of geometry and terms that all rows choose."""
+        key = terms.tobytes()
+        if key not in self._chosen:
+            index = self._columns(terms)
+            self._chosen[key] = self._search(self.total, index, self.coordinates.sizes[index], 15).ridge
+        return self._chosen[key]
+
+    def _search(self, data: Gram, index: np.ndarray, begin: np.ndarray, iterations: int) -> Relevance:
+        square, rigid = data.square.take(index, 0).take(index, 1), np.arange(self.rigid)
+        square[rigid, rigid] += 1.0 / self.plausible**2
+        _, groups = np.unique(self.coordinates.groups[index], return_inverse=True)
+        return relevance(
+            Gram(square, data.cross[index], data.total, data.rows), groups - int(self.rigid > 0), begin, iterations,
+            SETTLED, self.coordinates.counts[index],
+        )  # fmt: skip
 
 
 def fold_statistics(
@@ -158,14 +169,18 @@ def fold_statistics(
         each.append(whitened)
     if pooled:
         total = sum(each[1:], each[0])
-        training = [_without(total, part) for part in each]
     else:
         every = [np.arange(len(b)) for b in measured]
         total = _statistics(cell, measured, every, free, scales, weights, noises, torques)[1]
-        training = each
+    families = np.concatenate([np.full(rigid, -1), groups]).astype(int)
+    coordinates = condensed(total.square, families, np.concatenate([np.ones(rigid), sizes]))
+    total, each, held_out = (
+        coordinates.gram(total), [coordinates.gram(own) for own in each], [coordinates.gram(own) for own in held_out],
+    )  # fmt: skip
+    training = [total - own for own in each] if pooled else each
     wide = plausible_deviation(found.cell, found.free) if found.prior is None else found.prior
     plausible = np.where(np.isfinite(wide), wide, 10.0)
-    return FoldStatistics(rigid, groups, sizes, plausible, training, held_out, np.array(rows), total)
+    return FoldStatistics(rigid, groups, sizes, coordinates, plausible, training, held_out, np.array(rows), total)
 
 
 def blind_folds(
@@ -202,14 +217,10 @@ def blind_folds(
     result = np.zeros(folds.count, dtype=bool)
     noise = sum(square for _, square in squares) / folds.count
     for fold, own in enumerate(each):
-        spread = np.linalg.inv((_without(total, own).square + np.diag(known**-2)) * np.outer(known, known))
+        spread = np.linalg.inv(((total - own).square + np.diag(known**-2)) * np.outer(known, known))
         predicted = float(np.sum(squares[fold][0] * (spread * np.outer(known, known))))
         result[fold] = predicted > BLIND**2 * noise
     return result
-
-
-def _without(total: Gram, part: Gram) -> Gram:
-    return Gram(total.square - part.square, total.cross - part.cross, total.total - part.total, total.rows - part.rows)
 
 
 def _statistics(

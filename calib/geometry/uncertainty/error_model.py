@@ -20,7 +20,7 @@ import scipy.linalg
 from scipy.spatial import KDTree
 
 from calib.data.poses.measurements import PoseMeasurements, Positions, take
-from calib.estimation.relevance import SETTLED, Gram, gram, relevance
+from calib.estimation.relevance import SETTLED, Gram, condensed, gram, relevance
 from calib.estimation.variances import variance_weights
 from calib.geometry.fit import plausible_deviation
 from calib.geometry.installation import Installation
@@ -248,8 +248,6 @@ class _Rows:
         if found.prior is not None:
             wide = np.minimum(wide, found.prior[own])
         self.prior = np.where(np.isfinite(wide), wide, UNTOLD)
-        self.groups = np.concatenate([np.full(len(own), -1), term_groups(terms)]).astype(int)
-        self.sizes = np.concatenate([np.ones(len(own)), term_sizes(terms)])
         scales, weights = used_sigmas(found), row_weights(found)
         self.whitened: list[list[tuple[np.ndarray, np.ndarray]]] = []
         self.metric: list[tuple[np.ndarray, np.ndarray]] = []
@@ -261,19 +259,23 @@ class _Rows:
                   each.jacobian * root / scales[number][each.label]) for each in parts]
             )  # fmt: skip
             self.metric.append(next((each.value, each.jacobian) for each in parts if each.label == "position"))
-        self.total = sum((self._gram(k, slice(None)) for k in range(1, len(self.measured))), self._gram(0, slice(None)))
+        total = sum((self._gram(k, slice(None)) for k in range(1, len(self.measured))), self._gram(0, slice(None)))
+        groups = np.concatenate([np.full(len(own), -1), term_groups(terms)]).astype(int)
+        self.coordinates = condensed(total.square, groups, np.concatenate([np.ones(len(own)), term_sizes(terms)]))
+        self.total, columns = self.coordinates.gram(total), self.coordinates.columns
+        self.whitened = [[(value, columns(jacobian)) for value, jacobian in block] for block in self.whitened]
+        self.metric = [(value, columns(jacobian)) for value, jacobian in self.metric]
 
     def _gram(self, block: int, rows: np.ndarray | slice) -> Gram:
-        p = len(self.free)
         each = [
-            gram(value[:, rows].ravel(), jacobian[:, :, rows].reshape(p, -1).T)
+            gram(value[:, rows].ravel(), jacobian[:, :, rows].reshape(len(jacobian), -1).T)
             for value, jacobian in self.whitened[block]
         ]
         return sum(each[1:], each[0])
 
     def left_out(self, folds: Folds, levers: np.ndarray) -> Iterator[np.ndarray]:
         """Yield per fold of its rows (rows, 4): |e|², trace J Σ Jᵀ, squared distances from the rest."""
-        free, sizes = np.arange(len(self.prior)), self.sizes
+        free, sizes, space = np.arange(len(self.prior)), self.coordinates.sizes, self.coordinates
         for fold in range(folds.count):
             inside = [np.flatnonzero(members[rows] == fold) for members, rows in zip(folds.members, self.chosen)]
             if not 0 < sum(map(len, inside)) < sum(map(len, self.measured)):
@@ -281,15 +283,12 @@ class _Rows:
             data = self.total
             for number, rows in enumerate(inside):
                 if len(rows):
-                    out = self._gram(number, rows)
-                    data = Gram(
-                        data.square - out.square, data.cross - out.cross, data.total - out.total, data.rows - out.rows
-                    )
+                    data = data - self._gram(number, rows)
             square = data.square.copy()
             square[free, free] += 1.0 / self.prior**2
-            found = relevance(replace(data, square=square), self.groups, sizes, iterations=8, settled=SETTLED)
+            found = relevance(replace(data, square=square), space.groups, sizes, 8, SETTLED, space.counts)
             own = np.isfinite(found.ridge) & (found.ridge > 0.0)
-            sizes = np.where(own, found.ridge, self.sizes)  # where the next fold's search begins
+            sizes = np.where(own, found.ridge, space.sizes)  # where the next fold's search begins
             alive = np.flatnonzero(found.ridge > 0.0)
             precision = square[np.ix_(alive, alive)] / found.noise**2 + np.diag(found.ridge[alive] ** -2.0)
             scale = 1.0 / np.sqrt(np.diag(precision))
