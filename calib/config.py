@@ -211,7 +211,8 @@ def _complaint(errors: list[Any], kind: type, place: str) -> str:
         words = {"tuple_type": f"a list of tables, [[{loc[-1]}]]", "too_short": "at least one number"}.get(
             name, "a table"
         )
-    return f"{where}: expected {words}, found {shown(found)}"
+    hint = f"; {context['hint']}" if context.get("hint") else ""
+    return f"{where}: expected {words}, found {shown(found)}{hint}"
 
 
 def _keys(kind: Any) -> list[str]:

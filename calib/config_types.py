@@ -202,14 +202,15 @@ class Index:
 
 @dataclass(frozen=True)
 class OneOf:
-    """A text that is one of a few."""
+    """A text that is one of a few; `hint` follows the complaint."""
 
     allowed: tuple[str, ...]
+    hint: str = ""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         from pydantic_core import core_schema as core
 
-        inner, context = core.literal_schema(list(self.allowed)), {"allowed": list(self.allowed)}
+        inner, context = core.literal_schema(list(self.allowed)), {"allowed": list(self.allowed), "hint": self.hint}
         return core.custom_error_schema(inner, "one_of", custom_error_message="", custom_error_context=context)
 
 

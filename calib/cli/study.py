@@ -50,10 +50,12 @@ def study(
             studies, folder, methods=_names(methods), runs=runs, where=workers, report_only=report_only, plots=plots,
             say=progress,
         )  # fmt: skip
-    tables = [report.console_table(one) for one in found.conditions if one.methods]
-    if len(tables) > SHOWN:
-        tables = [report.overview(found.conditions), report.torque_table(found.conditions)]
-    say(*console.rendered(tables))
+    seen = [one for one in found.conditions if one.methods]
+    if len(seen) > SHOWN:
+        blocks = [report.overview(found.conditions), report.torque_table(found.conditions)]
+    else:
+        blocks = [block for one in seen for block in (report.console_table(one), *report.failures(one))]
+    say(*console.rendered(blocks))
     say(*outcome.described(found), f"written to {folder}: {outcome.REPORT} shows it")
 
 

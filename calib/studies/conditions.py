@@ -44,7 +44,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from calib.config import parse, read_toml, strict
-from calib.config_types import Filled, Name, NotNegative, OneOf, Real, Spread, Text, Whole
+from calib.config_types import Filled, Name, OneOf, Real, Spread, Text, Whole
 from calib.errors import UsageError, suggestion
 from calib.identification.methods.registry import METHODS, method_named
 
@@ -53,9 +53,11 @@ MISMATCHES = ("none", "geometry", "calibrated", "controller", "friction", "paylo
 TRIAL = 1  # raised whenever a trial of the same condition comes out otherwise: rows from before then do not count
 
 _Few = Spread(words="a value, or a list of them")
-Robots = Annotated[tuple[Annotated[str, OneOf(ROBOTS)], ...], _Few]
+Robots = Annotated[
+    tuple[Annotated[str, OneOf(ROBOTS, "a study needs the truth; methods on recordings: calib compare")], ...], _Few
+]
 Wholes = Annotated[tuple[Annotated[int, Whole(1, 100)], ...], _Few]
-Cutoffs = Annotated[tuple[NotNegative, ...], _Few]
+Cutoffs = Annotated[tuple[Annotated[float, Real(least=0, words="0 or more, Hz without a unit")], ...], _Few]
 Mismatches = Annotated[tuple[Annotated[str, OneOf(MISMATCHES)], ...], _Few]
 Methods = Annotated[tuple[Name, ...], _Few]
 Count = Annotated[int, Whole(0, 1_000_000)]
@@ -68,7 +70,7 @@ class Noise:
 
     name: Name
     sigma_q: Annotated[float, Real(least=0, most=0.1, unit="rad", quantity="angle")]
-    sigma_tau: NotNegative
+    sigma_tau: Annotated[float, Real(least=0, quantity="torque")]
 
 
 @strict

@@ -12,6 +12,7 @@ more than `ALIKE` times the processor time of the cheapest, and of such the firs
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import comb
@@ -45,6 +46,7 @@ class MethodSummary:
 
     Attributes:
         trials: number of its rows; failures: status → how many of them gave no estimate.
+        examples: status → data set and message of the first of these.
         figures: name of a figure (`FIGURES`) → its spread.
         rank: by the median torque error, from 1.
         as_good: not told from the best, or within `SLACK` of it, and reliable.
@@ -55,6 +57,7 @@ class MethodSummary:
     method: str
     trials: int
     failures: Mapping[str, int]
+    examples: Mapping[str, str]
     figures: Mapping[str, Quartiles]
     rank: int = 0
     as_good: bool = False
@@ -151,17 +154,16 @@ def _error(row: TrialRow) -> float:
 
 
 def _summary(name: str, rows: Sequence[TrialRow]) -> MethodSummary:
-    failures: dict[str, int] = {}
-    for row in rows:
-        if not row.found:
-            failures[row.status] = failures.get(row.status, 0) + 1
+    failures = Counter(row.status for row in rows if not row.found)
+    first = {row.status: row for row in sorted(rows, key=lambda row: -row.seed)}
+    examples = {status: f"data set {first[status].seed}: {first[status].message}" for status in failures}
     figures = {}
     for figure in FIGURES:
         bad = figure in ("torque_error", "torque_worst", "beta_error", "beta_distance")
         values = [float(getattr(row, figure)) for row in rows if row.found]
         values += [float("inf")] * (len(rows) - len(values)) if bad else []
         figures[figure] = spread(values)
-    return MethodSummary(name, len(rows), failures, figures)
+    return MethodSummary(name, len(rows), failures, examples, figures)
 
 
 def spread(values: Sequence[float]) -> Quartiles:
@@ -170,8 +172,8 @@ def spread(values: Sequence[float]) -> Quartiles:
     if not len(found):
         return Quartiles(float("nan"), float("nan"), float("nan"), 0)
     with np.errstate(invalid="ignore"):
-        lower, median, upper = (float(x) for x in np.quantile(found, [0.25, 0.5, 0.75], method="nearest"))
-    return Quartiles(median, lower, upper, len(found))
+        lower, upper = (float(x) for x in np.quantile(found, [0.25, 0.75], method="nearest"))
+    return Quartiles(float(np.median(found)), lower, upper, len(found))
 
 
 def sign_test(one: Mapping[int, float], other: Mapping[int, float]) -> float:

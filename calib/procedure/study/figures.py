@@ -22,7 +22,7 @@ from calib.procedure.report.style import (
     sheet,
     styled,
 )
-from calib.studies.summary import LEAST, ConditionSummary
+from calib.studies.summary import LEAST, ConditionSummary, spread
 from calib.studies.trial import TrialRow
 
 LINE = 0.21  # height of one method [in]
@@ -74,9 +74,10 @@ def _box(axes, place: int, values: np.ndarray, colour: str) -> None:
     if len(values) < LEAST:
         axes.plot(values, np.full(len(values), place), "o", color=colour, markersize=4.0, zorder=3)
         return
-    least, lower, middle, upper, most = np.quantile(values, [0.05, 0.25, 0.5, 0.75, 0.95], method="nearest")
+    least, most = np.quantile(values, [0.05, 0.95], method="nearest")
+    box = spread(values.tolist())
     axes.plot([least, most], [place, place], color=QUIET, linewidth=0.9, zorder=2)
-    axes.barh(place, upper - lower, 0.56, lower, color=colour, zorder=3)
-    axes.plot([middle, middle], [place - 0.34, place + 0.34], color="white", linewidth=1.4, zorder=4)
+    axes.barh(place, box.upper - box.lower, 0.56, box.lower, color=colour, zorder=3)
+    axes.plot([box.median, box.median], [place - 0.34, place + 0.34], color="white", linewidth=1.4, zorder=4)
     beyond = values[(values < least) | (values > most)]
     axes.plot(beyond, np.full(len(beyond), place), ".", color=QUIET, markersize=2.0, zorder=2)

@@ -15,7 +15,7 @@ HEADER = (
 
 def line(one: ComparedMethod) -> str:
     """Return what is known of a method before the others are done."""
-    words = one.failure or f"{one.unseen:.3g} % on unseen motion, {one.seconds:.2g} s"
+    words = one.failure or f"{one.unseen:.3g} % on other motion, {one.seconds:.2g} s"
     return f"{one.name}: {words}"
 
 

@@ -135,6 +135,16 @@ def console_table(one: ConditionSummary) -> Table:
     return replace(whole, header=header, rows=rows, numbers=range(1, len(header) - 1))
 
 
+def failures(one: ConditionSummary) -> list[Text]:
+    """Return each way in which a method failed on a condition, how often, and the first one's message; or nothing."""
+    said = [
+        f"{method.method}: {count} {status}, e.g. {method.examples[status]}"
+        for method in sorted(one.methods, key=lambda method: method.method)
+        for status, count in method.failures.items()
+    ]
+    return [Text("Without an estimate", said)] if said else []
+
+
 def _line(one: MethodSummary) -> tuple[str, ...]:
     def median(name: str) -> str:
         return _short(one.figures[name].median)
@@ -200,8 +210,7 @@ def make_page(
         own = [row for row in rows if row.digest == one.condition.digest]
         blocks = [condition_table(one)]
         drawn = [Pictures("", [figures.boxes(one, own)])] if plots else []
-        said = _failures(own)
-        blocks = [*blocks, *drawn, *([Text("Without an estimate", said)] if said else [])]
+        blocks = [*blocks, *drawn, *failures(one)]
         sections.append(Section(one.condition.name, blocks))
     here, style = resources.files("calib.procedure.study"), resources.files("calib.procedure.report")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
@@ -213,15 +222,3 @@ def make_page(
         issued=f"{when}, armature-calib {metadata.version('armature-calib')}, {len(rows)} trials",
         style=style.joinpath("certificate.css").read_text(encoding="utf-8"),
     )  # fmt: skip
-
-
-def _failures(rows: Sequence[TrialRow]) -> list[str]:
-    """Return the first message of each way in which a method failed, with how often."""
-    found: dict[tuple[str, str], list[TrialRow]] = {}
-    for row in rows:
-        if not row.found:
-            found.setdefault((row.method, row.status), []).append(row)
-    return [
-        f"{method}: {len(own)} {status}, e.g. data set {own[0].seed}: {own[0].message}"
-        for (method, status), own in sorted(found.items())
-    ]  # fmt: skip
