@@ -27,13 +27,13 @@ from calib.procedure.excitation import folder as motion_folder
 from calib.procedure.excitation.inputs import identifiable, read_model, read_prior
 from calib.procedure.excitation.limits import Points, read_motion_limits
 from calib.procedure.excitation.settings import ExcitationSettings
-from calib.procedure.report import motion_figures
 from calib.robot.kinematics import forward
 from calib.robot.load import load
 from trajectories.basis import SampledMotion
 from trajectories.design.objectives import condition_numbers
 from trajectories.design.search import StartSearch
 from trajectories.design.verify import dense_motion
+from trajectories.errors import NothingFeasible
 from trajectories.fourier import evaluate
 
 LIMITS = """
@@ -107,11 +107,15 @@ def check_playback(q: np.ndarray, stands: np.ndarray, metrics: dict) -> None:
 
 
 @pytest.fixture(scope="module")
-def earlier(tmp_path_factory) -> Path:
-    """Return the folder of a quick excitation, two periods of it."""
-    folder = tmp_path_factory.mktemp("excited") / "e"
-    designed = design.excite("lwr4plus", replace(SHORT, repeat=2))
-    return motion_folder.write_design(designed, folder, motion_figures.write_design)
+def designed() -> design.Designed:
+    """Return a quick excitation, two periods of it."""
+    return design.excite("lwr4plus", replace(SHORT, repeat=2))
+
+
+@pytest.fixture(scope="module")
+def earlier(designed, tmp_path_factory) -> Path:
+    """Return its folder."""
+    return motion_folder.write_design(designed, tmp_path_factory.mktemp("excited") / "e")
 
 
 def test_motions_before_count(earlier, tmp_path):
@@ -213,9 +217,8 @@ def test_recall_never_writes_onto_its_log(earlier, cell, calib):
     assert Path("log.npz").read_bytes() == kept
 
 
-def test_a_motion_folder_is_written_whole(tmp_path):
+def test_a_motion_folder_is_written_whole(designed, tmp_path):
     """A disk that fills in the middle leaves what was there: nothing, or the motion of before."""
-    designed = design.excite("lwr4plus", SHORT)
 
     def full(designed: design.Designed, folder: Path) -> None:
         raise OSError(28, "No space left on device")
@@ -248,10 +251,9 @@ def test_ctrl_c_keeps_the_best_motion_so_far(cell, calib, monkeypatch):
     assert metrics["history"][-1] < metrics["history"][0]
 
 
-def test_an_aim_in_place_of_condition_numbers_and_a_shorter_period():
-    plain = design.excite("lwr4plus", replace(SHORT, outlook=False))
+def test_an_aim_in_place_of_condition_numbers_and_a_shorter_period(designed):
     told = design.excite("lwr4plus", replace(SHORT, goals=("logdet",), outlook=False))
-    assert told.condition.raw > plain.condition.raw and told.found.merit < 0.0
+    assert told.condition.raw > designed.condition.raw and told.found.merit < 0.0
     short = design.excite("lwr4plus", replace(SHORT, goals=("duration=12",), shortest=10.0, outlook=False))
     samples = short.period * SHORT.rate
     assert 10.0 <= short.period < 16.0 and samples == pytest.approx(round(samples)) and short.proof.feasible
@@ -282,7 +284,6 @@ def test_ctrl_c_in_worker_processes(tmp_path, whom):
         ("[velocity]\nq9 = 1.0", (), "there is no key 'q9'"),
         ('[frequency]\nresonance = "0.2 Hz"', (), "not below the resonance"),
         ("[target]\nheight = 1.5", (), "breaks the workspace limit"),
-        ("[torque]\nall = 0.05", (), "breaks the torque limit"),
         ("[torque]\nmargin = 1.5", (), "torque.margin: expected a share"),
         ("[joints]\nq2 = [-1.0, 1.0]", ("--start", "0,1.2,0,0,0,0,0"), "joint2 at 1.2 is beyond its limits -1 to 1"),
         ("", ("--start", "0,nan,0,0,0,0,0"), "joint2 at nan is beyond"),
@@ -296,7 +297,6 @@ def test_ctrl_c_in_worker_processes(tmp_path, whom):
         ("", ("--existing", "nowhere.npz"), "cannot be read"),
         ('[frequency]\nresonance = "0.25 Hz"', (), "take fewer harmonics or a period above 16 s"),
         ("[target]\nreach = nan", (), "target.reach: expected a number above 0, found nan"),
-        ("", ("--hard", "wrist=0.9"), "hard goal torque slack of joints 6, 7"),
         ("", ("--goal", "wrist=2"), "above 0 and below 1"),
         ("", ("--goal", "elbow=0.1"), "none of raw"),
         ("", ("--goal", "wrist"), "expected NAME=NUMBER"),
@@ -316,6 +316,20 @@ def test_bad_input_is_refused_with_exit_code_2(cell, calib, extra, options, word
     code, _, err = calib("excite", "lwr4plus", "--limits", "limits.toml", "--out", "e", *quick, *options)
     assert (code, words in err) == (2, True), err
     assert not Path("e").exists()
+
+
+@pytest.mark.parametrize(
+    ("extra", "changed", "words"),
+    [
+        ("[torque]\nall = 0.05", {}, "breaks the torque limit"),
+        ("", {"hard": ("wrist=0.9",)}, "hard goal torque slack of joints 6, 7"),
+    ],
+)
+def test_a_search_without_a_result_names_what_was_in_the_way(tmp_path, extra, changed, words):
+    """The command says the same: see the workspace limit above."""
+    (tmp_path / "limits.toml").write_text(extra)
+    with pytest.raises(NothingFeasible, match=words):
+        design.excite("lwr4plus", replace(SHORT, evaluations=12, samples=40, **changed), limits=tmp_path / "limits.toml")
 
 
 def identified(folder: Path, spoil: str = "") -> None:
