@@ -25,7 +25,7 @@ POSES = "joint1,joint2,joint3,x,y,z\n" + "".join(
 )
 BASE = {
     "fit": ["arm.toml", "m.csv", "--out", "o", "--model", "frames", "--no-plots"],
-    "select": ["arm.toml", "--out", "o.csv", "-m", "4", "--candidates", "20", "--method", "detmax"],
+    "select": ["arm.toml", "--out", "o.csv", "-m", "4", "--candidates", "20", "--method", "detmax", "--no-plots"],
     "excite": ["arm.toml", "--out", "o", "--starts", "1", "--evaluations", "2", "--harmonics", "1", "--no-plots"],
     "plan": ["arm.toml", "--waypoints", "w.csv", "--out", "o", "--no-plots"],
     "recall": ["nothing", "l.npz", "--out", "o.npz"],

@@ -161,9 +161,9 @@ def fitted_folder(tmp_path: Path, covariance: float | None) -> Path:
     return folder
 
 
-def run(folder: Path, tmp_path: Path) -> tuple[dict, list[dict], Path]:
+def run(folder: Path, tmp_path: Path, *more: str) -> tuple[dict, list[dict], Path]:
     train, out = planted.write(tmp_path, "train.npz", 0), tmp_path / "out"
-    assert cli.run(["identify", *map(str, (folder, train, "--out", out, "--friction", "standard"))]) == 0
+    assert cli.run(["identify", *map(str, (folder, train, "--out", out, "--friction", "standard", *more))]) == 0
     rows = list(csv.DictReader((out / "estimate.csv").open()))
     return json.loads((out / "metrics.json").read_text())["geometry"], rows, out
 
@@ -186,7 +186,7 @@ def test_the_command_carries_the_fits_covariance(tmp_path, capsys):
 
 
 def test_the_command_says_where_the_geometry_is_taken_as_exact(tmp_path, capsys):
-    found, rows, out = run(fitted_folder(tmp_path, None), tmp_path)
+    found, rows, out = run(fitted_folder(tmp_path, None), tmp_path, "--no-plots")
     assert not found["propagated"] and {row["sigma_geometry"] for row in rows} == {""}
     assert "taken as exact" in capsys.readouterr().out.replace("\n", " ")
     assert not (out / calibrated.COVARIANCE).exists()

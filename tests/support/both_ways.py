@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from sessions import edit, quiet
+from without_figures import DRAWING
 
 from calib import cli
 from calib.errors import CalibError
@@ -69,7 +70,7 @@ def read(path: Path) -> dict[str, Any]:
 
 def command(*words: object) -> str:
     """Run a command, without figures; return how it was refused."""
-    bare = ["--no-plots"] if words[0] in ("fit", "identify", "excite") else []
+    bare = ["--no-plots"] if words[0] in DRAWING else []
     arguments = [*(str(word) for word in words), *bare]
     return refusal(lambda: cli.app(arguments, standalone_mode=False))
 

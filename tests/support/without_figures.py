@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from calib import cli
 
-DRAWING = ("fit", "identify", "excite", "plan", "next", "redo", "demo", "run")
+DRAWING = ("select", "fit", "identify", "excite", "plan", "next", "redo", "demo", "run")
 
 
 def words(*arguments: object) -> list[str]:

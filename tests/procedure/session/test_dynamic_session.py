@@ -229,7 +229,7 @@ def test_recordings_keep_the_plan_they_were_made_to(recorded: Session) -> None:
 
 def test_a_guided_demonstration_stops_where_an_engineer_would(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     out = str(tmp_path / "cell")
-    assert cli.run(["demo", "--guided", "--geometry-only", "--out", out]) == 0
+    assert cli.run(["demo", "--guided", "--geometry-only", "--no-plots", "--out", out]) == 0
     said = capsys.readouterr().out.replace("\n", "")
     assert "Drive the 40 poses" in said and f"calib demo --bring {out}" in said
     assert not list((tmp_path / "cell/3-measured").iterdir())
