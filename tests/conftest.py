@@ -9,6 +9,7 @@ from __future__ import annotations
 import signal
 from pathlib import Path
 
+import loaded as processes
 import pytest
 from hypothesis import HealthCheck, settings
 from recordings import DATA
@@ -22,6 +23,12 @@ settings.register_profile(
 )
 settings.register_profile("search", deadline=None, max_examples=2000)
 settings.load_profile("fixed")
+
+
+@pytest.fixture(scope="session")
+def loaded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
+    """Return the modules that one process has loaded at each of its stages."""
+    return processes.stages(tmp_path_factory.mktemp("loaded"))
 
 
 @pytest.fixture

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import ast
 import re
 from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
+from types import CodeType
 
 import pytest
 
@@ -25,11 +26,19 @@ RESULTS = (
 def paths(source: Path) -> set[str]:
     """Return the names of files in a module's string constants; sentences that speak of one are none."""
     found = set()
-    for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Constant) and isinstance(node.value, str):
-            known = re.fullmatch(r"/?(?:[\w.*-]+/)*([\w-]+\.[a-z]+)", node.value)
-            found |= {known[1]} if known else set()
+    for text in texts(compile(source.read_text(encoding="utf-8"), source, "exec", dont_inherit=True)):
+        known = re.fullmatch(r"/?(?:[\w.*-]+/)*([\w-]+\.[a-z]+)", text)
+        found |= {known[1]} if known else set()
     return found
+
+
+def texts(value: object) -> Iterator[str]:
+    """Yield the texts among the constants of compiled code, those of its functions and classes included."""
+    if isinstance(value, str):
+        yield value
+    inside = value.co_consts if isinstance(value, CodeType) else value
+    for inner in inside if isinstance(inside, (tuple, frozenset)) else ():
+        yield from texts(inner)
 
 
 def test_a_results_name_has_one_home() -> None:

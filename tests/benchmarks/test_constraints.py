@@ -1,6 +1,6 @@
 """PC-IDIM-IV on a simulated TX40 beside unconstrained IV.
 
-python -m pytest tests/benchmarks/test_constraints.py -o addopts= -s
+python -m pytest tests/benchmarks/test_constraints.py -m slow -s
 Ten seconds at 5 kHz, 60 parameters; processor time. Janot's slides tell of 40 s for PC-IDIM-IV.
 """
 
@@ -67,17 +67,23 @@ def seconds(recorded, constraints, method="iv"):
     return time.process_time() - began, found
 
 
-@pytest.mark.parametrize("method", ["iv", "didim"])
+@pytest.fixture(scope="module", params=["iv", "didim"])
+def free(recorded, request):
+    """The method, its seconds without constraints, and what it found."""
+    seconds(recorded, None, request.param)  # compiles
+    return request.param, *seconds(recorded, None, request.param)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ASKED)
-def test_constrained_instruments(recorded, name, method):
+def test_constrained_instruments(recorded, name, free):
+    method, alone, before = free
     terms = [MODEL.columns[k - MODEL.inertial] if k >= MODEL.inertial else None for k in BASE.kept]
-    seconds(recorded, None, method)  # compiles
-    free, before = seconds(recorded, None, method)
     constraints = make_constraints(ConstraintSettings(**ASKED[name]), MODEL, BASE, BASE.names, terms)
     held, found = seconds(recorded, constraints, method)
     assert found.constrained is not None and found.constrained.binding
-    each = held / free * len(before.rounds) / len(found.rounds)
+    each = held / alone * len(before.rounds) / len(found.rounds)
     print(
-        f"\n{method}, {name}: {held:.2f} s of processor time in {len(found.rounds)} rounds, free {free:.2f} s in "
-        f"{len(before.rounds)}: {held / free:.2f} times, round by round {each:.2f}"
+        f"\n{method}, {name}: {held:.2f} s of processor time in {len(found.rounds)} rounds, free {alone:.2f} s in "
+        f"{len(before.rounds)}: {held / alone:.2f} times, round by round {each:.2f}"
     )

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from scripts import run_here
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 NUMBERED = sorted(EXAMPLES.glob("0*.py"))
@@ -45,14 +46,16 @@ def test_01_fit_geometry(tmp_path):
     assert (tmp_path / "fit/robot.urdf").is_file()
 
 
-def test_02_choose_poses(tmp_path):
-    (share,) = figures(r"efficiency .*? ([\d.]+) \(", run("02_choose_poses.py", tmp_path))
+def test_02_choose_poses(tmp_path, capsys):
+    (share,) = figures(
+        r"efficiency .*? ([\d.]+) \(", run_here(EXAMPLES / "02_choose_poses.py", tmp_path, capsys=capsys)
+    )
     assert share > 0.9
     assert len((tmp_path / "poses.csv").read_text().splitlines()) == 21
 
 
-def test_04_compensate(tmp_path):
-    nominal, commands = figures(r"off by ([\d.]+) mm", run("04_compensate.py", tmp_path))
+def test_04_compensate(tmp_path, capsys):
+    nominal, commands = figures(r"off by ([\d.]+) mm", run_here(EXAMPLES / "04_compensate.py", tmp_path, capsys=capsys))
     assert commands < 0.2 * nominal
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
+
+from scripts import run_here
 
 from calib.studies.conditions import read_study
 from calib.studies.store import read_rows
@@ -20,9 +20,9 @@ def test_kept_rows_count():
     assert [one.name for one in read_study(["MCS-*"]).conditions if one.digest not in there] == []
 
 
-def test_tables_are_those_of_the_readme():
+def test_tables_are_those_of_the_readme(capsys):
     """Every line of every table that the kept rows and recordings give stands in the README."""
-    done = subprocess.run([sys.executable, SURVEY / "tables.py"], capture_output=True, text=True, check=True)
-    printed = [line for line in done.stdout.splitlines() if line.startswith("|")]
+    said = run_here(SURVEY / "tables.py", capsys=capsys)
+    printed = [line for line in said.splitlines() if line.startswith("|")]
     readme = set((SURVEY / "README.md").read_text().splitlines())
     assert len(printed) > 100 and [line for line in printed if line not in readme] == []

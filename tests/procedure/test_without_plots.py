@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import planted_motion as planted
@@ -36,12 +34,8 @@ def test_a_fit_without_plots_has_its_certificate_and_all_else(cell, calib):
     assert names(cell.folder / "with") == bare, "figures of the earlier fit are gone"
 
 
-def test_a_fit_without_plots_loads_no_matplotlib(cell):
-    measured = cell.write("m.csv", cell.measure(40))
-    command = ["fit", "ur5", str(measured), "--model", "geometry", "--out", "o", "--no-plots"]
-    code = f"import sys; from calib import cli; cli.run({command}); print('matplotlib' in sys.modules)"
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=cell.folder)
-    assert said.stdout.splitlines()[-1] == "False"
+def test_a_fit_without_plots_loads_no_matplotlib(loaded):
+    assert "matplotlib" not in loaded["fit without plots"]
 
 
 def test_ctrl_c_while_figures_are_drawn_leaves_nothing_half_made(cell, calib, monkeypatch):

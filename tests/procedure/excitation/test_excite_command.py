@@ -327,9 +327,10 @@ def test_bad_input_is_refused_with_exit_code_2(cell, calib, extra, options, word
 )
 def test_a_search_without_a_result_names_what_was_in_the_way(tmp_path, extra, changed, words):
     """The command says the same: see the workspace limit above."""
-    (tmp_path / "limits.toml").write_text(extra)
+    limits, few = tmp_path / "limits.toml", replace(SHORT, evaluations=12, samples=40, **changed)
+    limits.write_text(extra)
     with pytest.raises(NothingFeasible, match=words):
-        design.excite("lwr4plus", replace(SHORT, evaluations=12, samples=40, **changed), limits=tmp_path / "limits.toml")
+        design.excite("lwr4plus", few, limits=limits)
 
 
 def identified(folder: Path, spoil: str = "") -> None:

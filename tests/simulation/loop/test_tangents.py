@@ -95,15 +95,24 @@ def test_gains_may_follow_the_parameters():
 
 
 def test_what_has_no_tangents_says_so():
-    plant, controller = known_robots.plant("tx40"), known_robots.controller("tx40")
-    reference = references.random_fourier(-np.ones(6), np.ones(6), np.ones(6), 0.2, 5000.0)
+    plant, reference = known_robots.plant("tx40"), short()
     held = Plant(plant.bodies, (*plant.terms, *drives.presliding(0, [0.01])), np.append(plant.parameters, 0.1))
     with pytest.raises(CalibError, match=r"Fp1\.1"):
-        simulate_tangents(held, controller, reference, np.array([0]))
+        simulate_tangents(held, known_robots.controller("tx40"), reference, np.array([0]))
+
+
+def short() -> references.Reference:
+    return references.random_fourier(-np.ones(6), np.ones(6), np.ones(6), 0.2, 5000.0)
+
+
+@pytest.mark.slow  # the kernel takes 14 s to compile
+def test_a_loop_that_diverges_says_so():
+    plant, controller, reference = known_robots.plant("tx40"), known_robots.controller("tx40"), short()
     with pytest.raises(NotConverged, match="diverged"):
         simulate_tangents(plant, controllers.scaled(controller, 300.0), reference, np.array([5]))
 
 
+@pytest.mark.slow  # as above
 def test_a_loop_that_saturation_alone_keeps_finite_is_said_to_be_unstable():
     """Its simulation ends; its slopes grow without bounds, and no method may be given them."""
     plant, controller = known_robots.plant("rv2sq"), known_robots.controller("rv2sq")

@@ -1,0 +1,42 @@
+"""What a process has loaded at each of some stages: the command line, the API, its options, a fit, an options file."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from calib.robot.chain import random_joints
+from calib.robot.load import load
+from calib.simulation.cells import measured_files
+from calib.simulation.cells.cell import measure
+from calib.simulation.cells.virtual_cells import perturbed_cell
+
+CODE = """
+import json, sys
+loaded = {}
+def note(stage):
+    loaded[stage] = sorted(sys.modules)
+import calib.cli
+note("command line")
+import calib.api.kinematic
+note("geometry")
+import calib.data.poses.fit_options as f, calib.identification.identify_options as i
+f.read_options(), i.read_options()
+note("no options file")
+words = ["fit", "ur5", "measured.csv", "--model", "geometry", "--out", "o", "--no-plots"]
+assert calib.cli.run(words) == 0
+note("fit without plots")
+f.parse_options({})
+note("options file")
+print(json.dumps(loaded))
+"""
+
+
+def stages(folder: Path) -> dict[str, set[str]]:
+    """Return the modules loaded at each stage of one process that works in a folder."""
+    cell = perturbed_cell(load("ur5"), seed=1)
+    measured_files.write(measure(cell, random_joints(cell.nominal, 40, 0), 1), folder / "measured.csv")
+    done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True, cwd=folder)
+    return {stage: set(names) for stage, names in json.loads(done.stdout.splitlines()[-1]).items()}
