@@ -92,7 +92,7 @@ def closed(robot: ParallelRobot) -> ClosedRobot:
     minors = tuple(_best_rows(one.jacobian[0]) for one in links)
     fixed = _check_freedom(robot, start, links)
     opened = ClosedRobot(robot, start, minors, np.zeros(len(links) + 1), fixed)
-    rows = reading_rows(opened, links)
+    rows = _reading_rows(opened, links)
     if (rcond := float(_platform_rcond(opened, rows, rows)[0])) < SINGULAR:
         raise RobotError(
             f"robot '{robot.name}': home is singular (type 2): locked actuators do not hold it, rcond {rcond:.1g}"
@@ -140,7 +140,7 @@ def coordinates_of(known: ClosedRobot, posture: Posture) -> np.ndarray:
     return np.hstack([posture.pose[:, :3, 3] - home[:3, 3], angles])[:, known.robot.selected]
 
 
-def pose_of(known: ClosedRobot, coordinates: np.ndarray) -> np.ndarray:
+def _pose_of(known: ClosedRobot, coordinates: np.ndarray) -> np.ndarray:
     """Return poses (N, 4, 4) at platform coordinates (N, r), what the loops make of the others left out."""
     full = np.zeros((len(coordinates), 6))
     full[:, known.robot.selected] = coordinates
@@ -175,14 +175,14 @@ def twists(
     return D, least - times(D, least[:, robot.selected])
 
 
-def reading_rows(known: ClosedRobot, links: Sequence[LegLinks]) -> np.ndarray:
+def _reading_rows(known: ClosedRobot, links: Sequence[LegLinks]) -> np.ndarray:
     """Return J_p^inv (N, n, r): readings' rates by the twist's independent parts (A_p with B_p = -1, eqs 5, 15)."""
     D, _ = twists(known, links)
     rows = [one.inverse[:, list(leg.actuated)] @ (one.carried @ D) for leg, one in zip(known.robot.legs, links)]
     return np.concatenate(rows, axis=1)
 
 
-def check_postures(known: ClosedRobot, posture: Posture, links: Sequence[LegLinks] | None = None) -> None:
+def _check_postures(known: ClosedRobot, posture: Posture, links: Sequence[LegLinks] | None = None) -> None:
     """Refuse postures in a singularity, or beyond one.
 
     Raises:
@@ -195,7 +195,7 @@ def check_postures(known: ClosedRobot, posture: Posture, links: Sequence[LegLink
         weak = _leg_rcond(one, at_home) < SINGULAR
         _refuse(known, posture, weak, f"{leg.name} is singular (type 1: stretched or folded)")
         _refuse(known, posture, signs[:, k] * known.signs[k] < 0, f"{leg.name} is on another branch than at home")
-    weak = _platform_rcond(known, reading_rows(known, links), reading_rows(known, home)) < SINGULAR
+    weak = _platform_rcond(known, _reading_rows(known, links), _reading_rows(known, home)) < SINGULAR
     _refuse(known, posture, weak, "the platform is singular (type 2: locked actuators do not hold it)")
     _refuse(known, posture, signs[:, -1] * known.signs[-1] < 0, "the platform is beyond a type 2 singularity from home")
 
@@ -230,7 +230,7 @@ def _reached(known: ClosedRobot, wanted: np.ndarray, own: np.ndarray, aim: _Aim,
         for share in np.arange(1, count) / count:
             found = _newton(known, found, own + share * (wanted - own), aim, rough=True)
         found = _newton(known, found, wanted, aim)
-    check_postures(known, found)
+    _check_postures(known, found)
     return found
 
 
@@ -292,7 +292,7 @@ def _from_coordinates(
     known: ClosedRobot, links: Sequence[LegLinks], D: np.ndarray, t: np.ndarray, posture: Posture, wanted: np.ndarray
 ) -> np.ndarray:
     """Return the twist's independent parts (N, r) that bring the platform to coordinates (N, r)."""
-    target = pose_of(known, wanted)
+    target = _pose_of(known, wanted)
     turn = Rotation.from_matrix(target[:, :3, :3] @ posture.pose[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
     return np.hstack([target[:, :3, 3] - posture.pose[:, :3, 3], turn])[:, known.robot.selected]
 
@@ -337,7 +337,7 @@ def _determinants(known: ClosedRobot, links: Sequence[LegLinks]) -> np.ndarray:
     signs = [np.sign(np.linalg.det(one.jacobian[:, minor])) for one, minor in zip(links, known.minors)]
     last = np.zeros(len(links[0].gap))
     if not known.robot.redundant:
-        last = np.sign(np.linalg.det(reading_rows(known, links)))
+        last = np.sign(np.linalg.det(_reading_rows(known, links)))
     return np.column_stack([*signs, last])
 
 

@@ -47,7 +47,7 @@ def invert(A, out):
 
 
 @njit(**OPTIONS)
-def one_leg(links, constants, tail, attachment, held, q, pose, full, inverse, carried, gap, lever, frame):
+def _one_leg(links, constants, tail, attachment, held, q, pose, full, inverse, carried, gap, lever, frame):
     """Write one leg at one posture; see `calib.mechanism.leg_links.LegLinks`.
 
     Args:
@@ -137,10 +137,10 @@ def one_leg(links, constants, tail, attachment, held, q, pose, full, inverse, ca
 
 @njit(**OPTIONS)
 def legs(links, constants, tail, attachment, q, pose, full, inverse, carried, gap, lever):
-    """Write one leg at N postures: q (N, n), pose (N, 4, 4); arrays as of `one_leg` with N before."""
+    """Write one leg at N postures: q (N, n), pose (N, 4, 4); arrays as of `_one_leg` with N before."""
     frame = np.empty((4, 6 + 3 * q.shape[1]))
     for s in range(q.shape[0]):
-        one_leg(
+        _one_leg(
             links, constants, tail, attachment, gap.shape[1], q[s], pose[s], full[s], inverse[s], carried[s], gap[s],
             lever[s], frame,
         )  # fmt: skip
@@ -328,7 +328,7 @@ def accelerate(robot, values, q, pose, rate, tau, rates, twist, change):
     M, whole = np.zeros((r, r)), np.zeros((6, 6))
     mend, still, wrench, h, torque = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(r), np.zeros(n_t)
     for leg in range(L):
-        one_leg(
+        _one_leg(
             links[leg], constants[leg], tails[leg], attachments[leg], held[leg], q[starts[leg] : starts[leg + 1]], pose,
             full[leg], inverse[leg], carried[leg], gap[leg], lever[leg], frame,
         )  # fmt: skip

@@ -25,10 +25,10 @@ def along(known: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray, near:
         near: (N,) postures to start Newton from; None: from home.
     """
     posture = place(known, x, near)
-    return of_platform(known, posture, *twist_of(known, x, v, a))
+    return of_platform(known, posture, *_twist_of(known, x, v, a))
 
 
-def twist_of(known: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _twist_of(known: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the independent parts of the platform's twist and their derivatives, each (N, r).
 
     Position's are v and a themselves; ω = ψ̇ z + φ̇ Rz y + ρ̇ Rz Ry x of roll ρ, pitch φ, yaw ψ about the base's axes.
@@ -118,7 +118,7 @@ class PlatformRegressor:
                     moved = [within, v, a]
                     moved[order] = moved[order] + shift
                     posture = place(known, moved[0], near) if order == 0 else near
-                    twist = twist_of(known, *moved)
+                    twist = _twist_of(known, *moved)
                     ends.append(of(of_platform(known, posture, *twist, None if order == 0 else still)))
                 result[order, :, j] = (ends[0] - ends[1]) / (2.0 * step)
         return result[0] * inside, result[1], result[2]

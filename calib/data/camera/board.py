@@ -65,7 +65,7 @@ class Board:
             )
         if self.kind == "chessboard" and min(self.columns, self.rows) < 4:
             raise ValueError("a chessboard needs 4 squares each way at least")
-        if self.dictionary in DICTIONARIES and self.tags > (count := dictionary_size(self.dictionary)):
+        if self.dictionary in DICTIONARIES and self.tags > (count := _dictionary_size(self.dictionary)):
             raise ValueError(f"{self.tags} markers are needed, the dictionary {self.dictionary} has {count}")
 
     @property
@@ -113,7 +113,7 @@ def corners(board: Board) -> np.ndarray:
     return board.square * np.column_stack([across.ravel(), down.ravel(), np.zeros(across.size)])
 
 
-def dictionary_size(name: str) -> int:
+def _dictionary_size(name: str) -> int:
     """Return how many markers a dictionary has."""
     known = {"apriltag_16h5": 30, "apriltag_25h9": 35, "apriltag_36h10": 2320, "apriltag_36h11": 587}
     return known[name] if name in known else int(name.rsplit("_", 1)[1])

@@ -159,7 +159,7 @@ def distances(q: np.ndarray, learnt: np.ndarray, levers: np.ndarray) -> tuple[np
     return nearest, alone
 
 
-def joint_levers(chain: Chain, q: np.ndarray) -> np.ndarray:
+def _joint_levers(chain: Chain, q: np.ndarray) -> np.ndarray:
     """Return by how much the tip moves with each joint (n,) [m/rad or 1], rms over poses, by central differences."""
     rows = q[np.unique(np.linspace(0, len(q) - 1, 50).astype(int))]
     result, step = np.zeros(chain.n), 1e-4
@@ -191,7 +191,7 @@ def learn_errors(
     found = selected.fit
     if sum(len(block) for block in measured) < FEWEST or not all(isinstance(block, Positions) for block in measured):
         return None
-    levers = joint_levers(found.cell.chain, np.concatenate([block.q for block in measured]))
+    levers = _joint_levers(found.cell.chain, np.concatenate([block.q for block in measured]))
     rows = _Rows(selected, measured, torques)
     near = np.concatenate([*rows.left_out(random_folds(measured, 5, seed), levers)])
     groups = [selected.folds, *_range_folds(measured)]

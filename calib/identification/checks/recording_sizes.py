@@ -80,16 +80,16 @@ def compare_sizes(
     known = newtons and case.target.shape[1] == n
     known = known and chain.inertias is not None and bool(np.any(chain.inertias[:, 9] > 0.0))
     masses = share_of_nominal(motion.t, motion.q, case.target, chain, gravity, static=True) if known else nothing
-    speed = nothing if motion.v_measured is None else speed_ratio(motion.t, motion.q, motion.v_measured)
+    speed = nothing if motion.v_measured is None else _speed_ratio(motion.t, motion.q, motion.v_measured)
     bodies = _under(chain, gravity)
     many, few = (take_samples(case, bodies, count) for count in (ROWS, FEW))
-    lag = None if many is None else lag_of(many, motion.rate)
+    lag = None if many is None else _lag_of(many, motion.rate)
     clock = clock_ratio(few, chain) if newtons and few is not None else None
     exchange = exchanged(few, chain) if known and few is not None else None
     return RecordingSizes(case.name, masses, speed, lag, clock, exchange, motion.jumps)
 
 
-def speed_ratio(t: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+def _speed_ratio(t: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Return (n,) measured velocities over the slopes of the positions (N, n): ∫v dt on q, both without their trend.
 
     Integrals compare where slopes are noise. NaN for joints that hardly travel.
@@ -102,7 +102,7 @@ def speed_ratio(t: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
     return np.where(alike & (np.ptp(q, axis=0) > TRAVEL), (own * seen).sum(axis=0) / power, np.nan)
 
 
-def lag_of(samples: MotionSamples, rate: float) -> Lag | None:
+def _lag_of(samples: MotionSamples, rate: float) -> Lag | None:
     """Return the lag of the torques on which most joints agree; None where they do not.
 
     One joint alone may prefer a lag, since its friction is of another form than assumed; a clock is everybody's.

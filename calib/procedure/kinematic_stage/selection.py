@@ -212,7 +212,7 @@ def _outlook(
 ) -> PoseOutlook:
     """Return what chosen poses q (m, n) will tell, and what others would."""
     space, free = limits.space(seen), limits.space(seen, sight=False)
-    typical = typical_poses(limits, seen, search.seed)
+    typical = _typical_poses(limits, seen, search.seed)
     rows = space.jacobian(q)
     past = np.zeros((0, *rows.shape[1:])) if before is None else before
     blind = _blind(seen, free, typical, search, m, past) if limits.sight is not None else None
@@ -236,7 +236,7 @@ def _prediction(seen: Seen, outlook: PoseOutlook) -> SelectionPrediction | None:
     )  # fmt: skip
 
 
-def typical_poses(limits: Limits, seen: Seen, seed: int) -> np.ndarray:
+def _typical_poses(limits: Limits, seen: Seen, seed: int) -> np.ndarray:
     """Return poses (s, n) all over the workspace, seen or not, at which the tool's sigma is told."""
     free = limits.space(seen, sight=False)
     stream = np.random.default_rng([seed, 2])

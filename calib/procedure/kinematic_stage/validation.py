@@ -124,7 +124,7 @@ def assess(
     warnings = (
         *loud, *(one.told for one in findings.odd),
         *inputs.notes, *(note for block in blocks for note in block.notes), *elsewhere(fitted, validation),
-        *findings.notes, *_doubtful(validation), *_unsettled(validation), *interval_notes(validation),
+        *findings.notes, *_doubtful(validation), *_unsettled(validation), *_interval_notes(validation),
     )  # fmt: skip
     return Assessment(fitted, validation, verdict, tuple(dict.fromkeys(warnings)))
 
@@ -186,7 +186,7 @@ def _doubtful(validation: Mapping[str, Comparison]) -> list[str]:
     return result
 
 
-def interval_notes(validation: Mapping[str, Comparison]) -> list[str]:
+def _interval_notes(validation: Mapping[str, Comparison]) -> list[str]:
     """Say how many errors on unseen rows are within the interval that the fit states, and where it extrapolates."""
     result = []
     for name, each in validation.items():

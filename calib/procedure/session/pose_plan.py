@@ -46,7 +46,7 @@ def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], N
     links = (chain.base, chain.tip) if robot_file.suffix == ".urdf" else (None, None)
     stated = (instrument.sigma_position, instrument.sigma_orientation)
     choice = SelectionSettings(
-        kind=seen_as(instrument.measures), tools=(tuple(instrument.tool),), index=wanted.index, method=wanted.method,
+        kind=_seen_as(instrument.measures), tools=(tuple(instrument.tool),), index=wanted.index, method=wanted.method,
         sigmas=_sigmas(*stated), seed=settings.seed,
     )  # fmt: skip
     chosen = selection.choose(
@@ -82,7 +82,7 @@ def _sigmas(position: float, orientation: float) -> tuple[float, float] | None:
     return (position, orientation or SIGMA_ORIENTATION) if position else None
 
 
-def seen_as(measures: str) -> str:
+def _seen_as(measures: str) -> str:
     """Return the kind of measurement that poses are chosen for: an image tells a pose."""
     return "pose" if measures == Pixels.kind else measures
 
@@ -94,7 +94,7 @@ def _unseen(session: Session, robot_file: Any, chain: Chain, count: int) -> np.n
     name = session.settings.poses.constraints
     cell = targets_of(chain, [session.settings.instrument.tool])
     limits = read_limits(session.path(name) if name else None, cell, robot_file)
-    jacobian = observation(cell, seen_as(session.settings.instrument.measures))
+    jacobian = observation(cell, _seen_as(session.settings.instrument.measures))
     space = limits.space(jacobian)
     stream = np.random.default_rng([session.settings.seed, 1])
     if limits.camera is not None:

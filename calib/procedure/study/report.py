@@ -118,7 +118,7 @@ def described(one: Condition) -> str:
     return f"{one.robot}, {degrees:.3g}°, {one.sigma_tau:g} N·m, r = {one.decimation}, {filtered}{wrong}"
 
 
-def condition_table(one: ConditionSummary) -> Table:
+def _condition_table(one: ConditionSummary) -> Table:
     """Return all methods of a condition, best first."""
     rows = [_line(method) for method in one.methods]
     strong = frozenset(k for k, method in enumerate(one.methods) if method.chosen)
@@ -129,7 +129,7 @@ def condition_table(one: ConditionSummary) -> Table:
 
 def console_table(one: ConditionSummary) -> Table:
     """Return the columns of a condition's table that a terminal has room for."""
-    whole = condition_table(one)
+    whole = _condition_table(one)
     rows = [tuple(row[k] for k in ON_CONSOLE) for row in whole.rows]
     header = tuple(HEADER[k] for k in ON_CONSOLE)
     return replace(whole, header=header, rows=rows, numbers=range(1, len(header) - 1))
@@ -208,7 +208,7 @@ def make_page(
         if not one.methods:
             continue
         own = [row for row in rows if row.digest == one.condition.digest]
-        blocks = [condition_table(one)]
+        blocks = [_condition_table(one)]
         drawn = [Pictures("", [figures.boxes(one, own)])] if plots else []
         blocks = [*blocks, *drawn, *failures(one)]
         sections.append(Section(one.condition.name, blocks))

@@ -252,7 +252,7 @@ def simulate_tangents(
     model = np.empty((0, 0)) if controller.model is None else _body(plant.bodies, controller.model)
     scale = np.zeros((n, c)) if relative is None else np.ascontiguousarray(shaped(relative, (n, c), "relative"))
     status, reached = tangent_kernels.closed_loop_tangent(
-        packed(plant), (*layout_of(plant), find), model, controller.rows, scale, controller.sampled(reference),
+        packed(plant), (*_layout_of(plant), find), model, controller.rows, scale, controller.sampled(reference),
         np.empty((0, n)), reference.period, controller.smoothing(reference.period), controller.delay, float(every),
         np.array(reference.q[0]), np.array(reference.v[0]), count, out, slopes,
     )  # fmt: skip
@@ -290,7 +290,7 @@ def forward_dynamics(
     q, v, tau = (np.ascontiguousarray(shaped(x, (len(q), plant.bodies.n), "states")) for x in (q, v, tau))
     out, count = np.empty_like(q), len(plant.parameters)
     values = np.empty((0, count)) if parameters is None else shaped(parameters, (len(q), count), "parameters")
-    layout = layout_of(plant)
+    layout = _layout_of(plant)
     failed = loop_kernels.forward_dynamics(*packed(plant), *layout, np.ascontiguousarray(values), q, v, tau, out)
     if failed >= 0:
         raise CannotSimulate(f"sample {failed}: the inertia matrix is not positive definite")
@@ -345,7 +345,7 @@ def stepper(plant: Plant, columns: np.ndarray) -> Stepper:
     """Return a plant made ready to be advanced, with slopes by the parameters `columns` (c,)."""
     find = np.full(len(plant.parameters), -1)
     find[np.asarray(columns, dtype=int)] = 2 * plant.bodies.n + np.arange(len(columns))
-    return Stepper(packed(plant), (*layout_of(plant), find))
+    return Stepper(packed(plant), (*_layout_of(plant), find))
 
 
 def with_parameters(plant: Plant, parameters: np.ndarray) -> Plant:
@@ -379,7 +379,7 @@ def _coloured(white: np.ndarray, step: float) -> np.ndarray:
     return np.ascontiguousarray(lfilter([np.sqrt(1.0 - pole**2)], [1.0, -pole], white, axis=0))
 
 
-def layout_of(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _layout_of(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return where each parameter goes in what `packed` returns: order, entries, shares, owners of `loop_kernels`."""
     n, first = plant.bodies.n, plant.inertial
     order = np.ascontiguousarray(np.broadcast_to(plant.bodies.order, (plant.bodies.count, 10)), dtype=np.int64)

@@ -174,7 +174,7 @@ def dynamics(tree, body, linear, q, v, work, matrix, out):
 
 
 @njit(**JOINED)
-def factorise(matrix):
+def _factorise(matrix):
     """Overwrite the lower triangle with L, the diagonal with 1 / D, M = L D Lᵀ; False where M is not definite."""
     for i in range(matrix.shape[0]):
         for j in range(i):
@@ -210,7 +210,7 @@ def substitute(matrix, vector):
 
 
 @njit(**JOINED)
-def smooth_sign(scaled):
+def _smooth_sign(scaled):
     """Return tanh, cut where it is one to rounding."""
     return 1.0 if scaled > 20.0 else -1.0 if scaled < -20.0 else tanh(scaled)
 
@@ -242,20 +242,20 @@ def shape(code, acts, t, memory, q, v):
         return rate / sqrt(abs(rate) + last)
     if code == DEAD:
         wide = EDGE * last
-        return 0.5 * (smooth_sign((rate - last) / wide) + smooth_sign((rate + last) / wide))
+        return 0.5 * (_smooth_sign((rate - last) / wide) + _smooth_sign((rate + last) / wide))
     if code == LOAD_VELOCITY:
         return rate
     if code in (SIGN, LOAD):
-        return smooth_sign(rate / last)
+        return _smooth_sign(rate / last)
     if code == STRIBECK:
-        return smooth_sign(rate / last) * exp(-((abs(rate) / acts[t, 5]) ** acts[t, 6]))
+        return _smooth_sign(rate / last) * exp(-((abs(rate) / acts[t, 5]) ** acts[t, 6]))
     place = seen(acts, t, q)
     if code == POSITION:
         return place
     if code == STOP:
         return stop(memory, t, place, last)
     if code == PRESLIDING:
-        return stop(memory, t, place, acts[t, 6]) - smooth_sign(rate / last)
+        return stop(memory, t, place, acts[t, 6]) - _smooth_sign(rate / last)
     if code in (SINE, COSINE):
         gain = 1.0 / (1.0 + (rate / last) ** 2)
         return gain * (sin(acts[t, 6] * place) if code == SINE else cos(acts[t, 6] * place))
@@ -284,7 +284,7 @@ def friction(linear, kinds, acts, memory, q, v, out):
         if code in (LOAD, LOAD_VELOCITY):
             loaded = True
         elif code == SIGN:
-            out[kinds[t, 0]] -= acts[t, 0] * smooth_sign(seen(acts, t, v) / acts[t, 7])
+            out[kinds[t, 0]] -= acts[t, 0] * _smooth_sign(seen(acts, t, v) / acts[t, 7])
         else:
             out[kinds[t, 0]] -= acts[t, 0] * shape(code, acts, t, memory, q, v)
     return loaded
@@ -371,7 +371,7 @@ def accelerate(tree, body, linear, kinds, acts, memory, loads, q, v, tau, work, 
         out[j] = tau[j]
     dynamics(tree, body, linear, q, v, work, matrix, out)
     loaded = friction(linear, kinds, acts, memory, q, v, out)
-    if not factorise(matrix):
+    if not _factorise(matrix):
         return False
     substitute(matrix, out)
     if loaded:

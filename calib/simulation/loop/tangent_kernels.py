@@ -338,7 +338,7 @@ def _solve(matrix, by_q, by_v, columns, dq, dv, dtau, out):
 
 
 @njit(**OPTIONS)
-def advance_tangent(
+def _advance_tangent(
     plant, layout, memory, loads, q, v, dq, dv, tau, dtau, period, slopes, dslopes, work, matrix, rooms
 ):  # fmt: skip
     """Advance q, v (n,) and δq, δv (n, c) by one period as `loop_kernels.advance` does; slopes[0] are not known."""
@@ -392,7 +392,7 @@ def advance_tangent(
 
 @njit(**OPTIONS)
 def workspace(bodies, n, c):
-    """Return the arrays that `advance_tangent` works in."""
+    """Return the arrays that `_advance_tangent` works in."""
     own, more, ten = np.empty((bodies, 10)), np.empty((bodies + 1, 36)), np.empty(10)
     square, wide = (np.empty((n, n)), np.empty((n, n))), np.empty((n, c))
     return own, more, ten, square[0], square[1], wide, np.empty(n), np.empty(n), np.empty((n, c)), np.empty((n, c))
@@ -427,7 +427,7 @@ def advance_linearised(plant, layout, values, q, v, tau, period, gain, dq, dv):
         for j in range(n):
             gain[j, i] = unit[j]
     state = (q, v, dq, dv, tau, dtau, period, slopes, dslopes, work, matrix, rooms)
-    status = advance_tangent(plant, layout, memory, loads, *state)
+    status = _advance_tangent(plant, layout, memory, loads, *state)
     for j in range(n):
         if not abs(v[j]) < 1e6:
             return DIVERGED
@@ -537,7 +537,7 @@ def closed_loop_tangent(
             here, fast, dhere, dfast = q.copy(), v.copy(), dq.copy(), dv.copy()
             if part >= 1e-9:
                 state = (here, fast, dhere, dfast, acting, dtau, part * period, slopes, dslopes, work, matrix, rooms)
-                status = advance_tangent(plant, layout, memory, loads, *state)
+                status = _advance_tangent(plant, layout, memory, loads, *state)
                 if status != FINE:
                     return status, k
             for j in range(n):
@@ -548,7 +548,7 @@ def closed_loop_tangent(
             sample += 1
         if k + 1 < count:
             state = (q, v, dq, dv, acting, dtau, period, slopes, dslopes, work, matrix, rooms)
-            status = advance_tangent(plant, layout, memory, loads, *state)
+            status = _advance_tangent(plant, layout, memory, loads, *state)
             if status != FINE:
                 return status, k
         for j in range(n):
