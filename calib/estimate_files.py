@@ -63,7 +63,7 @@ def read_estimate(folder: Path) -> StoredEstimate:
 
 def write_covariance(path: Path, names: Sequence[str], covariance: np.ndarray) -> None:
     """Write the covariance (p, p) of p names as a table with a header and a first column of names."""
-    files.write_table(path, ("name", *names), ([name, *map(float, row)] for name, row in zip(names, covariance)))
+    files.write_numbers(path, ("name", *names), covariance, names)
 
 
 def read_covariance(path: Path) -> tuple[tuple[str, ...], np.ndarray]:

@@ -206,11 +206,17 @@ def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence
     return write(path, text.getvalue())
 
 
-def write_numbers(path: str | Path, header: Sequence[str], values: np.ndarray) -> Path:
-    """Write values (N, k) as `write_table` does, in half its time: logs are long."""
+def write_numbers(path: str | Path, header: Sequence[str], values: np.ndarray, names: Sequence[str] = ()) -> Path:
+    """Write values (N, k), a name before each row or none, as `write_table` does, in half its time: logs are long."""
     text = _headed(header)
     line = ",".join(["%.12g"] * values.shape[1]) + "\n"
-    text.write((line * len(values)) % tuple(values.ravel().tolist()))
+    if names:
+        first = csv.writer(text, lineterminator=",")
+        for name, row in zip(names, values.tolist()):
+            first.writerow([_cell(name)])
+            text.write(line % tuple(row))
+    else:
+        text.write((line * len(values)) % tuple(values.ravel().tolist()))
     return write(path, text.getvalue())
 
 

@@ -37,13 +37,16 @@ def identify_dynamics(
     from calib.api.dynamic import identify_dynamics as identified
     from calib.procedure.dynamic_stage import folder
     from calib.procedure.excitation import prediction
-    from calib.procedure.parallel_stage import folder as parallel_folder
     from calib.procedure.parallel_stage.robots import path_of
     from calib.procedure.report import console as shown
     from calib.procedure.report import dynamics_section
 
-    check = parallel_folder.check_identified if path_of(robot) else folder.check_identification_target
-    check(out, [options, *recordings, *(validate or [])])
+    if path_of(robot):
+        from calib.procedure.parallel_stage import folder as parallel_folder  # slow to load
+
+        parallel_folder.check_identified(out, [options, *recordings, *(validate or [])])
+    else:
+        folder.check_identification_target(out, [options, *recordings, *(validate or [])])
     if excitation is not None:
         prediction.check_folder(excitation)
 

@@ -62,7 +62,6 @@ def fit(
     from calib.api.kinematic import fit_geometry
     from calib.procedure.kinematic_stage import folder
     from calib.procedure.kinematic_stage.settings import FitSettings
-    from calib.procedure.parallel_stage import folder as parallel_folder
     from calib.procedure.parallel_stage.robots import path_of
     from calib.procedure.report import console as shown
     from calib.procedure.report import geometry_section
@@ -71,8 +70,12 @@ def fit(
         model, loss, folds, stations, tools, holdout, refit_frames,
         None if tolerance is None else 1e-3 * tolerance, seed,
     )  # fmt: skip
-    check = parallel_folder.check_fitted if path_of(robot) else folder.check_fit_target
-    check(out, [options, *measured, *(validate or [])])
+    if path_of(robot):
+        from calib.procedure.parallel_stage import folder as parallel_folder  # slow to load
+
+        parallel_folder.check_fitted(out, [options, *measured, *(validate or [])])
+    else:
+        folder.check_fit_target(out, [options, *measured, *(validate or [])])
 
     def read(given: Any) -> None:
         folder.check_fit_target(out, [given.source])

@@ -64,7 +64,6 @@ def excite(
     """Design a motion that excites ROBOT's dynamics, within limits."""
     from calib.api.motions import design_excitation
     from calib.procedure.excitation import folder
-    from calib.procedure.parallel_stage import folder as parallel_folder
     from calib.procedure.parallel_stage.robots import path_of
     from calib.workers.interrupts import finishing
 
@@ -75,8 +74,12 @@ def excite(
         start=_stands(start), repeat=repeat, slower=slower, existing=tuple(existing or ()), lock=tuple(lock or ()),
         noise=noise, outlook=outlook,
     )  # fmt: skip
-    check = parallel_folder.check_moved if path_of(robot) else folder.check_design_target
-    check(out, [robot, model, limits, *settings.existing])
+    if path_of(robot):
+        from calib.procedure.parallel_stage import folder as parallel_folder  # slow to load
+
+        parallel_folder.check_moved(out, [robot, model, limits, *settings.existing])
+    else:
+        folder.check_design_target(out, [robot, model, limits, *settings.existing])
     with progress() as say:
         designed = design_excitation(
             robot, settings, model=model, limits=limits, base=base, tip=tip, workers=workers, progress=say
@@ -127,15 +130,18 @@ def plan(
     """Plan the fastest motion of ROBOT through waypoints. Speeds and torques stay within its limits."""
     from calib.api.motions import plan_motion
     from calib.procedure.excitation import folder
-    from calib.procedure.parallel_stage import folder as parallel_folder
     from calib.procedure.parallel_stage.robots import path_of
 
     settings = PlanSettings(
         payloads=tuple(payload or ()), lines=line, rate=rate, shorten=shorten, stray=stray, start=_stands(start),
         slower=slower,
     )  # fmt: skip
-    check = parallel_folder.check_moved if path_of(robot) else folder.check_plan_target
-    check(out, [robot, waypoints, model, limits, drives])
+    if path_of(robot):
+        from calib.procedure.parallel_stage import folder as parallel_folder  # slow to load
+
+        parallel_folder.check_moved(out, [robot, waypoints, model, limits, drives])
+    else:
+        folder.check_plan_target(out, [robot, waypoints, model, limits, drives])
     with progress() as say:
         planned = plan_motion(
             robot, waypoints, settings, model=model, limits=limits, drives=drives, base=base, tip=tip, progress=say

@@ -69,8 +69,8 @@ def damped_step(factor: np.ndarray, target: np.ndarray, damping: float) -> np.nd
         return scipy.linalg.solve_triangular(factor, target)
     p = factor.shape[1]
     tail = np.sqrt(damping) * np.diag(np.linalg.norm(factor, axis=0))
-    q, r = np.linalg.qr(np.vstack([factor, tail]))
-    return scipy.linalg.solve_triangular(r, q[:p].T @ target)
+    upper, moved, _ = triangle(np.append(target, np.zeros(p)), np.vstack([factor, tail]))
+    return scipy.linalg.solve_triangular(upper, moved)
 
 
 def solve(

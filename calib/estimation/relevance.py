@@ -64,21 +64,23 @@ class Condensed:
     rounding: their evidence costs r³, not p³.
 
     Attributes:
-        groups: (r,) group of each coordinate, ascending; -1 for no ridge.
+        groups: (r,) group of each coordinate; -1 for no ridge.
         sizes: (r,) first guess of its prior standard deviation, one per group.
         counts: (r,) how many columns of x it stands for.
-        blocks: columns of x, and what they are in the coordinates that follow one another (columns, coordinates).
+        blocks: columns of x, and what they are in the coordinates that follow one another (columns, coordinates);
+            None where each stays as it is.
     """
 
     groups: np.ndarray
     sizes: np.ndarray
     counts: np.ndarray
-    blocks: tuple[tuple[np.ndarray, np.ndarray], ...]
+    blocks: tuple[tuple[np.ndarray, np.ndarray | None], ...]
 
     def columns(self, matrix: np.ndarray) -> np.ndarray:
         """Return Wᵀ in these coordinates (r, ...) from that in x (p, ...)."""
         flat = matrix.reshape(len(matrix), -1)
-        return np.concatenate([basis.T @ flat[own] for own, basis in self.blocks]).reshape(-1, *matrix.shape[1:])
+        parts = [flat[own] if basis is None else basis.T @ flat[own] for own, basis in self.blocks]
+        return np.concatenate(parts).reshape(-1, *matrix.shape[1:])
 
     def gram(self, data: Gram) -> Gram:
         """Return statistics in these coordinates."""
@@ -94,24 +96,23 @@ def condensed(square: np.ndarray, groups: np.ndarray, start: np.ndarray) -> Cond
         groups: (p,) group of each column; -1 for no ridge.
         start: (p,) first guess of each column's prior standard deviation; within a group their ratios stay.
     """
-    blocks, sizes = [], []
-    for group in np.unique(groups):
+    family, inverse, members = np.unique(groups, return_inverse=True, return_counts=True)
+    alone = np.flatnonzero((groups < 0) | (members[inverse] == 1))
+    blocks: list[tuple[np.ndarray, np.ndarray | None]] = [(alone, None)]
+    labels, sizes, counts = [groups[alone]], [start[alone]], [np.ones(len(alone))]
+    for group in family[(family >= 0) & (members > 1)]:
         own = np.flatnonzero(groups == group)
-        if group < 0:
-            blocks.append((own, np.eye(len(own))))
-            sizes.append(1.0)
-            continue
-        sizes.append(float(np.exp(np.log(start[own]).mean())))
-        profile = start[own] / sizes[-1]
+        size = float(np.exp(np.log(start[own]).mean()))
+        profile = start[own] / size
         seen, basis = np.linalg.eigh(square[np.ix_(own, own)] * np.outer(profile, profile))
         kept = seen > UNSEEN * seen[-1]
         kept[-1] = True
         blocks.append((own, profile[:, None] * basis[:, kept]))
-    widths = [basis.shape[1] for _, basis in blocks]
-    counts = [len(own) / width for (own, _), width in zip(blocks, widths)]
-    return Condensed(
-        np.repeat(np.unique(groups), widths), np.repeat(sizes, widths), np.repeat(counts, widths), tuple(blocks)
-    )
+        width = int(kept.sum())
+        labels.append(np.full(width, group))
+        sizes.append(np.full(width, size))
+        counts.append(np.full(width, len(own) / width))
+    return Condensed(np.concatenate(labels), np.concatenate(sizes), np.concatenate(counts), tuple(blocks))
 
 
 def relevance(
@@ -177,12 +178,11 @@ def relevance(
 def _posterior(
     square: np.ndarray, cross: np.ndarray, penalty: np.ndarray, beta: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and variances of x from WᵀW and Wᵀy, with columns scaled to unit information first."""
-    scale = 1.0 / np.sqrt(np.maximum(beta * np.diag(square) + penalty, 1e-300))
-    system = square * scale[:, None]
-    system *= beta * scale
-    system.flat[:: len(scale) + 1] += penalty * scale**2 + 1e-12
+    """Return mean and variances of x from WᵀW and Wᵀy; a diagonal raised by 1e-12 keeps it regular to rounding."""
+    system = square.copy()
+    diagonal = system.flat[:: len(penalty) + 1]
+    system.flat[:: len(penalty) + 1] = np.maximum((diagonal + penalty / beta) * (1.0 + 1e-12), 1e-280)
     factor = scipy.linalg.cholesky(system.T, lower=True, overwrite_a=True, check_finite=False)
-    solution = scale * scipy.linalg.cho_solve((factor, True), scale * beta * cross, check_finite=False)
+    solution = scipy.linalg.cho_solve((factor, True), cross, check_finite=False)
     inverse, _ = dtrtri(factor, lower=1, overwrite_c=1)  # of the triangle: the variances need no more
-    return solution, np.einsum("ij,ij->j", inverse, inverse) * scale**2
+    return solution, np.einsum("ij,ij->j", inverse, inverse) / beta

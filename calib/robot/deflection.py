@@ -83,6 +83,10 @@ def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = 
     """
     result = np.empty((len(deflection.terms), len(q)))
     levers = _Levers(deflection, q) if any(term.basis == "lever" for term in deflection.terms) else None
+    for basis, turn in (("cos", np.cos), ("sin", np.sin)):
+        where = [e for e, term in enumerate(deflection.terms) if term.basis == basis]
+        orders = np.array([deflection.terms[e].order for e in where])
+        result[where] = turn(orders[:, None] * q.T[[deflection.terms[e].source for e in where]])
     for e, term in enumerate(deflection.terms):
         if term.basis == "torque":
             if torque is None:
@@ -93,8 +97,6 @@ def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = 
             result[e] = levers.moment(term)
         elif term.basis == "joint":
             result[e] = q[:, term.source]
-        else:
-            result[e] = getattr(np, term.basis)(term.order * q[:, term.source])
     return result
 
 
@@ -106,14 +108,13 @@ class _Levers:
         if chain is None:
             raise CalibError("sag terms need the reference chain of the deflection")
         self.gravity = chain.gravity / np.linalg.norm(chain.gravity)
-        self.directions = sweep(chain, q).directions
+        self.across = np.cross(self.gravity, np.moveaxis(sweep(chain, q).directions, 1, -1))
         self.links = joint_frames(chain, q)[:, :, :3, :3]
         self.index = {name: k for k, name in enumerate(chain.names)}
 
     def moment(self, term: Term) -> np.ndarray:
         """Return (z × u) · ĝ = (ĝ × z) · u for every pose (m,)."""
-        across = np.cross(self.gravity, self.directions[self.index[term.element]].T)
-        return np.einsum("mi,mi->m", across, self.links[term.source, :, :, term.order])
+        return np.einsum("mi,mi->m", self.across[self.index[term.element]], self.links[term.source, :, :, term.order])
 
 
 def extra_displacements(
@@ -125,7 +126,8 @@ def extra_displacements(
     bases = evaluate(deflection, q) if bases is None else bases
     extra = np.zeros((len(chain.elements), len(q)))
     where = target_elements(chain, deflection)
-    np.add.at(extra, where, np.asarray(deflection.coefficients)[:, None] * bases)
+    for place in np.unique(where):
+        extra[place] = np.asarray(deflection.coefficients)[where == place] @ bases[where == place]
     return extra
 
 
