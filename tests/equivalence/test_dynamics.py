@@ -144,6 +144,15 @@ def test_command_and_session_agree(
     two = by_session(session)
     agree(by_command(session, tmp_path / "model"), two)
     assert two.verdict == verdict
+    if change is clean:
+        the_same_robot_is_exported(session, tmp_path / "export")
+
+
+def the_same_robot_is_exported(session: Session, out: Path) -> None:
+    geometry_steps.export(session, quiet)
+    assert not command("export", session.path("8-dynamics"), "--into", out)
+    for path in out.iterdir():
+        assert path.read_bytes() == (session.path(session.export) / path.name).read_bytes(), path.name
 
 
 @pytest.mark.slow
@@ -156,13 +165,3 @@ def test_the_same_motion_is_designed(session: Session, tmp_path: Path) -> None:
     for name in names - {"metrics.json"}:
         own = session.path("6-excitation/training") / name
         assert own.read_bytes() == (tmp_path / "motion" / name).read_bytes(), name
-
-
-def test_the_same_robot_is_exported(session: Session, tmp_path: Path) -> None:
-    for name, seed in (("training", 0), ("validation", 7)):
-        np.savez(session.path(f"7-recorded/{name}.npz"), allow_pickle=False, **planted.series(seed, noise=0.02))
-    by_session(session)
-    geometry_steps.export(session, quiet)
-    assert not command("export", session.path("8-dynamics"), "--into", tmp_path / "export")
-    for path in (tmp_path / "export").iterdir():
-        assert path.read_bytes() == (session.path(session.export) / path.name).read_bytes(), path.name

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from sessions import edit, quiet
+from typer.main import get_command
 from without_figures import DRAWING
 
 from calib import cli
@@ -18,6 +19,8 @@ from calib.errors import CalibError
 from calib.procedure.session import steps
 from calib.procedure.session.commands import NewSession, begin
 from calib.procedure.session.folder import Session, locked, open_session
+
+COMMAND = get_command(cli.app)
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,7 @@ def command(*words: object) -> str:
     """Run a command, without figures; return how it was refused."""
     bare = ["--no-plots"] if words[0] in DRAWING else []
     arguments = [*(str(word) for word in words), *bare]
-    return refusal(lambda: cli.app(arguments, standalone_mode=False))
+    return refusal(lambda: COMMAND(arguments, standalone_mode=False))
 
 
 def session_with(folder: Path, robot: Path, model: str, *measured: Path) -> Session:

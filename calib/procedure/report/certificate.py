@@ -10,8 +10,10 @@ import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
+from functools import cache
 from importlib import metadata, resources
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from calib import files
 from calib.folders import CERTIFICATE
@@ -20,6 +22,9 @@ from calib.procedure.kinematic_stage.folder import FitFolder
 from calib.procedure.report import fit_report, geometry_section
 from calib.procedure.report.fit_report import Report
 from calib.procedure.report.page import Page, Picture, Section, Table, Text
+
+if TYPE_CHECKING:
+    import jinja2
 
 WORDS = {"pass": "PASS", "marginal": "MARGINAL", "fail": "FAIL"}
 EDITED = "edited by hand"
@@ -111,6 +116,7 @@ def tolerance(millimetres: float | None) -> str:
     return f"{millimetres:g} mm rms on unseen poses"
 
 
+@cache
 def versions() -> str:
     """Return the toolkit's version and those of what its numbers depend on."""
     names = ("armature-calib", "numpy", "scipy")
@@ -120,14 +126,19 @@ def versions() -> str:
 
 def render(page: Page) -> str:
     """Return the page as HTML."""
+    style = resources.files("calib.procedure.report").joinpath("certificate.css").read_text(encoding="utf-8")
+    return _template().render(page=page, style=style, words=WORDS)
+
+
+@cache
+def _template() -> jinja2.Template:
+    """Return the page's template, compiled once for a process that writes many pages."""
     import jinja2  # slow to load, and not needed to write the rest
 
-    here = resources.files("calib.procedure.report")
-    source = here.joinpath(CERTIFICATE).read_text(encoding="utf-8")
-    style = here.joinpath("certificate.css").read_text(encoding="utf-8")
+    source = resources.files("calib.procedure.report").joinpath(CERTIFICATE).read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     environment.filters["data_uri"] = lambda png: f"data:image/png;base64,{base64.b64encode(png).decode()}"
-    return environment.from_string(source).render(page=page, style=style, words=WORDS)
+    return environment.from_string(source)
 
 
 def write_fit(outcome: Outcome, folder: Path, plots: bool = True) -> None:
