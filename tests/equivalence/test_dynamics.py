@@ -54,7 +54,7 @@ def with_dynamics(fitted: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 @pytest.fixture
 def session(with_dynamics: Path, tmp_path: Path) -> Session:
     shutil.copytree(with_dynamics, tmp_path / "cell")
-    return open_session(tmp_path / "cell")
+    return open_session(tmp_path / "cell", plots=False)
 
 
 def clean(training: Series, unseen: Series) -> None:
