@@ -65,6 +65,7 @@ def test_torques_are_shared_out_and_overconstraint_does_no_work():
     assert np.abs(np.diff(constant, axis=0)).max() < 0.5  # its sign does not jump along a motion
 
 
+@pytest.mark.slow  # the simulation's kernel takes 14 s to compile
 def test_a_simulated_robot_obeys_its_inverse_dynamics(dualv):
     """The forces of the log are those of the model on the log's own motion; the preload is the one asked for."""
     known, model, values, runs = dualv
@@ -91,6 +92,7 @@ def identified(dualv, rows: str):
     return model, identify_model(model, cases, IdentificationSettings(prior="none", essential="none", torque_rows=own))
 
 
+@pytest.mark.slow  # as above
 def test_inverse_dynamics_and_power_identify_it_and_weigh_its_payload(dualv):
     """Two runs, one with payload (eq. 36): its mass to 1 %, base parameters within their σ, IDIM tighter than PIM."""
     _, truth_model, truth, _ = dualv
@@ -108,6 +110,7 @@ def test_inverse_dynamics_and_power_identify_it_and_weigh_its_payload(dualv):
     assert all(sigmas["platform"][name] < sigmas["power"][name] for name in legs)
 
 
+@pytest.mark.slow  # as above
 def test_what_cannot_be_simulated_is_said(dualv):
     _, model, values, _ = dualv
     with pytest.raises(CannotSimulate, match="away from the reference"):

@@ -1,5 +1,6 @@
 """Claims on the convex bound and on selection among candidates."""
 
+from functools import cache
 from itertools import combinations
 
 import numpy as np
@@ -16,6 +17,12 @@ from poses.information import prepared
 from poses.select import SearchSettings, random_baseline, select_poses
 
 ARM = poses_arm.jacobian(poses_arm.random_poses(400, 0))
+
+
+@cache
+def of_the_arm():
+    """Return 17 of its poses."""
+    return select_poses(ARM, 17)
 
 
 def log_det_of(jacobians):
@@ -100,7 +107,7 @@ def test_exchange_ends_where_no_single_exchange_helps():
     "index", [*(pytest.param(index, marks=pytest.mark.slow) for index in ("O2", "O4", "O5")), "O3", "cond"]
 )
 def test_other_indices_improve_on_the_d_optimal_and_on_random_sets(index):
-    start = observability(ARM[select_poses(ARM, 17).indices], index)
+    start = observability(ARM[of_the_arm().indices], index)
     chosen = select_poses(ARM, 17, SearchSettings(index=index))
     assert chosen.value == pytest.approx(observability(ARM[chosen.indices], index))
     if index == "cond":
@@ -112,7 +119,7 @@ def test_other_indices_improve_on_the_d_optimal_and_on_random_sets(index):
 
 def test_o1_selection_does_not_see_units():
     scale = 10.0 ** np.random.default_rng(1).uniform(-3, 3, ARM.shape[2])
-    one, other = select_poses(ARM, 17), select_poses(ARM * scale, 17)
+    one, other = of_the_arm(), select_poses(ARM * scale, 17)
     assert (one.indices == other.indices).all()
     assert other.efficiency == pytest.approx(one.efficiency, rel=1e-5)
 
@@ -148,7 +155,7 @@ def test_interrupted_exchange_returns_the_best_so_far():
 
     chosen = select_poses(ARM, 17, progress=stop)
     assert chosen.interrupted and chosen.value > chosen.random_baseline
-    assert not select_poses(ARM, 17).interrupted
+    assert not of_the_arm().interrupted
 
 
 def test_errors_say_what_and_why():

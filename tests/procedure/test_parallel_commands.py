@@ -12,9 +12,9 @@ import calib as api
 from calib.mechanism import library as parallel
 from calib.mechanism import parallel_files
 from calib.mechanism.closure import closed, place
-from calib.mechanism.computed_torque import ComputedTorque, simulate
 from calib.mechanism.geometric_fit import changed, loop_parameters
 from calib.mechanism.parallel_model import make_parallel_model
+from calib.mechanism.platform_motion import PlatformRegressor, along
 from calib.robot import library
 
 HEAD = "t,q1,q2,q3,q4,tau1,tau2,tau3,tau4"
@@ -22,7 +22,10 @@ HEAD = "t,q1,q2,q3,q4,tau1,tau2,tau3,tau4"
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Return a folder with logs of a DualV without and with payload, and measured poses of another geometry."""
+    """Return a folder with logs of a DualV without and with payload, and measured poses of another geometry.
+
+    The torques are those that the motion needs, by the model: a simulation's kernel would be compiled for 14 s.
+    """
     path = tmp_path_factory.mktemp("dualv")
     known = closed(parallel_files.read(parallel.path("dualv")))
     model = make_parallel_model(known, ["Fv Fc"], v0=0.05, payloads=["5"])
@@ -35,14 +38,15 @@ def folder(tmp_path_factory):
             w, size, phase = 2 * np.pi * frequency, np.array([0.02, 0.02, 0.12]), rng.uniform(0, 6, 3)
             x, v = x + size * np.sin(w * t + phase), v + size * w * np.cos(w * t + phase)
             a = a - size * w**2 * np.sin(w * t + phase)
-        controller = ComputedTorque(values, preload=10.0, encoder=1e-5, torque=0.5)
-        log = simulate(model, values, controller, x, v, a, carried)
-        table = np.column_stack([log.t, log.q, log.tau])
+        q = along(known, x, v, a).posture.q[:, known.robot.actuated] + 1e-5 * rng.normal(size=(len(t), 4))
+        tau = PlatformRegressor(model, np.arange(model.p), values, 10.0, carried).torques(x, v, a)
+        tau = tau + 0.5 * rng.normal(size=tau.shape)
+        table = np.column_stack([t, q, tau])
         np.savetxt(path / f"{name}.csv", table, delimiter=",", header=HEAD, comments="")
         if name == "empty":
             table[:, [1, 2]] = table[:, [2, 1]]
             np.savetxt(path / "swapped.csv", table, delimiter=",", header=HEAD, comments="")
-            table = np.column_stack([log.t, log.q[:, :3], log.tau[:, :3]])
+            table = np.column_stack([t, q[:, :3], tau[:, :3]])
             np.savetxt(path / "three.csv", table, delimiter=",", header="t,q1,q2,q3,tau1,tau2,tau3", comments="")
     files = '[payload.5]\n[files."load.csv"]\npayload = ["5"]\n[files."other.csv"]\npayload = ["5"]\n'
     (path / "options.toml").write_text(files)
