@@ -8,7 +8,9 @@ ROUNDS = 200  # of the fixed point
 GROSS = 9.0  # squared errors count as so many times their variance at most (our choice)
 
 
-def variance_weights(squares: np.ndarray, shapes: np.ndarray, start: np.ndarray) -> np.ndarray:
+def variance_weights(
+    squares: np.ndarray, shapes: np.ndarray, start: np.ndarray, counts: np.ndarray | float = 1.0
+) -> np.ndarray:
     """Return the most probable weights θ >= 0 (k,) of  e² ~ (shapes θ) · χ²,  by multiplicative updates.
 
     Each update multiplies by the ratio of the two halves of the likelihood's gradient, so that all stay positive.
@@ -17,11 +19,12 @@ def variance_weights(squares: np.ndarray, shapes: np.ndarray, start: np.ndarray)
         squares: (m,) squared errors.
         shapes: (m, k) by what their variances may grow, not negative.
         start: (k,) not negative; what is zero stays.
+        counts: (m,) how many errors each is worth.
     """
     weights = np.array(start, dtype=float)
     for _ in range(ROUNDS):
         variance = np.maximum(shapes @ weights, 1e-30)
         ratio = np.minimum(squares / variance, GROSS)
-        push, pull = (ratio / variance) @ shapes, (1.0 / variance) @ shapes
+        push, pull = (counts * ratio / variance) @ shapes, (counts / variance) @ shapes
         weights *= push / np.maximum(pull, 1e-300)
     return weights
