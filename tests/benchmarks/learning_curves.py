@@ -30,6 +30,7 @@ PANDA, UR10E, TX40 = (
     "staubli_tx40/tx40_first_5p4s.npz",
 )
 KR300, LWR, TIAGO = "kuka_kr300_tuk/traj_", "kuka_lwr4plus_iit/measurements_1.npz", "tiago_laas/dynamic.npz"
+SHOWN = (0.5, 1, 2, 4, 8, 16, 32), (3, 5, 10, 20, 50, 100)  # on the axes [s], [%]
 CURVES = {  # training, its start, seconds, unseen, options
     "Panda": (PANDA, 0.0, (1, 2, 4, 6, 9.387), f"{PANDA}@9.387:11.9", {}),
     "UR10e": (f"{UR10E}2_10-30sec_12harm.npz", 8.0, (2, 4, 8, 16, 22), f"{UR10E}2_19_14harm50sec.npz", GAINS),
@@ -80,7 +81,10 @@ def draw(rows: list[dict], path: Path) -> None:
     axes.set(xscale="log", yscale="log", xlabel="learnt from [s]", ylabel="unexplained on other motion [%]")
     axes.set_title("dotted: the sigma stated", fontsize=9)
     axes.grid(alpha=0.3, which="both")
-    axes.legend()
+    axes.set_xticks(SHOWN[0], [f"{x:g}" for x in SHOWN[0]], minor=False)
+    axes.set_yticks(SHOWN[1], [f"{y:g}" for y in SHOWN[1]], minor=False)
+    axes.minorticks_off()
+    figure.legend(loc="outside right upper")
     figure.savefig(path, dpi=120)
 
 

@@ -13,7 +13,7 @@ from recordings import DATA
 
 ROOT = Path(__file__).parents[2]
 TABLE = (ROOT / "examples/real_recordings.md").read_text()
-MISSED = {"Panda, last 8.8 s": 90.0, "LWR4+, first half": 89.0}  # told in the table's text, with why
+MISSED = {"Panda, first 4 s": 89.0, "Panda, last 8.8 s": 91.5}  # told in the table's text, with why
 ROW = re.compile(r"^\| (.+?) \| (.+?) \| ([\d.]+) % \| ([\d.]+) % \|", re.MULTILINE)
 
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import planted_motion
 import pytest
 
+from calib.arrays import frozen
 from calib.dynamics.shapes import Joined
 from calib.identification.friction import ripple
 from calib.identification.friction.ripple import GearTravel
@@ -59,6 +63,12 @@ def test_noise_has_no_ripple(seed):
     noise = np.random.default_rng(seed).normal(size=learnt.q.shape)
     turns = ripple.find_turns(learnt, noise)
     assert [ripple.find(joint, learnt, noise[:, joint], turns) for joint in (0, 1)] == [None, None]
+
+
+def test_joints_that_hardly_move_have_no_ripple_to_be_found():
+    case = planted_motion.case("still", 0, duration=4.0)
+    still = replace(case, motion=replace(case.motion, q=frozen(1e-3 * case.motion.q)))
+    assert ripple.find_all([still], [np.array(case.target)]) == []
 
 
 def test_a_single_loud_moment_has_no_coherence():

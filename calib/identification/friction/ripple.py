@@ -95,6 +95,8 @@ def find_all(cases: Sequence[Case], residuals: Sequence[np.ndarray]) -> list[Rip
         return []
     q, v = (np.concatenate([getattr(case.motion, name)[::step] for case in cases])[kept] for name in ("q", "v"))
     moving = tuple(int(j) for j in np.flatnonzero(np.ptp(q, axis=0) >= LEAST))
+    if not moving:
+        return []
     track = GearTravel(q, v, block[kept], moving)
     fast = np.zeros(q.shape)
     for j in moving:
