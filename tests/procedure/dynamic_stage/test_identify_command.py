@@ -52,7 +52,7 @@ def test_the_folder_keeps_its_contract(robot, tmp_path, capsys):
         path.name for path in out.iterdir()
     }
     assert "verdict: pass" in capsys.readouterr().out
-    assert run(robot, train, *drawn) == 0, "an own folder may be written again"
+    assert run(robot, train, *drawn[:-1]) == 0, "an own folder may be written again"
     assert not (out / "plot_torque_3.png").exists(), "plots of the earlier run are gone"
 
 

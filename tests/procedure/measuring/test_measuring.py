@@ -181,7 +181,7 @@ def test_the_predicted_sigma_is_that_of_many_fits():
 
 def test_a_selection_tells_run_prediction_and_what_seeing_costs(tmp_path):
     (tmp_path / "c.toml").write_text(CELL)
-    wanted = calib.SelectionSettings("position", ((0.05, 0, 0.05),), candidates=200)
+    wanted = calib.SelectionSettings("position", ((0.05, 0, 0.05),), candidates=100)
     chosen = calib.select_poses("lwr4plus", 14, wanted, constraints=tmp_path / "c.toml")
     told = str(chosen)
     for words in (
