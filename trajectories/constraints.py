@@ -164,9 +164,10 @@ class TorqueLimit:
         return np.tile(np.arange(len(self.joints)), 2)
 
     def values(self, motion: SampledMotion) -> np.ndarray:
-        Y = self.regressor(motion.q, motion.v, motion.a)[:, self.joints]
-        torque, bound = Y @ self.parameters, (1 - self.margin) * self.limits[self.joints]
+        Y = motion.told(self.regressor)
+        torque, bound = (Y @ self.parameters)[:, self.joints], (1 - self.margin) * self.limits[self.joints]
         if self.covariance is not None:
+            Y = Y[:, self.joints]
             bound = bound - self.deviations * np.sqrt(np.einsum("njb,njb->nj", Y @ self.covariance, Y))
         return np.concatenate([torque - bound, -torque - bound], axis=1)
 

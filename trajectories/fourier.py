@@ -124,16 +124,16 @@ def table(times: np.ndarray, period: float, count: int) -> np.ndarray:
 
 
 def evaluate(coefficients: Sequence[np.ndarray], period: float, times: np.ndarray, order: int = 0) -> np.ndarray:
-    """Return d^r q / dt^r (N, n) straight from eq. 23, term by term: independent of tables and null spaces."""
+    """Return d^r q / dt^r (N, n) straight from eq. 23, independent of tables and null spaces."""
+    most = max(len(c) // 2 for c in coefficients)
+    rates = 2 * np.pi / period * np.arange(1, most + 1)
+    angle = np.outer(times, rates) + order * np.pi / 2  # each derivative turns sine and cosine by π/2
+    sine, cosine = rates**order * np.sin(angle), rates**order * np.cos(angle)
     result = np.zeros((len(times), len(coefficients)))
     for j, c in enumerate(coefficients):
         count = len(c) // 2
-        result[:, j] = c[0] if order == 0 else 0.0
-        for k in range(1, count + 1):
-            rate, turn = 2 * np.pi * k / period, order * np.pi / 2  # each derivative turns sine and cosine by π/2
-            result[:, j] += rate**order * (
-                c[k] * np.sin(rate * times + turn) + c[count + k] * np.cos(rate * times + turn)
-            )
+        result[:, j] = sine[:, :count] @ c[1 : 1 + count] + cosine[:, :count] @ c[1 + count :]
+        result[:, j] += c[0] if order == 0 else 0.0
     return result
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft
 
 from trajectories.errors import BadInput
 
@@ -104,14 +105,18 @@ def average(values: np.ndarray, found: Recalled) -> Averaged:
 
 def _likeness(q: np.ndarray, r: np.ndarray) -> np.ndarray:
     """Return 1 - D(k) / Σ |r - mean|² for every place (N - P + 1,)."""
-    from scipy.signal import fftconvolve  # slow to load
-
     centre = r.mean(axis=0)
     q, r = q - centre, r - centre
     energy = np.concatenate([[0.0], np.cumsum((q**2).sum(axis=1))])
     inside = energy[len(r) :] - energy[: -len(r)]
-    crossed = sum(fftconvolve(q[:, j], r[::-1, j], mode="valid") for j in range(q.shape[1]))
+    crossed = sum(sliding_products(q[:, j], r[:, j]) for j in range(q.shape[1]))
     return 1.0 - (inside + (r**2).sum() - 2 * crossed) / max((r**2).sum(), 1e-300)
+
+
+def sliding_products(x: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """Return Σ_i x[k + i] r[i] for every place k (N - P + 1,) of r (P,) in x (N,), by FFT."""
+    size = next_fast_len(len(x) + len(r) - 1, real=True)
+    return irfft(rfft(x, size) * rfft(r[::-1], size), size)[len(r) - 1 : len(x)]
 
 
 def _run_with(places: list[int], best: int, period: int) -> list[int]:

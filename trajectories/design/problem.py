@@ -119,7 +119,7 @@ def evaluate(problem: ExcitationProblem, basis: Basis, y: np.ndarray, sharpness:
     """
     x, factor = (y[:-1], float(y[-1])) if problem.free_period else (y, problem.stretch[0])
     motion = stretched(basis.motion(x), factor)
-    Y = problem.regressor(motion.q, motion.v, motion.a)
+    Y = motion.told(problem.regressor)
     seen: dict[tuple[int, int], Observed] = {}
     found = [_value(_sharpened(one, sharpness[0]), motion, Y, seen) for one in terms(problem)]
     if problem.goals:

@@ -18,7 +18,7 @@ from calib.dynamics.bodies import bodies_of, standard_parameters, with_gravity
 from calib.dynamics.rigid_body import inverse_dynamics
 from calib.robot.chain import Chain
 from trajectories.errors import BadInput
-from trajectories.recall import Recalled, find_periods
+from trajectories.recall import Recalled, find_periods, sliding_products
 
 STEP = 0.01  # of the coarse grid [s] (this and all below: our choice)
 LIKE = 0.9  # share of the motion's variance a recorded period has to explain
@@ -148,16 +148,14 @@ def _found(q: np.ndarray, reference: np.ndarray) -> Recalled | None:
 
 def _best_order(q: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return which recorded column (n,) moves most like each joint, and with which sign (n,), at any shift."""
-    from scipy.signal import fftconvolve  # slow to load
-
     n = reference.shape[1]
     likeness = np.zeros((2, n, n))
     for j in range(n):
         r = reference[:, j] - reference[:, j].mean()
         for k in range(n):
             x = q[:, k] - q[:, k].mean()
-            crossed = fftconvolve(x, r[::-1], mode="valid") / max(np.linalg.norm(r), 1e-12)
-            power = np.sqrt(np.maximum(fftconvolve(x**2, np.ones(len(r)), mode="valid"), 1e-12))
+            crossed = sliding_products(x, r) / max(np.linalg.norm(r), 1e-12)
+            power = np.sqrt(np.maximum(sliding_products(x**2, np.ones(len(r))), 1e-12))
             likeness[0, j, k], likeness[1, j, k] = (crossed / power).max(), (-crossed / power).max()
     order = linear_sum_assignment(-likeness.max(axis=0))[1]
     rows = np.arange(n)

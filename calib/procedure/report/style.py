@@ -271,14 +271,15 @@ class _Scale(Artist):
             fontsize=given.get("labelsize", style[f"{key}.labelsize"]), transform=IdentityTransform(),
         )  # fmt: skip
         text.set_figure(axes.figure)
-        furthest = level
+        furthest, axes_label = level, self._axis.label.get_text()
         for label, where in zip(labels, place):
             if label:
                 text.set_text(label)
                 text.set_position((where, level) if across else (level, where))
                 text.draw(renderer)
-                box = text.get_window_extent(renderer)
-                furthest = min(furthest, box.y0 if across else box.x0)
+                if axes_label:  # stands beyond the widest of them
+                    box = text.get_window_extent(renderer)
+                    furthest = min(furthest, box.y0 if across else box.x0)
         return furthest
 
 

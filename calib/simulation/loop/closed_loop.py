@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import solve_banded
 
 from calib.arrays import frozen, shaped
 from calib.dynamics.bodies import Bodies
@@ -373,10 +374,11 @@ def _draw(rng: np.random.Generator, sigma: np.ndarray, count: int) -> np.ndarray
 
 def _coloured(white: np.ndarray, step: float) -> np.ndarray:
     """Return x_k = p x_{k-1} + √(1 - p²) w_k, p = exp(-step), as wide as the white noise w (N, n)."""
-    from scipy.signal import lfilter
-
+    if not len(white):
+        return white
     pole = float(np.exp(-step))
-    return np.ascontiguousarray(lfilter([np.sqrt(1.0 - pole**2)], [1.0, -pole], white, axis=0))
+    bands = np.array([[1.0], [-pole]]) * np.ones(len(white))
+    return np.ascontiguousarray(solve_banded((1, 0), bands, np.sqrt(1.0 - pole**2) * white))
 
 
 def _layout_of(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
