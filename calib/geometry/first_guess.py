@@ -231,17 +231,16 @@ def _place_position(
     if tool is not None:
         return _align(position + rotation @ tool[:3, 3], seen), tool
     offsets = [np.zeros(3), _linear_offset(rotation, position, seen)]
-    best: tuple[float, np.ndarray, np.ndarray] | None = None
+    tried = list[tuple[float, np.ndarray, np.ndarray]]()
     for offset in offsets:
         for _ in range(5):  # alternate: placement by Kabsch, offset by its linear solution
             placement = _align(position + rotation @ offset, seen)
             inside = (seen - placement[:3, 3]) @ placement[:3, :3]
             error = float(np.median(np.linalg.norm(inside - position - rotation @ offset, axis=1)))
-            if best is None or error < best[0]:
-                best = error, placement, offset
+            tried.append((error, placement, offset))
             offset = np.median(np.einsum("mji,mj->mi", rotation, inside - position), axis=0)
-    assert best is not None
-    return best[1], pose(None, best[2])
+    _, placement, offset = min(tried, key=lambda one: one[0])
+    return placement, pose(None, offset)
 
 
 def _linear_offset(rotation: np.ndarray, position: np.ndarray, seen: np.ndarray) -> np.ndarray:

@@ -82,7 +82,6 @@ def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = 
         torque: (m, n) gravity torques [N m], for terms of basis ``torque``.
     """
     result = np.empty((len(deflection.terms), len(q)))
-    levers = _Levers(deflection, q) if any(term.basis == "lever" for term in deflection.terms) else None
     for basis, turn in (("cos", np.cos), ("sin", np.sin)):
         where = [e for e, term in enumerate(deflection.terms) if term.basis == basis]
         orders = np.array([deflection.terms[e].order for e in where])
@@ -92,11 +91,12 @@ def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = 
             if torque is None:
                 raise CalibError("a compliance needs gravity torques: give the robot masses, or ask for fitted ones")
             result[e] = torque[:, term.source]
-        elif term.basis == "lever":
-            assert levers is not None
-            result[e] = levers.moment(term)
         elif term.basis == "joint":
             result[e] = q[:, term.source]
+    if where := [e for e, term in enumerate(deflection.terms) if term.basis == "lever"]:
+        levers = _Levers(deflection, q)
+        for e in where:
+            result[e] = levers.moment(deflection.terms[e])
     return result
 
 

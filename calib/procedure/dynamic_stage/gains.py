@@ -15,7 +15,7 @@ from calib.errors import UsageError
 from calib.identification.cases import Case, make_case
 from calib.identification.gains import DriveGains, identify_gains, identify_relative_gains
 from calib.identification.identify import chain_states, common_decimator, find_base, first_fit
-from calib.identification.identify_options import FileSettings, IdentifyOptions, file_settings
+from calib.identification.identify_options import FileSettings, GainPair, IdentifyOptions, file_settings
 from calib.identification.rows import observe, pool, triangulate, with_blocks
 from calib.identification.settings import IdentificationSettings, make_model
 from calib.robot.chain import Chain
@@ -68,7 +68,7 @@ def find_gains(
     stated = [path for path in currents if file_settings(options, path).gains is not None]
     if options.gain_pair is not None:
         say("drive gains")
-        return _from_pair(chain, options, motions)
+        return _from_pair(chain, options, options.gain_pair, motions)
     bare = [path for path in currents if path not in stated and motions[path].drive_gain is None]
     if not bare:
         return FoundGains(options, None, None, TORQUE, ())
@@ -82,9 +82,8 @@ def find_gains(
     return _relative(chain, options, [(path, motions[path]) for path in training if path in bare])
 
 
-def _from_pair(chain: Chain, options: IdentifyOptions, motions: Mapping[str, Motion]) -> FoundGains:
-    pair, settings = options.gain_pair, options.settings
-    assert pair is not None
+def _from_pair(chain: Chain, options: IdentifyOptions, pair: GainPair, motions: Mapping[str, Motion]) -> FoundGains:
+    settings = options.settings
     known = {f"M{label}": own.mass for label, own in settings.payloads.items() if own.mass is not None}
     for label, own in settings.payloads.items():
         if own.com is not None and own.mass is not None:

@@ -168,5 +168,4 @@ def remains(found: ModelSelection, reach: float) -> bool:
 
 
 def _file_rows(block: PoseMeasurements) -> np.ndarray:
-    assert block.rows is not None
     return block.rows

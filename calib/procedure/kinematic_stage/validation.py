@@ -263,7 +263,6 @@ def _cell(value: float) -> float | None:
 
 
 def _numbers(block: PoseMeasurements) -> list[int]:
-    assert block.rows is not None
     return [int(row) for row in block.rows]
 
 

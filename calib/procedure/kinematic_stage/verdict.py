@@ -186,8 +186,9 @@ def _frames_asked(model: str, asked: str, left: float) -> Verdict | None:
 
 
 def _too_coarse(found: list[_Proof], tolerance: float | None) -> Verdict | None:
-    for proof in found if tolerance is not None else ():
-        assert tolerance is not None
+    if tolerance is None:
+        return None
+    for proof in found:
         if proof.after > tolerance:
             return Verdict("fail", f"{proof.where}: {proof.both}, above the tolerance of {1e3 * tolerance:g} mm")
     return None
