@@ -222,13 +222,13 @@ def test_a_gross_corner_and_images_that_contradict_all_others_are_left_out_and_n
     assert "2 images are left out" in said[0] and "turned by 180°" in said[0]
     assert said[0].endswith("(0006.png, 0007.png)")
     assert said[1].startswith("1 of ") and said[1].endswith("left out: corner 10 of 0004.png")
-    done, start, candidates = started(cell, replace(block, pixel=pixel, q=q))
+    done, start, candidates = started(cell, replace(block, pixel=pixel, q=q, lens=cell.lens))
     assert set(done.rows) == set(block.rows) - {6, 7, 21, 31}
     found = fit(start, [done], candidates, settings=Settings(loss="none"))
     assert position_errors(cell.cell, found.cell, found.cell.chain)[1] < 0.05
     q = np.concatenate([block.q[:27], np.roll(block.q[27:], 3, axis=0)])
     with pytest.raises(MeasurementError, match=r"13 of 40 images show the board .* was camera or board moved"):
-        complete_camera(cell.cell.nominal, replace(block, q=q))
+        complete_camera(cell.cell.nominal, replace(block, q=q, lens=cell.lens))
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
@@ -249,6 +249,7 @@ def test_the_noise_of_images_settles_wherever_the_camera_stands(seed):
 
 def test_rows_shifted_by_one_are_said_to_be():
     cell, block = study()
+    block = replace(block, lens=cell.lens)
     shifted = replace(take(block, np.arange(1, 40)), q=block.q[:-1])
     with pytest.raises(MeasurementError, match=r"shifted by 1 row: .* further down"):
         complete_camera(cell.cell.nominal, shifted)
