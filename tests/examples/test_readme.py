@@ -34,18 +34,25 @@ def commands(block: str) -> list[list[str]]:
 
 @pytest.fixture
 def at_a_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with the files the README speaks of."""
+    """A folder with the files the README speaks of, but logs."""
     cell, arm = virtual_cell("lwr4plus", 1), load("lwr4plus")
     (tmp_path / "robot.urdf").write_text(urdf_write.write_new(arm))
     measured_files.write(measure(cell, random_joints(arm, 60, 1), 2), tmp_path / "measured.csv")
     joints = ",".join(f"{name} [rad]" for name in arm.joint_names)
     np.savetxt(tmp_path / "targets.csv", 0.5 * random_joints(arm, 5, 2), delimiter=",", header=joints, comments="")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def with_logs(at_a_cell: Path) -> Path:
+    """All files the README speaks of."""
+    cell, arm = virtual_cell("lwr4plus", 1), load("lwr4plus")
     moves, speed = moving_arm(cell, "lwr4plus", 1), np.array([joint.velocity for joint in arm.joints])
     for seed, name in enumerate(("log", "other")):
         motion = random_fourier(0.6 * arm.lower, 0.6 * arm.upper, 0.6 * speed, 15.0, 1000.0, seed=seed)
-        measured_files.write_log(record(moves, motion, seed), tmp_path / f"{name}.csv")
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+        measured_files.write_log(record(moves, motion, seed), at_a_cell / f"{name}.csv")
+    return at_a_cell
 
 
 def test_blocks_are_found_and_short() -> None:
@@ -56,20 +63,24 @@ def test_blocks_are_found_and_short() -> None:
 
 
 @pytest.mark.slow
-def test_its_script_runs(at_a_cell: Path, capsys: pytest.CaptureFixture) -> None:
+def test_its_script_runs(with_logs: Path, capsys: pytest.CaptureFixture) -> None:
     exec(compile(SCRIPTS[0], "README.md", "exec"), {})
     assert "verdict: marginal" in capsys.readouterr().out  # its cell hides what no rigid geometry explains
     made = ("poses.csv", "motion/trajectory.csv", "calibrated/robot.urdf", "commands.csv")
-    assert all((at_a_cell / name).exists() for name in made)
+    assert all((with_logs / name).exists() for name in made)
 
 
-@pytest.mark.parametrize("number", [2, pytest.param(3, marks=pytest.mark.slow)])
-def test_its_commands_run(number: int, at_a_cell: Path, capsys: pytest.CaptureFixture) -> None:
-    for arguments in commands(BLOCKS[number]):
+def test_its_session_begins(at_a_cell: Path, capsys: pytest.CaptureFixture) -> None:
+    for arguments in commands(BLOCKS[2]):
         assert cli.run(arguments) == 0, (arguments, capsys.readouterr())
-    if number == 3:
-        made = ("fit/certificate.html", "motion/trajectory.csv", "calibrated/robot.urdf", "commands.csv")
-        assert all((at_a_cell / name).exists() for name in made)
+
+
+@pytest.mark.slow
+def test_its_commands_run(with_logs: Path, capsys: pytest.CaptureFixture) -> None:
+    for arguments in commands(BLOCKS[3]):
+        assert cli.run(arguments) == 0, (arguments, capsys.readouterr())
+    made = ("fit/certificate.html", "motion/trajectory.csv", "calibrated/robot.urdf", "commands.csv")
+    assert all((with_logs / name).exists() for name in made)
 
 
 def test_what_it_points_to_is_there() -> None:
