@@ -31,7 +31,7 @@ def folder(tmp_path_factory):
     model = make_parallel_model(known, ["Fv Fc"], v0=0.05, payloads=["5"])
     values = np.concatenate([model.known_parameters(), np.tile([0.05, 0.3], 4)])
     values[model.names.index("M5")] = 5.37
-    t, rng = np.arange(1500)[:, None] / 1000.0, np.random.default_rng(0)
+    t, rng = np.arange(1000)[:, None] / 1000.0, np.random.default_rng(0)
     for name, carried in (("empty", ()), ("load", ("5",)), ("other", ("5",))):
         x, v, a = np.zeros((3, len(t), 3))
         for frequency in (1.5, 2.5, 4.0, 5.5):
