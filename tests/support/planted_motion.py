@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -82,13 +83,19 @@ def torques(
     return full.regressor(q, v, a, load) @ truth(values, payload)
 
 
+@cache
+def _played(seed: int, terms: tuple[DriveTerm, ...], values: tuple, payload: bool, how: tuple) -> np.ndarray:
+    """Return the true torques (N, 3) of a motion."""
+    return torques(*motion(seed, **dict(how))[1:], terms, dict(values), payload)
+
+
 def series(
     seed: int, noise: float = 0.2, terms: tuple[DriveTerm, ...] = (), values: dict[str, float] | None = None,
     payload: bool = False, **how,
 ) -> dict[str, np.ndarray]:  # fmt: skip
     """Return t, q and tau as a controller would log them, torque noise white."""
-    t, q, v, a = motion(seed, **how)
-    tau = torques(q, v, a, terms, values, payload)
+    t, q = motion(seed, **how)[:2]
+    tau = _played(seed, terms, tuple((values or {}).items()), payload, tuple(how.items()))
     rng = np.random.default_rng(1000 + seed)
     return {"t": t, "q": q, "tau": tau + noise * rng.normal(size=tau.shape)}
 
