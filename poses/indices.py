@@ -128,11 +128,6 @@ def has_kinks(index: Index) -> bool:
     return index in _POWERS
 
 
-def is_better(value: float, than: float, index: Index) -> bool:
-    """Return whether `value` of the index beats `than`: larger, or smaller for cond."""
-    return value < than if index == "cond" else value > than
-
-
 def log_slope(s: np.ndarray, index: Index) -> np.ndarray:
     """Return ∂ log O / ∂s (p,)."""
     slope = np.zeros_like(s)

@@ -12,16 +12,16 @@ from numpy.typing import ArrayLike
 
 from poses.by_index import exchanged_by_index, merits
 from poses.candidates import draw_candidates
+from poses.continuous.local import Improved, improved
+from poses.continuous.multistart import multistart_search, random_starts
+from poses.continuous.tabu import DEFAULT_RULE, TabuRule, tabu_search
 from poses.convex import Bound, relaxed
 from poses.design import Design, Pool, design_of
 from poses.errors import BadInput, NotIdentifiable
 from poses.exchange import detmax, exchanged, greedy, kicked
 from poses.indices import Index, merit, observability
 from poses.information import Candidates, checked, log_det, prepared
-from poses.local import Improved, improved
-from poses.multistart import multistart_search, random_starts
 from poses.space import SearchSpace, is_feasible
-from poses.tabu import DEFAULT_RULE, TabuRule, tabu_search
 from poses.whole_space import Ceiling, bound_over_space
 
 Method = Literal["detmax", "polish", "local", "multistart", "tabu"]
@@ -143,10 +143,10 @@ def select_poses(
 
     * ``detmax`` chooses among the candidates: rounded relaxation and greedy start, pair exchange, DETMAX excursions,
       kicks (`poses.exchange`); other indices than O1 go on from there by `poses.by_index`.
-    * ``polish`` moves all joint values of that set at once (`poses.local`).
+    * ``polish`` moves all joint values of that set at once (`poses.continuous.local`).
     * ``local`` does so from one random set of the candidates, ``multistart`` from `starts` of them
-      (`poses.multistart`): the study's deterministic search and its remedy.
-    * ``tabu`` is IMHATR, the two-stage meta-heuristic (`poses.tabu`).
+      (`poses.continuous.multistart`): the study's deterministic search and its remedy.
+    * ``tabu`` is IMHATR, the two-stage meta-heuristic (`poses.continuous.tabu`).
 
     Args:
         jacobians: (N, rows, p) whitened observation Jacobians of the candidates in base columns; None takes them at q,

@@ -22,9 +22,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from poses.candidates import draw_candidates
+from poses.continuous.local import climb, restored
 from poses.convex import information_of, relaxed, scores_of
 from poses.information import log_det, prepared
-from poses.local import climb, restored
 from poses.space import SearchSpace, is_feasible, product
 
 BLOCK = 8

@@ -67,13 +67,6 @@ def to_inertia(parameters: np.ndarray, name: str = "") -> Any:
     return pin.Inertia.FromDynamicParameters(values[PINOCCHIO_ORDER])
 
 
-def from_inertia(inertia: Any) -> np.ndarray:
-    """Return the ten standard parameters of an inertia."""
-    result = np.empty(10)
-    result[PINOCCHIO_ORDER] = inertia.toDynamicParameters()
-    return result
-
-
 def inverse_dynamics(chain: Chain, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
     """Return rigid-body torques (N, n) by Pinocchio's RNEA, sample by sample, for any standard parameters (10 n,).
 

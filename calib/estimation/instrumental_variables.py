@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtrc, fdtrc
+from scipy.special import fdtrc
 
 from calib.arrays import shaped
 from calib.errors import CalibError, Unidentifiable
@@ -231,32 +231,6 @@ def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: f
     first, second = _rss(whole, target), _rss(columns[:, split.kept], target)
     f = (first - second) / k / (second / (rows - p - k)) / inflation if second > 0.0 else np.inf
     return ExogeneityTest(float(f), (k, dof), float(fdtrc(k, dof, f)))
-
-
-def hausman(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1.0) -> ExogeneityTest:
-    """Test the same claim by the distance of two estimates (Hausman 1978): (b_IV - b_LS)ᵀ (S_IV - S_LS)⁺ (…) ~ χ²(k).
-
-    Both covariances with the σ² of least squares, so that their difference is never negative: with λ the canonical
-    correlations of Z and W it is (1 - λ²) / λ² in the coordinates where S_LS is σ² I.
-
-    Args:
-        problem, std, inflation: as in `exogeneity`.
-    """
-    p, rows = len(problem.names), int(problem.data.rows.sum())
-    factor = combine(problem.data, std)
-    basis, upper = np.linalg.qr(factor[: 2 * p, p : 2 * p])
-    _, lam, vt = np.linalg.svd(basis[:p])
-    ordinary = solve_triangle(retriangulate(factor[:, p:]), problem.names)[0]
-    instrumental = solve_triangle(_projected(factor, problem.names), problem.names)[0]
-    gap = np.maximum(1.0 - lam**2, 0.0)
-    open_ = gap > 1e-12
-    k = int(open_.sum())
-    if k == 0:
-        raise CalibError("instruments equal to the columns leave nothing to test")
-    variance = _rss(factor[:, p : 2 * p], factor[:, -1]) / (rows - p)
-    distance = (vt @ upper @ (instrumental - ordinary))[open_]
-    chi = float(np.sum(distance**2 * lam[open_] ** 2 / gap[open_]) / variance / inflation)
-    return ExogeneityTest(chi, (k, 0), float(chdtrc(k, chi)))
 
 
 def projected(problem: Instruments, std: np.ndarray | None = None) -> np.ndarray:

@@ -31,7 +31,7 @@ from calib.geometry.installation import Installation
 from calib.robot.chain import Chain
 from calib.robot.deflection import Deflection
 from calib.robot.kinematics import forward
-from calib.transforms import invert, pose
+from calib.transforms import from_quaternion, invert, pose
 
 WRONG_UNIT = 15.0  # measured over predicted spread of the positions (our choice)
 UNITS = {
@@ -141,7 +141,7 @@ def _guess_from_poses(
     block: Poses, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
 ) -> Guess:
     _enough(block, rows, 3)
-    seen = pose(Rotation.from_quat(block.quaternion[rows]).as_matrix(), block.position[rows])
+    seen = from_quaternion(block.position[rows], block.quaternion[rows])
     if station is not None:
         return station, average_pose(invert(arm[rows]) @ invert(station) @ seen)
     if tool is not None:

@@ -34,10 +34,10 @@ from calib.simulation.cells.cell import SimulatedInstrument, measure, true_poses
 from calib.simulation.cells.virtual_cells import lwr4plus_cell, rigid
 from calib.transforms import invert
 from poses.candidates import draw_candidates
+from poses.continuous.tabu import TabuRule
 from poses.indices import Index, observability
 from poses.select import Method, SearchSettings, Selection, random_baseline, select_poses
 from poses.space import PoseConstraint, SearchSpace, is_feasible
-from poses.tabu import TabuRule
 from poses.whole_space import bound_over_space
 
 LIMITS = np.deg2rad([170.0, 120.0, 170.0, 120.0, 170.0, 90.0, 170.0])

@@ -16,7 +16,7 @@ from calib.procedure.measuring.pose_limits import read_limits
 from calib.robot.chain import Chain
 from calib.robot.load import load
 from poses.candidates import draw_candidates
-from poses.local import improved, merit_of
+from poses.continuous.local import improved, merit_of
 from poses.space import PoseConstraint, SearchSpace, is_feasible
 
 CONSTRAINTS = """

@@ -10,12 +10,12 @@ import pytest
 from differences import check
 
 from poses import constraints
+from poses.continuous.local import improved, merit_of
+from poses.continuous.tabu import TabuRule
 from poses.errors import BadInput
 from poses.indices import merit
-from poses.local import improved, merit_of
 from poses.select import SearchSettings, select_poses
 from poses.space import PoseConstraint, SearchSpace, central_difference, is_feasible
-from poses.tabu import TabuRule
 from poses.whole_space import bound_over_space
 
 SPACE = SearchSpace(planar.jacobian, planar.LOWER, planar.UPPER, planar.product)

@@ -6,11 +6,18 @@ import numpy as np
 import pinocchio as pin
 
 from calib.dynamics.bodies import PRISMATIC, bodies_of
-from calib.dynamics.model import from_inertia, to_inertia
+from calib.dynamics.model import PINOCCHIO_ORDER, to_inertia
 from calib.mechanism.closure import ClosedRobot
 from calib.mechanism.leg_links import Posture
 
 SMALL = np.array([1e-2, 0, 0, 1e-2, 0, 1e-2, 0, 0, 0, 0.1])
+
+
+def from_inertia(inertia: pin.Inertia) -> np.ndarray:
+    """Return the ten standard parameters of an inertia."""
+    result = np.empty(10)
+    result[PINOCCHIO_ORDER] = inertia.toDynamicParameters()
+    return result
 
 
 class ClosedTree:

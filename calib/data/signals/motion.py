@@ -171,11 +171,6 @@ def sample(recording: Recording, options: FilterOptions) -> Resampled:
     return resample(recording, options.clock, options.gap)
 
 
-def filters_of(motion: Motion) -> FilterOptions:
-    """Return the options that treat another recording as `motion` was: validation wants the filters of the fit."""
-    return FilterOptions(cutoff=tuple(float(f) for f in motion.cutoff), band=motion.band * (1 - 1e-9))
-
-
 def thin(motion: Motion) -> Motion:
     """Return the motion at the samples its decimator keeps: q, v, a as they are there, efforts filtered to the band.
 

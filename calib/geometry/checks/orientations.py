@@ -15,7 +15,7 @@ from calib.errors import MeasurementError
 from calib.geometry.images.hand_eye import place_pose
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
-from calib.transforms import pose
+from calib.transforms import from_quaternion
 
 ROWS = 200  # how many are looked at (this and the next three: our choice)
 WRONG = 20.0  # median misfit [deg] from which on the file's orientations are not what they are said to be
@@ -67,7 +67,7 @@ def _misfit(arm: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> tu
     Returns:
         The median angle [deg], and the median distance over the positions' spread.
     """
-    seen = pose(Rotation.from_quat(quaternion).as_matrix(), position)
+    seen = from_quaternion(position, quaternion)
     station, tool = place_pose(arm, seen)
     predicted = station @ arm @ tool
     turned = Rotation.from_matrix(np.swapaxes(predicted[:, :3, :3], 1, 2) @ seen[:, :3, :3]).magnitude()

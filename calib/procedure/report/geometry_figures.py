@@ -5,7 +5,7 @@ Before is light and after is dark everywhere, so that a greyscale print still te
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -316,30 +316,6 @@ def ladder(
         if len(taken):
             chosen = str(models[int(taken[-1])]).removeprefix("+ ")
             axes.set_title(f"{chosen} is where the gain ends: {errors[taken[-1]]:.3g} mm")
-        axes.grid(axis="y")
-    return figure
-
-
-def selection_growth(counts: Sequence[int], curves: Mapping[str, Sequence[float]], index: str = "O1") -> Figure:
-    """Draw an observability index as the set of poses grows, one line per method, labelled at its end.
-
-    Args:
-        counts: numbers of poses.
-        curves: method → index at each count; NaN where there is none.
-        index: its name.
-    """
-    shades = [AFTER, BROWN, QUIET, MARK, "#4d7c57"]
-    with styled():
-        figure, (axes,) = sheet(width=HALF, height=2.5, right=room(curves, 7.0))
-        for (name, values), colour in zip(curves.items(), shades * 3):
-            axes.plot(counts, values, color=colour, linewidth=1.4)
-            end = int(np.flatnonzero(np.isfinite(values))[-1])
-            axes.annotate(
-                name, (counts[end], values[end]), xytext=(4, 0), textcoords="offset points", color=colour, va="center",
-                fontsize=7, annotation_clip=False,
-            )  # fmt: skip
-        axes.set(xlabel="poses", ylabel=f"observability index {index}")
-        axes.margins(x=0.02)
         axes.grid(axis="y")
     return figure
 

@@ -11,7 +11,7 @@ from calib.data.recordings.clock import find_clock
 from calib.data.recordings.recording import Recording, take
 from calib.data.signals.bandwidth import propose_cutoffs, spectrum
 from calib.data.signals.decimation import decimate, decimate_regressor
-from calib.data.signals.motion import FilterOptions, filters_of, in_band, make_motion, moving, standstill, thin
+from calib.data.signals.motion import FilterOptions, in_band, make_motion, moving, standstill, thin
 from calib.data.signals.persistency import repeats, report_excitation
 from calib.data.signals.resampling import resample
 from calib.errors import MeasurementError, UsageError
@@ -150,13 +150,6 @@ def test_cutoffs_are_one_or_one_per_joint():
     with pytest.raises(UsageError, match="3 values for 2 joints"):
         make_motion(recorded(t, t), FilterOptions(cutoff=(1.0, 2.0, 3.0)))
     assert list(make_motion(recorded(t, t), FilterOptions(cutoff=(20.0, 30.0))).cutoff) == [20.0, 30.0]
-
-
-def test_another_recording_gets_the_same_filters():
-    t = even()
-    first = make_motion(recorded(t, t))
-    again = make_motion(recorded(t, 0.3 * t), filters_of(first))
-    assert list(again.cutoff) == list(first.cutoff) and again.decimator.factor == first.decimator.factor
 
 
 def test_proposed_cutoffs_follow_the_motion_and_the_noise():

@@ -137,9 +137,6 @@ def test_every_figure_is_drawn_from_plain_arrays(tmp_path: Path) -> None:
         geometry_figures.singular_values(np.array([3.0, 1.0, 1e-9, 0.0]), 2),
         geometry_figures.singular_values(np.array([3.0, 1.0]), 2),
         geometry_figures.ladder(["frames", "geometry"], [12, 34], [5e-3, 1e-3], [True, True], 1e-4),
-        geometry_figures.selection_growth(
-            range(5, 9), {"detmax": [1.0, 2.0, 3.0, 4.0], "random": [0.5, 1.0, np.nan, np.nan]}
-        ),
         geometry_figures.correlation_map(names, np.eye(20)),
     ]
     for number, figure in enumerate(drawn):

@@ -8,8 +8,8 @@ from functools import partial
 
 import numpy as np
 
+from poses.continuous.local import Improved, improved
 from poses.indices import Index
-from poses.local import Improved, improved
 from poses.space import SearchSpace
 
 

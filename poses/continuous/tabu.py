@@ -21,8 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from poses.candidates import draw_candidates
+from poses.continuous.local import Improved, improved
 from poses.indices import Index, merit
-from poses.local import Improved, improved
 from poses.space import SearchSpace, is_feasible
 
 
