@@ -15,7 +15,10 @@ from calib.data.signals.motion import FilterOptions, make_motion
 from calib.errors import MeasurementError
 from calib.identification.cases import Case, make_case
 from calib.identification.checks.recording_sizes import compare_sizes
-from calib.procedure.dynamic_stage.plausibility import findings
+from calib.identification.identify import identify
+from calib.identification.possible.contradiction import Contradiction, contradiction
+from calib.identification.settings import IdentificationSettings
+from calib.procedure.dynamic_stage.plausibility import findings, impossible
 from calib.procedure.findings import Finding, Verdict, held_by, settled
 
 NAMES = ("joint1", "joint2", "joint3")
@@ -137,3 +140,26 @@ def test_exchanged_joints_are_named() -> None:
     one = replace(log, q=log.q[:, order], effort=log.effort[:, order], v=None)
     (told,) = [one for one in found(one) if one.name == "order"]
     assert told.level == "marginal" and "joint2 and joint3 exchanged" in told.words
+
+
+def away(recording: Recording) -> Contradiction:
+    """Return how far an identification is from every possible robot."""
+    settings = IdentificationSettings(friction="standard", essential="none", prior="none")
+    far = contradiction(identify(ARM, [case_of(recording)], settings), ARM)
+    assert far is not None
+    return far
+
+
+def test_an_estimate_far_from_every_possible_robot_fails_and_one_with_other_friction_is_not_remarked() -> None:
+    sound = away(recorded())
+    assert sound.distance < sound.allowed and impossible(sound) == []
+    bent = away(recorded(tau=recorded().effort + 5.0 * np.sin(3.0 * recorded().q)))
+    assert impossible(bent) == []
+    (one,) = impossible(away(recorded(tau=recorded().effort * [1.0, -1.0, 1.0])))
+    assert one.level == "fail" and "no possible robot" in one.words and 'accept = ["bodies"]' in one.told
+    assert settled([one], ["bodies"])[0].allows == "pass"
+
+
+def test_a_contradiction_is_remarked_by_its_size() -> None:
+    levels = [[one.level for one in impossible(Contradiction(10.0 * times, 10.0))] for times in (4.0, 6.0, 12.0)]
+    assert levels == [[], ["marginal"], ["fail"]] and impossible(None) == []

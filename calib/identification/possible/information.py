@@ -75,6 +75,20 @@ class Information:
         return float(np.sqrt(max(float(rest @ rest) - self.best, 0.0)))
 
 
+def of(found: Identification, chain: Chain) -> Information:
+    """Return what an identification's data say, before anything of it is written."""
+    fitted, b = found.fitted, found.base.b
+    estimate, standard = fitted.estimate, found.dynamics.model.names
+    place = {name: k for k, name in enumerate(standard)}
+    transform = np.zeros((len(found.names), len(standard)))
+    transform[:b, [place[name] for name in found.base.standard]] = found.base.transform
+    transform[np.arange(b, len(found.names)), [place[name] for name in found.names[b:]]] = 1.0
+    return Information(
+        chain, found.dynamics, found.names, estimate.units, estimate.values, estimate.covariance, transform,
+        _information(found), True,
+    )  # fmt: skip
+
+
 def _information(found: Identification) -> np.ndarray:
     """Return the triangle [R z] (b + 1, b + 1) of an identification's data, without prior or constraints.
 

@@ -103,6 +103,13 @@ class PossibleBodies:
         return self.nearest <= self.allowed
 
 
+def bound(b: int) -> float:
+    """Return what the distance of b estimated parameters from true ones stays below in 95 % of all cases: √χ²(b)."""
+    from scipy.special import chdtri
+
+    return float(np.sqrt(chdtri(b, 0.05)))
+
+
 def find_possible(information: Information, weight: float | None = None, prior: str = "entropic") -> PossibleBodies:
     """Return the full standard parameters of an identified model.
 
@@ -114,14 +121,12 @@ def find_possible(information: Information, weight: float | None = None, prior: 
     Raises:
         UsageError: for a model without bodies (motor side alone), or a prior that is none.
     """
-    from scipy.special import chdtri
-
     if prior not in PRIORS:
         raise UsageError(f"prior '{prior}' is none of {', '.join(PRIORS)}{suggestion(prior, PRIORS)}")
     model = information.dynamics.model
     if not model.torque_rows.has_bodies:
         raise UsageError("the model holds drives alone (kind 'drive'): there are no bodies to make consistent")
-    allowed = float(np.sqrt(chdtri(information.b, 0.05)))
+    allowed = bound(information.b)
     choices = [
         (references, make_problem(information, references))
         for references in find_prior_bodies(information.chain, model)

@@ -326,7 +326,7 @@ def _left_out(
     rows, states = samples.matrix[inside], samples.states
     error = samples.error[inside] + rows @ (samples.values - values)
     own = np.sum((rows @ root) ** 2, axis=2)
-    far = samples.box(~inside).distance(*states[:, inside], own.shape[1])
+    far = samples.box(~inside).distance(*states[:, inside], rows=own.shape[1])
     return error.clip(-size, size), np.stack([own, np.ones_like(own), far], axis=2)
 
 

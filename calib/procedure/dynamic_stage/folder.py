@@ -118,7 +118,10 @@ class IdentificationFolder:
         known, stated = metrics.findings.controller, metrics.findings.errors
         found = None if stated is None else read_uncertainty(self.path, self.dynamics(), ())
         errors = stated and found and TorqueErrorModel(found.columns, found.covariance, stated)
-        return ModelFindings(metrics.findings.rests, metrics.findings.notes, known and known.controller(), errors)
+        return ModelFindings(
+            metrics.findings.rests, metrics.findings.notes, known and known.controller(), errors,
+            metrics.findings.contradiction,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

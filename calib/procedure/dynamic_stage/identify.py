@@ -10,6 +10,7 @@ import numpy as np
 from calib.data.signals.persistency import ExcitationReport, report_excitation
 from calib.identification.friction.passivity import driven
 from calib.identification.identify import Identification, identify
+from calib.identification.possible.contradiction import contradiction
 from calib.identification.scores import Score
 from calib.identification.uncertainty.geometry_uncertainty import GeometryUncertainty, propagate
 from calib.identification.uncertainty.torque_errors import learn_torque_errors
@@ -22,6 +23,7 @@ from calib.procedure.dynamic_stage.verdict import (
     resting_parameters,
 )
 from calib.procedure.findings import Verdict
+from calib.units import TORQUE
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +101,7 @@ def run(inputs: IdentificationInputs, progress: Progress | None = None) -> Ident
     findings = ModelFindings(
         resting_parameters(found), model_warnings(inputs.cases, found, excitation),
         None if loops is None else loops.controller, learn_torque_errors(found, inputs.cases, carried.covariance),
+        contradiction(found, inputs.chain) if inputs.unit == TORQUE else None,
     )  # fmt: skip
     result = assess(inputs, found.dynamics, findings, wrong, progress=say)
     return IdentificationOutcome(inputs, found, findings, result, carried, geometries, settings.seed)

@@ -12,6 +12,7 @@ from calib.identification.cases import Case
 from calib.identification.gains import DriveGains
 from calib.identification.methods.registry import METHODS
 from calib.identification.parameter_constraints import Held
+from calib.identification.possible.contradiction import Contradiction
 from calib.identification.scores import PredictionErrors, Score
 from calib.identification.uncertainty.torque_errors import TorqueDiscrepancy, TorqueIntervals
 from calib.procedure.dynamic_stage import geometry_tables
@@ -65,6 +66,7 @@ class StoredFindings:
     notes: tuple[str, ...]
     controller: StoredController | None = None
     errors: TorqueDiscrepancy | None = None
+    contradiction: Contradiction | None = None
 
 
 def switched_off(names: Sequence[str], base: int, sigma: np.ndarray) -> tuple[str, ...]:
@@ -136,6 +138,7 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
                 outcome.findings.notes,
                 StoredController.of(outcome.findings.controller),
                 outcome.findings.errors and outcome.findings.errors.discrepancy,
+                outcome.findings.contradiction,
             )
         ),
         "warnings": list(outcome.warnings),

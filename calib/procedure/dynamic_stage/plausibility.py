@@ -1,7 +1,7 @@
-"""What sizes, signs and clocks of the recordings mean for a verdict; all thresholds are our choice.
+"""What sizes, signs and clocks of the recordings mean for a verdict, and bodies that cannot be.
 
-A finding that makes the numbers of a model wrong by far is no note under a pass: it fails, or holds the verdict at
-marginal, until the options' ``accept`` says that it is meant. Findings and their names:
+All thresholds are our choice. A finding that makes the numbers of a model wrong by far is no note under a pass: it
+fails, or holds the verdict at marginal, until the options' ``accept`` says that it is meant. Findings and their names:
 
 masses   torques that pull against the robot's own masses, or `FAR` times as much as these ask for, or a share of it:
          fail; beyond `OFF`, or `FAR` at single joints: marginal
@@ -12,6 +12,8 @@ clock    inertias that are `INERT` times too large or small beside the masses th
          robot: marginal; beyond `FAR`: fail. Not said where measured velocities say so already
 order    two joints with which exchanged the robot's own masses leave less than `EXCHANGED` of the torques: marginal
 jump     a position that leaves the slope of the rows around it: marginal
+bodies   an estimate that is `NO_ROBOT` times as far from every possible robot as 95 % of right ones are: marginal;
+         beyond `NEVER` times: fail. Honest recordings at hand are up to 3.4 times as far (LWR4+; Panda 1.2, TIAGo 2.2)
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ import numpy as np
 
 from calib.identification.checks.recording_sizes import Lag, RecordingSizes
 from calib.identification.checks.whole_robot import ClockRatio, Exchange
+from calib.identification.possible.contradiction import Contradiction
 from calib.procedure.findings import Finding
 
 FAR, OFF = 3.0, 2.2
@@ -29,6 +32,7 @@ SLIGHT, WRONG = 0.05, 1.5
 HELPS = 0.3
 INERT = 2.0
 EXCHANGED = 0.98
+NO_ROBOT, NEVER = 5.0, 10.0
 
 
 def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Finding]:
@@ -40,6 +44,20 @@ def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Fin
         found += [*_lag(each.name, each.lag), *_order(each.name, each.exchange, joints)]
         found += [Finding("jump", "marginal", f"{each.name}: {words}") for words in each.jumps]
     return found
+
+
+def impossible(found: Contradiction | None) -> list[Finding]:
+    """Return what it means that an estimate is far from every possible robot."""
+    if found is None or found.distance < NO_ROBOT * found.allowed:
+        return []
+    return [
+        Finding(
+            "bodies", "fail" if found.distance > NEVER * found.allowed else "marginal",
+            f"no possible robot has such torques: the nearest one is {found.distance:.3g} standard deviations away, "
+            f"where {found.allowed:.3g} hold 95 % of right ones: is this the robot, are the columns in its order, "
+            "which way does gravity point? If all are right, the model lacks a kind of friction, or a load",
+        )
+    ]  # fmt: skip
 
 
 def _masses(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:

@@ -16,6 +16,7 @@ from calib.data.signals.persistency import ExcitationReport, repeats, report_exc
 from calib.identification.cases import Case
 from calib.identification.checks.recording_sizes import compare_sizes
 from calib.identification.friction.passivity import driven
+from calib.identification.possible.contradiction import Contradiction
 from calib.identification.prediction import Dynamics, predict
 from calib.identification.scores import Score, score
 from calib.identification.uncertainty.torque_errors import TorqueErrorModel, TorqueIntervals, intervals
@@ -47,12 +48,14 @@ class ModelFindings:
         notes: what a user should know of the model, whatever the unseen recordings are.
         controller: that was stated or identified; None without any.
         errors: what errors its torques are expected to have; None where too little was recorded to say.
+        contradiction: how far it is from every possible robot; None where nobody knows.
     """
 
     rests: Resting
     notes: tuple[str, ...] = ()
     controller: Controller | None = None
     errors: TorqueErrorModel | None = None
+    contradiction: Contradiction | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +139,8 @@ def assess(
     settings = inputs.options.settings
     labels = settings.torque_rows.numbered(inputs.chain.n)
     sizes = [compare_sizes(case, inputs.chain, settings.gravity, inputs.unit == TORQUE) for case in inputs.cases]
-    odd = settled(plausibility.findings(sizes, inputs.chain.joint_names), inputs.options.accept)
+    odd = plausibility.findings(sizes, inputs.chain.joint_names) + plausibility.impossible(findings.contradiction)
+    odd = settled(odd, inputs.options.accept)
     verdict = judge(fit, proofs, repeated, excitation, wrong, labels)
     verdict = with_intervals(verdict, {name: expected[name] for name in proofs if name in expected}, labels)
     verdict = held_by(with_prior(verdict, findings.rests), odd)

@@ -1,0 +1,72 @@
+"""Does an estimate contradict every robot that can exist? Its distance from the nearest one, where it is large.
+
+Where the model is right, 95 % of all estimates are within √χ²(b) of a possible robot. Honest recordings are farther:
+friction of another form has no place in a possible body, and the data's sigmas do not know of it. Only a distance
+several times that bound tells of signs, orders and robots; what it means is for a verdict to say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from calib.dynamics.idim import IdentificationModel
+from calib.errors import NotConverged
+from calib.identification.possible import nearest as border
+from calib.identification.possible.information import of
+from calib.identification.possible.prior_bodies import find_prior_bodies
+from calib.identification.possible.problem import make_problem
+from calib.identification.possible.solve import bound, solve
+from calib.robot.chain import Chain
+
+if TYPE_CHECKING:
+    from calib.identification.identify import Identification
+
+WEIGHT = 1.0  # γ that hardly draws, yet keeps Newton's steps off the border: its distance is at most a tenth larger
+WITHIN = 3.0  # times the bound, up to which no semidefinite program is solved for the last tenth
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """How far an estimate is from the nearest possible robot.
+
+    Attributes:
+        distance: in standard deviations (Mahalanobis); up to `WITHIN` times `allowed` that of a robot near it.
+        allowed: what it stays below in 95 % of all cases where the model is right.
+    """
+
+    distance: float
+    allowed: float
+
+
+def contradiction(found: Identification, chain: Chain) -> Contradiction | None:
+    """Return how far an estimate is from what can exist; None where its rows hold no bodies, or nothing was found.
+
+    Args:
+        found: the estimate, of torques.
+        chain: the robot it was identified on.
+    """
+    model = found.dynamics.model
+    if not isinstance(model, IdentificationModel) or not model.torque_rows.has_bodies:
+        return None
+    information = of(found, chain)
+    allowed = bound(information.b)
+    problems = [make_problem(information, one) for one in find_prior_bodies(chain, model)]
+
+    def distances() -> Iterator[float]:
+        for problem in problems[: max(len(problems) - 1, 1)]:
+            try:
+                yield information.distance(border.nearest(problem))
+            except NotConverged:
+                continue
+
+    try:
+        away = information.distance(solve(problems[-1], WEIGHT))
+    except (NotConverged, ValueError):  # the latter where curvatures overflow
+        away = np.inf
+    if away > WITHIN * allowed:
+        away = min((away, *distances()))
+    return Contradiction(float(away), allowed) if np.isfinite(away) else None
