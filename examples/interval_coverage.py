@@ -39,6 +39,7 @@ RECORDINGS = {
     "UR10 B": (UR10 / "model.urdf", UR10 / "B_joint_configurations.csv", 0.4),
     "Motoman small": (MOTOMAN / "model_right.urdf", MOTOMAN / "right_6x6x6_150.csv", 1 / 3),
     "Motoman wide": (MOTOMAN / "model_right.urdf", MOTOMAN / "right_wide_386.csv", 0.25),
+    "TIAGo, three markers": (DATA / "tiago_laas/model.urdf", DATA / "tiago_laas/mocap_35poses.csv", 0.25),
 }
 STATIONS = (
     ("UR10 A", "UR10 B"), ("UR10 B", "UR10 A"), ("Motoman small", "Motoman wide"), ("Motoman wide", "Motoman small"),
