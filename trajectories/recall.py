@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft
+from scipy.fft import next_fast_len
 
 from trajectories.errors import BadInput
 
@@ -116,7 +116,7 @@ def _likeness(q: np.ndarray, r: np.ndarray) -> np.ndarray:
 def sliding_products(x: np.ndarray, r: np.ndarray) -> np.ndarray:
     """Return Σ_i x[k + i] r[i] for every place k (N - P + 1,) of r (P,) in x (N,), by FFT."""
     size = next_fast_len(len(x) + len(r) - 1, real=True)
-    return irfft(rfft(x, size) * rfft(r[::-1], size), size)[len(r) - 1 : len(x)]
+    return np.fft.irfft(np.fft.rfft(x, size) * np.fft.rfft(r[::-1], size), size)[len(r) - 1 : len(x)]
 
 
 def _run_with(places: list[int], best: int, period: int) -> list[int]:
