@@ -68,6 +68,13 @@ def test_the_total_says_which_criterion_was_missed():
     assert "joint 2 (70 %" in judged(None, scored([4, 70, 4])).reason, "without unseen motion the fit's own counts"
 
 
+@pytest.mark.parametrize("own, unseen, level", [(29, None, "marginal"), (31, None, "fail"), (31, 20, "fail")])
+def test_a_model_that_misses_its_own_motion_fails_without_unseen_motion_too(own, unseen, level):
+    other = None if unseen is None else scored([4, 4, 4], total=unseen)
+    found = judged(other, scored([4, 4, 4], total=own))
+    assert found.level == level and ("above 30 % fails" in found.reason) == (level == "fail")
+
+
 def test_motion_far_beyond_the_limits_is_a_warning():
     case, chain = planted.case("train", 0), planted.arm()
     assert verdict.beyond(case, chain) == []
