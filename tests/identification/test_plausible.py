@@ -10,11 +10,12 @@ import planted_motion as planted
 import pytest
 
 from calib.data.recordings.checks import check_recording
-from calib.data.recordings.recording import Joints, Recording, earlier
+from calib.data.recordings.recording import Joints, Recording, earlier, take
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.errors import MeasurementError
 from calib.identification.cases import Case, make_case
 from calib.identification.checks.recording_sizes import compare_sizes
+from calib.identification.checks.whole_robot import Rearranged
 from calib.identification.identify import identify
 from calib.identification.possible.contradiction import Contradiction, contradiction
 from calib.identification.settings import IdentificationSettings
@@ -140,6 +141,28 @@ def test_exchanged_joints_are_named() -> None:
     one = replace(log, q=log.q[:, order], effort=log.effort[:, order], v=None)
     (told,) = [one for one in found(one) if one.name == "order"]
     assert told.level == "marginal" and "joint2 and joint3 exchanged" in told.words
+
+
+def test_a_right_angle_at_a_joints_zero_is_named_and_no_exchange_is_told_in_its_place() -> None:
+    turned = recorded().q + np.array([0.0, np.pi / 2, 0.0])
+    told = [one for one in found(replace(recorded(), q=turned, v=None)) if one.name in ("zero", "order")]
+    assert [one.level for one in told] == ["marginal"] and "with -90 deg at joint2" in told[0].words
+
+
+def test_an_exchange_that_leaves_the_torques_unexplained_is_not_told() -> None:
+    def told(left: float, factor: float, quarters: int = 0) -> bool:
+        joints = (1,) if quarters else (1, 2)
+        size = replace(compare_sizes(case_of(recorded()), ARM), other=Rearranged(joints, quarters, factor, left))
+        return bool(findings([size], NAMES))
+
+    assert told(0.02, 0.9) and not told(0.46, 0.85) and not told(0.02, 0.99)
+    assert told(0.02, 0.5, 1) and not told(0.02, 0.9, 1)
+
+
+def test_a_gap_of_the_log_is_no_slope() -> None:
+    log = recorded()
+    gap = (log.t > 4.0) & (log.t < 7.0)
+    assert found(take(log, ~gap)) == []
 
 
 def away(recording: Recording) -> Contradiction:

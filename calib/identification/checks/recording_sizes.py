@@ -16,7 +16,8 @@ from calib.dynamics.bodies import Bodies, bodies_of, with_gravity
 from calib.identification.cases import Case
 from calib.identification.checks.motion_samples import MotionSamples, basis, left_share, take_samples
 from calib.identification.checks.recorded_motion import share_of_nominal
-from calib.identification.checks.whole_robot import ClockRatio, Exchange, clock_ratio, exchanged
+from calib.identification.checks.whole_robot import ClockRatio, Rearranged, clock_ratio, rearranged
+from calib.identification.rows import segments
 from calib.robot.chain import Chain
 
 ROWS, FEW = 1500, 500  # samples on which a lag is looked for, and all else
@@ -51,7 +52,7 @@ class RecordingSizes:
         speed: (n,) measured velocities over the slopes of the positions; NaN where there are none, or no travel.
         lag: of the torques; None where the recording is too short to tell.
         clock: inertias beside masses; None where the motion does not tell.
-        exchange: of two joints that explains more than their order as recorded; None where there is none to look for.
+        other: order or zeros of the joints that explain more than those recorded; None where none is looked for.
         jumps: of positions, in words.
     """
 
@@ -60,7 +61,7 @@ class RecordingSizes:
     speed: np.ndarray
     lag: Lag | None
     clock: ClockRatio | None = None
-    exchange: Exchange | None = None
+    other: Rearranged | None = None
     jumps: tuple[str, ...] = ()
 
 
@@ -80,23 +81,30 @@ def compare_sizes(
     known = newtons and case.target.shape[1] == n
     known = known and chain.inertias is not None and bool(np.any(chain.inertias[:, 9] > 0.0))
     masses = share_of_nominal(motion.t, motion.q, case.target, chain, gravity, static=True) if known else nothing
-    speed = nothing if motion.v_measured is None else _speed_ratio(motion.t, motion.q, motion.v_measured)
+    speed, v = nothing, motion.v_measured
+    if v is not None:
+        speed = _speed_ratio(motion.t, motion.q, v, motion.segment)
     bodies = _under(chain, gravity)
     many, few = (take_samples(case, bodies, count) for count in (ROWS, FEW))
     lag = None if many is None else _lag_of(many, motion.rate)
     clock = clock_ratio(few, chain) if newtons and few is not None else None
-    exchange = exchanged(few, chain) if known and few is not None else None
-    return RecordingSizes(case.name, masses, speed, lag, clock, exchange, motion.jumps)
+    other = rearranged(few, chain) if known and few is not None else None
+    return RecordingSizes(case.name, masses, speed, lag, clock, other, motion.jumps)
 
 
-def _speed_ratio(t: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+def _speed_ratio(t: np.ndarray, q: np.ndarray, v: np.ndarray, segment: np.ndarray) -> np.ndarray:
     """Return (n,) measured velocities over the slopes of the positions (N, n): ∫v dt on q, both without their trend.
 
-    Integrals compare where slopes are noise. NaN for joints that hardly travel.
+    Integrals compare where slopes are noise; each segment (N,) by itself, since nobody knows the speed in a gap. NaN
+    for joints that hardly travel.
     """
-    grown = np.concatenate([np.zeros((1, q.shape[1])), np.cumsum((v[1:] + v[:-1]) / 2 * np.diff(t)[:, None], axis=0)])
-    trend = np.column_stack([np.ones(len(t)), t - t.mean()])
-    own, seen = (x - trend @ np.linalg.lstsq(trend, x, rcond=None)[0] for x in (np.asarray(q), grown))
+    own, seen = np.array(q), np.empty_like(q)
+    for a, b in segments(segment):
+        step = np.diff(t[a:b])[:, None]
+        seen[a:b] = np.concatenate([0.0 * v[a : a + 1], np.cumsum((v[a + 1 : b] + v[a : b - 1]) / 2 * step, axis=0)])
+        trend = np.column_stack([np.ones(b - a), t[a:b] - t[a:b].mean()])
+        for x in (own, seen):
+            x[a:b] -= trend @ np.linalg.lstsq(trend, x[a:b], rcond=None)[0]
     power = np.maximum((own**2).sum(axis=0), 1e-300)
     alike = (own * seen).sum(axis=0) > 0.9 * np.sqrt(power * (seen**2).sum(axis=0))
     return np.where(alike & (np.ptp(q, axis=0) > TRAVEL), (own * seen).sum(axis=0) / power, np.nan)

@@ -1,4 +1,4 @@
-"""Torques beside those of the whole robot: does its clock run right, and are its joints in order?
+"""Torques beside those of the whole robot: does its clock run right, are its joints in order, and where is their zero?
 
 A clock that runs s times too slow makes accelerations s² times too small, so that inertias come out s² times too large
 while masses, which gravity tells, stay as they are. How large inertias are beside masses, lengths alone say nearly: for
@@ -28,6 +28,7 @@ ROUNDS = 3  # of weighing joints by what is left of them
 SURE = 5.0  # sigmas from which on a factor is told
 ALIKE = 0.3  # least rms speed of exchanged joints, of the fastest one's: one that hardly moves may have any column
 KNOWN = 0.5  # largest share of their torques' variance that is left as recorded
+QUARTERS = (1, 2, 3)  # turns of a joint's zero that are tried [90 deg]
 
 
 @dataclass(frozen=True)
@@ -44,11 +45,20 @@ class ClockRatio:
 
 
 @dataclass(frozen=True)
-class Exchange:
-    """Two joints, from 0, with which exchanged the robot's own masses explain more, and the factor on what is left."""
+class Rearranged:
+    """Positions rearranged so that the robot's own masses explain more of the torques.
 
-    joints: tuple[int, int]
+    Attributes:
+        joints: the two, from 0, whose columns are exchanged; or the one whose zero is moved.
+        quarters: by how many right angles that is added to; 0: columns are exchanged.
+        factor: what is left of the torques over what is left as recorded, rms, the geometric mean of all joints.
+        left: largest share of a joint's variance that is left then.
+    """
+
+    joints: tuple[int, ...]
+    quarters: int
     factor: float
+    left: float
 
 
 def clock_ratio(samples: MotionSamples, chain: Chain) -> ClockRatio | None:
@@ -88,29 +98,40 @@ def _factor(torque: np.ndarray, common: np.ndarray, free: np.ndarray) -> tuple[f
     return alpha, float(np.sqrt(np.sum(weight[:, None] ** 2 * own**2 * np.array(spread)[:, None]))) / power
 
 
-def exchanged(samples: MotionSamples, chain: Chain) -> Exchange | None:
-    """Return the two joints whose exchange lets the robot's own masses explain most more; None without such.
+def rearranged(samples: MotionSamples, chain: Chain) -> Rearranged | None:
+    """Return the exchange of two joints, or the right angles at one's zero, that explain most more; None without such.
 
     Each joint's torque is that of gravity and that of motion, by the robot's masses, each times a factor, and a drive.
     """
     masses = standard_parameters(chain)
-    before = np.array(list(_left(samples, masses, (0, 0))))
+    order, straight = np.arange(chain.n), np.zeros(chain.n)
+    before = np.maximum(list(_left(samples, masses, order, straight)), 1e-9)
     speed = samples.v.std(axis=0)
     moves = (speed > ALIKE * speed.max()) & (before < KNOWN)
+    tried = [((a, b), 0) for a, b in combinations(np.flatnonzero(moves).tolist(), 2)]
+    turning = [j for j, joint in enumerate(chain.joints) if joint.kind != "prismatic"]
+    tried += [((j,), quarters) for j in turning for quarters in QUARTERS]
     found = None
-    for pair in combinations(np.flatnonzero(moves).tolist(), 2):
-        after = np.array(list(_left(samples, masses, pair)))
-        factor = float(np.exp(0.5 * np.mean(np.log(np.maximum(after, 1e-9) / np.maximum(before, 1e-9)))))
+    for joints, quarters in tried:
+        now, zero = order.copy(), straight.copy()
+        now[list(joints)] = joints[::-1]
+        zero[list(joints)] = quarters * np.pi / 2
+        after = np.maximum(list(_left(samples, masses, now, zero)), 1e-9)
+        factor = float(np.exp(0.5 * np.mean(np.log(after / before))))
         if found is None or factor < found.factor:
-            found = Exchange(pair, factor)
+            found = Rearranged(joints, quarters, factor, float(after.max()))
     return found
 
 
-def _left(samples: MotionSamples, masses: np.ndarray, pair: tuple[int, int]) -> Iterator[float]:
-    """Yield what is left of each recorded joint's torque where the columns of two joints are exchanged."""
-    order = np.arange(samples.q.shape[1])
-    order[list(pair)] = order[list(pair)[::-1]]
+def _left(samples: MotionSamples, masses: np.ndarray, order: np.ndarray, zero: np.ndarray) -> Iterator[float]:
+    """Yield what is left of each recorded joint's torque.
+
+    Args:
+        order: (n,) recorded column that holds each joint.
+        zero: (n,) added to its positions [rad].
+    """
     q, v, a = (np.ascontiguousarray(x[:, order]) for x in (samples.q, samples.v, samples.a))
+    q += zero
     still = inverse_dynamics(samples.bodies, masses, q, np.zeros_like(v), np.zeros_like(a))
     moving = inverse_dynamics(samples.bodies, masses, q, v, a) - still
     drives, torque = drive_columns(v, a), samples.torque

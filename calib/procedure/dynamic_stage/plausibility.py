@@ -10,7 +10,10 @@ lag      torques that come later than the positions of their row, at most joints
          them earlier): a note; where that explains `HELPS` of what is left: marginal
 clock    inertias that are `INERT` times too large or small beside the masses that gravity tells, for the lengths of the
          robot: marginal; beyond `FAR`: fail. Not said where measured velocities say so already
-order    two joints with which exchanged the robot's own masses leave less than `EXCHANGED` of the torques: marginal
+order    two joints with which exchanged the robot's own masses leave less than `EXCHANGED` of the torques, and of no
+         joint's more than `UNTOLD`: marginal. Honest recordings gain nothing (1.0 and above), and where another robot,
+         or a zero, is wrong, an exchange leaves that wrong
+zero     a joint with a right angle or two at whose zero they leave less than `TURNED`, likewise: marginal
 jump     a position that leaves the slope of the rows around it: marginal
 bodies   an estimate that is `NO_ROBOT` times as far from every possible robot as 95 % of right ones are: marginal;
          beyond `NEVER` times: fail. Honest recordings at hand are up to 3.4 times as far (LWR4+; Panda 1.2, TIAGo 2.2)
@@ -23,7 +26,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from calib.identification.checks.recording_sizes import Lag, RecordingSizes
-from calib.identification.checks.whole_robot import ClockRatio, Exchange
+from calib.identification.checks.whole_robot import ClockRatio, Rearranged
 from calib.identification.possible.contradiction import Contradiction
 from calib.procedure.findings import Finding
 
@@ -31,7 +34,7 @@ FAR, OFF = 3.0, 2.2
 SLIGHT, WRONG = 0.05, 1.5
 HELPS = 0.3
 INERT = 2.0
-EXCHANGED = 0.98
+EXCHANGED, TURNED, UNTOLD = 0.98, 0.7, 0.3
 NO_ROBOT, NEVER = 5.0, 10.0
 
 
@@ -41,7 +44,7 @@ def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Fin
     for each in sizes:
         speed = list(_speed(each, joints))
         found += [*_masses(each, joints), *speed, *([] if speed else _clock(each.name, each.clock))]
-        found += [*_lag(each.name, each.lag), *_order(each.name, each.exchange, joints)]
+        found += [*_lag(each.name, each.lag), *_other(each.name, each.other, joints)]
         found += [Finding("jump", "marginal", f"{each.name}: {words}") for words in each.jumps]
     return found
 
@@ -131,11 +134,17 @@ def _clock(name: str, found: ClockRatio | None) -> Iterator[Finding]:
     )  # fmt: skip
 
 
-def _order(name: str, found: Exchange | None, joints: Sequence[str]) -> Iterator[Finding]:
-    if found is None or found.factor > EXCHANGED:
+def _other(name: str, found: Rearranged | None, joints: Sequence[str]) -> Iterator[Finding]:
+    if found is None or found.left > UNTOLD or found.factor > (TURNED if found.quarters else EXCHANGED):
         return
-    yield Finding(
-        "order", "marginal",
-        f"{name}: with {' and '.join(joints[j] for j in found.joints)} exchanged the robot's own masses leave "
-        f"{100 * found.factor:.0f} % of what they leave as recorded: are these columns exchanged?",
-    )  # fmt: skip
+    named = " and ".join(joints[j] for j in found.joints)
+    share = f"the robot's own masses leave {100 * found.factor:.0f} % of what they leave as recorded"
+    if found.quarters:
+        degrees = (90 * found.quarters + 180) % 360 - 180 or 180
+        yield Finding(
+            "zero", "marginal",
+            f"{name}: with {degrees:+.0f} deg at {named} {share}: is its zero elsewhere than the robot file's, or is "
+            "this another robot?",
+        )  # fmt: skip
+    else:
+        yield Finding("order", "marginal", f"{name}: with {named} exchanged {share}: are these columns exchanged?")

@@ -2,12 +2,12 @@
 
 The verdict of calib identify (exit code 0 for pass and marginal, 1 for fail) judges the raw total of the worst
 validation recording in which the robot moves and which does not repeat the training: above 30 % unexplained it fails;
-it passes up to 10 % and up to 2 times the training's own error; between, it is marginal. The training's own error
-fails above 30 % likewise. A model is marginal as well without such a recording, or where the training motion is too poor to tell parameters apart. A joint of which 50 % or
-more is unexplained (in the band, and while it moves) is named and allows no pass; from 95 % on it fails the model
-where its rms torque is 10 % or more of the greatest joint's. Friction that drives a joint fails. A model of which the
-95 % intervals hold less than 93 % of the errors on unseen motion, beyond chance, is no better than marginal. The reason
-says which of these held.
+it passes up to 10 % and up to 2 times the training's own error; between, it is marginal. The training's own error fails
+above 30 % likewise. A model is marginal as well without such a recording, or where the training motion is too poor to
+tell parameters apart. A joint of which 50 % or more is unexplained (in the band, and while it moves) is named and
+allows no pass; from 95 % on it fails the model where its rms torque is 10 % or more of the greatest joint's. Friction
+that drives a joint fails. A model of which the 95 % intervals hold less than 93 % of the errors on unseen motion,
+beyond chance, is no better than marginal. The reason says which of these held.
 """
 
 from __future__ import annotations
