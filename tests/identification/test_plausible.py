@@ -97,9 +97,27 @@ def test_torques_beyond_all_limits_are_another_unit() -> None:
     check_recording(recorded(), joints)
     with pytest.raises(MeasurementError, match="N mm"):
         check_recording(recorded(tau=1e3 * recorded().effort), joints)
-    spiked = recorded().effort.copy()
-    spiked[7] = 1e4
-    assert "another unit?" in " ".join(check_recording(recorded(tau=spiked), joints).notes)
+    larger = recorded().effort * [1.0, 3.0, 1.0]
+    assert "another unit?" in " ".join(check_recording(recorded(tau=larger), joints).notes)
+
+
+@pytest.mark.parametrize("spike", [100.0, 1e5, 1e300])
+@pytest.mark.parametrize("limit", [60.0, np.inf])
+def test_a_spike_of_a_torque_is_left_out_with_its_row_and_many_are_refused(spike: float, limit: float) -> None:
+    joints, log = Joints(NAMES, effort=np.full(3, limit)), recorded()
+    spiked = log.effort.copy()
+    spiked[7, 1] = spike
+    kept = check_recording(recorded(tau=spiked), joints)
+    if spike < 1e3:  # nothing says that it is none
+        assert len(kept) == len(log)
+        return
+    (note,) = [note for note in kept.notes if "spike" in note]
+    assert len(kept) == len(log) - 1 and note.startswith(f"row 8: the torque of joint2 (joint 2) is {spike:.4g} at ")
+    assert check_recording(kept, joints).notes == kept.notes
+    spiked[7:400:7, 1] = spike
+    if limit < np.inf or spike > 1e12:
+        with pytest.raises(MeasurementError, match="row 8.*torque of joint2.*more rows"):
+            check_recording(recorded(tau=spiked), joints)
 
 
 def test_currents_without_gains_compare_with_no_masses() -> None:

@@ -19,6 +19,11 @@ MOVES = 1e-3  # a joint that goes less far has not moved [rad or m]: above encod
 POSES = 300  # of a recording, among which two alike are looked for
 BACK = 0.05  # of each joint's travel by which two poses may differ to be one
 BEYOND = 3.0  # times its limit: no joint's torque reaches that
+SPIKES = 0.002  # share of the rows, and `FEW` at least, that may be spikes of a torque
+FEW = 3
+OUTSIDE, WILD = 2.0, 10.0  # times what the other rows stay below: a spike beyond the joint's limit, one within
+MANY = 0.05  # share of the rows from which on they are no spikes, but another unit
+HUGE = 1e12  # no quantity of a robot is larger, whatever its unit
 JUMP = 0.02  # no position leaves the slope of the rows around it by that [rad]; real ones do by 7 mrad; in m a tenth
 NEEDED = ("t", "q", "effort", "v", "tau_link", "tau_motor")
 
@@ -32,6 +37,8 @@ def check_recording(recording: Recording, joints: Joints | None = None) -> Recor
     """
     _check_count(recording)
     _check_finite(recording)
+    recording = _drop_spikes(recording, joints)
+    _check_finite(recording, HUGE)
     recording = _drop_repeats(recording)
     _check_time(recording.t, recording.rows, recording.file)
     _check_size(recording, joints)
@@ -50,18 +57,57 @@ def _check_count(recording: Recording) -> None:
         raise MeasurementError(message, recording.file)
 
 
-def _check_finite(recording: Recording) -> None:
-    """Refuse NaN and infinities; in `q_link` they say that a joint has no second encoder."""
+def _check_finite(recording: Recording, most: float = np.inf) -> None:
+    """Refuse NaN, infinities and what is beyond `most`; NaN in `q_link` says that a joint has no second encoder."""
     for name in NEEDED:
         values = getattr(recording, name)
-        if values is None or np.isfinite(values).all():
+        if values is None or (np.abs(values) < most).all():
             continue
-        bad = np.argwhere(~np.isfinite(values.reshape(len(recording), -1)))
+        bad = np.argwhere(~(np.abs(values) < most).reshape(len(recording), -1))
         row, joint = (int(i) for i in bad[0])
         where = "t" if name == "t" else column(recording, name, joint)
         many = f" (and in {len(np.unique(bad[:, 0])) - 1} more rows)" if len(bad) > 1 else ""
-        message = f"found {values.reshape(len(recording), -1)[row, joint]}{many}; cut that part out, or leave the rows"
-        raise MeasurementError(message + " out", recording.file, int(recording.rows[row]), where)
+        message = f"found {values.reshape(len(recording), -1)[row, joint]:g}{many}; cut that part out, or leave the"
+        raise MeasurementError(f"{message} rows out", recording.file, int(recording.rows[row]), where)
+
+
+def _drop_spikes(recording: Recording, joints: Joints | None) -> Recording:
+    """Return the recording without the few rows in which a torque is one that its joint cannot have.
+
+    That is `BEYOND` its limit and `OUTSIDE` of what all but `SPIKES` of its rows stay below, or `WILD` times that.
+
+    Raises:
+        MeasurementError: where more rows than that, up to `MANY`, are beyond the limit by as much.
+    """
+    count = len(recording)
+    few = max(FEW, int(SPIKES * count))
+    limit = np.full(recording.n, np.inf)
+    if joints is not None and recording.kind == "torque":
+        limit = np.where(np.isfinite(joints.effort) & (joints.effort > 0), BEYOND * joints.effort, np.inf)
+    size, beyond = np.abs(recording.effort - np.median(recording.effort, axis=0)), np.abs(recording.effort) > limit
+    ordered = np.sort(size, axis=0)
+    usual = ordered[count - few - 1]
+    wild = ((size > WILD * usual) | ((size > OUTSIDE * usual) & beyond)) & (usual > 0.0)
+    if not 0 < wild.any(axis=1).sum() <= few:
+        usual = ordered[count - int(MANY * count) - 1]
+        wild = (size > WILD * usual) & beyond
+    rows = wild.any(axis=1)
+    if not rows.any():
+        return recording
+    row = int(np.argmax(rows))
+    j = int(np.argmax(wild[row]))
+    found = f"is {recording.effort[row, j]:.4g} at {recording.t[row]:.6g} s"
+    more = f" (and in {int(rows.sum()) - 1} more rows)" if rows.sum() > 1 else ""
+    if rows.sum() > few:
+        message = f"{found}{more}, where {1 - MANY:.0%} of the rows are within {usual[j]:.4g} of its median"
+        advice = "spikes of the log, too many to be left out? Cut those parts out"
+        place = column(recording, "effort", j)
+        raise MeasurementError(f"{message}: {advice}", recording.file, int(recording.rows[row]), place)
+    note = (
+        f"row {recording.rows[row]}: the {column(recording, 'effort', j)} {found}{more}, the other rows are within "
+        f"{size[~rows, j].max():.4g} of its median: a spike of the log; left out"
+    )
+    return _noted(take(recording, ~rows), note)
 
 
 def _drop_repeats(recording: Recording) -> Recording:
@@ -258,4 +304,4 @@ def _round_trip(q: np.ndarray) -> slice | None:
 
 
 def _noted(recording: Recording, *notes: str) -> Recording:
-    return replace(recording, notes=(*recording.notes, *notes)) if notes else recording
+    return replace(recording, notes=tuple(dict.fromkeys((*recording.notes, *notes)))) if notes else recording
