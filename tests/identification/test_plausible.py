@@ -116,7 +116,7 @@ def test_a_spike_of_a_torque_is_left_out_with_its_row_and_many_are_refused(spike
     assert check_recording(kept, joints).notes == kept.notes
     spiked[7:400:7, 1] = spike
     if limit < np.inf or spike > 1e12:
-        with pytest.raises(MeasurementError, match="row 8.*torque of joint2.*more rows"):
+        with pytest.raises(MeasurementError, match=r"row 8.*torque of joint2.*more rows"):
             check_recording(recorded(tau=spiked), joints)
 
 
