@@ -22,7 +22,7 @@ class Status(Enum):
 
     CONVERGED = "converged"
     STALLED = "stalled: no damping gives a better step; the model is at its floor or the Jacobian is wrong"
-    ITERATIONS = "stopped at the iteration limit; raise it, or start nearer (a better nominal, fewer free parameters)"
+    ITERATIONS = "stopped at the iteration limit; start nearer (a better nominal, fewer free parameters)"
 
     @property
     def good(self) -> bool:

@@ -6,6 +6,7 @@ import html
 import shutil
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import planted_motion as planted
@@ -26,10 +27,16 @@ def by_command(robot: Path, out: Path, model: str, fit: Path, unseen: Path) -> J
     if refused:
         return Judgement(refused=refused)
     found = read(out / "metrics.json")
-    numbers = {key: found[key] for key in ("fit", "validation", "model", "ladder", "outliers", "not_identifiable")}
+    numbers = {key: found[key] for key in ("fit", "validation", "model", "ladder", "not_identifiable")}
+    numbers["outliers"] = named(found["outliers"])
     return Judgement(
         found["verdict"], found["reason"], numbers, plainly(found["warnings"], robot.parent, fit.parent, unseen.parent)
     )
+
+
+def named(outliers: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return outliers with their files' names, wherever these lie."""
+    return [{**each, "file": Path(each["file"]).name} for each in outliers]
 
 
 def flat(words: str) -> str:
@@ -50,7 +57,8 @@ def by_session(robot: Path, folder: Path, model: str, fit: Path, unseen: Path) -
     if refused:
         return Judgement(refused=refused.replace(str(session.path("3-measured")), str(fit.parent)))
     fitted, held = read(session.path("4-fit/metrics.json")), read(session.path("5-validation/metrics.json"))
-    numbers = {key: fitted[key] for key in ("fit", "model", "ladder", "outliers", "not_identifiable")}
+    numbers = {key: fitted[key] for key in ("fit", "model", "ladder", "not_identifiable")}
+    numbers["outliers"] = named(fitted["outliers"])
     numbers["validation"] = held["validation"]
     page = flat(html.unescape(session.path("certificate.html").read_text()))
     for words in (held["reason"], *held["warnings"]):
@@ -97,7 +105,16 @@ def named_oddly(files: Path, place: Path) -> tuple[Path, Path, Path]:
     return files / "robot.toml", fit, unseen
 
 
-@pytest.mark.parametrize("case", [clean, copied, swapped, moved, named_oddly])
+def spoiled(files: Path, place: Path) -> tuple[Path, Path, Path]:
+    lines = (files / "measured.csv").read_text().splitlines()
+    cells = lines[9].split(",")
+    column = lines[0].split(",").index(next(name for name in lines[0].split(",") if name.split(" ")[0] == "y"))
+    lines[9] = ",".join([*cells[:column], str(float(cells[column]) + 50.0), *cells[column + 1 :]])
+    (place / "measured.csv").write_text("\n".join(lines) + "\n")
+    return files / "robot.toml", place / "measured.csv", files / "validation.csv"
+
+
+@pytest.mark.parametrize("case", [clean, copied, swapped, moved, named_oddly, spoiled])
 def test_command_and_session_agree(files: Path, tmp_path: Path, case: Callable[[Path, Path], tuple[Path, ...]]) -> None:
     robot, fit, unseen = case(files, tmp_path)
     one = by_command(robot, tmp_path / "out", "geometry", fit, unseen)
@@ -105,6 +122,11 @@ def test_command_and_session_agree(files: Path, tmp_path: Path, case: Callable[[
     agree(one, two)
     if case is copied:
         assert any("20 rows" in note and "not unseen" in note for note in two.notes)
+    if case is spoiled:
+        assert two.verdict == "pass", "one wrong cell neither draws the fit nor fails it"
+        assert not command("fit", robot, fit, "--loss", "none", "--model", "geometry", "--out", tmp_path / "none")
+        told = " ".join(read(tmp_path / "none/metrics.json")["warnings"])
+        assert "1 row is grossly off" in told and "measured.csv row 9" in told and "no rigid geometry" not in told
 
 
 def test_a_robot_that_comes_with_corrections_keeps_them_as_its_nominal(files: Path, tmp_path: Path) -> None:

@@ -85,7 +85,6 @@ def session_with(folder: Path, robot: Path, model: str, *measured: Path) -> Sess
     for old, new in (
         ("plan = true", "plan = false"),
         ('model = "auto"', f'model = "{model}"'),
-        ('loss = "none"', 'loss = "auto"'),
     ):
         edit(settings, old, new)
     for path in measured:

@@ -192,7 +192,8 @@ class _Climber:
     def effects(self, model: str) -> None:
         """Try the effects one by one on top of the geometry; by name, take all up to it.
 
-        The geometry need not pay alone: gear errors may hide what it brings. Then both together have to.
+        The geometry need not pay alone: gear errors may hide what it brings. Then both together have to. Effects whose
+        fit does not come to an end, though nobody asked for them, are left out again.
         """
         if self.full is None or (model != "auto" and self.chosen != "geometry"):
             return
@@ -201,6 +202,7 @@ class _Climber:
         self._tick("observation matrix")
         statistics = self._statistics(self.full, everything)
         place = _places(offered)
+        before = self.chosen, self.best, tuple(self.rungs)
         names = [effect.name for effect in EFFECTS]
         if model == "auto":
             climbed = len(self.rungs)
@@ -222,6 +224,11 @@ class _Climber:
             self.chosen = " + ".join(["geometry", *kept])
             last = max(k for k, rung in enumerate(self.rungs) if rung.kept)
             self.rungs[last] = replace(self.rungs[last], parameters=len(self.best.free))
+            if model == "auto" and not (status := self.best.solution.status).good and before[1].solution.status.good:
+                note = f"did not converge ({status.name.lower()}): left out"
+                tried = [replace(rung, kept=False, note=note) for rung in self.rungs[len(before[2]) :]]
+                (self.chosen, self.best, rigid), self.offered = before, ()
+                self.rungs = [*rigid, *tried]
 
     def _greedy(
         self, statistics: FoldStatistics, offered: dict[str, list[Term]], place: dict[str, np.ndarray]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -30,7 +31,7 @@ from calib.procedure.kinematic_stage.comparison import (
 )
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import Findings
-from calib.procedure.kinematic_stage.remarks import Outlier, named_outliers, plateau, remains, remark
+from calib.procedure.kinematic_stage.remarks import Outlier, gross_rows, named_outliers, plateau, remains, remark
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import Arms, Assessment, assess
 from calib.procedure.measuring.image_findings import image_notes
@@ -41,6 +42,7 @@ from calib.robot.chain import stretched_length
 
 Progress = Callable[[str], None]
 MOVED = 3.0  # nominal errors fall by this factor when each file gets a station of its own: it was moved (our choice)
+HEEDS_ALL = ("none", "huber")  # losses that let a few gross rows draw a fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,11 +129,10 @@ def run(
     say("placing the instrument and the tool")
     start = install(inputs.chain, inputs.fit, inputs.known)
     torques = [gravity_of(inputs.chain, block) for block in inputs.fit]
-    found = select_model(
+    climb = partial(
+        select_model,
         start,
         inputs.fit,
-        asked,
-        settings=settings,
         torques=torques,
         fixed=fixed_parameters(start, options),
         prior=stated_prior(start, options),
@@ -139,15 +140,22 @@ def run(
         seed=seed,
         progress=lambda done, total, what: say(f"fitting: {what}"),
     )
+    found, long = climb(asked, settings=settings), stretched_length(inputs.chain)
     status = found.fit.solution.status
     if not status.good:
-        raise NotConverged(f"the fit of model '{found.chosen}' did not converge: {status.value}", found.fit)
+        odd = plausibility.findings(found.nominal.cell, found.fit, inputs.fit, torques, None, long)
+        why = [one.words for one in settled(odd, options.accept) if one.allows == "fail"]
+        words = f"the fit of model '{found.chosen}' did not converge: {status.value}"
+        raise NotConverged("; ".join([words, *why]), found.fit)
+    said = plateau(found, long)
+    if said and settings.loss in HEEDS_ALL:
+        said = gross_rows(found, climb("geometry", settings=replace(settings, loss="cauchy")), long) or said
     say("comparing on unseen poses")
     rigid = rigid_fit(found, inputs.fit, settings)
     named = named_outliers(found.fit)
     told = *map(remark, diagnose(found.fit)), *image_notes(found.fit)
     notes = *_moved_between(found.nominal.cell, inputs.fit, settings), *told
-    findings = _found_of(inputs, found, named, notes, torques, options.accept)
+    findings = _found_of(inputs, found, named, said, notes, torques, options.accept)
     say("learning what errors to expect")
     expected = learn_errors(found, inputs.fit, torques, seed)
     findings = replace(findings, discrepancy=None if expected is None else expected.discrepancy)
@@ -186,12 +194,14 @@ def assessed(outcome: Outcome, inputs: Inputs, options: FitOptions, wanted: FitS
 
 
 def _found_of(
-    inputs: Inputs, found: ModelSelection, named: Sequence[Outlier], notes: Sequence[str],
+    inputs: Inputs, found: ModelSelection, named: Sequence[Outlier], said: str, notes: Sequence[str],
     torques: Sequence[np.ndarray | None], accepted: Sequence[str],
 ) -> Findings:  # fmt: skip
-    """Return what a fit says of itself, whatever rows it has not seen; `notes` are those of moved instruments etc."""
+    """Return what a fit says of itself, whatever rows it has not seen.
+
+    `said` is what keeps rigid geometries from explaining the rows, `notes` are those of moved instruments etc.
+    """
     long = stretched_length(inputs.chain)
-    said = plateau(found, long)
     left = cross_validated(found)
     odd = plausibility.findings(found.nominal.cell, found.fit, inputs.fit, torques, left, long)
     return Findings(

@@ -20,7 +20,7 @@ from calib.geometry.checks.unidentified import (
     Rank,
     Unidentified,
 )
-from calib.geometry.model_choice.ladder import ModelSelection
+from calib.geometry.model_choice.ladder import GROSS, ModelSelection
 from calib.geometry.observation import observe
 from calib.geometry.result import GeometricFit, outliers
 from calib.units import ERRORS
@@ -145,6 +145,26 @@ def plateau(found: ModelSelection, reach: float) -> str:
         f"no rigid geometry explains these measurements: on rows left out {1e3 * best.cross_validated:.2f} mm rms "
         f"remain with the best one ({best.model}, {best.parameters} parameters), where a sound arm of {reach:.1f} m "
         f"reach leaves less than {1e3 * FLOOR * reach:.2f} mm"
+    )
+
+
+def gross_rows(found: ModelSelection, robust: ModelSelection, reach: float) -> str:
+    """Say that rows grossly off, and no arm, leave what `plateau` complains of; empty where they do not.
+
+    Args:
+        found: the selection of models with a loss that heeds every row.
+        robust: the rigid models on the same rows with a loss that does not.
+        reach: of the arm [m].
+    """
+    off = [row for row in named_outliers(robust.rigid) if row.sigmas > GROSS]
+    if not off or plateau(robust, reach):
+        return ""
+    count, listed = len({(row.file, row.row) for row in off}), ", ".join(row.words for row in off[:3])
+    best = min(rung.cross_validated for rung in robust.rungs)
+    return (
+        f"{count} row{'s are' if count > 1 else ' is'} grossly off, and the loss '{found.loss}' lets "
+        f"{'them' if count > 1 else 'it'} draw the fit: {listed}{', …' if len(off) > 3 else ''}; with loss auto the "
+        f"other rows are explained to {1e3 * best:.2f} mm rms"
     )
 
 

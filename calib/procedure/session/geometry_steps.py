@@ -194,10 +194,11 @@ def _drifts(session: Session, chain: Chain) -> list[str]:
 
 
 def _fit_settings(session: Session) -> FitSettings:
-    """Return how the geometry is fitted and judged, as session.toml says."""
+    """Return how the geometry is fitted and judged, as session.toml says; what is ``auto`` there, as the options do."""
     wanted = session.settings.fit
+    model, loss = (None if value == "auto" else value for value in (wanted.model, wanted.loss))
     return FitSettings(
-        model=wanted.model, loss=wanted.loss, stations=wanted.stations, tolerance=_tolerance_of(session),
+        model=model, loss=loss, stations=wanted.stations, tolerance=_tolerance_of(session),
         refit_frames=wanted.validation_frames == "own", seed=session.settings.seed,
     )  # fmt: skip
 
@@ -214,7 +215,7 @@ def _gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
 
 def fit(session: Session, say: Say) -> list[str]:
     """Fit the geometry to the measured files; validation files are not looked at."""
-    settings, selection = session.settings, selection_prediction(session)
+    selection = selection_prediction(session)
     outcome = fitting.run(_gathered(session), _options_of(session), _fit_settings(session), say, selection)
     outputs.write_folder(outcome, session.fit.path, partial(certificate.write_fit, plots=session.plots))
     count = len(outcome.selection.fit.free)
@@ -226,7 +227,9 @@ def fit(session: Session, say: Say) -> list[str]:
     ]
     if outcome.outliers:
         named = ", ".join(each.words for each in outcome.outliers[:3])
-        advice = "" if settings.fit.loss != "none" else '; look at these rows, or set loss = "huber" in session.toml'
+        advice = (
+            "" if outcome.selection.loss != "none" else '; look at these rows, or set loss = "cauchy" in session.toml'
+        )
         count = len({(each.file, each.row) for each in outcome.outliers})
         notes.append(f"{count} row{'s do' if count > 1 else ' does'} not fit: {named}{advice}")
     return notes
@@ -246,7 +249,7 @@ def validate(session: Session, say: Say) -> list[str]:
         notes += check_file(session, chain, path, plan, like)
     say("comparing on unseen poses")
     given, options, wanted = _gathered(session, unseen), _options_of(session), _fit_settings(session)
-    settings = combine(Settings(), loss=wanted.loss, loss_scale=options.loss_scale)
+    settings = combine(Settings(), loss=wanted.loss or options.loss, loss_scale=options.loss_scale)
     found = assess(
         fit.arms(given, settings), given, fit.findings(), settings, asked=wanted.model or options.model,
         tolerance=wanted.tolerance, seed=wanted.seed,

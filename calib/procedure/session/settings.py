@@ -30,11 +30,13 @@ from calib.config_types import (  # fmt: skip
     Whole,
     shown,
 )
-from calib.data.poses.fit_options import LOSSES, MODELS
+from calib.data.poses.fit_options import LOSSES, MODELS, FitOptions
 from calib.errors import SessionError
 from calib.identification.friction.friction_ladder import NAMES as FRICTION
 from calib.identification.methods.registry import METHODS
-from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION
+from calib.identification.settings import IdentificationSettings
+from calib.procedure.excitation.settings import DEFAULT_DESIGN, HARMONICS
+from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSettings
 from poses.indices import Index
 from poses.select import Method
 
@@ -108,14 +110,16 @@ class PosesSection:
 class FitSection:
     """How to fit and to judge the geometry."""
 
-    model: Annotated[str, OneOf(MODELS), About(f"or {', '.join(MODELS[1:])}")] = "auto"
-    loss: Annotated[str, OneOf(LOSSES), About("or auto, huber, cauchy")] = "none"
+    model: Annotated[str, OneOf(MODELS), About(f"or {', '.join(MODELS[1:])}")] = FitOptions.model
+    loss: Annotated[str, OneOf(LOSSES), About("or none, huber, cauchy; auto: robust where rows are grossly wrong")] = (
+        FitOptions.loss
+    )
     options: Annotated[
         Beside, About("a TOML file beside this one: column names, units; see `calib formats options`")
     ] = ""
     stations: Annotated[
         str, OneOf(("each", "one")), About("each measured file has its own base placement, or one for all")
-    ] = "each"
+    ] = FitSettings.stations
     validation_frames: Annotated[
         str, OneOf(("fit", "own")), About("own: base and tool placement are fitted anew on validation files")
     ] = "fit"
@@ -136,12 +140,14 @@ class DynamicsSection:
     wanted: Annotated[Flag, About("false: geometry only")] = True
     plan: Annotated[Flag, About("false: recorded files hold other motions than those designed here")] = True
     validation: Annotated[Flag, About("false: no second motion is designed or asked for")] = True
-    period: Annotated[Positive, About("of the designed motion [s]; the validation motion's is 0.8 of it")] = 20.0
-    harmonics: Annotated[int, Whole(1), About("frequencies per joint")] = 12
-    rate: Annotated[float, Real(above=0, most=1e5, unit="Hz"), About("of the controller [Hz]")] = 1000.0
+    period: Annotated[Positive, About("of the designed motion [s]; the validation motion's is 0.8 of it")] = (
+        DEFAULT_DESIGN.period
+    )
+    harmonics: Annotated[int, Whole(1), About("frequencies per joint")] = HARMONICS
+    rate: Annotated[float, Real(above=0, most=1e5, unit="Hz"), About("of the controller [Hz]")] = DEFAULT_DESIGN.rate
     repeats: Annotated[int, Whole(1), About("how often the robot plays each motion")] = 3
-    starts: Annotated[int, Whole(1), About("random starts of the search for a motion")] = 4
-    evaluations: Annotated[int, Whole(1), About("most per start")] = 1000
+    starts: Annotated[int, Whole(1), About("random starts of the search for a motion")] = DEFAULT_DESIGN.starts
+    evaluations: Annotated[int, Whole(1), About("most per start")] = DEFAULT_DESIGN.evaluations
     limits: Annotated[Beside, About("a TOML file beside this one; see `calib formats limits`")] = ""
     torques: Annotated[
         str,
@@ -150,8 +156,8 @@ class DynamicsSection:
     ] = "motor"
     friction: Annotated[
         str, OneOf(FRICTION), About("or standard, or one rung of the ladder; see calib identify --friction")
-    ] = "auto"
-    method: Annotated[str, OneOf(tuple(METHODS)), About("or ols, irls, tls")] = "wls"
+    ] = IdentificationSettings.friction
+    method: Annotated[str, OneOf(tuple(METHODS)), About("or ols, irls, tls")] = IdentificationSettings.method
     options: Annotated[Beside, About("a TOML file beside this one; see `calib formats identify-options`")] = ""
     tolerance_percent: Annotated[
         NotNegative, About("largest torque error on unseen motion that is good enough; 0: none")

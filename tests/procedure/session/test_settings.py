@@ -11,7 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from calib.data.poses.fit_options import FitOptions
+from calib.dynamics.torque_rows import torque_rows
 from calib.errors import SessionError
+from calib.identification.settings import IdentificationSettings
+from calib.procedure.excitation.settings import HARMONICS, ExcitationSettings
+from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
 from calib.procedure.session.commands import NewSession, begin
 from calib.procedure.session.folder import open_session
 from calib.procedure.session.settings import (
@@ -179,6 +184,35 @@ def test_a_wrong_value_is_named_with_what_is_expected(old: Path, before: str, af
     old.write_text(OLD.replace(before, after, 1))
     with pytest.raises(SessionError, match=message):
         read_settings(old)
+
+
+# keys of session.toml that mean something else than the commands' options of that name, or that these have not
+OWN = {
+    "fit": {"options", "validation_frames", "tolerance_mm"},
+    "poses": {"fit", "validation", "plan", "constraints"},
+    "dynamics": {
+        "wanted", "plan", "validation", "harmonics", "repeats", "limits", "torques", "options", "tolerance_percent",
+        "payloads",
+    },
+}  # fmt: skip
+
+
+def test_a_new_sessions_defaults_are_the_commands() -> None:
+    commands = {
+        "fit": (FitOptions(), FitSettings()),
+        "poses": (SelectionSettings(),),
+        "dynamics": (ExcitationSettings(), IdentificationSettings()),
+    }
+    new = {"fit": FitSection(), "poses": PosesSection(), "dynamics": DynamicsSection()}
+    for name, section in new.items():
+        for key in dataclasses.fields(section):
+            stated = [getattr(one, key.name) for one in commands[name] if getattr(one, key.name, None) is not None]
+            if key.name not in OWN[name]:
+                assert stated, f"[{name}] {key.name}: no command has it, and it is none of OWN"
+                assert getattr(section, key.name) == stated[0], f"[{name}] {key.name}"
+    fit, dynamics = FitSection(), DynamicsSection()
+    assert (fit.validation_frames == "own") == FitSettings().refit_frames and (fit.tolerance_mm or None) is None
+    assert torque_rows(dynamics.torques) is IdentificationSettings().torque_rows and dynamics.harmonics == HARMONICS
 
 
 def test_the_example_names_every_key_with_its_default() -> None:
