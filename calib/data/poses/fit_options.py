@@ -17,7 +17,7 @@ TOML; every key is optional, and a key that is none of these is refused. Lengths
     beta = true                      # a sixth element for nearly parallel axes of an MDH table
     fix = ["theta1"]                 # parameters that stay at their nominal value
     free = ["d3"]                    # if given, only these move
-    accept = []                      # findings that are meant so: unexplained, reflection, scale
+    accept = []                      # findings that are meant so: unexplained, reflection, sign, moved, scale
 
     [columns]                        # our name = the file's
     x = "X_leica"
@@ -64,7 +64,7 @@ Radians = Annotated[float, Real(above=0, most=1.0, unit="rad")]
 Each = Spread(3, "a number or three")
 
 
-FINDINGS = ("unexplained", "reflection", "scale")  # that the verdict may call a fit odd for
+FINDINGS = ("unexplained", "reflection", "sign", "moved", "scale")  # that the verdict may call a fit odd for
 
 
 @strict

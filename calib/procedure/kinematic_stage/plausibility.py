@@ -5,9 +5,13 @@ marginal, until the options' ``accept`` says that it is meant. Findings of poses
 
 unexplained   on rows left out even the chosen model leaves more than `NO_ARM` of the reach: fail
 reflection    with the instrument's y turned the nominal arm fits `BETTER` times as well: its axes are left-handed: fail
+sign          so with the signs of some joints reversed, and better than with y turned: fail
+moved         the fit turned an element of the arm by more than `TURNED`, or moved it by more than `SHIFTED` of the
+              reach, and no sign says why: marginal. Sound arms at hand turned by 33 mrad at most (Motoman; UR5 12)
 scale         one factor on all measured lengths takes away `SHARE` of the squares of the nominal arm's errors; off one
-              by more than `GROWN`: marginal, else a note; so where the fitted lengths grew together, marginal where
-              that is more than `ALONE` of their change
+              by more than `FOREIGN`: fail, by more than `GROWN`: marginal, else a note; so where the fitted lengths
+              grew together and that is more than `ALONE` of their change. No instrument is off by per cents, a badly
+              printed board by one or two; two sizes of one maker's robots differ by more
 commanded     less than `TOO_GOOD` remains, which no instrument measures: a note
 """
 
@@ -21,14 +25,18 @@ from calib.data.poses.measurements import PoseMeasurements, take
 from calib.data.poses.pixels import Pixels
 from calib.geometry.accuracy import errors
 from calib.geometry.checks.instrument_scale import Scale, length_factor, mirrored_rms, scale_of
+from calib.geometry.checks.joint_signs import reversed_joints
 from calib.geometry.images.camera_guess import pnp_poses
 from calib.geometry.installation import Installation
 from calib.geometry.result import GeometricFit
 from calib.procedure.findings import Finding
+from calib.procedure.kinematic_stage.remarks import FLOOR
 
 NO_ARM = 0.015
 BETTER = 3.0
-SHARE, LEAST, GROWN, ALONE = 0.3, 1e-3, 5e-3, 0.8
+SHARE, LEAST, GROWN, FOREIGN, ALONE = 0.3, 1e-3, 5e-3, 0.025, 0.8
+TURNED, SHIFTED = 0.1, 0.03  # [rad], of the reach
+NAMED = 5  # elements in a sentence
 TOO_GOOD = 2e-6  # [m]
 LOOKED_AT = 100  # images
 
@@ -52,11 +60,11 @@ def findings(
     """
     before, after = (_rms(cell, blocks, torques) for cell in (nominal, fit.cell))
     remains = after if left is None else left
-    found = []
-    if before > NO_ARM * reach:
-        found += _reflection(before, mirrored_rms(nominal, blocks, torques))
+    shown, pulled = _as_positions(blocks, torques)
+    wrong_way = _wrong_way(nominal, shown, pulled, before, reach)
+    found = [*wrong_way, *([] if any(one.name == "sign" for one in wrong_way) else _moved(fit, reach))]
     found += [*_unexplained(remains, reach), *_commanded(before, after)]
-    scale = scale_of(nominal, *_as_positions(blocks, torques))
+    scale = scale_of(nominal, shown, pulled)
     if scale is not None and before * np.sqrt(1.0 - scale.explained) < NO_ARM * reach:
         found += _scale(scale) or _lengths(length_factor(fit))
     return found
@@ -84,13 +92,64 @@ def _unexplained(remains: float, reach: float) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def _reflection(before: float, mirrored: float) -> Iterator[Finding]:
+def _wrong_way(
+    nominal: Installation,
+    blocks: Sequence[PoseMeasurements],
+    torques: Sequence[np.ndarray | None],
+    before: float,
+    reach: float,
+) -> list[Finding]:
+    """Tell of joints or axes whose reversal lets the nominal arm explain the rows; of both, what leaves less."""
+    if not before > FLOOR * reach:
+        return []
+    signs = reversed_joints(nominal, blocks, torques)
+    mirrored = mirrored_rms(nominal, blocks, torques) if before > NO_ARM * reach else np.nan
+    if signs is not None and signs.before > BETTER * signs.rms and not mirrored < signs.rms:
+        names = [nominal.chain.joint_names[j] for j in signs.joints]
+        several = len(names) > 1
+        one = Finding(
+            "sign", "fail",
+            f"{_joined(names)} seem{'' if several else 's'} to turn the other way: with "
+            f"{'their signs' if several else 'its sign'} reversed the nominal arm is off by {1e3 * signs.rms:.3g} mm "
+            f"rms, as recorded by {1e3 * signs.before:.3g} mm: is the sign of a column reversed, or an axis of the "
+            "robot's file?",
+        )  # fmt: skip
+        return [one]
     if before > BETTER * mirrored:
-        yield Finding(
+        one = Finding(
             "reflection", "fail",
             f"the instrument's axes seem left-handed: with y turned the nominal arm is off by {1e3 * mirrored:.3g} mm "
             f"rms, as measured by {1e3 * before:.3g} mm: is the sign of a column reversed, or are two exchanged?",
         )  # fmt: skip
+        return [one]
+    return []
+
+
+def _moved(fit: GeometricFit, reach: float) -> list[Finding]:
+    """Tell of elements of the arm that are further from their nominal than those of a sound arm."""
+    told = []
+    for element, value, nominal in zip(fit.cell.chain.elements, fit.cell.chain.values, fit.start.chain.values):
+        change = float(value - nominal)
+        if element.unit == "m" and abs(change) > SHIFTED * reach:
+            told.append((abs(change) / (SHIFTED * reach), f"{element.name} by {1e3 * change:+.0f} mm"))
+        change = (change + np.pi) % (2.0 * np.pi) - np.pi
+        if element.unit == "rad" and abs(change) > TURNED:
+            told.append((abs(change) / TURNED, f"{element.name} by {np.degrees(change):+.0f}°"))
+    if not told:
+        return []
+    words = [each for _, each in sorted(told, reverse=True)]
+    more = f" and {len(words) - NAMED} more" if len(words) > NAMED else ""
+    one = Finding(
+        "moved", "marginal",
+        f"the fit moved {', '.join(words[:NAMED])}{more} from the nominal arm, further than any sound arm is off: is "
+        "this the robot, does its file count a joint's angle from another zero or the other way, are the columns in "
+        "its order?",
+    )  # fmt: skip
+    return [one]
+
+
+def _joined(names: Sequence[str]) -> str:
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
 def _scale(found: Scale) -> list[Finding]:
@@ -98,10 +157,11 @@ def _scale(found: Scale) -> list[Finding]:
         return []
     grown = 100.0 * (found.factor - 1.0)
     one = Finding(
-        "scale", "marginal" if abs(found.factor - 1.0) > GROWN else "pass",
+        "scale", _level(found.factor),
         f"all measured lengths are {abs(grown):.2g} % {'larger' if grown > 0 else 'smaller'} than the arm's, by one "
         f"factor, {found.factor:.4f} ± {found.sigma:.1g}, which explains {100 * found.explained:.0f} % of what the "
-        "nominal arm leaves: is the instrument's (or a camera's target's) scale right? The fit takes it for the arm's",
+        f"nominal arm leaves: {_foreign(found)}is the instrument's (or a camera's target's) scale right? The "
+        "fit takes it for the arm's",
     )  # fmt: skip
     return [one]
 
@@ -110,14 +170,22 @@ def _lengths(found: Scale | None) -> list[Finding]:
     """Tell that the fitted lengths grew together, whatever else of the nominal arm was wrong."""
     if found is None or abs(found.factor - 1.0) < max(LEAST, 3.0 * found.sigma):
         return []
-    doubtful = abs(found.factor - 1.0) > GROWN and found.explained > ALONE
     one = Finding(
-        "scale", "marginal" if doubtful else "pass",
+        "scale", _level(found.factor) if found.explained > ALONE else "pass",
         f"the fitted lengths are together {found.factor:.4f} ± {found.sigma:.1g} times the nominal ones, and that one "
-        f"factor is {100 * found.explained:.0f} % of their change: an arm may be so, the instrument's scale (or the "
-        "size of a board's square) may be so, and these measurements do not tell which",
+        f"factor is {100 * found.explained:.0f} % of their change: {_foreign(found)}an arm may be so, the instrument's "
+        "scale (or the size of a board's square) may be so, and these measurements do not tell which",
     )  # fmt: skip
     return [one]
+
+
+def _foreign(found: Scale) -> str:
+    return "is this the robot? If it is, " if _level(found.factor) == "fail" else ""
+
+
+def _level(factor: float) -> str:
+    off = abs(factor - 1.0)
+    return "fail" if off > FOREIGN else "marginal" if off > GROWN else "pass"
 
 
 def _commanded(before: float, after: float) -> Iterator[Finding]:

@@ -54,14 +54,45 @@ def test_frames_alone_are_judged_too(cell, calib, change, name):
     assert (again[0], verdict()[0]) == (0, "pass") and "(accepted by the options)" in again[1]
 
 
-@pytest.mark.parametrize("factor, level", [(1.0, None), (1.05, "marginal"), (0.97, "marginal"), (1.003, "pass")])
-def test_one_factor_on_all_lengths_is_the_instruments(cell, calib, factor, level):
+@pytest.mark.parametrize("reversed_ones", [(1,), (4,), (2, 5)])
+@pytest.mark.parametrize("model", ["frames", "geometry"])
+def test_joints_that_turn_the_other_way_are_named(cell, calib, reversed_ones, model):
+    """The full geometry explains a reversed joint by axes turned by 180°, so that what it leaves tells nothing."""
+    rows = cell.measure(COUNT)
+    for row in rows:
+        row |= {f"q{j + 1}": -row[f"q{j + 1}"] for j in reversed_ones}
+    path = cell.write("m.csv", rows, [*(f"q{j + 1}" for j in range(6)), *"xyz"])
+    code, _, err = calib("fit", "ur5", path, "--out", "o", "--model", model)
+    level, reason, odd = verdict()
+    assert (code, level) == (1, "fail"), err
+    assert odd[0] == "sign" and "moved" not in odd
+    names = " and ".join(cell.nominal.joint_names[j] for j in reversed_ones)
+    assert reason.startswith(f"{names} seem")
+    if model == "frames":
+        Path("a.toml").write_text('accept = ["unexplained", "sign"]')
+        assert calib("fit", "ur5", "m.csv", "--out", "o", "--model", model, "--options", "a.toml")[0] == 0
+
+
+def test_a_joint_counted_from_another_zero_is_told(cell, calib):
+    rows = [row | {"q3": row["q3"] + np.pi / 2} for row in cell.measure(COUNT)]
+    path = cell.write("m.csv", rows, [*(f"q{j + 1}" for j in range(6)), *"xyz"])
+    calib("fit", "ur5", path, "--out", "o", "--model", "geometry")
+    level, reason, odd = verdict()
+    assert (level, odd) == ("marginal", ["moved"])
+    assert reason.startswith("the fit moved ") and "-90°" in reason
+
+
+@pytest.mark.parametrize(
+    "factor, level", [(1.0, None), (1.05, "fail"), (0.97, "fail"), (0.98, "marginal"), (1.003, "pass")]
+)
+def test_one_factor_on_all_lengths_is_the_instruments_or_another_robots(cell, calib, factor, level):
     calib("fit", "ur5", changed(cell, "m.csv", lambda place: factor * place), "--out", "o", "--model", "frames")
     found = json.loads(Path("o/metrics.json").read_text())["findings"]["odd"]
     own = {one["name"]: one for one in found}
     assert ("scale" in own) == (level is not None)
     if level is not None:
         assert own["scale"]["level"] == level
+        assert ("is this the robot?" in own["scale"]["words"]) == (level == "fail")
         said = float(own["scale"]["words"].partition("by one factor, ")[2].split()[0])
         assert said == pytest.approx(factor, abs=5e-4)
 
