@@ -6,8 +6,8 @@ it passes up to 10 % and up to 2 times the training's own error; between, it is 
 above 30 % likewise. A model is marginal as well without such a recording, or where the training motion is too poor to
 tell parameters apart. A joint of which 50 % or more is unexplained (in the band, and while it moves) is named and
 allows no pass; from 95 % on it fails the model where its rms torque is 10 % or more of the greatest joint's. Friction
-that drives a joint fails. A model of which the 95 % intervals hold less than 93 % of the errors on unseen motion,
-beyond chance, is no better than marginal. The reason says which of these held.
+that drives a joint fails. A model of which the 95 % intervals hold less than 93 % of the errors on unseen motion (90 %
+at a joint), beyond chance, is no better than marginal. The reason says which of these held.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ CONDITION = 200.0  # of the observation matrix with columns of unit norm
 MOVES = 0.1  # share of moving rows below which a recording is no motion
 BEND = 1e-4  # rms of link minus motor position that shows elasticity [rad or m]
 HOLDS = 0.93  # least share of errors on unseen motion within the 95 % intervals, beyond chance
+JOINT_HOLDS = 0.90  # the same for a single joint, whose errors may leave them twice as often as stated
 SURELY = 2.0  # sigmas below zero from which on a drive's inertia or friction is called negative
 SLOW_SHARE = 0.1  # share of samples near standstill from which on Coulomb friction is drawn down
 
@@ -160,12 +161,13 @@ def with_intervals(verdict: Verdict, expected: Mapping[str, TorqueIntervals], ro
     """
     for name, one in expected.items():
         chance = 3.0 * np.sqrt((1.0 - COVERED) * COVERED / np.maximum(one.independent, 1.0))
-        low = [f"{rows[k]} ({100 * one.joints[k]:.0f} %)" for k in np.flatnonzero(one.joints < HOLDS - chance).tolist()]
-        if not low and one.covered >= HOLDS - np.sqrt(np.sum(chance**2)) / len(chance):
+        rare = np.flatnonzero(one.joints < JOINT_HOLDS - chance).tolist()
+        if not rare and one.covered >= HOLDS - np.sqrt(np.sum(chance**2)) / len(chance):
             continue
-        where = f", least at joint {', '.join(low)}" if low else ""
+        low = ", ".join(f"{rows[k]} ({100 * one.joints[k]:.0f} %)" for k in rare)
         told = (
-            f"its 95 % intervals do not hold: {100 * one.covered:.0f} % of the errors on {name} are within them{where}"
+            f"its 95 % intervals do not hold{f' for {low}' if low else ''}: {100 * one.covered:.0f} % of the errors on "
+            f"{name} are within them"
         )
         level = "marginal" if verdict.level == "pass" else verdict.level
         return Verdict(level, f"{verdict.reason}; {told}; learn from motion like this, too")
