@@ -118,6 +118,8 @@ def assess(
         nominal_cross_validated=findings.nominal_cross_validated, reach=findings.reach, blind=findings.blind,
     )  # fmt: skip
     verdict = held_by(verdict, findings.odd)
+    if copies := _copies(inputs):
+        verdict = replace(verdict, reason=f"not unseen: {', '.join(copies)}; {verdict.reason}")
     clause, loud = urdf_alone(fitted, validation)
     verdict = verdict if not clause else replace(verdict, reason=f"{verdict.reason}; {clause}")
     blocks = (*inputs.fit, *(unseen.block for unseen in inputs.unseen.values()))
@@ -127,6 +129,20 @@ def assess(
         *findings.notes, *_doubtful(validation), *_unsettled(validation), *_interval_notes(validation),
     )  # fmt: skip
     return Assessment(fitted, validation, verdict, tuple(dict.fromkeys(warnings)))
+
+
+def _copies(inputs: Inputs) -> list[str]:
+    """Name files given as unseen that hold what was fitted."""
+    words = []
+    for name, unseen in inputs.unseen.items():
+        if unseen.seen:
+            own = next((Path(block.file).name for block in inputs.fit if _same_rows(block, unseen.block)), "")
+            words.append(f"{name} {f'is a copy of {own}' if own else 'repeats rows of the fit'}")
+    return words
+
+
+def _same_rows(one: PoseMeasurements, other: PoseMeasurements) -> bool:
+    return np.array_equal(one.q, other.q) and np.array_equal(one.measured, other.measured)
 
 
 def nominal_arm(inputs: Inputs, settings: Settings) -> Installation:

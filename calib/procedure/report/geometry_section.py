@@ -89,8 +89,13 @@ def certificate_section(report: Report, drawn: Mapping[str, Picture]) -> Section
 
 
 def _key_figures(report: Report) -> list[KeyFigure]:
-    """Return the errors that the verdict rests on, before and after: of the worst unseen rows, else of the fit's."""
+    """Return the errors that the verdict rests on, before and after.
+
+    Of the worst unseen rows; without any, those of cross-validation, where it judged; else of the fit's rows.
+    """
     metrics, proofs = report.metrics, report.metrics.proofs
+    if not proofs and (left := _left_out(metrics)):
+        return [left]
     name, proof = max(proofs.items(), key=lambda item: _main_rms(item[1]), default=("fit", metrics.fit))
     own = next((rows for rows in report.sets if rows.name == name), None)
     basis = f"{proof.poses} {'unseen' if proofs else 'fitted'} poses"
@@ -110,6 +115,18 @@ def _key_figures(report: Report) -> list[KeyFigure]:
         )
         result.append(KeyFigure(f"{label}, largest", _size(before.max, unit), _size(after.max, unit), "", basis))
     return result
+
+
+def _left_out(metrics: FitMetrics) -> KeyFigure | None:
+    """Return the errors of both arms by cross-validation; None where they did not judge (`verdict.judge`)."""
+    found, nominal = metrics.findings, metrics.fit.nominal.main
+    if found is None or found.cross_validated is None or nominal is None or len(metrics.ladder) < 2:
+        return None
+    before = nominal.rms if found.nominal_cross_validated is None else 1e3 * found.nominal_cross_validated
+    label = "position" if metrics.fit.nominal.position_mm else "distance"
+    allowed = f"{metrics.tolerance_mm:g} mm" if metrics.tolerance_mm else ""
+    after = _size(1e3 * found.cross_validated, "mm")
+    return KeyFigure(f"{label}, rms", _size(before, "mm"), after, "", "rows left out in turn", allowed)
 
 
 def _main_rms(rows: ComparedRows) -> float:

@@ -188,12 +188,14 @@ def listed(session: Session) -> list[tuple[str, str, str, str]]:
         wanted += [*session.identification.tables, session.identification.model]
     wanted += [*session.fit.tables, *exported[1:]]
     made = {name: mark for step in read_state(session).steps.values() for name, mark in step.outputs.items()}
-    rows = []
+    rows, seen = [], [name for name, found in session.validation.metrics().validation.items() if not found.unseen]
     for path in wanted:
         name = path.relative_to(session.folder)
         role = ROLES[name.parts[0]]
         if name.parts[-1].lower().startswith("validation") or name.parts[1].lower().startswith("validation"):
-            role += ", unseen by the fit" if name.parts[0] == "3-measured" else ", unseen by the identification"
+            which = "the fit" if name.parts[0] == "3-measured" else "the identification"
+            known = name.parts[0] == "3-measured" and name.parts[1] in seen
+            role += f", {'NOT unseen' if known else 'unseen'} by {which}"
         if name.parts[0] in ("4-fit", "8-dynamics", session.export) and made.get(str(name)) != fingerprint(path):
             role = certificate.EDITED
         rows.append((str(name), role, f"{path.stat().st_size}", fingerprint(path)))
