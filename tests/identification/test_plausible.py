@@ -202,5 +202,6 @@ def test_an_estimate_far_from_every_possible_robot_fails_and_one_with_other_fric
 
 
 def test_a_contradiction_is_remarked_by_its_size() -> None:
-    levels = [[one.level for one in impossible(Contradiction(10.0 * times, 10.0))] for times in (4.0, 6.0, 12.0)]
+    levels = [[one.level for one in impossible(Contradiction(10.0 * times, 10.0, 3.0))] for times in (4.0, 6.0, 12.0)]
     assert levels == [[], ["marginal"], ["fail"]] and impossible(None) == []
+    assert impossible(Contradiction(120.0, 10.0, 0.1)) == []

@@ -36,10 +36,12 @@ class Contradiction:
     Attributes:
         distance: in standard deviations (Mahalanobis); up to `WITHIN` times `allowed` that of a robot near it.
         allowed: what it stays below in 95 % of all cases where the model is right.
+        unexplained: of the torques, in weighted rows, that the nearest possible robot leaves beside the estimate [%].
     """
 
     distance: float
     allowed: float
+    unexplained: float
 
 
 def contradiction(found: Identification, chain: Chain) -> Contradiction | None:
@@ -69,4 +71,6 @@ def contradiction(found: Identification, chain: Chain) -> Contradiction | None:
         away = np.inf
     if away > WITHIN * allowed:
         away = min((away, *distances()))
-    return Contradiction(float(away), allowed) if np.isfinite(away) else None
+    if not np.isfinite(away):
+        return None
+    return Contradiction(float(away), allowed, 100.0 * float(away) / float(np.linalg.norm(information.factor[:, -1])))
