@@ -118,6 +118,10 @@ def _evaluated(node: ast.expr) -> float:
     raise ValueError(ast.dump(node))
 
 
+def _or_zero(value: Any, otherwise: Callable[[Any], Any]) -> Any:
+    return 0.0 if isinstance(value, (int, float)) and not isinstance(value, bool) and value == 0 else otherwise(value)
+
+
 def _not_nan(value: float) -> float:
     if value != value:
         raise ValueError("nan")
@@ -130,10 +134,11 @@ class Real:
 
     Attributes:
         above, least, most: what it has to be above, and its least and largest values; beyond `most`, another unit is
-            suspected.
+            suspected. With both `above` and `least` numbers between them are of another unit likewise.
         unit: of `most`, for the complaint.
         quantity: read texts with units of it, too, see `number`; "1" for texts without unit.
         infinite: whether infinity counts.
+        zero: whether 0 counts beside all that.
         words: what was expected; by default said from the bounds.
     """
 
@@ -143,27 +148,39 @@ class Real:
     unit: str = ""
     quantity: str = ""
     infinite: bool = False
+    zero: bool = False
     words: str = ""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         from pydantic_core import core_schema as core
 
-        words = self.words or ("a number" if self.above is None else f"a number above {self.above:g}")
-        if not self.words and self.least is not None:
+        words, later = self.words or ("a number" if self.above is None else f"a number above {self.above:g}"), None
+        if self.above is not None and self.most is not None:
+            later = self.least
+        elif not self.words and self.least is not None:
             words = f"{self.least:g} or more"
-        inner = core.float_schema(strict=True, gt=self.above, ge=self.least, allow_inf_nan=self.infinite)
+        least = self.least if later is None else None
+        inner = core.float_schema(strict=True, gt=self.above, ge=least, allow_inf_nan=self.infinite)
         if self.infinite:
             inner = core.no_info_after_validator_function(_not_nan, inner)
         result = core.custom_error_schema(inner, "expected", custom_error_message=words)
         if self.most is not None:
             hint = " (are these mm, or degrees?)" if self.unit in ("m", "rad") else ""
-            words = f"{self.unit or 'a number'}, at most {self.most:g}{hint}"
-            bound = core.custom_error_schema(core.float_schema(le=self.most), "expected", custom_error_message=words)
+            span = f"{'' if later is None else f'at least {later:g} and '}at most {self.most:g}"
+            bound = core.float_schema(ge=later, le=self.most)
+            words = f"{self.unit or 'a number'}, {span}{hint}"
+            bound = core.custom_error_schema(bound, "expected", custom_error_message=words)
             result = core.chain_schema([result, bound])
+        if self.zero:
+            result = core.no_info_wrap_validator_function(_or_zero, result)
         return Checked(self._read).around(result) if self.quantity else result
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
         bounds = {"exclusiveMinimum": self.above, "minimum": self.least, "maximum": self.most}
+        if self.zero:
+            bounds = {"minimum": 0.0, "maximum": self.most}
+        elif self.least is not None:
+            del bounds["exclusiveMinimum"]
         found = {"type": "number", **{key: value for key, value in bounds.items() if value is not None}}
         return {"anyOf": [found, {"type": "string"}]} if self.quantity else found
 

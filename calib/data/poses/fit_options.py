@@ -59,8 +59,12 @@ EULER = ("wpr", "xyz", "vector")
 MODELS = ("auto", "frames", "offsets", "geometry", "stiffness", "bending", "coupling", "harmonics", "wobble")
 LOSSES = ("auto", "none", "huber", "cauchy")
 
-Metres = Annotated[float, Real(above=0, most=0.1, unit="m")]
-Radians = Annotated[float, Real(above=0, most=1.0, unit="rad")]
+FINEST = 1e-10  # no instrument's sigma is smaller [m or rad]; our choice
+Metres = Annotated[float, Real(above=0, least=FINEST, most=0.1, unit="m")]
+Radians = Annotated[float, Real(above=0, least=FINEST, most=1.0, unit="rad")]
+Prior = Annotated[float, Real(above=0, least=1e-12, most=1e6)]  # [m, rad, or a deflection's unit]
+MetresOrZero = Annotated[float, Real(above=0, least=FINEST, most=0.1, unit="m", zero=True)]
+RadiansOrZero = Annotated[float, Real(above=0, least=FINEST, most=1.0, unit="rad", zero=True)]
 Each = Spread(3, "a number or three")
 
 
@@ -81,7 +85,7 @@ class Sigma:
     position: Annotated[tuple[Metres, Metres, Metres], Each] | None = None
     orientation: Annotated[tuple[Radians, Radians, Radians], Each] | None = None
     distance: Metres | None = None
-    floor: Metres = 0.0
+    floor: MetresOrZero = 0.0
 
 
 @strict
@@ -143,7 +147,7 @@ class FitOptions(FileOptions):
     fix: Names = ()
     free: Names = ()
     accept: tuple[Annotated[str, OneOf(FINDINGS)], ...] = ()
-    prior: Mapping[str, Positive] = field(default_factory=dict)
+    prior: Mapping[str, Prior] = field(default_factory=dict)
     source: Annotated[str, Hidden()] = ""
 
     def for_file(self, path: str | Path) -> FileOptions:

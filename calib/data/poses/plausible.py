@@ -8,12 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from calib.data.csv_table import Table
-from calib.data.poses.fit_options import FileOptions
+from calib.data.poses.fit_options import FINEST, FileOptions
 from calib.errors import MeasurementError
 from calib.units import ANGLES
 
 TURN = 2.1 * math.pi  # a joint value beyond this needs limits that allow it [rad]; our choice, as all of these
-FINEST = 1e-10  # no instrument's sigma is smaller [m or rad]
 FAR = 50.0  # no instrument measures a robot from further away [m]
 STILL = 1e-6  # a joint that moves less has not moved [rad or m]
 SLACK = 1e-3  # encoders stand a little beyond a limit [rad or m]

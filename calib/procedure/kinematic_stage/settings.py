@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from calib.arguments import Within, checked
-from calib.data.poses.fit_options import LOSSES, MODELS
+from calib.data.poses.fit_options import FINEST, LOSSES, MODELS
 from calib.errors import UsageError
 from calib.procedure.measuring.run import DEFAULT_RUN, RunSettings
 
 Place = Annotated[float, Within(-100.0, 100.0)]  # of a target in the tip's frame [m]
-Sigma = Annotated[float, Within(above=0.0, most=10.0)]  # [m or rad]
+Sigma = Annotated[float, Within(least=FINEST, most=10.0)]  # [m or rad]
 
 
 @checked

@@ -30,7 +30,7 @@ from calib.config_types import (  # fmt: skip
     Whole,
     shown,
 )
-from calib.data.poses.fit_options import LOSSES, MODELS, FitOptions
+from calib.data.poses.fit_options import LOSSES, MODELS, FitOptions, MetresOrZero, RadiansOrZero
 from calib.errors import SessionError
 from calib.identification.friction.friction_ladder import NAMES as FRICTION
 from calib.identification.methods.registry import METHODS
@@ -83,8 +83,8 @@ class InstrumentSection:
     measures: Annotated[
         str, OneOf(("pose", "position", "pixels")), About("pose (with orientation), position or pixels")
     ]
-    sigma_position: Annotated[NotNegative, About("of one measurement, per axis; 0: to be estimated")] = 0.0
-    sigma_orientation: NotNegative = 0.0
+    sigma_position: Annotated[MetresOrZero, About("of one measurement, per axis; 0: to be estimated")] = 0.0
+    sigma_orientation: RadiansOrZero = 0.0
     tool: Annotated[
         tuple[float, float, float],
         Expect("three numbers [m]"),

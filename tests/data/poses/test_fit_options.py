@@ -7,9 +7,11 @@ import re
 
 import pytest
 
+from calib.config import parse
 from calib.data.poses import fit_options as module
 from calib.data.poses.fit_options import FitOptions, check_files, parse_options, read_options
 from calib.errors import UsageError
+from calib.procedure.session.settings import InstrumentSection
 
 
 def test_defaults_without_a_file():
@@ -92,3 +94,14 @@ def test_files_that_are_no_toml(tmp_path):
     path.write_text("kind = position")
     with pytest.raises(UsageError, match=r"fit.toml: is no TOML.*line 1"):
         read_options(path)
+
+
+@pytest.mark.parametrize("sigma", [1e-300, 1e-11, 0.2, 1e300])
+def test_a_sigma_that_no_instrument_has_is_refused_in_options_and_session_alike(sigma):
+    words = r"expected m, at least 1e-10 and at most 0.1 \(are these mm, or degrees\?\), found "
+    with pytest.raises(UsageError, match="sigma.position: " + words):
+        parse_options({"sigma": {"position": sigma}})
+    section = {"name": "tracker", "measures": "position"}
+    with pytest.raises(UsageError, match="sigma_position: " + words):
+        parse(InstrumentSection, section | {"sigma_position": sigma}, "s")
+    assert parse(InstrumentSection, section | {"sigma_position": 0}, "s").sigma_position == 0.0, "to be estimated"
