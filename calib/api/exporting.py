@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 from calib.api.dynamic import DynamicsModel
@@ -28,7 +29,8 @@ def export(
 
     Of a fit: robot.urdf, joint_offsets.csv, ur_kinematics.yaml of a UR arm, joint corrections where there are any. Of
     an identification also masses and friction, as URDF, MJCF, drives.csv and parameters.json. Each file is read back by
-    an independent reader before it is put in place.
+    an independent reader before it is put in place. A result whose verdict is fail is exported with a warning, which
+    stands in the URDFs and a README.txt, too.
 
     Args:
         result: a fit, an identification, or the folder of one.
@@ -48,8 +50,13 @@ def export(
         identified = is_identified(place)
         delivery.check_into(into, place, optional(urdf), dynamics.WRITTEN if identified else delivery.WRITTEN)
         if identified:
-            return tuple(dynamics.deliver_dynamics(place, optional(urdf), into, prior))
-        return tuple(delivery.deliver(place, _source_of(place) if urdf is None else Path(urdf), into))
+            lines = dynamics.deliver_dynamics(place, optional(urdf), into, prior)
+        else:
+            lines = delivery.deliver(place, _source_of(place) if urdf is None else Path(urdf), into)
+        failed = delivery.mark_failed(into, delivery.verdicts(place))
+    for words in failed:
+        warnings.warn(words, stacklevel=3)
+    return (*failed, *lines)
 
 
 def _source_of(place: Path) -> Path:

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from calib.cli.shared import Base, Plots, Robot, Seed, Tip, numbers, progress, say, say_written
+from calib.cli.shared import Base, Plots, Robot, Seed, Tip, exit_failed, numbers, progress, say, say_written
 
 app = typer.Typer()
 
@@ -190,9 +190,14 @@ def export(
         str, typer.Option(help="with --into: what draws masses that the torques do not tell, entropic or euclidean")
     ] = "entropic",
 ) -> None:
-    """Write the calibrated robot for other programs. With --into: in all forms, identified dynamics included."""
+    """Write the calibrated robot for other programs. With --into: in all forms, identified dynamics included.
+
+    A result whose verdict is fail is written for inspection, marked as such; the exit code is 1 then.
+    """
+    import warnings
+
     from calib.errors import UsageError
-    from calib.procedure.export import geometry
+    from calib.procedure.export import delivery, geometry
     from calib.procedure.parallel_stage.robots import refuse_parallel
 
     refuse_parallel(folder, "export", "a URDF holds no closed loops: take its robot.toml and dynamics.json")
@@ -201,10 +206,10 @@ def export(
 
         if out or ur_kinematics or offsets:
             raise UsageError("--into writes all files into one folder; leave --out, --ur-kinematics and --offsets out")
-        with progress() as show:
+        with progress() as show, warnings.catch_warnings(action="ignore"):  # what it warns of is the first line
             show("all forms, and each file read back")
             lines = export_all(folder, into, urdf=urdf, prior=prior)
-        say_written(lines, into)
+        say_written(lines, into, "fail" if delivery.failure(delivery.verdicts(folder)) else "")
         return
     if (urdf is None) != (out is None) or not (urdf or ur_kinematics or offsets):
         raise UsageError(
@@ -212,8 +217,11 @@ def export(
         )
     found = geometry.read(folder)
     geometry.check_targets(folder, urdf, [path for path in (out, ur_kinematics, offsets) if path])
+    failed = delivery.failure(delivery.verdicts(folder))
     if urdf and out:
         read = geometry.export_urdf(found, urdf, out, for_corrections)
+        if failed:
+            delivery.mark_file(out, failed)
         say(f"{out}: joint origins of {urdf} calibrated, all else kept; base link and flange stay where the source has "
             f"them; {read}")  # fmt: skip
     if ur_kinematics:
@@ -229,6 +237,9 @@ def export(
         left = geometry.without_corrections(folder)
         note += f": {left}" if left else ""
         say(note)
+    if failed:
+        say(failed)
+        exit_failed("fail")
 
 
 @app.command()

@@ -8,16 +8,27 @@ from pathlib import Path
 from calib import files
 from calib.errors import RobotError, UsageError
 from calib.folders import check_target, write_staged
+from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.export import geometry
 from calib.procedure.export.geometry import results
 from calib.procedure.export.parameters import PARAMETERS
-from calib.procedure.kinematic_stage.folder import CORRECTED_URDF, FORMULA, TERMS, URDF
+from calib.procedure.kinematic_stage.folder import (
+    CORRECTED_URDF,
+    FORMULA,
+    IN_SESSION,
+    TERMS,
+    URDF,
+    VALIDATED,
+    FitFolder,
+    ValidationFolder,
+)
 from calib.robot.calibrated import ROBOT
 from calib.robot.formats.markup import with_comment
 
 COPIED = (ROBOT, TERMS, FORMULA)
 OFFSETS, UR_KINEMATICS = "joint_offsets.csv", "ur_kinematics.yaml"
 WRITTEN = (*COPIED, URDF, CORRECTED_URDF, OFFSETS, UR_KINEMATICS)
+DYNAMICS = "dynamics"  # where they are, if on another geometry than robot.urdf's
 MARKS = (OFFSETS, PARAMETERS)  # by which an earlier export is known, of a geometry or of dynamics
 FIRST = "verdict fail: "  # how a README.txt of ours begins; another's is left alone
 
@@ -90,21 +101,54 @@ def _write(fit: Path, source: Path, out: Path) -> list[str]:
     return notes
 
 
+def verdicts(folder: Path) -> dict[str, tuple[str, str]]:
+    """Return verdict and reason of a fit or an identification by its folder; in a session those on unseen rows.
+
+    Empty where the folder is of an earlier version and does not say it.
+    """
+    identified = IdentificationFolder(folder)
+    validated = ValidationFolder(folder.absolute().parent / VALIDATED)
+    try:
+        if identified.model.is_file():
+            found = identified.unseen.verdict() if identified.unseen.report.is_file() else identified.metrics()
+            return {"dynamics": (found.verdict, found.reason)}
+        own = folder.absolute().name == IN_SESSION and validated.judged.is_file()
+        judged = validated.metrics() if own else FitFolder(folder).metrics()
+    except UsageError:
+        return {}
+    return {"geometry": (judged.verdict, judged.reason)}
+
+
+def failure(verdicts: Mapping[str, tuple[str, str]]) -> str:
+    """Return what to say of an export whose verdicts fail; empty where none does."""
+    failed = [f"{stage}: {reason}" for stage, (verdict, reason) in verdicts.items() if verdict == "fail"]
+    return f"{FIRST}{'; '.join(failed)}; do not use" if failed else ""
+
+
 def mark_failed(out: Path, verdicts: Mapping[str, tuple[str, str]]) -> list[str]:
-    """Write failed verdicts at the head of the exported URDFs and into a README.txt beside them; return what to say.
+    """Write failed verdicts at the head of the exported XML files and into a README.txt beside them; return the words.
 
     Args:
-        out: the folder of the export; without a failed stage an earlier README.txt is removed from it.
+        out: the folder of the export; without a failed stage an earlier README.txt of ours is removed from it.
         verdicts: stage to verdict (``pass``, ``marginal``, ``fail``) and reason.
     """
-    failed = [f"{stage}: {reason}" for stage, (verdict, reason) in verdicts.items() if verdict == "fail"]
+    from calib.procedure.export.masses import MJCF  # slow to load, and needed after a failure alone
+
     readme = out / "README.txt"
-    if not failed:
-        if readme.exists() and readme.read_text(encoding="utf-8", errors="replace").startswith(FIRST):
-            readme.unlink()
+    ours = not readme.exists() or readme.read_text(encoding="utf-8", errors="replace").startswith(FIRST)
+    words = failure(verdicts)
+    if not words:
+        if ours:
+            readme.unlink(missing_ok=True)
         return []
-    words = f"{FIRST}{'; '.join(failed)}; do not use"
-    files.write(readme, f"{words}\nThe files in this folder were exported for inspection only.\n")
-    for path in sorted(out.rglob("*.urdf")):
-        files.write(path, with_comment(path.read_bytes(), words))
+    if ours:
+        files.write(readme, f"{words}\nThe files in this folder were exported for inspection only.\n")
+    for path in (place / name for place in (out, out / DYNAMICS) for name in (URDF, CORRECTED_URDF, MJCF)):
+        if path.is_file():
+            mark_file(path, words)
     return [words]
+
+
+def mark_file(path: Path, words: str) -> None:
+    """Write words at the head of an XML file, as a comment."""
+    files.write(path, with_comment(path.read_bytes(), words))

@@ -271,7 +271,7 @@ def export(session: Session, say: Say) -> list[str]:
 
 
 def _exported(session: Session, out: Path, say: Say) -> list[str]:
-    from calib.procedure.export.delivery import deliver
+    from calib.procedure.export.delivery import DYNAMICS, deliver
 
     source = robot_file(session)
     lines = deliver(session.fit.path, source, out)
@@ -281,7 +281,7 @@ def _exported(session: Session, out: Path, say: Say) -> list[str]:
 
     say("all parameters of possible bodies")
     corrected = (out / outputs.CORRECTED_URDF).exists()  # identified on another geometry than robot.urdf's
-    place = out / "dynamics" if corrected else out
+    place = out / DYNAMICS if corrected else out
     try:
         found = deliver_dynamics(session.identification.path, source if source.suffix == ".urdf" else None, place)
     except (RobotError, UsageError) as error:  # the geometry stands by itself

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calib import export
 from calib.robot.formats import urdf
 from calib.robot.formats.urdf_write import write_new
 from calib.robot.kinematics import forward
@@ -144,3 +145,20 @@ def test_an_arm_without_ur_axes_has_no_ur_kinematics(cell, calib):
     panda = load("panda")
     with pytest.raises(Exception, match="not the axes of a UR arm"):
         export_ur_kinematics(CalibratedChain(panda, panda), Path("y.yaml"))
+
+
+def test_a_failed_result_is_exported_with_its_verdict_and_exit_code_1(cell, calib, fitted):
+    code, _, _ = calib("fit", "source.urdf", "a.csv", "--holdout", "0.25", "--tolerance", "1e-6", "--model", "geometry",
+                       "--out", "bad")  # fmt: skip
+    assert code == 1
+    code, out, _ = calib("export", "bad", "--into", "x")
+    assert code == 1 and "verdict fail: geometry: " in out and "above the tolerance" in out
+    assert Path("x/README.txt").read_text().startswith("verdict fail: ")
+    assert "<!-- verdict fail" in Path("x/robot.urdf").read_text()
+    code, out, _ = calib("export", "bad", "--urdf", "source.urdf", "--out", "one.urdf", "--offsets", "one.csv")
+    assert code == 1 and "verdict fail" in out and "<!-- verdict fail" in Path("one.urdf").read_text()
+    assert Path("one.csv").exists() and not Path("README.txt").exists()
+    with pytest.warns(UserWarning, match="verdict fail: geometry"):
+        assert export("bad", "x")[0].startswith("verdict fail")
+    assert calib("export", fitted, "--into", "x")[0] == 0
+    assert not Path("x/README.txt").exists() and "verdict fail" not in Path("x/robot.urdf").read_text()
