@@ -15,6 +15,7 @@ import numpy as np
 import scipy.linalg
 
 State = TypeVar("State")
+EXACT = 0.01
 
 
 class Status(Enum):
@@ -88,7 +89,8 @@ def solve(
     eq. 12). ``damping=0`` is the iterative linear least squares of eq. 11: every step is taken.
 
     Converged (our choice): the next Gauss–Newton step is shorter than ``tolerance`` standard deviations of the
-    estimate, ‖Qᵀr‖ <= tolerance · ‖r‖ / sqrt(dof); or ‖r‖ has fallen to rounding, 1e-11 of where it started.
+    estimate, ‖Qᵀr‖ <= tolerance · ‖r‖ / sqrt(dof); or ‖r‖ has fallen to rounding, 1e-11 of where it started; or no step
+    is better any more, and what is left is `EXACT` standard deviations of a measurement rms, as of computed ones.
 
     Args:
         linearise: state -> residual (rows,) and W (rows, p), whitened.
@@ -109,7 +111,7 @@ def solve(
         elif count >= limit:
             status = Status.ITERATIONS
         elif lam > 1e10:
-            status = Status.STALLED
+            status = Status.CONVERGED if cost <= EXACT**2 * matrix.shape[0] else Status.STALLED
         else:
             trial = retract(state, damped_step(factor, target, lam))
             reduced = triangle(*linearise(trial))

@@ -57,17 +57,23 @@ class Layout:
 
     def ignored(self, table: Table) -> tuple[str, ...]:
         """Return the columns of `table` that are not read, in its order."""
+        return tuple(name for name in table.header if name not in self.used)
+
+    @property
+    def used(self) -> frozenset[str]:
+        """The file's names of all columns that are read."""
         used = {*self.joints, *self.orientation, *self.sigma_rotation, *self.group, *self.base}
         used |= {self.distance, self.sigma_distance, self.tool}
         used.update(name for names in (*self.positions, *self.sigmas) for name in names)
-        return tuple(name for name in table.header if name not in used)
+        return frozenset(used)
 
 
 def find_layout(table: Table, options: FileOptions, joints: Sequence[str]) -> Layout:
     """Return which columns of `table` are to be read for a robot with these joints.
 
     Raises:
-        MeasurementError: where a column is missing, or the header allows several kinds and the options name none.
+        MeasurementError: where a column is missing or mapped in vain, or the header allows several kinds, or several
+            triples, and the options name none.
     """
     check_names(table, options, joints)
     found = _layout(table, options, joints)
@@ -76,6 +82,12 @@ def find_layout(table: Table, options: FileOptions, joints: Sequence[str]) -> La
     if twice:
         message = "is read twice, as two different columns: is one of them mapped to it by mistake? See [columns]"
         raise MeasurementError(message, table.file, column=twice[0])
+    for name, theirs in options.columns.items():
+        if theirs not in found.used:
+            message = (
+                f"is mapped to '{name}' by the options, yet nothing reads it in a file of kind '{found.kind}': take "
+            )
+            raise MeasurementError(f"{message}it out of [columns], or state another kind", table.file, column=theirs)
     return found
 
 
@@ -210,19 +222,43 @@ def _find_targets(table: Table, options: FileOptions) -> tuple[tuple, tuple, tup
 
 
 def _family(table: Table, options: FileOptions, names: Sequence[str], mark: str = "") -> tuple[str, ...]:
-    """Return the file's names of columns that go together (plain, ``_meas``, ``_measured``); () if none is there."""
-    missing = ""
-    for suffix in SUFFIXES:
-        wanted = [name + mark + suffix for name in names]
-        found = tuple(_find(table, options, name) for name in wanted)
-        if all(found):
-            return found
-        if any(found) and not missing:
-            missing = next(name for name, there in zip(wanted, found) if not there)
-    if missing:
-        message = f"missing{suggestion(missing, table.header)}: {', '.join(name + mark for name in names)} go together"
-        raise MeasurementError(message, table.file, column=missing)
+    """Return the file's names of columns that go together (plain, ``_meas``, ``_measured``); () if none is there.
+
+    Where the options map some of them, the others are those that the file has under one of these names.
+
+    Raises:
+        MeasurementError: where one is missing, or the file has them under several of these names.
+    """
+    ours = [name + mark for name in names]
+    if any(name in options.columns for name in ours):
+        return tuple(_mapped(table, options, name, ours) for name in ours)
+    forms = [[name + suffix for name in ours] for suffix in SUFFIXES]
+    complete = [form for form in forms if all(name in table for name in form)]
+    if len(complete) > 1:
+        first, second = (", ".join(form) for form in complete[:2])
+        one = ", ".join(f'{name} = "{theirs}"' for name, theirs in zip(ours, complete[-1]))
+        message = f"the header has {first} and {second}: which of them are to be read? Map them in the options"
+        raise MeasurementError(f"{message}: [columns] {one}", table.file, column=complete[0][0])
+    if complete:
+        return tuple(complete[0])
+    for form in forms:
+        missing = [name for name in form if name not in table]
+        if len(missing) < len(form):
+            message = f"missing{suggestion(missing[0], table.header)}: {', '.join(ours)} go together"
+            raise MeasurementError(message, table.file, column=missing[0])
     return ()
+
+
+def _mapped(table: Table, options: FileOptions, name: str, together: Sequence[str]) -> str:
+    """Return the file's name of one column of a family of which the options map some."""
+    if name in options.columns:
+        return options.columns[name]
+    found = [name + suffix for suffix in SUFFIXES if name + suffix in table]
+    if len(found) == 1:
+        return found[0]
+    what = f"{' and '.join(found)} could be it" if found else f"missing{suggestion(name, table.header)}"
+    message = f"{what}: {', '.join(together)} go together, and [columns] maps some of them only; map it, too"
+    raise MeasurementError(message, table.file, column=name)
 
 
 def _find(table: Table, options: FileOptions, name: str) -> str:

@@ -19,7 +19,7 @@ TOML; every key is optional, and a key that is none of these is refused. Lengths
     free = ["d3"]                    # if given, only these move
     accept = []                      # findings that are meant so: unexplained, reflection, sign, moved, scale
 
-    [columns]                        # our name = the file's
+    [columns]                        # our name = the file's; y and z go with x
     x = "X_leica"
     [units]                          # of columns whose header states none: our name, or joints, position, distance,
     joints = "deg"                   # orientation, sigma, sigma_rotation

@@ -5,6 +5,7 @@ Columns by default (a unit in brackets is converted, ``q1 [deg]``, ``x [mm]``; p
 ==================  ===================================================================================================
 joints              the robot's joint names, or ``q_<joint name>``, or ``q1`` to ``qn``
 position, pose      ``x y z``; with ``qx qy qz qw`` or ``r11`` to ``r33`` a pose; also with ``_meas``, ``_measured``
+                    (where a file has both, the options' [columns] say which is to be read)
 several reflectors  ``x1 y1 z1 x2 y2 z2 ...``, each a row of its own; an empty triple is a reflector not seen
 base frame          ``base_x`` … ``base_qw``, measured with every row: the target is then seen from there
 sigmas              ``sigma_x``, ``_y``, ``_z`` (numbered as the reflectors, or common), ``sigma_rx``, ``_ry``, ``_rz``

@@ -30,14 +30,13 @@ from calib.geometry.images.camera_guess import pnp_poses
 from calib.geometry.installation import Installation
 from calib.geometry.result import GeometricFit
 from calib.procedure.findings import Finding
-from calib.procedure.kinematic_stage.remarks import FLOOR
+from calib.procedure.kinematic_stage.remarks import FLOOR, TOO_GOOD
 
 NO_ARM = 0.015
 BETTER = 3.0
 SHARE, LEAST, GROWN, FOREIGN, ALONE = 0.3, 1e-3, 5e-3, 0.025, 0.8
 TURNED, SHIFTED = 0.1, 0.03  # [rad], of the reach
 NAMED = 5  # elements in a sentence
-TOO_GOOD = 2e-6  # [m]
 LOOKED_AT = 100  # images
 
 

@@ -26,6 +26,7 @@ from calib.geometry.result import GeometricFit, outliers
 from calib.units import ERRORS
 
 FLOOR = 4e-4  # rms per metre of reach: more is not left by a rigid geometry of a sound arm (our choice)
+TOO_GOOD = 2e-6  # rms [m]: less is left by no instrument (our choice)
 STILL = 45.0  # [deg] orientation range below which "the wrist is held still" is the likely reason (our choice)
 
 

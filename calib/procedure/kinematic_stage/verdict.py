@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.procedure.findings import Verdict
 from calib.procedure.kinematic_stage.comparison import Comparison
-from calib.procedure.kinematic_stage.remarks import FLOOR
+from calib.procedure.kinematic_stage.remarks import FLOOR, TOO_GOOD
 
 WORSE = 1.01  # calibrated over nominal rms on the unseen from which on it is worse, not only no better
 GAIN = 0.10  # a smaller gain in rms on the unseen is no gain worth a new robot file
@@ -59,7 +59,8 @@ def judge(
     4. only frames were asked for: pass, with nothing claimed of the arm;
     5. frames were chosen, so that no model of the arm is better than the nominal one: pass where what remains is below
        `calib.procedure.kinematic_stage.remarks.FLOOR` of the reach (there is nothing to gain), else fail; where not
-       every station could be left out as a whole, the choice itself is in doubt: marginal in place of pass;
+       every station could be left out as a whole, the choice itself is in doubt: marginal in place of pass. With any
+       model, pass where the nominal arm leaves less than any instrument (`TOO_GOOD`);
     6. on some unseen file the calibrated arm is worse than the nominal one: fail. By cross-validation alone, where both
        leave less than `FLOOR` of the reach: marginal, since the nominal arm may have been fitted to these very rows;
     7. no unseen rows and no cross-validation: marginal;
@@ -195,9 +196,10 @@ def _too_coarse(found: list[_Proof], tolerance: float | None) -> Verdict | None:
 
 
 def _nothing_gained(found: list[_Proof], model: str, reach: float, blind: Sequence[str]) -> Verdict | None:
-    if model != "frames":
-        return None
     worst = max((proof.before for proof in found), default=np.inf)
+    if model != "frames":
+        words = f"nothing to gain: the nominal arm leaves {1e6 * worst:.2g} µm rms on unseen poses"
+        return Verdict("pass", words) if worst < TOO_GOOD else None
     if blind and worst <= FLOOR * reach < np.inf:
         return Verdict(
             "marginal",

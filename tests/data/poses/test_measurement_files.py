@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.data.poses.fit_options import FileOptions, Sigma
 from calib.data.poses.pose_files import joint_columns, read_measurements
+from calib.errors import MeasurementError
 
 
 def read(path, options=None, **more):
@@ -75,11 +76,38 @@ def test_measured_columns_with_a_suffix_are_taken_and_said(write, good, suffix):
     assert any(f"x{suffix}" in note for note in block.notes) and any(f"qw{suffix}" in note for note in block.notes)
 
 
-def test_plain_columns_win_over_suffixed_ones(write, good):
-    rows = [[*row[:6], 9, 9, 9] for row in good]
-    block = read(write("q1,q2,q3,x,y,z,x_meas,y_meas,z_meas", rows))
-    np.testing.assert_array_equal(block.position, np.array(good, dtype=float)[:, 3:6])
-    assert block.ignored == ("x_meas", "y_meas", "z_meas")
+@pytest.mark.parametrize("names", [("x", "y", "z"), ("x_meas", "y_meas", "z_meas")])
+def test_commanded_beside_measured_positions_are_refused_until_the_options_say_which(write, good, names):
+    path = write("q1,q2,q3,x,y,z,x_meas,y_meas,z_meas", [[*row[:6], 9, 9, 9] for row in good])
+    with pytest.raises(MeasurementError, match=r'which of them.*\[columns\] x = "x_meas"'):
+        read(path)
+    block = read(path, FileOptions(columns=dict(zip("xyz", names))))
+    expected = np.array(good, dtype=float)[:, 3:6] if names[0] == "x" else np.full((len(good), 3), 9.0)
+    np.testing.assert_array_equal(block.position, expected)
+    assert block.ignored == (("x_meas", "y_meas", "z_meas") if names[0] == "x" else ("x", "y", "z"))
+
+
+def test_a_map_of_some_columns_is_completed_by_those_that_go_with_them(write, good):
+    path = write("q1,q2,q3,x_meas,y_meas,z_meas", [row[:6] for row in good])
+    block = read(path, FileOptions(columns={"x": "y_meas", "y": "x_meas"}))
+    np.testing.assert_array_equal(block.position, np.array(good, dtype=float)[:, [4, 3, 5]])
+
+
+@pytest.mark.parametrize(
+    "header, columns, said",
+    [
+        ("x_meas,y_meas,z_meas", {"x": "z_meas"}, "is read twice"),
+        ("x,y,z,x_meas,y_meas,z_meas", {"x": "x_meas", "y": "y_meas"}, "z and z_meas could be it"),
+        ("a,b,height", {"x": "a", "y": "b"}, "map it, too"),
+        ("x,y,z,qx_meas", {"qx": "qx_meas"}, "map it, too"),
+        ("x,y,z,std", {"sigma_distance": "std"}, "nothing reads it in a file of kind 'position'"),
+    ],
+)
+def test_a_map_that_cannot_be_followed_is_refused(write, good, header, columns, said):
+    width = len(header.split(","))
+    path = write(f"q1,q2,q3,{header}", [[*row[:3], *range(1, 1 + width)] for row in good])
+    with pytest.raises(MeasurementError, match=said):
+        read(path, FileOptions(columns=columns))
 
 
 def test_rotation_matrices_give_the_same_as_quaternions(write, good):

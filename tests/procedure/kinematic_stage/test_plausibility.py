@@ -125,6 +125,18 @@ def test_computed_positions_are_noted(cell, calib):
     assert verdict()[2] == ["commanded"] and "not measured ones?" in out
 
 
+def test_positions_without_any_error_leave_nothing_to_gain(cell, calib):
+    """No step is better than the start here: the residuals are rounding."""
+    rows = cell.measure(COUNT)
+    q = np.array([[row[f"q{j + 1}"] for j in range(6)] for row in rows])
+    for row, place in zip(rows, forward(cell.nominal, q)[:, :3, 3]):
+        row |= dict(zip("xyz", place))
+    path = cell.write("m.csv", rows, [*(f"q{j + 1}" for j in range(6)), *"xyz"])
+    code, _, err = calib("fit", "ur5", path, "--out", "o")
+    assert not code, err
+    assert verdict()[1].startswith("nothing to gain") and verdict()[2] == ["commanded"]
+
+
 @pytest.mark.parametrize("columns", ["tool_position,socket", "bar,distance"])
 def test_one_row_per_socket_or_bar_tells_nothing(cell, calib, columns):
     rows = ["0.1,0.2,0.3,0.4,0.5,0.6,a,0.5", "0.2,0.2,0.3,0.4,0.5,0.6,b,0.5"]
