@@ -15,8 +15,13 @@ LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "cm": 1e-
 # as recordings name them, in small letters
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 POSITIONS = {"rad": 1.0, "m": 1.0, "deg": DEG, "°": DEG, "mrad": 1e-3, "mm": 1e-3}
+TURNED = ("rad", "deg", "°", "mrad", "rad/s", "deg/s", "°/s", "rpm")
+"""Those among `POSITIONS` and `VELOCITIES` that turning joints have; the others are those of sliding ones."""
 VELOCITIES = {"rad/s": 1.0, "m/s": 1.0, "deg/s": DEG, "°/s": DEG, "mm/s": 1e-3, "rpm": math.pi / 30}
-EFFORTS = {"nm": 1.0, "n·m": 1.0, "n.m": 1.0, "n*m": 1.0, "n m": 1.0, "n": 1.0, "mnm": 1e-3, "knm": 1e3}
+EFFORTS = {
+    **{f"n{dot}{length}": size for length, size in (("m", 1.0), ("mm", 1e-3)) for dot in ("", "·", ".", "*", " ", "-")},
+    "n": 1.0, "mnm": 1e-3, "knm": 1e3,
+}  # fmt: skip
 CURRENTS = {"a": 1.0, "ma": 1e-3}
 
 QUANTITIES: Mapping[str, Mapping[str, float]] = {
@@ -24,7 +29,7 @@ QUANTITIES: Mapping[str, Mapping[str, float]] = {
     "length": LENGTHS,
     "angular speed": {"rad/s": 1.0, "deg/s": DEG, "°/s": DEG, "rpm": math.pi / 30},
     "speed": {"m/s": 1.0, "mm/s": 1e-3},
-    "torque": {"Nm": 1.0, "N m": 1.0},
+    "torque": {"Nm": 1.0, "N m": 1.0, "N·m": 1.0, "Nmm": 1e-3, "N mm": 1e-3, "N·mm": 1e-3},
     "force": {"N": 1.0},
     "frequency": {"rad/s": 1.0, "Hz": 2 * math.pi},
 }

@@ -40,7 +40,7 @@ def check_joints(
         MeasurementError: for degrees under a rad header, values outside the limits, a robot that never moved.
     """
     kinds = kinds or ["revolute"] * len(joints)
-    _check_joint_units(table, columns, kinds)
+    _check_joint_units(table, columns, kinds, options)
     if len(q) > 1 and np.ptp(q, axis=0).max() < STILL:
         message = f"all {len(q)} rows have the same joint values: one pose tells nothing of the robot"
         raise MeasurementError(message, table.file, int(table.rows[-1]), columns[0])
@@ -60,13 +60,15 @@ def check_joints(
     return (*notes, *_few_degrees(q, table, columns, kinds, options))
 
 
-def _check_joint_units(table: Table, columns: Sequence[str], kinds: Sequence[str]) -> None:
-    """Refuse a header whose unit does not suit the joint: mm for a revolute one, deg for a prismatic one."""
+def _check_joint_units(table: Table, columns: Sequence[str], kinds: Sequence[str], options: FileOptions) -> None:
+    """Refuse a stated unit that does not suit the joint: mm for a revolute one, deg for a prismatic one."""
     for name, kind in zip(columns, kinds):
-        unit = table.units[table.index(name)].lower()
-        if unit and (unit in ANGLES) == (kind == "prismatic"):
-            message = f"the unit [{unit}] does not suit a {kind} joint: is the column in its place?"
-            raise MeasurementError(message, table.file, column=name)
+        unit = _stated(table, name, options)
+        if unit and (unit.lower() in ANGLES) == (kind == "prismatic"):
+            message, advice = f"the unit [{unit}] does not suit a {kind} joint", "is the column in its place?"
+            if not table.units[table.index(name)]:
+                advice = "the options state it; if it holds for some joints only, state it by their columns' names"
+            raise MeasurementError(f"{message}: {advice}", table.file, column=name)
 
 
 def check_lengths(values: np.ndarray, table: Table, columns: Sequence[str]) -> None:

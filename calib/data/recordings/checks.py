@@ -247,8 +247,8 @@ def _effort_notes(recording: Recording, joints: Joints | None) -> list[str]:
         j = int(np.argmax(np.where(known, usual / np.where(known, limit, 1.0), 0.0)))
         message = (
             f"|torque| reaches {usual[j]:.4g} where the joint's limit is {limit[j]:g}, and every joint is beyond "
-            f"{BEYOND:g} times its limit: are these N mm, or another robot's? If N mm, say so (a header 'tau_1 [mNm]', "
-            "or units: torque = 'mNm'); if N m, correct the limits in the robot's file"
+            f"{BEYOND:g} times its limit: are these N mm, or another robot's? If N mm, say so (a header 'tau_1 [Nmm]', "
+            "or units: torque = 'Nmm'); if N m, correct the limits in the robot's file"
         )
         raise MeasurementError(message, recording.file, column=column(recording, "effort", j))
     high = known & (most > 1.2 * np.where(known, limit, np.inf))

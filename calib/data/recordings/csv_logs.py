@@ -17,7 +17,7 @@ import numpy as np
 from calib.data.csv_table import Table, read_table
 from calib.data.recordings.archives import Ends
 from calib.data.recordings.recording import Joints, Recording, cut, named
-from calib.data.recordings.recording_options import SYNONYMS, RecordingOptions, one_effort, scale
+from calib.data.recordings.recording_options import SYNONYMS, RecordingOptions, check_units, one_effort, scale
 from calib.errors import MeasurementError, UsageError, suggestion
 
 _NUMBERED = re.compile(r"^(?P<stem>.*?)[_\s.]?(?P<number>\d+)$")
@@ -37,6 +37,7 @@ def read_log(
         if ours != "t" and len(columns) != n:
             message = f"{len(columns)} columns of {ours} ({', '.join(_called(table, columns))}) for {n} of q"
             raise MeasurementError(message, path)
+        check_units(ours, [table.units[place] for place in columns], joints, path)
     kind = "current" if "current" in found else "torque"
     series: dict[str, Any] = {
         "effort" if ours == kind else ours: np.column_stack([_values(table, c, ours, options) for c in columns])

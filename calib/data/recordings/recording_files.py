@@ -10,7 +10,7 @@ from calib.data.recordings.bags import read_bag
 from calib.data.recordings.checks import check_recording
 from calib.data.recordings.csv_logs import read_log
 from calib.data.recordings.recording import Joints, Recording, earlier, parse_cut
-from calib.data.recordings.recording_options import RecordingOptions
+from calib.data.recordings.recording_options import RecordingOptions, check_units
 from calib.errors import MeasurementError
 
 Reader = Callable[[Path, Joints | None, RecordingOptions, Ends], Recording]
@@ -30,6 +30,8 @@ def read_recording(
     """
     file, start, stop = parse_cut(str(path))
     options = options or RecordingOptions()
+    for name, unit in options.units.items():
+        check_units(name, [unit] * len(joints.names if joints else ()), joints, file)
     reader = _reader(Path(file))
     recording = reader(Path(file), joints, options, (start, stop))
     if joints is not None:

@@ -23,7 +23,7 @@ FloBaRoID writes times, positions, velocities, torques.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -32,7 +32,7 @@ from calib.config import strict
 from calib.config_types import Checked, Flag, Hidden, Name, OneOf, Positive, Real, Text, shown
 from calib.data.recordings.recording import Joints, named
 from calib.errors import MeasurementError, UsageError, suggestion
-from calib.units import CURRENTS, EFFORTS, POSITIONS, TIMES, VELOCITIES
+from calib.units import CURRENTS, EFFORTS, POSITIONS, TIMES, TURNED, VELOCITIES
 
 SYNONYMS: Mapping[str, tuple[str, ...]] = {
     "t": ("t", "time", "times", "timestamp", "timestamps", "stamp"),
@@ -122,6 +122,16 @@ def scale(name: str, unit: str) -> float:
     except ValueError as wrong:
         raise UsageError(str(wrong)) from None
     return SCALES[name][unit.lower()] if unit else 1.0
+
+
+def check_units(name: str, units: Sequence[str], joints: Joints | None, path: str | Path) -> None:
+    """Refuse units, one per column of the series `name`, that turning or sliding joints do not have; "" is SI."""
+    if joints is None or len(units) != len(joints.names) or name not in ("q", "v", "q_link", "q_ref"):
+        return
+    for joint, kind, unit in zip(joints.names, joints.kinds, units):
+        if unit and (unit.lower() in TURNED) == (kind == "prismatic"):
+            message = f"the unit [{unit}] of {name} does not suit {joint}, a {kind} joint: is it what the file is in?"
+            raise MeasurementError(message, path)
 
 
 def find_names(members: tuple[str, ...], options: RecordingOptions, path: Path) -> dict[str, str]:

@@ -134,6 +134,8 @@ def test_a_unit_that_does_not_suit_the_joint(write, good):
     kinds = ("prismatic", "revolute", "revolute")
     refused(write("q1 [deg]," + POSE[3:], good), "does not suit a prismatic joint", None, "q1", kinds=kinds)
     refused(write("q1 [mm]," + POSE[3:], good), "does not suit a revolute joint", None, "q1")
+    stated = FileOptions(units={"joints": "mm"})
+    refused(write(POSE, good), r"\[mm\] does not suit a revolute joint: the options state it", None, "q1", stated)
 
 
 def test_a_header_that_fits_several_kinds(write, good):

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from calib.data.recordings.recording import Joints
 from calib.data.recordings.recording_files import read_recording
+from calib.data.recordings.recording_options import RecordingOptions
 from calib.errors import MeasurementError
 
 
@@ -29,6 +31,23 @@ def test_a_descending_arm_gives_energy_back_and_is_no_reversed_sign(tmp_path, ba
     assert (work < 0) != back, "the drives of the one that only comes down are paid by gravity"
     np.savez(tmp_path / "log.npz", **(series | {"tau": sign * series["tau"]}))
     assert alarms(tmp_path / "log.npz") == alarm
+
+
+@pytest.mark.parametrize("unit", ["Nmm", "N·mm", "N mm", "mNm"])
+def test_newton_millimetres_are_known_by_their_spellings(tmp_path, unit):
+    series = falling(True)
+    names = ["t", "q1", "q2", f"tau1 [{unit}]", f"tau2 [{unit}]"]
+    table = np.column_stack([series["t"], series["q"], 1e3 * series["tau"]])
+    np.savetxt(tmp_path / "log.csv", table, delimiter=",", header=",".join(names), comments="")
+    assert read_recording(tmp_path / "log.csv").effort == pytest.approx(series["tau"])
+
+
+def test_a_unit_that_a_joint_does_not_have_is_refused(tmp_path):
+    np.savez(tmp_path / "log.npz", **falling(True))
+    for unit, kind in (("mm", "revolute"), ("deg", "prismatic")):
+        with pytest.raises(MeasurementError, match=rf"unit \[{unit}\] of q does not suit b, a {kind} joint"):
+            joints = Joints(("a", "b"), ("prismatic" if unit == "mm" else "revolute", kind))
+            read_recording(tmp_path / "log.npz", joints, RecordingOptions(units={"q": unit}))
 
 
 def test_a_file_that_is_no_recording_is_told_why(tmp_path):
