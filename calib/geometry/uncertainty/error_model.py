@@ -26,10 +26,10 @@ from calib.geometry.fit import plausible_deviation
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.effects import term_groups, term_sizes
 from calib.geometry.model_choice.folds import Folds, random_folds
-from calib.geometry.model_choice.ladder import ModelSelection
+from calib.geometry.model_choice.ladder import GROSS, ModelSelection
 from calib.geometry.observation import observe, prepare
 from calib.geometry.parameters import layout
-from calib.geometry.result import row_weights, used_sigmas
+from calib.geometry.result import outliers, row_weights, used_sigmas
 from calib.geometry.uncertainty.spread import pose_sigmas
 from calib.robot.chain import Chain
 from calib.robot.deflection import Deflection
@@ -180,7 +180,7 @@ def learn_errors(
     """Learn what errors to expect from those on rows left out; None without positions, or with too few.
 
     For every fold the geometry and the ridges of all effects that were taken up are found anew: ridges of all rows know
-    what was left out.
+    what was left out. With a robust loss, rows beyond `GROSS` robust sigmas are no errors of the arm and do not count.
 
     Args:
         selected: the model and its fit of all rows.
@@ -233,6 +233,8 @@ class _Rows:
         every = max(1, -(-sum(map(len, measured)) // MOST))
         self.chosen = [np.arange(0, len(block), every) for block in measured]
         self.measured = [take(block, rows) for block, rows in zip(measured, self.chosen)]
+        gross = set() if selected.loss == "none" else {(file, row) for file, row, *_ in outliers(found, GROSS)}
+        self.counts = [np.array([(b.file, int(row)) not in gross for row in b.rows], bool) for b in self.measured]
         torques = [None] * len(measured) if torques is None else torques
         given = [None if torque is None else torque[rows] for torque, rows in zip(torques, self.chosen)]
         cell = found.cell
@@ -306,7 +308,8 @@ class _Rows:
                 error = value - np.einsum("f,fim->im", found.values, jacobian)
                 own = np.sum((root.T @ jacobian[alive].reshape(len(alive), -1)) ** 2, axis=0)
                 near = distances(self.measured[number].q[rows], learnt, levers)
-                yield np.stack([np.sum(error**2, axis=0), own.reshape(3, -1).sum(axis=0), *near], axis=1)
+                result = np.stack([np.sum(error**2, axis=0), own.reshape(3, -1).sum(axis=0), *near], axis=1)
+                yield result[self.counts[number][rows]]
 
 
 def _placed_anew(columns: np.ndarray, frames: np.ndarray) -> np.ndarray:

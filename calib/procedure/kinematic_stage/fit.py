@@ -151,6 +151,7 @@ def run(
     if said and settings.loss in HEEDS_ALL:
         said = gross_rows(found, climb("geometry", settings=replace(settings, loss="cauchy")), long) or said
     say("comparing on unseen poses")
+    settings = combine(settings, loss=found.loss)
     rigid = rigid_fit(found, inputs.fit, settings)
     named = named_outliers(found.fit)
     told = *map(remark, diagnose(found.fit)), *image_notes(found.fit)

@@ -20,7 +20,7 @@ from calib.geometry.fit import polish_frames, without_corrections
 from calib.geometry.installation import Installation
 from calib.geometry.observation import predict, prepare
 from calib.geometry.uncertainty.error_model import ErrorModel
-from calib.geometry.weighing import Settings
+from calib.geometry.weighing import Settings, combine
 from calib.procedure.findings import Verdict, held_by
 from calib.procedure.kinematic_stage.comparison import (
     Comparison,
@@ -99,12 +99,12 @@ def assess(
         arms: what is compared.
         inputs: the rows.
         findings: what the fit says of itself.
-        settings: of the fit, as asked for.
+        settings: of the fit, as asked for; the loss is the one that the fit chose.
         asked: the model asked for.
         tolerance: largest rms on unseen poses that is good enough [m].
         seed: of the pairs whose distances are compared.
     """
-    both = arms.nominal, arms.calibrated
+    both, settings = (arms.nominal, arms.calibrated), combine(settings, loss=findings.loss or settings.loss)
     torques = [gravity_of(inputs.chain, block) for block in inputs.fit]
     alone = without_corrections(arms.calibrated, arms.rigid, inputs.fit, settings)
     fitted = compare(*both, inputs.fit, torques, "fitted on these rows", False, seed, alone=alone)

@@ -242,6 +242,24 @@ def test_fixed_parameters_stay(cell, calib):
     assert values["theta4"] != before["theta4"]
 
 
+def test_gross_rows_reach_neither_the_urdf_nor_the_intervals(cell, calib):
+    """The loss that auto takes for them counts for all that comes of the fit, not for the calibrated arm alone."""
+
+    def gears(count: int, seed: int) -> list[dict[str, float]]:
+        return [row | {"q3": row["q3"] + 1e-3 * np.sin(2.0 * row["q2"])} for row in cell.measure(count, seed)]
+
+    rows, columns = gears(100, 0), [*(f"q{j + 1}" for j in range(6)), *"xyz"]
+    clean = cell.write("clean.csv", rows, columns)
+    wrong = cell.write("m.csv", [row | {"x": row["x"] + 0.05 * (k % 10 == 0)} for k, row in enumerate(rows)], columns)
+    unseen, alone, radius = cell.write("v.csv", gears(40, 1), columns), [], []
+    for file in (clean, wrong):
+        calib("fit", "ur5", file, "--validate", unseen, "--model", "coupling", "--out", "o")
+        found = json.loads(Path("o/metrics.json").read_text())["validation"]["v.csv"]
+        alone.append(found["urdf_alone"]["position_mm"]["rms"])
+        radius.append(found["interval95"]["median_mm"])
+    assert alone[1] < 1.2 * alone[0] and radius[1] < 1.5 * radius[0]
+
+
 def test_refitting_a_fits_own_folder_is_no_failure(cell, calib):
     file = cell.write("a.csv", cell.measure(60))
     assert calib("fit", "ur5", file, "--out", "arm")[0] == 0
