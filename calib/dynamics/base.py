@@ -25,6 +25,7 @@ from calib.estimation.base_columns import ColumnSplit, split_columns
 from calib.estimation.triangles import retriangulate
 
 SAMPLES = 500
+SMALLEST = 1e-4  # coefficients below are not printed: on a calibrated geometry nearly all are there, and small
 BLOCK = 2048  # samples per factorisation: bounds the memory, and keeps it in the processor's cache
 NEGLIGIBLE = 1e-11  # coefficients below this part of the largest of their column are rounding
 
@@ -78,10 +79,9 @@ class Base:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The b names, with R where others are regrouped in."""
-        return tuple(
-            self.standard[k] + ("R" if row.any() else "") for k, row in zip(self.kept, self.split.coefficients)
-        )
+        """The b names, with R where others are regrouped in, by no less than `SMALLEST`."""
+        told = (np.abs(self.split.coefficients) >= SMALLEST).any(axis=1)
+        return tuple(self.standard[k] + ("R" if found else "") for k, found in zip(self.kept, told))
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -206,12 +206,12 @@ def r_factor(model: RegressorModel, samples: States, loads: Loads = (None,)) -> 
     return retriangulate(triangles.reshape(-1, p))
 
 
-def expressions(base: Base, digits: int = 5, smallest: float = 1e-4) -> tuple[str, ...]:
+def expressions(base: Base, digits: int = 5, smallest: float = SMALLEST) -> tuple[str, ...]:
     """Return what each base parameter stands for, e.g. ``ZZ1R = ZZ1 + YY2``.
 
     Args:
         digits: significant digits of the coefficients.
-        smallest: coefficients below are left out (on a calibrated geometry nearly all are there, and small).
+        smallest: coefficients below are left out.
     """
     lines = []
     for name, k, row in zip(base.names, base.kept, base.split.coefficients):

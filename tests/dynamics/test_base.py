@@ -182,6 +182,8 @@ def test_regrouping_on_the_calibrated_geometry():
     old, new = (base.BaseModel(calibrated, one).regressor(q, v, a) @ (one.transform @ chi) for one in (first, second))
     assert np.allclose(new, wanted, rtol=0, atol=1e-8)
     assert np.abs(old - wanted).max() > 1e-2
+    for name, line in zip(second.names, base.expressions(second)):  # R where others are in, and nowhere else
+        assert name.endswith("R") == (" + " in line or " - " in line), line
 
 
 def test_a_leaning_axis_adds_weak_directions_and_the_remainder_says_what_they_carry():

@@ -107,19 +107,20 @@ def _over_workspace(report: Report, proof: RowErrors, label: str) -> dict[str, C
     }
 
 
-def draw_dynamics(found: DynamicReport, folder: Path, excitation: Path) -> dict[str, Pictures]:
+def draw_dynamics(found: DynamicReport, folder: Path, excitation: Path | None) -> dict[str, Pictures]:
     """Return the figures of the dynamics by name, as a page shows them; those that the data do not give are empty.
 
     Args:
         folder: of the identification.
-        excitation: folder with ``training/trajectory.csv`` and its ``metrics.json``, if a motion was designed.
+        excitation: folder with ``training/trajectory.csv`` and its ``metrics.json``; None where other motions
+            were played.
     """
     from calib.procedure.report import uncertainty_figures
 
     return {
         "errors": Pictures("", _judged(found.unseen)),
         "torques": Pictures("Torques", _torques(found.unseen)),
-        "excitation": Pictures("Excitation", _excitation(excitation)),
+        "excitation": Pictures("Excitation", [] if excitation is None else _excitation(excitation)),
         "geometry": Pictures("", list(uncertainty_figures.from_folder(folder).values())),
         "parameters": Pictures("Dynamic parameters", [_significance(found)]),
     }

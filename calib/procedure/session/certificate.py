@@ -14,6 +14,7 @@ from calib.errors import command_line
 from calib.folders import CERTIFICATE
 from calib.procedure.excitation.coefficients import SAMPLES
 from calib.procedure.kinematic_stage.folder import SCHEMA, URDF
+from calib.procedure.kinematic_stage.metrics import FitMetrics
 from calib.procedure.report import certificate, fit_report, viewer
 from calib.procedure.report.fit_report import RowErrors
 from calib.procedure.report.page import Section, Text
@@ -46,7 +47,8 @@ def certify(session: Session, say: Say) -> list[str]:
         if session.plots:
             from calib.procedure.report.figures import draw_dynamics
 
-            drawn = draw_dynamics(dynamics, session.identification.path, session.path("6-excitation"))
+            motions = session.path("6-excitation") if session.settings.dynamics.plan else None
+            drawn = draw_dynamics(dynamics, session.identification.path, motions)
         tolerance = session.settings.dynamics.tolerance_percent
         section = dynamics_section.certificate_section(dynamics, drawn, exported, tolerance)
         judged.append(_with_arrival(section, _arrival_notes(session, "7-recorded", "predict")))
@@ -108,7 +110,7 @@ def _setup(session: Session, found: fit_report.Report) -> list[tuple[str, str]]:
         *simulated(session),
         ("robot", f"{found.robot}, {found.base} to {found.tip}, {len(found.joints)} joints"),
         ("description", settings.robot.given),
-        ("instrument", f"{instrument.name}, measures {instrument.measures}{stated}{turning}"),
+        ("instrument", f"{instrument.name}, {_used(session, found.metrics)}{stated}{turning}"),
         ("session made", settings.created.replace("T", " ")),
         ("measurements", _named([*fitted[0], *fitted[1]])),
         ("pose plan", _session_plan(session)),
@@ -120,6 +122,15 @@ def _setup(session: Session, found: fit_report.Report) -> list[tuple[str, str]]:
         ("command", command_line("next", session.folder.name)),
         ("toolkit", certificate.versions()),
     ]
+
+
+def _used(session: Session, found: FitMetrics) -> str:
+    """Return what the instrument measures, and what of it was used where the files hold something else."""
+    said = session.settings.instrument.measures
+    turned = found.fit.calibrated.orientation_deg is not None
+    used = {("position", True): "poses with orientation", ("pose", False): "positions or distances alone"}
+    other = used.get((said, turned))
+    return f"said to measure {said}; the files hold {other}, which were used" if other else f"measures {said}"
 
 
 def _dynamic_setup(session: Session) -> list[tuple[str, str]]:
@@ -184,7 +195,8 @@ def listed(session: Session) -> list[tuple[str, str, str, str]]:
     ]
     if session.dynamic:
         wanted += [path for paths in recordings(session) for path in paths if path.is_file()]
-        wanted += sorted(session.path("6-excitation").glob(f"*/{SAMPLES}"))
+        if session.settings.dynamics.plan:  # else other motions were played
+            wanted += sorted(session.path("6-excitation").glob(f"*/{SAMPLES}"))
         wanted += [*session.identification.tables, session.identification.model]
     wanted += [*session.fit.tables, *exported[1:]]
     made = {name: mark for step in read_state(session).steps.values() for name, mark in step.outputs.items()}

@@ -11,6 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from calib import files
 from calib.data.recordings.recording_files import read_recording
 from calib.dynamics.torque_rows import torque_rows
@@ -79,10 +81,11 @@ def excite(session: Session, say: Say) -> list[str]:
     from calib.procedure.excitation import folder as motion_folder
     from calib.procedure.excitation.settings import ExcitationSettings
 
-    draw = None
+    wanted, notes, draw = session.settings.dynamics, [], None
+    if not wanted.plan:
+        return ["no motion is designed: the recorded files hold others (plan = false)"]
     if session.plots:
         from calib.procedure.report.motion_figures import write_design as draw
-    wanted, notes = session.settings.dynamics, []
     limits = session.path(wanted.limits) if wanted.limits else None
     names = ["training", "validation"] if wanted.validation else ["training"]
     for name in names:
@@ -133,7 +136,7 @@ def _check_recording(session: Session, path: Path, name: str) -> tuple[list[floa
     chain, options = calibrated(session), options_of(session)
     own = file_settings(options, str(path))
     recording = read_recording(str(path), inputs.joints_of(chain), own.recording)
-    rate = (len(recording) - 1) / max(recording.duration, 1e-9)
+    rate = 1.0 / max(float(np.median(np.diff(recording.t))), 1e-9)  # as identification takes it
     sensors = ", and sensors behind the gears" if recording.tau_link is not None else ""
     notes = [f"{path.name}: {recording.duration:.1f} s at {rate:.4g} Hz, {recording.kind}s{sensors}"]
     notes += [f"{path.name}: {note}" for note in recording.notes]

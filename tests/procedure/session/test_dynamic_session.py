@@ -94,6 +94,18 @@ def test_two_lines_say_what_to_play_and_what_to_log(waiting: Session) -> None:
     assert "7-recorded/training.csv" in second and "q_joint1 [deg]" in second and "tau_joint7 [Nm]" in second
 
 
+def test_without_a_plan_no_motion_is_designed_or_presented(waiting: Session) -> None:
+    shutil.rmtree(waiting.path("6-excitation"))
+    head, dynamics = waiting.path("session.toml").read_text().split("[dynamics]\n")
+    assert dynamics.count("plan = true ") == 1
+    waiting.path("session.toml").write_text(f"{head}[dynamics]\n{dynamics.replace('plan = true ', 'plan = false')}")
+    session = open_session(waiting.folder)
+    stopped = go_on(session)
+    assert stopped is not None and stopped.step.name == "record"
+    assert not session.path("6-excitation").exists()
+    assert "unseen one" in instructions.asks(session, stopped)[0]
+
+
 @pytest.mark.slow
 def test_it_ends_in_one_certificate_of_both(whole: Session) -> None:
     assert set(kinds(whole).values()) == {steps.DONE}
