@@ -160,10 +160,15 @@ def check_identification_target(out: Path, inputs: Sequence[str | Path | None] =
 
 
 def write_folder(
-    outcome: IdentificationOutcome, out: Path, plots: Callable[[IdentificationOutcome, Path], None] | None = None
-) -> Path:
-    """Write all files of an identification, all or none; see `calib.folders`."""
-    check_identification_target(out, [outcome.inputs.source, outcome.inputs.source.parent])
+    outcome: IdentificationOutcome, out: Path, plots: Callable[[IdentificationOutcome, Path], None] | None = None,
+    *, owned: bool = False,
+) -> Path:  # fmt: skip
+    """Write all files of an identification, all or none; see `calib.folders`.
+
+    An `owned` folder is ours, whatever is left in it.
+    """
+    if not owned:
+        check_identification_target(out, [outcome.inputs.source, outcome.inputs.source.parent])
 
     def write(folder: Path) -> None:
         _write_all(outcome, folder)

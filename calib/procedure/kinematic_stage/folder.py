@@ -193,9 +193,12 @@ def check_fit_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> Non
     check_target(out, OURS, (METRICS, calibrated.ROBOT, RESIDUALS), "fit", inputs)
 
 
-def write_folder(outcome: Outcome, out: Path, plots: Callable[[Outcome, Path], None] | None = None) -> Path:
-    """Write all files of a fit, all or none; see `calib.folders`."""
-    check_fit_target(out, [outcome.inputs.source])
+def write_folder(
+    outcome: Outcome, out: Path, plots: Callable[[Outcome, Path], None] | None = None, *, owned: bool = False
+) -> Path:
+    """Write all files of a fit, all or none; see `calib.folders`. An `owned` folder is ours, whatever is left in it."""
+    if not owned:
+        check_fit_target(out, [outcome.inputs.source])
 
     def write(folder: Path) -> None:
         _write_all(outcome, folder)

@@ -183,7 +183,7 @@ def identify(session: Session, say: Say) -> list[str]:
     )  # fmt: skip
     outcome = identifying.run(given, progress=say)
     say("writing")
-    identification_outputs.write_folder(outcome, session.identification.path, draw)
+    identification_outputs.write_folder(outcome, session.identification.path, draw, owned=True)
     found = outcome.found
     raw, normalised = found.condition
     own = next(iter(outcome.fit.values()))

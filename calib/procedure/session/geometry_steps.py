@@ -217,7 +217,8 @@ def fit(session: Session, say: Say) -> list[str]:
     """Fit the geometry to the measured files; validation files are not looked at."""
     selection = selection_prediction(session)
     outcome = fitting.run(_gathered(session), _options_of(session), _fit_settings(session), say, selection)
-    outputs.write_folder(outcome, session.fit.path, partial(certificate.write_fit, plots=session.plots))
+    draw = partial(certificate.write_fit, plots=session.plots)
+    outputs.write_folder(outcome, session.fit.path, draw, owned=True)
     count = len(outcome.selection.fit.free)
     notes = [f"model {outcome.selection.chosen}, {count} parameters on {outcome.fit.poses} poses", *outcome.warnings]
     notes += [

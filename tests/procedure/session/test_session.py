@@ -289,3 +289,12 @@ def test_time_does_not_enter_the_results(measured: Session, finished_folder: Pat
     assert go_on(measured) is None
     for name in ("4-fit/estimate.csv", "5-validation/errors.csv", "6-export/robot.urdf", "2-poses/poses.csv"):
         assert measured.path(name).read_text() == (finished_folder / name).read_text()
+
+
+@pytest.mark.parametrize(
+    "gone", ["4-fit/robot.toml", "4-fit/metrics.json", "5-validation/metrics.json", "6-export/robot.urdf"]
+)
+def test_a_step_that_lost_a_file_is_made_again(finished: Session, gone: str) -> None:
+    finished.path(gone).unlink()
+    assert go_on(open_session(finished.folder)) is None
+    assert finished.path(gone).exists()
