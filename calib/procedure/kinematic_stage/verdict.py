@@ -15,6 +15,7 @@ WORSE = 1.01  # calibrated over nominal rms on the unseen from which on it is wo
 GAIN = 0.10  # a smaller gain in rms on the unseen is no gain worth a new robot file
 HOLDS, FEWEST = 0.93, 20  # least coverage of the 95 % intervals, beyond chance; errors it takes to say so
 TRANSFER = 3.0  # unseen errors this many times the fit's own: the fit does not transfer
+REFUTED = 5.0  # unseen errors this many times what rows left out promised, and no gain: the calibration is refuted
 OUTLIERS = 0.05  # more rows than this share that do not fit: something is wrong with the measurements or the model
 TURNED = 5.0  # rms of the calibrated arm's orientations [deg] that no calibrated arm has
 ELSEWHERE = 0.10  # of the reach: errors of both arms that say where the instrument stood, and nothing of the arms
@@ -66,7 +67,8 @@ def judge(
     7. no unseen rows and no cross-validation: marginal;
     8. no rigid geometry explains the measurements (`calib.procedure.kinematic_stage.remarks.plateau`), and what else
        the chosen model holds does not explain them either (`remains`): marginal at best;
-    9. unseen errors above `TRANSFER` times the fit's own: marginal;
+    9. unseen errors above `TRANSFER` times the fit's own: marginal; fail where they are above `REFUTED` times those of
+       cross-validation, too, and the gain is below `GAIN`;
     10. the 95 % intervals that the fit states hold less than `HOLDS` of the errors on some unseen file, beyond chance:
         marginal;
     11. the gain on the unseen is below `GAIN`: marginal;
@@ -117,6 +119,10 @@ def judge(
         times = f"errors are {worst.after / own:.1f} times those on the fitted poses"
         advice = f"; if the instrument or tool stood elsewhere, {OWN_FRAMES}" if _shares_frames(proofs) else ""
         also = f"; {broken}" if broken else ""
+        small = worst.after > (1.0 - GAIN) * worst.before
+        if proofs and small and cross_validated is not None and worst.after > REFUTED * cross_validated:
+            times = f"hardly any gain, and {times}; rows left out promised {1e3 * cross_validated:.3f} mm"
+            return Verdict("fail", f"{worst.where}, {times}: {worst.both}{also}{advice}")
         return Verdict("marginal", f"{worst.where}, {times}: {worst.both}{also}{advice}")
     if broken:
         return Verdict("marginal", f"{worst.where}: {worst.both}; {broken}")

@@ -39,6 +39,8 @@ DEFAULTS = {"model": "geometry", "asked": "auto", "cross_validated": 1e-4, "outl
         ({"a": rows(1.0, 0.1), "b": rows(1.0, 1.1)}, {}, "fail", "on b, unseen, the calibrated arm is worse"),
         ({"a": rows(0.100, 0.1005)}, {}, "marginal", "gain is small"),
         ({"a": rows(1.0, 0.5)}, {}, "marginal", "5.0 times those on the fitted"),
+        ({"a": rows(3.3, 3.1)}, {}, "fail", "hardly any gain, and errors are 31.0 times those on the fitted"),
+        ({"a": rows(3.3, 3.1)}, {"cross_validated": 1e-3}, "marginal", "31.0 times those on the fitted"),
         (
             {"a": rows(1.0, 0.1)},
             {"unexplained": "no rigid geometry explains"},
