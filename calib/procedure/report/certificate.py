@@ -6,6 +6,7 @@ It is written as HTML, one file without any outside reference, for the screen an
 from __future__ import annotations
 
 import base64
+import hashlib
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -19,6 +20,7 @@ from calib import files
 from calib.folders import CERTIFICATE
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.folder import FitFolder
+from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.report import fit_report, geometry_section
 from calib.procedure.report.fit_report import Report
 from calib.procedure.report.page import Page, Picture, Section, Table, Text
@@ -152,7 +154,7 @@ def write_fit(outcome: Outcome, folder: Path, plots: bool = True) -> None:
     drawn = draw(report) if plots else {}
     for name, figure in drawn.items():
         files.write(folder / f"plot_{name}.png", figure.png)
-    files.write(folder / CERTIFICATE, render(of_fit(report, drawn)))
+    files.write(folder / CERTIFICATE, render(of_fit(report, drawn, outcome.inputs)))
 
 
 def draw(report: Report) -> Mapping[str, Picture]:
@@ -162,14 +164,34 @@ def draw(report: Report) -> Mapping[str, Picture]:
     return figures.draw(report)
 
 
-def of_fit(report: Report, drawn: Mapping[str, Picture]) -> Page:
-    """Return the certificate of a fit alone, without a session around it."""
+def of_fit(report: Report, drawn: Mapping[str, Picture], inputs: Inputs | None = None) -> Page:
+    """Return the certificate of a fit alone, without a session around it; of its inputs the files are named."""
+    rows = [] if inputs is None else _files_of(inputs)
+    named = (("description", str(inputs.source)), ("measurements", ", ".join(_measured(inputs)))) if inputs else ()
     given = (
         ("robot", f"{report.robot}, {report.base} to {report.tip}, {len(report.joints)} joints"),
+        *named,
         ("model", report.metrics.model),
         ("tolerance", tolerance(report.metrics.tolerance_mm)),
         ("seed", str(report.metrics.seed)),
         ("toolkit", versions()),
     )
     section = geometry_section.certificate_section(report, drawn)
-    return certificate(f"Calibration of {report.robot}", "Geometry", given, [section])
+    return certificate(f"Calibration of {report.robot}", "Geometry", given, [section], rows)
+
+
+def _measured(inputs: Inputs) -> dict[str, tuple[Path, str]]:
+    """Return the files that were fitted and judged on by name: where they are, and what they are."""
+    found = {Path(block.file).name: (Path(block.file), "measured") for block in inputs.fit if block.file}
+    for unseen in inputs.unseen.values():
+        path, seen = Path(unseen.block.file), "NOT unseen" if unseen.seen else "unseen"
+        if not unseen.held_out and unseen.block.file:
+            found.setdefault(path.name, (path, f"measured, {seen} by the fit"))
+    return found
+
+
+def _files_of(inputs: Inputs) -> list[tuple[str, str, str, str]]:
+    """Return name, role, bytes and SHA-256 of the files of a fit's inputs, those in memory left out."""
+    given = {inputs.source.name: (inputs.source, "nominal robot"), **_measured(inputs)}
+    there = [(name, role, path.read_bytes()) for name, (path, role) in given.items() if path.is_file()]
+    return [(name, role, str(len(data)), hashlib.sha256(data).hexdigest()) for name, role, data in there]

@@ -136,6 +136,7 @@ def _symlog(axes: Axes, linear: float) -> None:
     """Make the y axis linear up to `linear` from zero, and logarithmic beyond."""
     axes.set_yscale("symlog", linthresh=linear)
     low, high = axes.get_ylim()
+    low, high = axes.set_ylim(min(low, -linear), max(high, linear))  # so that there are ticks beside zero
     most = max(abs(low), abs(high), linear)
     powers = linear * 10.0 ** np.arange(0, max(1, int(np.log10(most / linear)) + 1))
     powers = powers[:: -(-len(powers) // 3)]

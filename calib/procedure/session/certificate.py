@@ -89,8 +89,10 @@ def _arrival_notes(session: Session, place: str, unseen: str) -> list[str]:
 
 
 def _with_arrival(section: Section, lines: list[str]) -> Section:
-    """Return a section with what was noticed when its files came."""
-    return replace(section, blocks=[*section.blocks, Text("What was noticed when the files came", lines)])
+    """Return a section with what was noticed when its files came, and is not said in it anyway."""
+    said = {line for block in section.blocks if isinstance(block, Text) for line in block.lines}
+    fresh = [line for line in dict.fromkeys(lines) if line not in said]
+    return replace(section, blocks=[*section.blocks, Text("What was noticed when the files came", fresh)])
 
 
 def simulated(session: Session) -> list[tuple[str, str]]:

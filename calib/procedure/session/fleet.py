@@ -11,8 +11,8 @@ from functools import partial
 from pathlib import Path
 
 from rich.console import RenderableType
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from calib import bug_reports, files
 from calib.errors import CalibError, TaskLost, UsageError, exit_code
@@ -142,10 +142,10 @@ def table(outcomes: Sequence[FleetRow]) -> RenderableType:
         found.add_column(name, justify="right", no_wrap=True)
     names = [Path(one.folder).resolve().name for one in outcomes]
     for one, name in zip(outcomes, names):
-        state, verdict = (f"[{COLOURS[x]}]{x}[/]" if x else "" for x in (one.state, one.verdict))
+        state, verdict = (Text(x, COLOURS[x]) if x else "" for x in (one.state, one.verdict))
         numbers = ["" if x is None else f"{x:.3g}" for x in (one.nominal, one.calibrated, one.torque)]
         shown = name if names.count(name) == 1 else one.folder
-        found.add_row(escape(shown), state, verdict, *numbers, f"{one.seconds:.1f}")
+        found.add_row(Text(shown), state, verdict, *numbers, f"{one.seconds:.1f}")
     return found
 
 

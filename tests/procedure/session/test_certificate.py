@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import io
 import json
 import re
@@ -84,6 +85,8 @@ def test_what_was_noticed_on_arrival_stands_on_it(page: str, finished_folder: Pa
     lines = (finished_folder / "3-measured/checked.txt").read_text().splitlines()
     assert "What was noticed when the files came" in text
     assert all(line in text for line in lines) and any("drift.csv: measured again" in line for line in lines)
+    told = json.loads((finished_folder / "5-validation/metrics.json").read_text())["warnings"]
+    assert told and all(text.count(line) == 1 for line in told), "nothing is noted twice"
     assert "validation.csv: joints read back are off" in text and "measured.csv: joints read back are off" in text
 
 
@@ -100,6 +103,13 @@ def test_numbers_of_the_report_are_those_of_the_fit(finished_folder: Path) -> No
     assert np.sqrt(np.mean(errors**2)) == pytest.approx(metrics["fit"]["calibrated"]["position_mm"]["rms"], rel=1e-5)
     assert len(found.sets[0].q) == len(found.sets[0].points) == len(errors)
     assert found.noise["position"] == pytest.approx(60e-6 * np.sqrt(3))
+
+
+def test_a_fits_own_certificate_names_its_files(finished_folder: Path) -> None:
+    page = (finished_folder / "4-fit/certificate.html").read_text()
+    for name in ("1-robot/robot.toml", "3-measured/measured.csv"):
+        digest = hashlib.sha256((finished_folder / name).read_bytes()).hexdigest()
+        assert digest in page and f"<td>{Path(name).name}</td>" in page
 
 
 def test_hostile_names_do_not_become_markup(finished_folder: Path) -> None:

@@ -31,6 +31,7 @@ def cells(finished_folder: Path, planned_folder: Path, tmp_path: Path) -> Path:
 def test_one_that_fails_stops_none(cells: Path, capsys: pytest.CaptureFixture) -> None:
     assert run("run", *sorted(cells.iterdir())) == 2
     said = capsys.readouterr().out
+    assert "[red]" not in said and "[/]" not in said
     assert "1 of 4 done" in said and "1 waiting, 2 failed" in said
     assert f"{cells / 'b'} failed" in said and "looks like" in said and f"{cells / 'c'} waits for a file" in said
     assert "looks like" in (cells / "b/run.log").read_text() and "Bring " in (cells / "c/run.log").read_text()
