@@ -23,6 +23,7 @@ _PLAIN = {
 _WORDS = {
     bool: "True or False", int: "a whole number", float: "a number", str: "a text", NoneType: "None", Path: "a path",
 }  # fmt: skip
+_TABLE = "found a DataFrame: write it, frame.to_csv('table.csv', index=False), and give the file"
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,8 @@ def _checked(function: Callable[..., Any], name: str, annotated: Any, method: bo
                 hint = hints[argument]
                 if get_origin(hint) is Annotated and _fits(value, get_args(hint)[0]):  # of its type, beyond its range
                     raise UsageError(f"{argument} {shown(value)}: expected {_words(hint)}")
-                raise UsageError(f"{name}: {argument}: expected {_words(hint)}, found {shown(value)}")
+                found = _TABLE if hasattr(value, "to_csv") else f"found {shown(value)}"
+                raise UsageError(f"{name}: {argument}: expected {_words(hint)}, {found}")
         return function(*args, **kwargs)
 
     return call
@@ -103,7 +105,7 @@ def _fits(value: Any, hint: Any) -> bool:
     if kind is Literal:
         return value in inner
     if kind is tuple or kind is Sequence:
-        array = hasattr(value, "__array__") and getattr(value, "ndim", 0) > 0
+        array = hasattr(value, "__array__") and getattr(value, "ndim", 0) > 0 and not hasattr(value, "columns")
         if isinstance(value, (str, bytes)) or not (array or isinstance(value, Sequence)):
             return False
         fixed = kind is tuple and inner[-1] is not ...

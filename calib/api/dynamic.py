@@ -71,6 +71,7 @@ class DynamicsModel:
             raise UsageError("too little was recorded to say what errors the torques have: record longer")
         return expected.sigma(self.outcome.found.dynamics, *(np.asarray(x, dtype=float) for x in (q, v, a)))
 
+    @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write the folder that `calib identify --out` writes."""
         from calib.procedure.report import dynamics_figures

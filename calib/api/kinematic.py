@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 Progress = Callable[[str], None]
 Measured = str | Path | PoseMeasurements
+Several = Measured | Sequence[Measured | Sequence[Measured]]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -49,6 +50,7 @@ class PoseSelection:
         """(m, n) joint values [rad or m]."""
         return np.asarray(self.chosen.selection.q)
 
+    @checked
     def save(self, path: str | Path, *, plots: bool = True) -> Path:
         """Write the poses as CSV under the joints' names [rad or m], and beside it what they will tell.
 
@@ -62,6 +64,7 @@ class PoseSelection:
             save(figure, beside[name])
         return selection.write(self.chosen, path)
 
+    @checked
     def save_run(self, path: str | Path) -> Path:
         """Write the run through the poses, in their order, as CSV: t [s], pose (0 for a via-point), joints."""
         return write_run(Path(path), self.chosen.run, self.chosen.chain)
@@ -148,6 +151,7 @@ class GeometryFit:
         torque = gravity_of(self.outcome.inputs.chain, poses)
         return self.outcome.expected.position_sigma(poses.q, torque, tool=tool)
 
+    @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write the folder that `calib fit --out` writes: robot.toml, URDF, estimate, residuals, certificate."""
         from calib.procedure.report import certificate
@@ -210,6 +214,7 @@ class JointCommands:
         """(m, n) joint values [rad or m] that put the nominal robot there: what would be sent without compensation."""
         return self.commands.nominal
 
+    @checked
     def save(self, path: str | Path, *, partial: bool = False) -> Path:
         """Write the commands as CSV; `partial` writes what is reached, even where some targets are not."""
         return compensation_file.write(self.commands, self.fitted, self.targets, Path(path), partial)
@@ -266,10 +271,10 @@ def select_poses(
 @checked
 def fit_geometry(
     robot: str | Path | CalibratedChain | FoundRobot,
-    measured: Measured | Sequence[Measured],
+    measured: Several,
     settings: FitSettings | None = None,
     *,
-    validate: Measured | Sequence[Measured] = (),
+    validate: Several = (),
     options: FitOptions | str | Path | None = None,
     poses: PoseSelection | str | Path | None = None,
     base: str | None = None,
@@ -283,7 +288,7 @@ def fit_geometry(
         robot, base, tip: the nominal robot, as of `calib.load`; or what it returned. Of a parallel robot the result is
             a `calib.api.parallel.ParallelGeometry`, with the same members and an outcome of its own; its measurements
             are files.
-        measured: CSV files, or what `read_poses` returned.
+        measured: CSV files, what `read_poses` returned, or several of either.
         settings: model, loss, folds, stations, tools, rows to hold out, tolerance, seed.
         validate: unseen poses, like `measured`.
         options: what the files' headers do not say, priors, fixed parameters (``calib formats options``).

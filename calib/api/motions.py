@@ -34,6 +34,7 @@ class ExcitationDesign:
 
     designed: design.Designed
 
+    @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write the folder that `calib excite --out` writes: trajectory.csv, ROS 2 messages, metrics, figures."""
         from calib.procedure.report import motion_figures
@@ -72,6 +73,7 @@ class MotionPlan:
         """How long the motion takes [s]."""
         return self.planned.track.duration
 
+    @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write the folder that `calib plan --out` writes."""
         from calib.procedure.report import motion_figures

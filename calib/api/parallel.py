@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calib.api.rendering import as_text, data_frame
+from calib.arguments import checked
 from calib.estimation.estimate import Estimate
 from calib.procedure.excitation.parallel import ParallelDesign
 from calib.procedure.findings import Verdict
@@ -48,6 +49,7 @@ class ParallelGeometry:
         """Changes of the loops' constants [m, rad] with their covariance."""
         return self.outcome.found.estimate
 
+    @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write the folder that `calib fit --out` writes; it has no figures."""
         return folder.write_fitted(self.outcome, Path(out))
@@ -105,6 +107,7 @@ class ParallelDynamics:
         """
         return self.outcome.model.torque(self.outcome.found.dynamics.values, q, v, a, ())
 
+    @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write the folder that `calib identify --out` writes."""
         return folder.write_identified(self.outcome, Path(out), plots)
@@ -150,6 +153,7 @@ class ParallelExcitation:
     designed: ParallelDesign
     rate: float
 
+    @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write the folder that `calib excite --out` writes; it has no figures."""
         return folder.write_designed(self.robot, self.designed, self.rate, Path(out))
@@ -180,6 +184,7 @@ class ParallelMotionPlan:
         """How long the motion takes [s]."""
         return self.planned.duration
 
+    @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write the folder that `calib plan --out` writes; it has no figures."""
         return folder.write_planned(self.planned, Path(out))

@@ -91,10 +91,10 @@ def read_recording(
 
 
 def listed(given: object | Sequence[object]) -> list:
-    """Return what was given, one or several, as a list."""
+    """Return what was given, one or several, some of them several in turn, as a list."""
     if isinstance(given, (str, Path)) or not isinstance(given, Sequence):
         return [given]
-    return list(given)
+    return [one for each in given for one in listed(each)]
 
 
 def optional(path: str | Path | None) -> Path | None:

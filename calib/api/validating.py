@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any, overload
 
 from calib.api.dynamic import DynamicsModel, Recorded
-from calib.api.kinematic import GeometryFit, Measured
+from calib.api.kinematic import GeometryFit, Measured, Several
 from calib.api.parallel import ParallelDynamics, ParallelGeometry
 from calib.api.reading import listed
 from calib.arguments import checked
+from calib.errors import UsageError
 from calib.procedure.dynamic_stage import identify as arm_identify
 from calib.procedure.dynamic_stage import inputs as recorded
 from calib.procedure.kinematic_stage import fit as arm_fit
@@ -19,7 +20,7 @@ from calib.procedure.kinematic_stage import inputs as measured
 
 
 @overload
-def validate(result: GeometryFit, unseen: Measured | Sequence[Measured]) -> GeometryFit: ...
+def validate(result: GeometryFit, unseen: Several) -> GeometryFit: ...
 @overload
 def validate(result: DynamicsModel, unseen: Recorded | Sequence[Recorded]) -> DynamicsModel: ...
 @overload
@@ -29,7 +30,7 @@ def validate(result: ParallelDynamics, unseen: Recorded | Sequence[Recorded]) ->
 @checked
 def validate(
     result: GeometryFit | DynamicsModel | ParallelGeometry | ParallelDynamics,
-    unseen: Measured | Recorded | Sequence[Measured | Recorded],
+    unseen: Measured | Recorded | Sequence[Measured | Recorded | Sequence[Measured]],
 ) -> Any:
     """Hold a result against poses or motion it has not seen, and judge it anew.
 
@@ -43,12 +44,15 @@ def validate(
     Raises:
         MeasurementError: for files that cannot be right, naming row and column.
     """
+    given = listed(unseen)
+    if not given:
+        raise UsageError("validate: unseen: nothing is given to validate on")
     if isinstance(result, (ParallelGeometry, ParallelDynamics)):
-        return _of_parallel(result, listed(unseen))
+        return _of_parallel(result, given)
     if isinstance(result, GeometryFit):
-        given = measured.with_unseen(result.outcome.inputs, listed(unseen), result.options, result.settings)
-        return replace(result, outcome=arm_fit.assessed(result.outcome, given, result.options, result.settings))
-    more = recorded.with_unseen(result.outcome.inputs, listed(unseen))
+        both = measured.with_unseen(result.outcome.inputs, given, result.options, result.settings)
+        return replace(result, outcome=arm_fit.assessed(result.outcome, both, result.options, result.settings))
+    more = recorded.with_unseen(result.outcome.inputs, given)
     return replace(result, outcome=arm_identify.assessed(result.outcome, more))
 
 

@@ -340,4 +340,11 @@ def _ragged(row: Sequence[str], names: Sequence[str], separator: str) -> str:
 
 def _not_utf8(error: UnicodeDecodeError, path: str | Path) -> MeasurementError:
     byte = error.object[error.start]
+    if _begins_as_archive(path):
+        return MeasurementError("is an archive (NumPy's .npz, a spreadsheet), where a CSV table is expected", path)
     return MeasurementError(f"is not UTF-8 text (byte 0x{byte:02x}): save it as 'CSV UTF-8'", path)
+
+
+def _begins_as_archive(path: str | Path) -> bool:
+    with open(path, "rb") as file:
+        return file.read(4) == b"PK\3\4"

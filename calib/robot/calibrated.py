@@ -52,9 +52,11 @@ class CorrectedChain:
     deflection: Deflection
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class CalibratedChain:
     """A robot as the geometric fit leaves it, and as identification, excitation, export and compensation take it.
+
+    ``print`` shows its joints and how they are limited.
 
     Attributes:
         chain: the best geometry that does without joint corrections: what a URDF holds and dynamics are identified on.
@@ -86,6 +88,24 @@ class CalibratedChain:
     def deflection(self) -> Deflection:
         """The joint corrections, without terms where there are none."""
         return Deflection() if self.corrections is None else self.corrections.deflection
+
+    def __repr__(self) -> str:
+        return f"<CalibratedChain {self.chain.name}: {self.chain.n} joints, {self._state}>"
+
+    def __str__(self) -> str:
+        rows: list[tuple[str, ...]] = [("joint", "", "from", "to", "speed", "effort")]
+        for joint in self.chain.joints:
+            numbers = (joint.lower, joint.upper, joint.velocity, joint.effort)
+            rows.append((joint.name, f"{joint.kind} [{joint.unit}]", *(f"{number:.4g}" for number in numbers)))
+        widths = [max(map(len, column)) for column in zip(*rows)]
+        table = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in rows]
+        return "\n".join([f"{self.chain.name}: {self.chain.base} to {self.chain.tip}, {self._state}", *table])
+
+    @property
+    def _state(self) -> str:
+        parts = ["calibrated" if self.moved else "nominal geometry"]
+        parts += [f"{len(self.deflection.terms)} joint corrections"] if self.corrections is not None else []
+        return ", ".join([*parts, "with masses" if self.chain.inertias is not None else "without masses"])
 
     @property
     def moved(self) -> bool:

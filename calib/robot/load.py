@@ -50,6 +50,8 @@ def load_calibrated(robot: str | Path, base: str | None = None, tip: str | None 
 def resolve(robot: str | Path) -> Path:
     """Return the file that `robot` names; a file in the working folder goes before the library."""
     path, names = Path(robot), library.names()
+    if not str(robot).strip():
+        raise RobotError(f"an empty text names no robot; the library has {', '.join(names)}")
     known = f"a path of a .urdf or .toml file, a folder with robot.toml, or one of the library: {', '.join(names)}"
     if path.is_dir():
         if (path / calibrated.ROBOT).is_file():

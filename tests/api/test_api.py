@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from without_figures import run
 
 import calib
 from calib import cli
+from calib.errors import MeasurementError, UsageError
 from calib.robot import description
 from calib.simulation.cells import measured_files
 from calib.simulation.cells.cell import measure
@@ -93,6 +95,11 @@ def model(logs: Path) -> calib.DynamicsModel:
         (lambda: calib.FitSettings(tolerance="0.1"), "FitSettings: tolerance: expected a number or None, found '0.1'"),
         (lambda: calib.FitSettings(tolerance=0.0), "tolerance 0 mm: expected a length above 0"),
         (lambda: calib.FitSettings(stations="two"), "^stations two: expected one of each, one"),
+        (lambda: calib.SelectionSettings(kind="positions"), "^kind positions: expected one of pose, position"),
+        (lambda: calib.SelectionSettings(method="detmx"), "^method detmx: expected one of detmax"),
+        (lambda: calib.ExcitationSettings(goals=("foo=3",)), "goal 'foo=3': 'foo' is none of raw"),
+        (lambda: calib.ExcitationSettings(hard=("logdet",)), "goal 'logdet': expected NAME=NUMBER"),
+        (lambda: calib.load(""), "an empty text names no robot"),
     ],
 )
 def test_an_argument_of_another_type_is_refused_by_its_name(call, words):
@@ -104,6 +111,12 @@ def test_numbers_and_sequences_of_numpy_are_numbers_and_sequences():
     start, tool = np.zeros(6), np.array([[0.1, 0.0, 0.0]])
     assert calib.ExcitationSettings(period=np.float32(5), seed=np.int64(3), start=start, goals=["raw=35"]).seed == 3
     assert calib.SelectionSettings(tools=tool, seconds=2).tools is tool  # type: ignore[arg-type]
+
+
+def test_a_data_frame_is_refused_by_its_name():
+    frame = pytest.importorskip("pandas").DataFrame({"q1": [0.0]})
+    with pytest.raises(UsageError, match=r"measured: .*found a DataFrame: write it"):
+        calib.fit_geometry("ur5", frame)
 
 
 def test_at_most_25_names_all_documented():
@@ -134,6 +147,47 @@ def test_measurements_and_robots_in_memory_are_the_same(fitted, cell):
     again = calib.fit_geometry(robot, calib.read_poses(cell / "measured.csv", robot), fitted.settings)
     np.testing.assert_array_equal(again.estimate.values, fitted.estimate.values)
     np.testing.assert_array_equal(again.robot.covariance, fitted.robot.covariance)
+
+
+def test_measurements_in_memory_get_the_checks_of_files(fitted, cell):
+    block = calib.read_poses(cell / "measured.csv", "ur5")[0]
+    odd = np.array(block.position)
+    odd[2, 1] = np.nan
+    for wrong, words in (
+        (replace(block, q=np.rad2deg(10.0 * block.q)), r"measured\.csv, row 1, .*outside the limits"),
+        (replace(block, position=odd), r"row 3, column 'y': found nan"),
+        (replace(block, position=1e3 * block.position), "if it is in mm"),
+        (replace(block, q=block.q[:, :5]), r"q has shape \(60, 5\)"),
+    ):
+        with pytest.raises(MeasurementError, match=words):
+            calib.fit_geometry("ur5", [wrong, cell / "other.csv"], fitted.settings)
+
+
+def test_what_readers_return_may_stand_among_files(fitted, cell):
+    both = [calib.read_poses(cell / "measured.csv", "ur5"), cell / "other.csv"]
+    assert len(calib.fit_geometry("ur5", both, calib.FitSettings(model="geometry")).outcome.inputs.fit) == 2
+    with pytest.raises(UsageError, match="nothing is given"):
+        calib.validate(fitted, [])
+    with pytest.raises(UsageError, match="save: out: expected a text or a path, found None"):
+        fitted.save(None)
+    np.savez(cell / "log.npz", q=np.zeros(3))
+    with pytest.raises(MeasurementError, match="is an archive"):
+        calib.validate(fitted, cell / "log.npz")
+
+
+def test_a_robot_prints_as_a_short_table(fitted):
+    lines = str(fitted.robot).splitlines()
+    assert len(lines) == 8 and "calibrated" in lines[0] and " revolute [rad] " in lines[2]
+    assert repr(calib.load("ur5")).startswith("<CalibratedChain ur5: 6 joints, nominal geometry")
+
+
+@pytest.mark.parametrize(
+    "stamps, words", [(lambda t: t[::-1], "time runs backwards"), (lambda t: np.nan * t, "column 't': found nan")]
+)
+def test_time_that_cannot_be_is_told_of_recordings_in_memory(logs, stamps, words):
+    given = calib.read_recording(logs / "train.npz", logs / "robot.toml")
+    with pytest.raises(MeasurementError, match=words):
+        calib.identify_dynamics(logs / "robot.toml", replace(given, t=stamps(np.array(given.t))))
 
 
 def test_validation_afterwards_is_validation_at_once(fitted, cell):

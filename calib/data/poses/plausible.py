@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from calib.data.csv_table import Table
 from calib.data.poses.fit_options import FINEST, FileOptions
+from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.errors import MeasurementError
 from calib.units import ANGLES
 
@@ -58,6 +60,37 @@ def check_joints(
         if bounded:
             notes += _beyond(q[:, j], table, joint, span, kind)
     return (*notes, *_few_degrees(q, table, columns, kinds, options))
+
+
+def check_block(
+    block: PoseMeasurements, options: FileOptions, kinds: Sequence[str] | None = None, limits: Limits | None = None
+) -> PoseMeasurements:
+    """Return a block in memory with the notes that a file of its rows would get, or refuse it as that file."""
+    q, joints = np.asarray(block.q), tuple(block.joint_names)
+    place = block.file or "measurements in memory"
+    if len(block) == 0 or q.ndim != 2 or q.shape[1] != len(joints):
+        message = f"q has shape {q.shape} where there are {len(joints)} joints: expected (rows, joints)"
+        raise MeasurementError(message, place)
+    table = Table(place, joints, ("",) * len(joints), tuple(q.T), block.rows)
+    _check_finite(q, table, joints)
+    notes = check_joints(q, table, joints, joints, replace(options, units={}, columns={}), kinds, limits)
+    if isinstance(block, Positions):
+        _check_finite(block.position, table, "xyz")
+        check_lengths(block.position, table, "xyz")
+        if block.sigma is not None:
+            check_positive(block.sigma, table, ("sigma_x", "sigma_y", "sigma_z"), "a sigma must be above 0")
+    if isinstance(block, Poses):
+        unit_quaternions(block.quaternion, table, ("qx", "qy", "qz", "qw"))
+    return replace(block, notes=tuple(dict.fromkeys((*block.notes, *notes))))
+
+
+def _check_finite(values: np.ndarray, table: Table, columns: Sequence[str]) -> None:
+    """Refuse values (m, k) that are not finite."""
+    bad = np.argwhere(~np.isfinite(values))
+    if len(bad):
+        row, k = (int(i) for i in bad[0])
+        message = f"found {values[row, k]:g} where a number is needed"
+        raise MeasurementError(message, table.file, int(table.rows[row]), columns[k])
 
 
 def _check_joint_units(table: Table, columns: Sequence[str], kinds: Sequence[str], options: FileOptions) -> None:

@@ -146,7 +146,8 @@ def _path(each: str | Path | Recording) -> str:
     """Return the path of a recording; of one in memory its file and span, so that two cuts of a file differ."""
     if not isinstance(each, Recording):
         return str(each)
-    return f"{each.file or 'recording'}@{each.t[0]:.6g}:{each.t[-1]:.6g}"
+    file, t = each.file or "recording", each.t[np.isfinite(each.t)]
+    return f"{file}@{t.min():.6g}:{t.max():.6g}" if len(t) > 1 else file  # what they must be is checked later
 
 
 def _with_choices(options: IdentifyOptions, method: str | None, friction: str | None, seed: int) -> IdentifyOptions:

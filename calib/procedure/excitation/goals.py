@@ -13,7 +13,7 @@ import numpy as np
 
 from calib.errors import UsageError
 from calib.procedure.excitation.inputs import ExcitationInputs
-from calib.procedure.excitation.settings import ExcitationSettings
+from calib.procedure.excitation.settings import AIMS, ExcitationSettings, split_goal
 from trajectories.design.objectives import (
     Duration,
     Excitation,
@@ -26,7 +26,6 @@ from trajectories.design.objectives import (
 from trajectories.design.problem import AttainmentGoal
 
 SCALINGS: tuple[Scaling, ...] = ("raw", "normalised")
-AIMS: tuple[Index, ...] = ("logdet", "smallest")
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,11 +68,7 @@ def read_goals(settings: ExcitationSettings, given: ExcitationInputs, condition:
         for text in texts:
             if text in AIMS and weight is None:
                 continue
-            name, _, amount = text.partition("=")
-            try:
-                value = float(amount)
-            except ValueError:
-                raise UsageError(f"goal '{text}': expected NAME=NUMBER, e.g. wrist=0.1, or {', '.join(AIMS)}") from None
+            name, value = split_goal(text)
             objective, goal = _objective(name, value, given, condition, settings.shortest)
             result.append(NamedGoal(name, AttainmentGoal(objective, goal, weight)))
     return result

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 from calib.arguments import Within, checked
 
 Rate = Annotated[float, Within(above=0.0, most=1e5)]  # [Hz]
 Slower = Annotated[float, Within(1.0, 1000.0)]
 HARMONICS = 12  # per joint: cond falls by a fifth from 5 to 12, by a tenth more to 20 at twice the cost (our choice)
+FAMILIES = ("fourier", "bspline")
+GOALS = ("raw", "normalised", "duration", "coverage", "wrist")  # and joint1, joint2, …
+AIMS: tuple[Literal["logdet", "smallest"], ...] = ("logdet", "smallest")
 COARSE = 5  # harmonics that a search begins with (our choice)
 
 
@@ -63,6 +67,35 @@ class ExcitationSettings:
     lock: tuple[str, ...] = ()
     noise: Annotated[float, Within(above=0.0, most=1.0)] | None = None
     outlook: bool = True
+
+    def __post_init__(self) -> None:
+        if self.family not in FAMILIES:
+            raise _refusal(f"family '{self.family}' is none of {', '.join(FAMILIES)}")
+        for text in (*self.goals, *self.hard):
+            if text not in AIMS or text in self.hard:
+                split_goal(text)
+
+
+def split_goal(text: str) -> tuple[str, float]:
+    """Return name and number of a goal, ``wrist=0.1``.
+
+    Raises:
+        UsageError: for a name that no goal has, and for no number.
+    """
+    name, _, amount = text.partition("=")
+    try:
+        value = float(amount)
+    except ValueError:
+        raise _refusal(f"goal '{text}': expected NAME=NUMBER, e.g. wrist=0.1, or {', '.join(AIMS)}") from None
+    if name not in GOALS and not re.fullmatch(r"joint[1-9]\d*", name):
+        raise _refusal(f"goal '{text}': '{name}' is none of {', '.join(GOALS)}, joint1 …")
+    return name, value
+
+
+def _refusal(words: str) -> Exception:
+    from calib.errors import UsageError  # numpy behind it: the command line makes its defaults here, and is quick
+
+    return UsageError(words)
 
 
 DEFAULT_DESIGN = ExcitationSettings()

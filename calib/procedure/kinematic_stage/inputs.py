@@ -12,6 +12,7 @@ from calib.data.poses.fit_options import FileOptions, FitOptions, check_files
 from calib.data.poses.image_folders import JOINTS, is_image_folder, read_images
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.data.poses.pixels import IN_HAND, Pixels
+from calib.data.poses.plausible import check_block
 from calib.data.poses.pose_files import joint_columns, read_measurements
 from calib.errors import CalibError, MeasurementError, UsageError
 from calib.geometry.checks.copied_rows import repeated
@@ -229,8 +230,11 @@ def read_file(
 def _blocks(
     each: Path | PoseMeasurements, chain: Chain, options: FitOptions, like: Sequence[PoseMeasurements] = ()
 ) -> list[PoseMeasurements]:
-    named = isinstance(each, (str, Path))
-    return read_file(Path(each), chain, options, like) if named else _checked([each], chain, like)
+    if isinstance(each, (str, Path)):
+        return read_file(Path(each), chain, options, like)
+    if tuple(each.joint_names) == chain.joint_names or len(each.joint_names) == chain.n:
+        each = check_block(each, options.for_file(_path(each)), joint_kinds(chain), (chain.lower, chain.upper))
+    return _checked([each], chain, like)
 
 
 def _path(each: Path | PoseMeasurements) -> Path:

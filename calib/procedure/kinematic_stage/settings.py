@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, get_args
 
 from calib.arguments import Within, checked
 from calib.data.poses.fit_options import FINEST, LOSSES, MODELS
@@ -12,6 +13,11 @@ from calib.procedure.measuring.run import DEFAULT_RUN, RunSettings
 
 Place = Annotated[float, Within(-100.0, 100.0)]  # of a target in the tip's frame [m]
 Sigma = Annotated[float, Within(least=FINEST, most=10.0)]  # [m or rad]
+
+
+def _refuse_other(option: str, value: str | None, allowed: Sequence[str | None]) -> None:
+    if value not in allowed:
+        raise UsageError(f"{option} {value}: expected one of {', '.join(name for name in allowed if name)}")
 
 
 @checked
@@ -51,8 +57,7 @@ class FitSettings:
             ("stations", ("each", "one")),
             ("tools", ("one", "each")),
         ):
-            if (value := getattr(self, option)) not in allowed:
-                raise UsageError(f"{option} {value}: expected one of {', '.join(name for name in allowed if name)}")
+            _refuse_other(option, getattr(self, option), allowed)
         if not 0.0 <= self.holdout < 1.0:
             raise UsageError(f"holdout {self.holdout:g}: expected a share from 0 to below 1")
         if self.tolerance is not None and not 0.0 < self.tolerance < float("inf"):
@@ -100,6 +105,13 @@ class SelectionSettings:
     run: RunSettings = DEFAULT_RUN
 
     def __post_init__(self) -> None:
+        _refuse_other("kind", self.kind, ("pose", "position"))
+        if (self.index, self.method) != ("O1", "detmax"):  # the defaults load nothing: the command line is quick
+            from poses.indices import Index
+            from poses.select import Method
+
+            _refuse_other("index", self.index, get_args(Index))
+            _refuse_other("method", self.method, get_args(Method))
         for option, least in (("starts", 1), ("evaluations", 1), ("climbs", 0)):
             if (value := getattr(self, option)) < least:
                 raise UsageError(f"{option} {value}: expected at least {least}")
