@@ -80,8 +80,10 @@ class Base:
     @property
     def names(self) -> tuple[str, ...]:
         """The b names, with R where others are regrouped in, by no less than `SMALLEST`."""
-        told = (np.abs(self.split.coefficients) >= SMALLEST).any(axis=1)
-        return tuple(self.standard[k] + ("R" if found else "") for k, found in zip(self.kept, told))
+        return tuple(
+            self.standard[k] + ("R" if (np.abs(row) >= SMALLEST).any() else "")
+            for k, row in zip(self.kept, self.split.coefficients)
+        )
 
     @property
     def units(self) -> tuple[str, ...]:

@@ -137,7 +137,8 @@ def _copies(inputs: Inputs) -> list[str]:
     for name, unseen in inputs.unseen.items():
         if unseen.seen:
             own = next((Path(block.file).name for block in inputs.fit if _same_rows(block, unseen.block)), "")
-            words.append(f"{name} {f'is a copy of {own}' if own else 'repeats rows of the fit'}")
+            same = "was fitted on" if own == name else f"is a copy of {own}"
+            words.append(f"{name} {same if own else 'repeats rows of the fit'}")
     return words
 
 

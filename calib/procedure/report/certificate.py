@@ -166,8 +166,10 @@ def draw(report: Report) -> Mapping[str, Picture]:
 
 def of_fit(report: Report, drawn: Mapping[str, Picture], inputs: Inputs | None = None) -> Page:
     """Return the certificate of a fit alone, without a session around it; of its inputs the files are named."""
-    rows = [] if inputs is None else _files_of(inputs)
-    named = (("description", str(inputs.source)), ("measurements", ", ".join(_measured(inputs)))) if inputs else ()
+    rows, named = [], []
+    if inputs is not None:
+        measured = ", ".join(path.name for path in _measured(inputs))
+        rows, named = _files_of(inputs), [("description", str(inputs.source)), ("measurements", measured)]
     given = (
         ("robot", f"{report.robot}, {report.base} to {report.tip}, {len(report.joints)} joints"),
         *named,
@@ -180,18 +182,18 @@ def of_fit(report: Report, drawn: Mapping[str, Picture], inputs: Inputs | None =
     return certificate(f"Calibration of {report.robot}", "Geometry", given, [section], rows)
 
 
-def _measured(inputs: Inputs) -> dict[str, tuple[Path, str]]:
-    """Return the files that were fitted and judged on by name: where they are, and what they are."""
-    found = {Path(block.file).name: (Path(block.file), "measured") for block in inputs.fit if block.file}
+def _measured(inputs: Inputs) -> dict[Path, str]:
+    """Return the files that were fitted and judged on, and what they are."""
+    found = {Path(block.file): "measured" for block in inputs.fit if block.file}
     for unseen in inputs.unseen.values():
         path, seen = Path(unseen.block.file), "NOT unseen" if unseen.seen else "unseen"
         if not unseen.held_out and unseen.block.file:
-            found.setdefault(path.name, (path, f"measured, {seen} by the fit"))
+            found.setdefault(path, f"measured, {seen} by the fit")
     return found
 
 
 def _files_of(inputs: Inputs) -> list[tuple[str, str, str, str]]:
     """Return name, role, bytes and SHA-256 of the files of a fit's inputs, those in memory left out."""
-    given = {inputs.source.name: (inputs.source, "nominal robot"), **_measured(inputs)}
-    there = [(name, role, path.read_bytes()) for name, (path, role) in given.items() if path.is_file()]
+    given = {inputs.source: "nominal robot", **_measured(inputs)}
+    there = [(path.name, role, path.read_bytes()) for path, role in given.items() if path.is_file()]
     return [(name, role, str(len(data)), hashlib.sha256(data).hexdigest()) for name, role, data in there]
