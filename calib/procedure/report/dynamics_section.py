@@ -235,7 +235,7 @@ def _interval_blocks(
             continue
         cells.append((name, f"{found.coverage_percent:.1f} %", *(f"{x:.0f} %" for x in found.joints_percent)))
         cells.append(("  median half width", "", *(f"{x:.3g} {unit}" for x, unit in zip(found.median, units))))
-        cells.append(("  of the time extrapolated", f"{found.extrapolated_percent:.0f} %"))
+        cells.append(("  of the time extrapolated", f"{found.extrapolated_percent:.0f} %", *[""] * len(rows)))
     if not cells:
         return []
     header = ("errors within the 95 % interval", "all", *rows)

@@ -32,6 +32,7 @@ from calib.procedure.report.style import (
 from calib.units import ERRORS
 
 PALE = "#c3ccd6"  # of what is not told from zero
+LINE = 0.13  # between labels of 6.5 points [in]
 
 
 def error_histogram(
@@ -337,9 +338,11 @@ def correlation_map(names: Sequence[str], correlation: np.ndarray, threshold: fl
     block = correlation[np.ix_(chosen, chosen)]
     labels = [str(names[k]) for k in chosen]
     margin = room(labels, 6.5)
-    side = HALF - margin - 0.72
+    side = max(HALF - margin - 0.72, LINE * len(labels))  # long names widen the figure, and never overlap
     with styled():
-        figure, (axes,) = sheet(width=HALF, height=side + margin + 0.3, left=margin, bottom=margin, right=0.72, top=0.3)
+        figure, (axes,) = sheet(
+            width=margin + side + 0.72, height=side + margin + 0.3, left=margin, bottom=margin, right=0.72, top=0.3
+        )
         image = axes.imshow(block, cmap="PuOr", vmin=-1.0, vmax=1.0, aspect="auto")
         label_ticks(axes.xaxis, range(len(labels)), labels, 6.5, rotation=90)
         label_ticks(axes.yaxis, range(len(labels)), labels, 6.5)

@@ -125,6 +125,14 @@ def test_another_versions_report_is_refused(finished_folder: Path, tmp_path: Pat
         fit_report.read(tmp_path / "report.json")
 
 
+def test_names_of_correlated_parameters_do_not_overlap() -> None:
+    names = [f"shoulder_lift_joint.offset cos {k} shoulder_lift_joint" for k in range(12)]
+    figure = geometry_figures.correlation_map(names, 0.5 + 0.5 * np.eye(12), 0.0)
+    axes = figure.axes[0].get_position()
+    inches = axes.height * figure.get_figheight(), axes.width * figure.get_figwidth()
+    assert min(inches) / len(names) > 6.5 / 72.0, "a line per name"
+
+
 def test_before_and_after_differ_in_greyscale() -> None:
     def grey(colour: str) -> float:
         return float(np.dot(to_rgb(colour), (0.299, 0.587, 0.114)))
