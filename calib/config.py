@@ -23,6 +23,7 @@ from calib.errors import CalibError, UsageError, suggestion
 T = TypeVar("T")
 LARGEST = 8_000_000  # bytes of a file, and levels of tables in tables (our choices)
 DEEPEST = 32
+_PLAIN = {"float": "a number", "int": "a whole number", "string": "a text", "bool": "true or false"}  # of pydantic's
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 
@@ -209,7 +210,7 @@ def _complaint(errors: list[Any], kind: type, place: str) -> str:
         words = first["msg"]
     else:
         words = {"tuple_type": f"a list of tables, [[{loc[-1]}]]", "too_short": "at least one number"}.get(
-            name, "a table"
+            name, _PLAIN.get(name.split("_")[0], "a table")
         )
     hint = f"; {context['hint']}" if context.get("hint") else ""
     return f"{where}: expected {words}, found {shown(found)}{hint}"

@@ -217,6 +217,7 @@ def test_constraints_that_cannot_be(table: dict[str, Any], words: str) -> None:
         ({"slow": [0.1, -1]}, "slow: expected a number above 0, found -1"),
         ({"files": {"run": {"npz": {"gains": [1.0]}}}}, r'the dot needs quotes: \[files."run.npz"\]'),
         ({"files": {"a.npz": {"payload": ["tool"]}}}, 'files."a.npz".payload: there is no key .tool.; there are none'),
+        ({"constraints": {"sum": [{"weights": {"Fv5": "a"}}]}}, "weights.Fv5: expected a number, found 'a'"),
         ({"payload": 3}, "payload: expected a table, found 3"),
         ({"gain_identification": {"loaded": "a"}}, "there is no 'unloaded'; needed are unloaded, loaded"),
     ],

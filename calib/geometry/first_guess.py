@@ -101,7 +101,7 @@ def check_scale(block: PoseMeasurements, arm: np.ndarray) -> None:
     if 1.0 / WRONG_UNIT < ratio < WRONG_UNIT:
         return
     factor = min(UNITS, key=lambda each: abs(np.log(ratio / each)))
-    likely = f": {UNITS[factor]}?" if abs(np.log(ratio / factor)) < np.log(2.0) else ""
+    likely = f": {UNITS[factor]}?" if abs(np.log(ratio / factor)) < np.log(2.0) else "."
     raise MeasurementError(
         f"the measured positions spread over {measured:.4g} m where the robot's joints make it move over "
         f"{predicted:.4g} m, {ratio:.3g} times as much{likely} State the unit in the header, as in 'x [mm]', or look "

@@ -167,6 +167,8 @@ def read_options(path: str | Path | None = None) -> FitOptions:
 def parse_options(table: Mapping[str, Any], source: str = "options") -> FitOptions:
     """Return the options that a parsed TOML table holds; `source` is for messages."""
     found = replace(parse(FitOptions, inherited(table, FileOptions), source), source=source)
+    if "free" in table and not found.free:
+        raise UsageError(f"{source}: free: names no parameter; leave the key out to free all")
     both = set(found.fix) & set(found.free)
     if both:
         raise UsageError(f"{source}: '{min(both)}' stands in fix and in free; take it out of one")

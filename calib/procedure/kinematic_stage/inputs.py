@@ -173,8 +173,10 @@ def load_robot(
     if measured is not None and tip is None:
         known = read_tree(text(source)[0], str(source)).joints
         table = measured / JOINTS if measured.is_dir() else measured
-        wanted = [*joint_columns(table), *options.for_file(measured).columns]
+        header = joint_columns(table)
+        wanted = [*header, *options.for_file(measured).columns]
         names = [name for name in dict.fromkeys(wanted) if name in known and known[name].actuated]
+        names = [] if f"q{len(names) + 1}" in header else names  # numbered columns hold more joints than are named
     return load(robot, base, tip, names or None), source
 
 

@@ -77,6 +77,8 @@ def test_a_files_table_adds_to_what_holds_for_every_file():
         ({"check_limits": 0}, "check_limits: expected true or false, found 0"),
         ({"fix": "theta1"}, "fix: expected a list of names"),
         ({"fix": ["d3"], "free": ["d3"]}, "'d3' stands in fix and in free"),
+        ({"free": []}, "free: names no parameter; leave the key out to free all"),
+        ({"prior": {"d3": 1e-300}}, "prior.d3: expected a number, at least 1e-12"),
         ({"prior": {"d3": 0}}, "prior.d3: expected a number above 0"),
         ({"where": {"day": True}}, "where.day: expected a text or a number"),
         ({"columns": {"x": 3}}, "columns.x: expected a text"),

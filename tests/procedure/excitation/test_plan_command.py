@@ -165,6 +165,7 @@ def test_waypoints_of_the_tool(room, capsys):
     [
         (WAYPOINTS[:1], "1 waypoint"),
         (WAYPOINTS[[0, 0, 1]], "waypoints 1 and 2 are the same"),
+        (WAYPOINTS[[0, 0]], "waypoints 1 and 2 are the same"),
         (np.where(WAYPOINTS == 1.0, np.nan, WAYPOINTS), "row 2, column 'q2': found an empty or NaN cell"),
         (WAYPOINTS * 2, "beyond"),
     ],

@@ -11,7 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from calib.data.poses.fit_options import FitOptions
 from calib.errors import CalibError
+from calib.procedure.kinematic_stage.inputs import load_robot
 
 POSE = ["q1", "q2", "q3", "q4", "q5", "q6", "x", "y", "z", "qx", "qy", "qz", "qw"]
 
@@ -88,6 +90,19 @@ def test_a_unit_that_is_stated_is_not_advised(cell, calib):
         row["q1 [deg]"] *= 60.0
     code, _, err = calib("fit", "ur5", cell.write("bad.csv", rows, list(rows[0])[:9]), "--out", "done")
     assert (code, "read as [deg]" in err or "columns swapped" in err, "looks like" in err) == (2, True, False)
+
+
+def test_some_numbered_columns_may_be_named_by_the_urdfs_joints(tmp_path):
+    links = "".join(f'<link name="link_{k}"/>' for k in range(4))
+    joints = "".join(
+        f'<joint name="joint_{k + 1}" type="continuous"><parent link="link_{k}"/><child link="link_{k + 1}"/>'
+        '<origin xyz="0.1 0 0.3"/><axis xyz="0 1 0"/></joint>'
+        for k in range(3)
+    )
+    (tmp_path / "robot.urdf").write_text(f'<robot name="r">{links}{joints}</robot>')
+    (tmp_path / "m.csv").write_text("q1,q2,q3,x,y,z\n")
+    options = FitOptions(columns={"joint_2": "q3", "joint_3": "q2"})
+    assert load_robot(tmp_path / "robot.urdf", tmp_path / "m.csv", options)[0].n == 3
 
 
 def test_swapped_joint_columns_cannot_pass_unnoticed(cell, calib):
