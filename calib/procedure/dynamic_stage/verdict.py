@@ -3,11 +3,11 @@
 The verdict of calib identify (exit code 0 for pass and marginal, 1 for fail) judges the raw total of the worst
 validation recording in which the robot moves and which does not repeat the training: above 30 % unexplained it fails;
 it passes up to 10 % and up to 2 times the training's own error; between, it is marginal. The training's own error fails
-above 30 % likewise. A model is marginal as well without such a recording, or where the training motion is too poor to
-tell parameters apart. A joint of which 50 % or more is unexplained (in the band, and while it moves) is named and
-allows no pass; from 95 % on it fails the model where its rms torque is 10 % or more of the greatest joint's. Friction
-that drives a joint fails. A model of which the 95 % intervals hold less than 93 % of the errors on unseen motion (90 %
-at a joint), beyond chance, is no better than marginal. The reason says which of these held.
+above 30 % of the torque in its band. A model is marginal as well without such a recording, or where the training motion
+is too poor to tell parameters apart. A joint of which 50 % or more is unexplained (in the band, and while it moves) is
+named and allows no pass; from 95 % on it fails the model where its rms torque is 10 % or more of the greatest joint's.
+Friction that drives a joint fails. A model of which the 95 % intervals hold less than 93 % of the errors on unseen
+motion (90 % at a joint), beyond chance, is no better than marginal. The reason says which of these held.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def judge(
     `NOTHING` is left of a torque that `MATTERS`.
 
     0. friction drives a joint: fail;
-    1. the unseen error, or the fit's own, is above `POOR`: fail;
+    1. the unseen error, or the fit's own in its band, is above `POOR`: fail;
     2. no unseen motion (or a repeat of the training's only): marginal;
     3. the training motion is too poor to tell parameters apart: marginal;
     4. the unseen error is above `GOOD`, or `TRANSFER` times the fit's own: marginal;
@@ -108,6 +108,8 @@ def _judge_totals(
 ) -> Verdict:
     """Return the verdict by rules 1 to 5; `standing`: there were recordings in which the robot stands."""
     own = max((found.raw.total for found in fit.values()), default=np.nan)
+    learnt = max((found.filtered.total for found in fit.values()), default=np.nan)
+    poor = f"{learnt:.2f} % in its band, above {POOR:g} % fails"
     if not validation:
         why = "there is no unseen motion: validate on another recording (--validate)"
         if repeated:
@@ -115,12 +117,14 @@ def _judge_totals(
         elif standing:
             why = "the robot stands in the validation recordings, where friction takes any value"
         told = f"{why}; on the training motion {own:.2f} % of the torque is unexplained"
-        return Verdict("fail", f"{told}; above {POOR:g} % fails") if own > POOR else Verdict("marginal", told)
+        return Verdict("fail", f"{told}; {poor}") if learnt > POOR else Verdict("marginal", told)
     name = max(validation, key=lambda key: validation[key].raw.total)
     worst = validation[name].raw.total
     told = f"on {name}, unseen: {worst:.2f} % of the torque unexplained, {own:.2f} % on the training motion"
-    if max(worst, own) > POOR:
+    if worst > POOR:
         return Verdict("fail", f"{told}; above {POOR:g} % fails")
+    if learnt > POOR:
+        return Verdict("fail", f"{told}; {poor}")
     if any(report.poor for report in excitation.values()) and all(report.poor for report in excitation.values()):
         return Verdict("marginal", f"{told}; but the training motion cannot tell the parameters apart")
     if worst > GOOD:
