@@ -26,7 +26,7 @@ from __future__ import annotations
 from math import cos, exp, isinf, pi, sin, sqrt, tanh
 
 import numpy as np
-from numba import njit
+from numba import get_num_threads, njit
 
 OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
 JOINED = {**OPTIONS, "forceinline": True}
@@ -39,6 +39,11 @@ MOST = 64  # steps that friction may ask for in one period
 BRISK = 1.5  # reciprocals of friction's fastest decay in a step of the midpoint rule, which is stable up to 2
 REACH = 6.0  # smoothing widths from standstill within which the sign counts as stiff: one period away at most 6 v0
 FINE, SINGULAR, STIFF, DIVERGED = -1, 1, 2, 3
+
+
+def threads_allowed() -> int:
+    """Return how many threads numba may use here: workers are given fewer than the machine has."""
+    return int(get_num_threads())
 
 
 @njit(**JOINED)
