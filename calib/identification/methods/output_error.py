@@ -127,7 +127,8 @@ class _Comparison:
             if self.torques:
                 rest, slope = case.target - run.torque[index], run.by_torque[index]
             else:
-                rest, slope = motion.q - low_passed(run.q, motion)[index], run.by_q[index]
+                moved, slope = (low_passed(x, motion)[index] for x in (run.q, run.by_q))
+                rest = motion.q - moved
             there = self.robot.carried(case)[self.robot.columns]
             used = thinned(case.present, motion.segment, self.problem.decimator)
             rest, slope = (decimate(x, self.problem.decimator, motion.segment) for x in (rest, slope))

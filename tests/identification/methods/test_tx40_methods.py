@@ -23,6 +23,7 @@ def test_a_tx40_is_recovered(name):
     data = make_experiment(Condition("lowest noise", "tx40", np.deg2rad(1e-4), 0.05), 0)
     found, (percent, sigmas) = METHODS[name].estimate(data.problem), EXPECTED[name]
     assert found.found
+    assert name != "cloe" or found.iterations <= 10  # slopes pass the low-pass of the positions; 18 where they did not
     wrong = data.matrix @ found.estimate.values - data.torque
     assert 100.0 * np.linalg.norm(wrong) / np.linalg.norm(data.torque) < percent
     away = (found.estimate.values - data.truth) / found.estimate.sigma
