@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -157,7 +156,11 @@ def the_same_robot_is_exported(session: Session, out: Path) -> None:
 
 @pytest.mark.slow
 def test_the_same_motion_is_designed(session: Session, tmp_path: Path) -> None:
-    dynamics_steps.excite(replace(session, plots=False), quiet)
+    settings = session.path("session.toml")
+    head, dynamics = settings.read_text().split("[dynamics]", 1)
+    settings.write_text(f"{head}[dynamics]{dynamics.replace('plan = false', 'plan = true', 1)}")
+    session = open_session(settings.parent, plots=False)
+    dynamics_steps.excite(session, quiet)
     words = "--period 4 --harmonics 2 --rate 100 --starts 1 --evaluations 20 --repeat 1"
     assert not command("excite", session.path("4-fit"), *words.split(), "--out", tmp_path / "motion")
     names = {path.name for path in (tmp_path / "motion").iterdir()}

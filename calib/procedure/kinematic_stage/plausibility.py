@@ -9,9 +9,9 @@ sign          so with the signs of some joints reversed, and better than with y 
 moved         the fit turned an element of the arm by more than `TURNED`, or moved it by more than `SHIFTED` of the
               reach, and no sign says why: marginal. Sound arms at hand turned by 33 mrad at most (Motoman; UR5 12)
 scale         one factor on all measured lengths takes away `SHARE` of the squares of the nominal arm's errors; off one
-              by more than `FOREIGN`: fail, by more than `GROWN`: marginal, else a note; so where the fitted lengths
-              grew together and that is more than `ALONE` of their change. No instrument is off by per cents, a badly
-              printed board by one or two; two sizes of one maker's robots differ by more
+              by more than `FOREIGN` and 3 of its sigmas: fail, by more than `GROWN`: marginal, else a note; so where
+              the fitted lengths grew together and that is more than `ALONE` of their change. No instrument is off by
+              per cents, a badly printed board by one or two; two sizes of one maker's robots differ by more
 commanded     less than `TOO_GOOD` remains, which no instrument measures: a note
 """
 
@@ -156,7 +156,7 @@ def _scale(found: Scale) -> list[Finding]:
         return []
     grown = 100.0 * (found.factor - 1.0)
     one = Finding(
-        "scale", _level(found.factor),
+        "scale", _level(found),
         f"all measured lengths are {abs(grown):.2g} % {'larger' if grown > 0 else 'smaller'} than the arm's, by one "
         f"factor, {found.factor:.4f} ± {found.sigma:.1g}, which explains {100 * found.explained:.0f} % of what the "
         f"nominal arm leaves: {_foreign(found)}is the instrument's (or a camera's target's) scale right? The "
@@ -170,7 +170,7 @@ def _lengths(found: Scale | None) -> list[Finding]:
     if found is None or abs(found.factor - 1.0) < max(LEAST, 3.0 * found.sigma):
         return []
     one = Finding(
-        "scale", _level(found.factor) if found.explained > ALONE else "pass",
+        "scale", _level(found) if found.explained > ALONE else "pass",
         f"the fitted lengths are together {found.factor:.4f} ± {found.sigma:.1g} times the nominal ones, and that one "
         f"factor is {100 * found.explained:.0f} % of their change: {_foreign(found)}an arm may be so, the instrument's "
         "scale (or the size of a board's square) may be so, and these measurements do not tell which",
@@ -179,12 +179,12 @@ def _lengths(found: Scale | None) -> list[Finding]:
 
 
 def _foreign(found: Scale) -> str:
-    return "is this the robot? If it is, " if _level(found.factor) == "fail" else ""
+    return "is this the robot? If it is, " if _level(found) == "fail" else ""
 
 
-def _level(factor: float) -> str:
-    off = abs(factor - 1.0)
-    return "fail" if off > FOREIGN else "marginal" if off > GROWN else "pass"
+def _level(found: Scale) -> str:
+    off = abs(found.factor - 1.0)
+    return "fail" if off - 3.0 * found.sigma > FOREIGN else "marginal" if off > GROWN else "pass"
 
 
 def _commanded(before: float, after: float) -> Iterator[Finding]:
