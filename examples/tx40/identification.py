@@ -42,7 +42,8 @@ from calib.estimation.whiteness import examine
 from calib.identification.cases import Case, make_case
 from calib.identification.loop.controller import identify_controller
 from calib.identification.loop.loop_recordings import Loop
-from calib.identification.methods.instrumental import Instrumental, Round, identify_instrumental, simulated_case
+from calib.identification.loop.simulated_motion import simulated_case
+from calib.identification.methods.instrumental import Instrumental, Round, identify_instrumental
 from calib.identification.parameter_constraints import hold
 from calib.identification.parameter_constraints import signs as signed
 from calib.identification.rows import observe

@@ -26,8 +26,8 @@ from calib.errors import CalibError, CannotSimulate, Diverged
 from calib.estimation.linear import LinearFit
 from calib.estimation.sequential.kalman import Belief, Filter, believe, corrected, linearly_predicted, points, predicted
 from calib.identification.cases import Case
+from calib.identification.loop.simulated_motion import low_passed
 from calib.identification.methods.believed import BelievedRobot, believed_robot, start_of
-from calib.identification.methods.instrumental import low_passed
 from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 from calib.identification.rows import segments

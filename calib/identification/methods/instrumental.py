@@ -22,8 +22,8 @@ import numpy as np
 
 from calib.arrays import frozen
 from calib.data.signals.decimation import Decimator
-from calib.data.signals.filtering import curvature, low_pass, slope
-from calib.data.signals.motion import Motion, velocity_noise
+from calib.data.signals.filtering import low_pass, slope
+from calib.data.signals.motion import velocity_noise
 from calib.dynamics import base as bases
 from calib.dynamics.base import Base
 from calib.dynamics.drives import standard
@@ -36,6 +36,7 @@ from calib.estimation.triangles import Triangles, absorb, combine, empty, residu
 from calib.estimation.whiteness import inflation
 from calib.identification.cases import Case
 from calib.identification.loop.loop_recordings import Loop
+from calib.identification.loop.simulated_motion import low_passed, simulated_case, simulated_samples
 from calib.identification.parameter_constraints import Constraints, Held, hold, signs
 from calib.identification.rows import ObservationRows, observe
 from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, inertia_diagonal, simulate, with_parameters
@@ -329,41 +330,6 @@ def _result(
     )  # fmt: skip
 
 
-def simulated_case(case: Case, run: SimulatedRun, loop: Loop) -> Case:
-    """Return the case with the simulated motion at the instants of the recorded one, filtered like that one.
-
-    The same low-pass and differences: what they do to a motion (they round off reversals) is in W and in Z alike, and
-    what tells W from Z is noise.
-    """
-    index, motion = simulated_samples(case, run.t, loop), case.motion
-    q = low_passed(run.q, motion)
-    v, a = slope(q, motion.rate), curvature(q, motion.rate)
-    return replace(case, motion=replace(motion, q=q[index], v=v[index], a=a[index]))
-
-
-def simulated_samples(case: Case, t: np.ndarray, loop: Loop) -> np.ndarray:
-    """Return the places of a case's instants among the simulated ones `t` [s]."""
-    step = loop.reference.period * loop.every
-    since = case.motion.t - loop.reference.t[0]
-    index = np.rint(since / step).astype(int)
-    if index[0] < 0 or index[-1] >= len(t) or np.abs(index * step - since).max() > 0.01 * step:
-        raise CalibError(
-            f"the recording runs from {case.motion.t[0]:.6g} s to {case.motion.t[-1]:.6g} s in steps of "
-            f"{1 / case.motion.rate:.6g} s, the simulation from {t[0]:.6g} s to {t[-1]:.6g} s in steps of "
-            f"{step:.6g} s: give the whole reference, and `every`"
-        )
-    return index
-
-
-def low_passed(q: np.ndarray, motion: Motion) -> np.ndarray:
-    """Return simulated positions through the low-pass of the recorded ones."""
-    result = np.empty_like(q)
-    for cutoff in np.unique(motion.cutoff):
-        own = motion.cutoff == cutoff
-        result[:, own] = low_pass(q[:, own], motion.rate, float(cutoff))
-    return result
-
-
 def _regular(model: IdentificationModel, loop: Loop, inertia: np.ndarray | None) -> Plant:
     """Return a robot of inertia diag(J) and nothing else; its last n terms hold J."""
     if inertia is None:
@@ -487,8 +453,7 @@ def _distance(runs: Runs) -> np.ndarray:
     away, size = np.zeros((2, runs[0][0][0].motion.n))
     for (case, loop), run in runs:
         motion = case.motion
-        index = np.rint((motion.t - loop.reference.t[0]) / (loop.reference.period * loop.every)).astype(int)
-        away += np.sum((motion.q - low_passed(run.q, motion)[index]) ** 2, axis=0)
+        away += np.sum((motion.q - low_passed(run.q, motion)[simulated_samples(case, run.t, loop)]) ** 2, axis=0)
         size += np.sum((motion.q - motion.q.mean(axis=0)) ** 2, axis=0)
     return frozen(100.0 * np.sqrt(away / size))
 

@@ -26,8 +26,8 @@ from calib.estimation.correlated import scatter
 from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import condition_numbers, require_rank
 from calib.identification.loop.loop_recordings import ClosedLoops, close_loops
+from calib.identification.loop.simulated_motion import low_passed, simulated_samples
 from calib.identification.methods.believed import BelievedRobot, believed_robot, serial_arm, start_of
-from calib.identification.methods.instrumental import low_passed, simulated_samples
 from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 from calib.identification.rows import thinned
