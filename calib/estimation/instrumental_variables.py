@@ -66,8 +66,8 @@ class ExogeneityTest:
     """A test of the claim that W is uncorrelated with the noise, hence least squares unbiased.
 
     Attributes:
-        statistic: F (augmented regression) or χ² (Hausman's form).
-        degrees: of freedom, numerator and denominator; (k, 0) for χ².
+        statistic: F of the augmented regression.
+        degrees: of freedom, numerator and denominator.
         p: probability of a larger statistic if the claim is true.
     """
 

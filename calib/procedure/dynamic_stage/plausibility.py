@@ -16,7 +16,7 @@ order    two joints with which exchanged the robot's own masses leave less than 
 zero     a joint with a right angle or two at whose zero they leave less than `TURNED`, likewise: marginal
 jump     a position that leaves the slope of the rows around it: marginal
 bodies   an estimate that is `NO_ROBOT` times as far from every possible robot as 95 % of right ones are: marginal;
-         beyond `NEVER` times: fail. Honest recordings at hand are up to 3.6 times as far (LWR4+; Panda 1.5, TIAGo 2.0).
+         beyond `NEVER` times: fail. Honest recordings at hand are up to 3.6 times as far (LWR4+; Panda 1.5, TIAGo 2.3).
          Not said where that robot leaves less than `NOTICED` % of the torque more: precise data find 0.1 % of a gain
 """
 

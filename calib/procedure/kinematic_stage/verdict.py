@@ -34,6 +34,10 @@ class _Proof:
     def both(self) -> str:
         return f"rms {1e3 * self.before:.3f} mm nominal, {1e3 * self.after:.3f} mm calibrated"
 
+    @property
+    def small_gain(self) -> bool:
+        return self.after > (1.0 - GAIN) * self.before
+
 
 def judge(
     fit: Comparison,
@@ -116,23 +120,30 @@ def judge(
         return Verdict("marginal", f"{unexplained}; {worst.where}: {worst.both}")
     broken = _intervals_broken(proofs)
     if worst.after > TRANSFER * own:
-        times = f"errors are {worst.after / own:.1f} times those on the fitted poses"
-        advice = f"; if the instrument or tool stood elsewhere, {OWN_FRAMES}" if _shares_frames(proofs) else ""
-        also = f"; {broken}" if broken else ""
-        small = worst.after > (1.0 - GAIN) * worst.before
-        if proofs and small and cross_validated is not None and worst.after > REFUTED * cross_validated:
-            times = f"hardly any gain, and {times}; rows left out promised {1e3 * cross_validated:.3f} mm"
-            return Verdict("fail", f"{worst.where}, {times}: {worst.both}{also}{advice}")
-        return Verdict("marginal", f"{worst.where}, {times}: {worst.both}{also}{advice}")
+        return _not_transferred(worst, own, cross_validated, proofs, broken)
     if broken:
         return Verdict("marginal", f"{worst.where}: {worst.both}; {broken}")
-    if worst.after > (1.0 - GAIN) * worst.before:
+    if worst.small_gain:
         return Verdict("marginal", f"{worst.where}, the gain is small: {worst.both}; the arm may be calibrated already")
     if outlier_share > OUTLIERS:
         share = f"{100 * outlier_share:.0f} % of the fitted rows do not fit (outliers)"
         return Verdict("marginal", f"{worst.where}: {worst.both}; but {share}")
     kept = "" if tolerance is None else f", within the tolerance of {1e3 * tolerance:g} mm"
     return Verdict("pass", f"{worst.where}: {worst.both}{kept}")
+
+
+def _not_transferred(
+    worst: _Proof, own: float, cross_validated: float | None, proofs: Mapping[str, Comparison], broken: str
+) -> Verdict:
+    """Judge unseen errors far above those of the fit's own rows, by rule 9."""
+    words = f"errors are {worst.after / own:.1f} times those on the fitted poses"
+    advice = f"; if the instrument or tool stood elsewhere, {OWN_FRAMES}" if _shares_frames(proofs) else ""
+    level = "marginal"
+    if proofs and worst.small_gain and cross_validated is not None and worst.after > REFUTED * cross_validated:
+        level = "fail"
+        words = f"hardly any gain, and {words}; rows left out promised {1e3 * cross_validated:.3f} mm"
+    also = f"; {broken}" if broken else ""
+    return Verdict(level, f"{worst.where}, {words}: {worst.both}{also}{advice}")
 
 
 def _intervals_broken(proofs: Mapping[str, Comparison]) -> str:
