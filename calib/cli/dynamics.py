@@ -35,23 +35,17 @@ def identify_dynamics(
 ) -> None:
     """Identify ROBOT's dynamics from recordings, and judge them. What counts is how well other motion is predicted."""
     from calib.api.dynamic import identify_dynamics as identified
-    from calib.procedure.dynamic_stage import folder
     from calib.procedure.excitation import prediction
-    from calib.procedure.parallel_stage.robots import path_of
+    from calib.procedure.parallel_stage.destination import check_destination
     from calib.procedure.report import console as shown
     from calib.procedure.report import dynamics_section
 
-    if path_of(robot):
-        from calib.procedure.parallel_stage import folder as parallel_folder  # slow to load
-
-        parallel_folder.check_identified(out, [options, *recordings, *(validate or [])])
-    else:
-        folder.check_identification_target(out, [options, *recordings, *(validate or [])])
+    check_destination("identify", robot, out, [options, *recordings, *(validate or [])])
     if excitation is not None:
         prediction.check_folder(excitation)
 
     def read(given: Any) -> None:
-        folder.check_identification_target(out, [given.source, given.source.parent])
+        check_destination("identify", robot, out, [given.source, given.source.parent])
         say(*shown.rendered(dynamics_section.read_blocks(given)))
 
     with progress() as show:

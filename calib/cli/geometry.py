@@ -60,9 +60,8 @@ def fit(
     to gain; that it is good enough is said only with --tolerance.
     """
     from calib.api.kinematic import fit_geometry
-    from calib.procedure.kinematic_stage import folder
     from calib.procedure.kinematic_stage.settings import FitSettings
-    from calib.procedure.parallel_stage.robots import path_of
+    from calib.procedure.parallel_stage.destination import check_destination
     from calib.procedure.report import console as shown
     from calib.procedure.report import geometry_section
 
@@ -70,15 +69,10 @@ def fit(
         model, loss, folds, stations, tools, holdout, refit_frames,
         None if tolerance is None else 1e-3 * tolerance, seed,
     )  # fmt: skip
-    if path_of(robot):
-        from calib.procedure.parallel_stage import folder as parallel_folder  # slow to load
-
-        parallel_folder.check_fitted(out, [options, *measured, *(validate or [])])
-    else:
-        folder.check_fit_target(out, [options, *measured, *(validate or [])])
+    check_destination("fit", robot, out, [options, *measured, *(validate or [])])
 
     def read(given: Any) -> None:
-        folder.check_fit_target(out, [given.source])
+        check_destination("fit", robot, out, [given.source])
         say(*shown.rendered(geometry_section.read_blocks(given)))
 
     with progress() as show:

@@ -63,8 +63,7 @@ def excite(
 ) -> None:
     """Design a motion that excites ROBOT's dynamics, within limits."""
     from calib.api.motions import design_excitation
-    from calib.procedure.excitation import folder
-    from calib.procedure.parallel_stage.robots import path_of
+    from calib.procedure.parallel_stage.destination import check_destination
     from calib.workers.interrupts import finishing
 
     settings = ExcitationSettings(
@@ -74,12 +73,7 @@ def excite(
         start=_stands(start), repeat=repeat, slower=slower, existing=tuple(existing or ()), lock=tuple(lock or ()),
         noise=noise, outlook=outlook,
     )  # fmt: skip
-    if path_of(robot):
-        from calib.procedure.parallel_stage import folder as parallel_folder  # slow to load
-
-        parallel_folder.check_moved(out, [robot, model, limits, *settings.existing])
-    else:
-        folder.check_design_target(out, [robot, model, limits, *settings.existing])
+    check_destination("excite", robot, out, [robot, model, limits, *settings.existing])
     with progress() as say:
         designed = design_excitation(
             robot, settings, model=model, limits=limits, base=base, tip=tip, workers=workers, progress=say
@@ -129,19 +123,13 @@ def plan(
 ) -> None:
     """Plan the fastest motion of ROBOT through waypoints. Speeds and torques stay within its limits."""
     from calib.api.motions import plan_motion
-    from calib.procedure.excitation import folder
-    from calib.procedure.parallel_stage.robots import path_of
+    from calib.procedure.parallel_stage.destination import check_destination
 
     settings = PlanSettings(
         payloads=tuple(payload or ()), lines=line, rate=rate, shorten=shorten, stray=stray, start=_stands(start),
         slower=slower,
     )  # fmt: skip
-    if path_of(robot):
-        from calib.procedure.parallel_stage import folder as parallel_folder  # slow to load
-
-        parallel_folder.check_moved(out, [robot, waypoints, model, limits, drives])
-    else:
-        folder.check_plan_target(out, [robot, waypoints, model, limits, drives])
+    check_destination("plan", robot, out, [robot, waypoints, model, limits, drives])
     with progress() as say:
         planned = plan_motion(
             robot, waypoints, settings, model=model, limits=limits, drives=drives, base=base, tip=tip, progress=say
