@@ -16,7 +16,7 @@ from calib.arguments import checked
 from calib.data.poses.fit_options import FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.target_files import Targets, read_targets
-from calib.errors import UsageError, as_ours
+from calib.errors import CalibError, UsageError, as_ours
 from calib.estimation.estimate import Estimate
 from calib.procedure.findings import Verdict
 from calib.procedure.kinematic_stage import compensation, compensation_file, fit, folder, inputs, selection
@@ -323,6 +323,19 @@ def fit_geometry(
     return GeometryFit(fit.run(given, chosen, wanted, progress, prediction or None), chosen, wanted)
 
 
+def read_fitted(folder: str | Path) -> compensation.Fitted:
+    """Return what the folder of a fit says of the arm in its cell, `calib.procedure.kinematic_stage.compensation.read`.
+
+    Raises:
+        UsageError: where it is none, lacks something, or is of a parallel robot.
+    """
+    try:
+        return compensation.read(folder)
+    except CalibError:  # looked at again only where reading failed
+        refuse_parallel(folder, "compensation", "its controller takes the calibrated robot.toml")
+        raise
+
+
 @checked
 def compensate(
     fitted: GeometryFit | compensation.Fitted | str | Path,
@@ -353,8 +366,7 @@ def compensate(
         found = fitted
     else:
         with saved(fitted) as place:
-            refuse_parallel(place, "compensation", "its controller takes the calibrated robot.toml")
-            found = compensation.read(place)
+            found = read_fitted(place)
     chain = found.nominal.chain
     if not isinstance(targets, Targets):
         limits = (chain.lower, chain.upper)

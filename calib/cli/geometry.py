@@ -265,12 +265,9 @@ def compensate(
     from calib.api import kinematic
     from calib.files import check_target
     from calib.procedure.export.geometry import results
-    from calib.procedure.kinematic_stage import compensation
-    from calib.procedure.parallel_stage.robots import refuse_parallel
 
     may = numbers(tolerance, 2, "--tolerance")
-    refuse_parallel(folder, "compensation", "its controller takes the calibrated robot.toml")
-    fitted = compensation.read(folder)
+    fitted = kinematic.read_fitted(folder)
     check_target(out, [targets, *results(fitted.folder)])
     with progress() as show:
         found = kinematic.compensate(

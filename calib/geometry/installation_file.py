@@ -33,8 +33,8 @@ from calib.errors import CalibError, RobotError
 from calib.geometry.images.optics import BoardShape, Optics
 from calib.geometry.installation import Installation
 from calib.records import read_record
-from calib.robot import calibrated, description
-from calib.robot.calibrated import nominal_of
+from calib.robot import calibrated
+from calib.robot.calibrated import CalibratedChain, nominal_of
 from calib.robot.chain import Chain
 from calib.robot.tables import placement, placement_table
 
@@ -103,8 +103,25 @@ def read(path: str | Path) -> Installation:
         path: the folder of a fit, or its ``robot.toml``; any other robot file gives identity frames.
     """
     path = _file(path)
-    robot, extra = calibrated.read(path), description.read_extra(path)
-    cell = _placed(robot.complete, _typed(_Frames, extra, str(path)), str(path))
+    return _calibrated(*calibrated.read_whole(path), str(path))
+
+
+def read_arms(path: str | Path) -> tuple[Installation, Installation]:
+    """Return the calibrated arm of a fit as `read` does, and the nominal one.
+
+    The nominal one has the frames that let it fit the same measurements best; of a fit that started from an earlier
+    fit's folder they are not known: then it has no stations and no tools.
+
+    Raises:
+        RobotError: where the file does not say which arm that was.
+    """
+    path = _file(path)
+    robot, extra = calibrated.read_whole(path)
+    return _calibrated(robot, extra, str(path)), _nominal(robot, extra, str(path))
+
+
+def _calibrated(robot: CalibratedChain, extra: Mapping[str, Any], where: str) -> Installation:
+    cell = _placed(robot.complete, _typed(_Frames, extra, where), where)
     return replace(cell, deflection=robot.deflection)
 
 
@@ -139,19 +156,10 @@ def _placed(chain: Chain, found: _Frames, where: str) -> Installation:
     return Installation(chain, **given)
 
 
-def nominal(path: str | Path) -> Installation:
-    """Return the nominal arm of a fit, with the frames that let it fit the same measurements best.
-
-    A fit that started from an earlier fit's folder has none: then there are no stations and no tools.
-
-    Raises:
-        RobotError: where the file does not say which arm that was.
-    """
-    path = _file(path)
-    chain = nominal_of(calibrated.read(path))
-    where = f"{path}, provenance"
-    known = _typed(_NominalFrames, description.read_extra(path).get("provenance", {}), where)
-    seen = _typed(_Frames, description.read_extra(path), str(path))
+def _nominal(robot: CalibratedChain, extra: Mapping[str, Any], path: str) -> Installation:
+    chain, where = nominal_of(robot), f"{path}, provenance"
+    known = _typed(_NominalFrames, extra.get("provenance", {}), where)
+    seen = _typed(_Frames, extra, path)
     found = _Frames(known.nominal_station, known.nominal_tool, seen.camera, seen.board)
     cell = _placed(chain, found, where)
     none: dict[str, Any] = {"stations": np.zeros((0, 4, 4)), "station_names": ()}

@@ -124,8 +124,14 @@ def read(path: str | Path) -> CalibratedChain:
     Raises:
         RobotError: naming the file and what in it is wrong.
     """
+    return read_whole(path)[0]
+
+
+def read_whole(path: str | Path) -> tuple[CalibratedChain, dict[str, Any]]:
+    """Return what `read` does, and the tables beside the robot (`calib.robot.description.EXTRA`)."""
     path = Path(path) / ROBOT if Path(path).is_dir() else Path(path)
-    complete, extra, where = description.read(path), description.read_extra(path), str(path)
+    complete, extra = description.read_whole(path)
+    where = str(path)
     known = extra.get("provenance", {})
 
     def valued(key: str) -> Chain | None:
@@ -135,10 +141,11 @@ def read(path: str | Path) -> CalibratedChain:
 
     chain = valued("rigid") or complete
     deflection = _deflection(extra.get("deflection", {}), complete, where)
-    return CalibratedChain(
+    robot = CalibratedChain(
         chain, valued("nominal"), _covariance(path.parent / COVARIANCE, chain),
         CorrectedChain(complete, deflection) if deflection.terms else None, str(known.get("robot", "")),
     )  # fmt: skip
+    return robot, extra
 
 
 def write(

@@ -63,6 +63,11 @@ def read(path: str | Path, propose_beta: bool = True) -> Chain:
     Raises:
         RobotError: naming the table, the key and what is wrong with it.
     """
+    return read_whole(path, propose_beta)[0]
+
+
+def read_whole(path: str | Path, propose_beta: bool = True) -> tuple[Chain, dict[str, Any]]:
+    """Return what `read` and `read_extra` do, the file parsed once."""
     table = load(path)
     if "leg" in table or table.get("kind") == "parallel":
         raise RobotError(
@@ -71,13 +76,19 @@ def read(path: str | Path, propose_beta: bool = True) -> Chain:
         )
     robot = {key: value for key, value in table.items() if key not in EXTRA}
     if "element" not in robot:
-        return mdh.from_table(robot, str(path), propose_beta)
-    return _from_elements(robot, str(path))
+        chain = mdh.from_table(robot, str(path), propose_beta)
+    else:
+        chain = _from_elements(robot, str(path))
+    return chain, _beside(table)
 
 
 def read_extra(path: str | Path) -> dict[str, Any]:
     """Return the tables beside the robot (`EXTRA`) as plain dictionaries."""
-    return {key: value for key, value in load(path).items() if key in EXTRA}
+    return _beside(load(path))
+
+
+def _beside(table: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in table.items() if key in EXTRA}
 
 
 def write(path: str | Path, chain: Chain, extra: Mapping[str, Any] | None = None, source: str = "") -> Path:

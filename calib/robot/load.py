@@ -43,8 +43,9 @@ def load_calibrated(robot: str | Path, base: str | None = None, tip: str | None 
     path = resolve(robot)
     if path.suffix == ".urdf":
         return CalibratedChain(load(path, base, tip), source=str(robot))
-    _check_ends(path, description.read(path), base, tip)
-    return calibrated.read(path)
+    found = calibrated.read(path)
+    _check_ends(path, found.complete, base, tip)
+    return found
 
 
 def resolve(robot: str | Path) -> Path:

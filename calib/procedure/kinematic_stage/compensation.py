@@ -105,7 +105,7 @@ def read(folder: str | Path) -> Fitted:
     fit = inside if inside.robot.is_file() and not fit.robot.is_file() else fit
     if not fit.robot.is_file():
         raise UsageError(f"{fit.path} holds no robot.toml; give the folder that `calib fit --out` has written")
-    cell, nominal = installation_file.read(fit.path), installation_file.nominal(fit.path)
+    cell, nominal = installation_file.read_arms(fit.path)
     free, covariance = read_covariance(fit.path, cell)
     own = fit.metrics()
     judged = proof.metrics() if proof.judged.is_file() else own

@@ -201,7 +201,7 @@ def _chosen(path: Path, chain: Chain) -> np.ndarray:
 
 def _measured(place: Path) -> Measured:
     """Return the rows of ``residuals.csv`` whose position was measured, as both arms see them."""
-    after, before = installation_file.read(place), installation_file.nominal(place)
+    after, before = installation_file.read_arms(place)
     with FitFolder(place).residuals.open(encoding="utf-8", newline="") as file:
         known = set(map(shielded, after.station_names))
         rows = [row for row in csv.DictReader(file) if row["dx [mm]"] and row["station"] in known]

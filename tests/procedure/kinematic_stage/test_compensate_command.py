@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib import cli
+from calib import cli, config
 from calib.data.poses.target_files import read_targets
 from calib.geometry import inverse
 from calib.geometry.installation import Installation
@@ -128,6 +128,15 @@ def test_joint_targets_are_the_nominal_robots_poses(cell, fitted, here, calib):
     position, turn = off(at, forward(cell.nominal, q))
     assert position < 1e-7 and turn < 1e-7
     assert np.abs(sent - q).max() < 0.2
+
+
+def test_the_robots_file_is_parsed_once(cell, fitted, here, calib, monkeypatch):
+    parsed, parse = [], config.tomllib.loads
+    monkeypatch.setattr(config.tomllib, "loads", lambda text: (parsed.append(text), parse(text))[1])
+    write(here / "t.csv", Q, drawn(cell, 3, 7))
+    code, _, err = calib("compensate", fitted, "t.csv", "--out", "commands.csv")
+    assert code == 0, err
+    assert parsed == [(fitted / "robot.toml").read_text()]
 
 
 def test_the_nominal_frame_moves_the_arm_least(cell, fitted, here, calib):
