@@ -6,7 +6,6 @@ It is written as HTML, one file without any outside reference, for the screen an
 from __future__ import annotations
 
 import base64
-import hashlib
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -28,6 +27,7 @@ from calib.procedure.report.page import Page, Picture, Section, Table, Text
 if TYPE_CHECKING:
     import jinja2
 
+FileRow = tuple[str, str, str, str]  # name, what it is, bytes, SHA-256
 WORDS = {"pass": "PASS", "marginal": "MARGINAL", "fail": "FAIL"}
 EDITED = "edited by hand"
 SHORT = 12  # hexadecimal digits of a SHA-256 on the first sheet
@@ -58,7 +58,7 @@ def certificate(
     subtitle: str,
     setup: Sequence[tuple[str, str]],
     sections: Sequence[Section],
-    files: Sequence[tuple[str, str, str, str]] = (),
+    files: Sequence[FileRow] = (),
     now: datetime | None = None,
 ) -> Page:
     """Return the page of a certificate.
@@ -67,7 +67,7 @@ def certificate(
         setup: label and value of what was calibrated, with what, when, by which command; shortened on the first sheet,
             which leaves `BEHIND` out.
         sections: what was judged.
-        files: name, role, bytes, SHA-256 of what it rests on; those of the first sheet come first.
+        files: what it rests on, see `file_row`; those of the first sheet come first.
         now: when it is made; this moment by default.
     """
     behind = [*map(_fitting, sections), Section("Setup", [Table("", ("what", "value"), [*setup])])]
@@ -109,6 +109,16 @@ def _fitting(section: Section) -> Section:
 def shortened(text: str, most: int) -> str:
     """Return a text cut at a word, with an ellipsis, where it is longer than `most` letters."""
     return text if len(text) <= most else f"{text[: most - 1].rsplit(' ', 1)[0]} …"
+
+
+def file_row(name: str, role: str, path: Path) -> FileRow:
+    """Return how a certificate lists a file that it rests on: name, what it is, bytes, SHA-256."""
+    return name, role, str(path.stat().st_size), files.fingerprint(path)
+
+
+def unseen_role(role: str, seen: bool, judged: str) -> str:
+    """Return what a file of validation is: whether what is `judged` has seen its rows."""
+    return f"{role}, {'NOT unseen' if seen else 'unseen'} by {judged}"
 
 
 def tolerance(millimetres: float | None) -> str:
@@ -169,7 +179,9 @@ def of_fit(report: Report, drawn: Mapping[str, Picture], inputs: Inputs | None =
     rows, named = [], []
     if inputs is not None:
         measured = ", ".join(path.name for path in _measured(inputs))
-        rows, named = _files_of(inputs), [("description", str(inputs.source)), ("measurements", measured)]
+        given = {inputs.source: "nominal robot", **_measured(inputs)}
+        rows = [file_row(path.name, role, path) for path, role in given.items() if path.is_file()]
+        named = [("description", str(inputs.source)), ("measurements", measured)]
     given = (
         ("robot", f"{report.robot}, {report.base} to {report.tip}, {len(report.joints)} joints"),
         *named,
@@ -186,14 +198,6 @@ def _measured(inputs: Inputs) -> dict[Path, str]:
     """Return the files that were fitted and judged on, and what they are."""
     found = {Path(block.file): "measured" for block in inputs.fit if block.file}
     for unseen in inputs.unseen.values():
-        path, seen = Path(unseen.block.file), "NOT unseen" if unseen.seen else "unseen"
         if not unseen.held_out and unseen.block.file:
-            found.setdefault(path, f"measured, {seen} by the fit")
+            found.setdefault(Path(unseen.block.file), unseen_role("measured", unseen.seen, "the fit"))
     return found
-
-
-def _files_of(inputs: Inputs) -> list[tuple[str, str, str, str]]:
-    """Return name, role, bytes and SHA-256 of the files of a fit's inputs, those in memory left out."""
-    given = {inputs.source: "nominal robot", **_measured(inputs)}
-    there = [(path.name, role, path.read_bytes()) for path, role in given.items() if path.is_file()]
-    return [(name, role, str(len(data)), hashlib.sha256(data).hexdigest()) for name, role, data in there]

@@ -16,10 +16,11 @@ from calib.procedure.excitation.coefficients import SAMPLES
 from calib.procedure.kinematic_stage.folder import SCHEMA, URDF
 from calib.procedure.kinematic_stage.metrics import FitMetrics
 from calib.procedure.report import certificate, fit_report, viewer
+from calib.procedure.report.certificate import FileRow
 from calib.procedure.report.fit_report import RowErrors
 from calib.procedure.report.page import Section, Text
 from calib.procedure.session.dynamics_steps import recordings
-from calib.procedure.session.folder import CHECKED, MARK, SELECTION, Session, fingerprint, read_state
+from calib.procedure.session.folder import CHECKED, MARK, SELECTION, Session, read_state
 from calib.procedure.session.geometry_steps import measured_files, robot_file
 from calib.records import read_record
 
@@ -186,7 +187,7 @@ def _pose_checks(session: Session) -> list[tuple[str, str]]:
     return [(words, ", ".join(names)) for words, names in rows if names]
 
 
-def listed(session: Session) -> list[tuple[str, str, str, str]]:
+def listed(session: Session) -> list[FileRow]:
     """Return the files the certificate rests on, the ones to be filed first: name, what it is, bytes, SHA-256."""
     exported = sorted(path for path in session.path(session.export).glob("*") if path.is_file())
     exported.sort(key=lambda path: path.name != URDF)
@@ -209,8 +210,8 @@ def listed(session: Session) -> list[tuple[str, str, str, str]]:
         if name.parts[-1].lower().startswith("validation") or name.parts[1].lower().startswith("validation"):
             which = "the fit" if name.parts[0] == "3-measured" else "the identification"
             known = name.parts[0] == "3-measured" and name.parts[1] in seen
-            role += f", {'NOT unseen' if known else 'unseen'} by {which}"
-        if name.parts[0] in ("4-fit", "8-dynamics", session.export) and made.get(str(name)) != fingerprint(path):
+            role = certificate.unseen_role(role, known, which)
+        if name.parts[0] in ("4-fit", "8-dynamics", session.export) and made.get(str(name)) != files.fingerprint(path):
             role = certificate.EDITED
-        rows.append((str(name), role, f"{path.stat().st_size}", fingerprint(path)))
+        rows.append(certificate.file_row(str(name), role, path))
     return rows

@@ -21,7 +21,6 @@ session.lock     there while a command works on the session
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
@@ -31,7 +30,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -212,21 +210,6 @@ def open_session(folder: Path, plots: bool = True) -> Session:
     if not path.exists():
         raise SessionError(_no_session(folder))
     return Session(folder, read_settings(path), plots=plots)
-
-
-def fingerprint(path: Path) -> str:
-    """Return the SHA-256 of a file, in hex; read once as long as it stays as it is."""
-    found = path.stat()
-    return _digest(path.absolute(), found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns)
-
-
-@lru_cache(maxsize=1024)
-def _digest(path: Path, *_: int) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
 
 
 def read_state(session: Session) -> StateFile:

@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 
 from calib.errors import SessionError
+from calib.files import fingerprint
 from calib.procedure.excitation import coefficients
 from calib.procedure.report import certificate
 from calib.procedure.session import dynamics_steps, geometry_steps
@@ -26,7 +27,6 @@ from calib.procedure.session.folder import (
     Session,
     StateFile,
     StepRecord,
-    fingerprint,
     read_state,
     write_state,
 )
