@@ -29,8 +29,8 @@ def export(
 
     Of a fit: robot.urdf, joint_offsets.csv, ur_kinematics.yaml of a UR arm, joint corrections where there are any. Of
     an identification also masses and friction, as URDF, MJCF, drives.csv and parameters.json. Each file is read back by
-    an independent reader before it is put in place. A result whose verdict is fail is exported with a warning, which
-    stands in the URDFs and a README.txt, too.
+    an independent reader before it is put in place. A result whose verdict is no pass is exported with a warning that
+    says why, which stands in the URDFs and a README.txt, too.
 
     Args:
         result: a fit, an identification, or the folder of one.
@@ -53,10 +53,10 @@ def export(
             lines = dynamics.deliver_dynamics(place, optional(urdf), into, prior)
         else:
             lines = delivery.deliver(place, _source_of(place) if urdf is None else Path(urdf), into)
-        failed = delivery.mark_failed(into, delivery.verdicts(place))
-    for words in failed:
+        judged = delivery.mark(into, delivery.verdicts(place))
+    for words in judged:
         warnings.warn(words, stacklevel=3)
-    return (*failed, *lines)
+    return (*judged, *lines)
 
 
 def _source_of(place: Path) -> Path:

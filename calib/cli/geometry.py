@@ -186,7 +186,7 @@ def export(
 ) -> None:
     """Write the calibrated robot for other programs. With --into: in all forms, identified dynamics included.
 
-    A result whose verdict is fail is written for inspection, marked as such; the exit code is 1 then.
+    A result whose verdict is no pass is marked so, with the reason; with fail, for inspection only, the exit code is 1.
     """
     import warnings
 
@@ -203,7 +203,7 @@ def export(
         with progress() as show, warnings.catch_warnings(action="ignore"):  # what it warns of is the first line
             show("all forms, and each file read back")
             lines = export_all(folder, into, urdf=urdf, prior=prior)
-        say_written(lines, into, "fail" if delivery.failure(delivery.verdicts(folder)) else "")
+        say_written(lines, into, delivery.worst(delivery.verdicts(folder)))
         return
     if (urdf is None) != (out is None) or not (urdf or ur_kinematics or offsets):
         raise UsageError(
@@ -211,15 +211,18 @@ def export(
         )
     found = geometry.read(folder)
     geometry.check_targets(folder, urdf, [path for path in (out, ur_kinematics, offsets) if path])
-    failed = delivery.failure(delivery.verdicts(folder))
+    verdicts = delivery.verdicts(folder)
+    judged = delivery.remark(verdicts)
     if urdf and out:
         read = geometry.export_urdf(found, urdf, out, for_corrections)
-        if failed:
-            delivery.mark_file(out, failed)
+        if judged:
+            delivery.mark_file(out, judged)
         say(f"{out}: joint origins of {urdf} calibrated, all else kept; base link and flange stay where the source has "
             f"them; {read}")  # fmt: skip
     if ur_kinematics:
         geometry.export_ur_kinematics(found, ur_kinematics)
+        if judged:
+            delivery.mark_file(ur_kinematics, judged)
         say(f"{ur_kinematics}: for kinematics_params_file of ur_description")
         if note := geometry.flange_note(found):
             say(f"note: {note}")
@@ -231,9 +234,9 @@ def export(
         left = geometry.without_corrections(folder)
         note += f": {left}" if left else ""
         say(note)
-    if failed:
-        say(failed)
-        exit_failed("fail")
+    if judged:
+        say(judged)
+    exit_failed(delivery.worst(verdicts))
 
 
 @app.command()

@@ -105,6 +105,7 @@ def _layout(table: Table, options: FileOptions, joints: Sequence[str]) -> Layout
     orientation = _find_orientation(table, options)
     if not orientation:
         raise MeasurementError("kind 'pose' needs qx qy qz qw, or r11 to r33; the header has neither", table.file)
+    _check_one_source(table, options, positions[0], orientation)
     if len(positions) > 1:
         message = "kind 'pose' allows one target per row, found numbered positions"
         raise MeasurementError(message, table.file, column=positions[1][0])
@@ -112,6 +113,25 @@ def _layout(table: Table, options: FileOptions, joints: Sequence[str]) -> Layout
         notes = (*notes, f"the orientation is read from {', '.join(orientation)}")
     rotation = _family(table, options, SIGMA_ROTATION)
     return Layout(kind, columns, positions, sigmas, orientation, rotation, tool=tool, base=base, notes=notes)
+
+
+def _check_one_source(table: Table, options: FileOptions, position: Sequence[str], orientation: Sequence[str]) -> None:
+    """Refuse a plain position beside a measured orientation, or the reverse: the plain columns may be the command.
+
+    Measured is what is named so, or what the options map though the file has the plain names, too.
+    """
+    families = ((POSITION, position), (QUATERNION if len(orientation) == len(QUATERNION) else MATRIX, orientation))
+    for (names, plain), (others, measured) in (families, families[::-1]):
+        if plain != names or any(name in options.columns for name in names) or measured == others:
+            continue
+        if measured[0].endswith(SUFFIXES[1:]) or all(name in table for name in others):
+            mapped = ", ".join(f'{name} = "{name}"' for name in names)
+            alone = "" if names == POSITION else ', or read the positions alone (kind = "position")'
+            message = (
+                f"the header has {', '.join(names)} beside {', '.join(measured)}: were the former measured, too, or "
+                f"are they what was commanded? If measured, map them in the options ([columns] {mapped}){alone}"
+            )
+            raise MeasurementError(message, table.file, column=names[0])
 
 
 def _grouped_layout(table: Table, options: FileOptions, kind: str, joints: tuple[str, ...]) -> Layout:

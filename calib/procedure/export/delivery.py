@@ -12,6 +12,7 @@ from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.export import geometry
 from calib.procedure.export.geometry import results
 from calib.procedure.export.parameters import PARAMETERS
+from calib.procedure.findings import LEVELS
 from calib.procedure.kinematic_stage.folder import (
     CORRECTED_URDF,
     FORMULA,
@@ -30,7 +31,8 @@ OFFSETS, UR_KINEMATICS = "joint_offsets.csv", "ur_kinematics.yaml"
 WRITTEN = (*COPIED, URDF, CORRECTED_URDF, OFFSETS, UR_KINEMATICS)
 DYNAMICS = "dynamics"  # where they are, if on another geometry than robot.urdf's
 MARKS = (OFFSETS, PARAMETERS)  # by which an earlier export is known, of a geometry or of dynamics
-FIRST = "verdict fail: "  # how a README.txt of ours begins; another's is left alone
+SAID = {"fail": "; do not use", "marginal": ""}  # verdicts that the exported files state, and what is added to them
+FIRST = tuple(f"verdict {level}: " for level in SAID)  # how a README.txt of ours begins; another's is left alone
 
 
 def deliver(fit: Path, source: Path, out: Path) -> list[str]:
@@ -119,36 +121,48 @@ def verdicts(folder: Path) -> dict[str, tuple[str, str]]:
     return {"geometry": (judged.verdict, judged.reason)}
 
 
-def failure(verdicts: Mapping[str, tuple[str, str]]) -> str:
-    """Return what to say of an export whose verdicts fail; empty where none does."""
-    failed = [f"{stage}: {reason}" for stage, (verdict, reason) in verdicts.items() if verdict == "fail"]
-    return f"{FIRST}{'; '.join(failed)}; do not use" if failed else ""
+def worst(verdicts: Mapping[str, tuple[str, str]]) -> str:
+    """Return the worst of the stages' verdicts; empty where there is none."""
+    return max((level for level, _ in verdicts.values()), key=LEVELS.index, default="")
 
 
-def mark_failed(out: Path, verdicts: Mapping[str, tuple[str, str]]) -> list[str]:
-    """Write failed verdicts at the head of the exported XML files and into a README.txt beside them; return the words.
+def remark(verdicts: Mapping[str, tuple[str, str]]) -> str:
+    """Return what to say of an export whose worst verdict is no pass: every stage that has it, with the reason."""
+    level = worst(verdicts)
+    if level not in SAID:
+        return ""
+    reasons = (f"{stage}: {reason}" for stage, (own, reason) in verdicts.items() if own == level)
+    return f"verdict {level}: {'; '.join(reasons)}{SAID[level]}"
+
+
+def mark(out: Path, verdicts: Mapping[str, tuple[str, str]]) -> list[str]:
+    """Write a verdict that is no pass at the head of the exported files and into a README.txt; return the words.
 
     Args:
-        out: the folder of the export; without a failed stage an earlier README.txt of ours is removed from it.
+        out: the folder of the export; where all stages pass an earlier README.txt of ours is removed from it.
         verdicts: stage to verdict (``pass``, ``marginal``, ``fail``) and reason.
     """
-    from calib.procedure.export.masses import MJCF  # slow to load, and needed after a failure alone
+    from calib.procedure.export.masses import MJCF  # slow to load, and needed for a verdict that is no pass alone
 
     readme = out / "README.txt"
     ours = not readme.exists() or readme.read_text(encoding="utf-8", errors="replace").startswith(FIRST)
-    words = failure(verdicts)
+    words = remark(verdicts)
     if not words:
         if ours:
             readme.unlink(missing_ok=True)
         return []
     if ours:
-        files.write(readme, f"{words}\nThe files in this folder were exported for inspection only.\n")
-    for path in (place / name for place in (out, out / DYNAMICS) for name in (URDF, CORRECTED_URDF, MJCF)):
+        inspect = "The files in this folder were exported for inspection only.\n" if worst(verdicts) == "fail" else ""
+        files.write(readme, f"{words}\n{inspect}")
+    names = (URDF, CORRECTED_URDF, MJCF, UR_KINEMATICS)
+    for path in (place / name for place in (out, out / DYNAMICS) for name in names):
         if path.is_file():
             mark_file(path, words)
     return [words]
 
 
 def mark_file(path: Path, words: str) -> None:
-    """Write words at the head of an XML file, as a comment."""
-    files.write(path, with_comment(path.read_bytes(), words))
+    """Write words, one line, at the head of an XML or YAML file, as a comment."""
+    content = path.read_bytes()
+    xml = b"<" in content[:8]  # behind a byte order mark, perhaps in UTF-16; our YAML begins with a comment
+    files.write(path, with_comment(content, words) if xml else f"# {words}\n".encode() + content)

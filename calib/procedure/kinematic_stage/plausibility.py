@@ -7,7 +7,8 @@ unexplained   on rows left out even the chosen model leaves more than `NO_ARM` o
 reflection    with the instrument's y turned the nominal arm fits `BETTER` times as well: its axes are left-handed: fail
 sign          so with the signs of some joints reversed, and better than with y turned: fail
 moved         the fit turned an element of the arm by more than `TURNED`, or moved it by more than `SHIFTED` of the
-              reach, and no sign says why: marginal. Sound arms at hand turned by 33 mrad at most (Motoman; UR5 12)
+              reach, and no sign says why: marginal, or fail from `NO_MOUNTING` times that on, as no mounting is off.
+              Sound arms at hand turned by 33 mrad at most (Motoman; UR5 12)
 scale         one factor on all measured lengths takes away `SHARE` of the squares of the nominal arm's errors; off one
               by more than `FOREIGN` and 3 of its sigmas: fail, by more than `GROWN`: marginal, else a note; so where
               the fitted lengths grew together and that is more than `ALONE` of their change. No instrument is off by
@@ -36,6 +37,7 @@ NO_ARM = 0.015
 BETTER = 3.0
 SHARE, LEAST, GROWN, FOREIGN, ALONE = 0.3, 1e-3, 5e-3, 0.025, 0.8
 TURNED, SHIFTED = 0.1, 0.03  # [rad], of the reach
+NO_MOUNTING = 5.0  # times these: 0.5 rad, 15 % of the reach
 NAMED = 5  # elements in a sentence
 LOOKED_AT = 100  # images
 
@@ -139,7 +141,7 @@ def _moved(fit: GeometricFit, reach: float) -> list[Finding]:
     words = [each for _, each in sorted(told, reverse=True)]
     more = f" and {len(words) - NAMED} more" if len(words) > NAMED else ""
     one = Finding(
-        "moved", "marginal",
+        "moved", "fail" if max(told)[0] > NO_MOUNTING else "marginal",
         f"the fit moved {', '.join(words[:NAMED])}{more} from the nominal arm, further than any sound arm is off: is "
         "this the robot, does its file count a joint's angle from another zero or the other way, are the columns in "
         "its order?",

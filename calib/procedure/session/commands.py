@@ -146,9 +146,11 @@ def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", 
 def _ending(session: Session) -> tuple[str, ...]:
     """Return what is said of a session that has come to its end: a failed one's robot is for inspection only."""
     page, robot = session.path(CERTIFICATE), session.path(f"{session.export}/{URDF}")
-    if verdict_of(session) == "fail":
+    level = verdict_of(session)
+    if level == "fail":
         return ("", f"certificate: {page}", f"verdict fail: exported for inspection only, do not use: {robot}")
-    return ("", f"done; certificate: {page}", f"robot: {robot}")
+    held = "" if level == "pass" else f" (verdict {level}: {robot.parent.name}/README.txt says why)"
+    return ("", f"done; certificate: {page}", f"robot: {robot}{held}")
 
 
 def status_lines(folder: Path) -> Iterator[RenderableType]:

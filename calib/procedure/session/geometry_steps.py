@@ -263,12 +263,12 @@ def validate(session: Session, say: Say) -> list[str]:
 
 
 def export(session: Session, say: Say) -> list[str]:
-    """Put the calibrated robot into the forms others read; of a failed one the files say so."""
-    from calib.procedure.export.delivery import mark_failed
+    """Put the calibrated robot into the forms others read; of one that does not pass the files say so."""
+    from calib.procedure.export.delivery import mark
 
     out = session.path(session.export)
     lines = _exported(session, out, say)
-    return [*mark_failed(out, verdicts(session)), *lines]
+    return [*mark(out, verdicts(session)), *lines]
 
 
 def _exported(session: Session, out: Path, say: Say) -> list[str]:

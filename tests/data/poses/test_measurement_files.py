@@ -7,6 +7,7 @@ import pytest
 from measured_rows import JOINTS, POSE
 from scipy.spatial.transform import Rotation
 
+from calib.data.poses.columns import MATRIX
 from calib.data.poses.fit_options import FileOptions, Sigma
 from calib.data.poses.pose_files import joint_columns, read_measurements
 from calib.errors import MeasurementError
@@ -85,6 +86,35 @@ def test_commanded_beside_measured_positions_are_refused_until_the_options_say_w
     expected = np.array(good, dtype=float)[:, 3:6] if names[0] == "x" else np.full((len(good), 3), 9.0)
     np.testing.assert_array_equal(block.position, expected)
     assert block.ignored == (("x_meas", "y_meas", "z_meas") if names[0] == "x" else ("x", "y", "z"))
+
+
+POSITIONS, TURNS = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
+
+
+@pytest.mark.parametrize(
+    "header, mapped, plain",
+    [
+        ("x_meas,y_meas,z_meas,qx,qy,qz,qw", {}, TURNS),
+        ("x_measured,y_measured,z_measured,r11,r12,r13,r21,r22,r23,r31,r32,r33", {}, MATRIX),
+        ("x,y,z,x_meas,y_meas,z_meas,qx,qy,qz,qw", {name: name + "_meas" for name in POSITIONS}, TURNS),
+        ("x,y,z,px,py,pz,qx,qy,qz,qw", dict(zip(POSITIONS, ("px", "py", "pz"))), TURNS),
+        ("x,y,z,qx_meas,qy_meas,qz_meas,qw_meas", {}, POSITIONS),
+    ],
+)
+def test_a_plain_orientation_beside_measured_positions_is_refused_until_it_is_mapped(
+    write, good, header, mapped, plain
+):
+    names = header.split(",")
+    matrices = Rotation.from_quat(np.array(good, dtype=float)[:, 6:]).as_matrix().reshape(-1, 9)
+    turned = [[*row[6:]] if "r11" not in names else [*matrix] for row, matrix in zip(good, matrices)]
+    count = len(names) - len(turned[0])
+    path = write(f"q1,q2,q3,{header}", [[*row[:6], *row[3:6]][: 3 + count] + turn for row, turn in zip(good, turned)])
+    with pytest.raises(MeasurementError, match=f'what was commanded.*{plain[0]} = "{plain[0]}"') as told:
+        read(path, FileOptions(columns=mapped))
+    assert ('kind = "position"' in str(told.value)) == (plain != POSITIONS)
+    block = read(path, FileOptions(columns={**mapped, **{name: name for name in plain}}))
+    assert block.kind == "pose"
+    assert read(path, FileOptions(kind="position", columns=mapped)).kind == "position"
 
 
 def test_a_map_of_some_columns_is_completed_by_those_that_go_with_them(write, good):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from calib import export
 from calib.robot.formats import urdf
@@ -162,3 +163,22 @@ def test_a_failed_result_is_exported_with_its_verdict_and_exit_code_1(cell, cali
         assert export("bad", "x")[0].startswith("verdict fail")
     assert calib("export", fitted, "--into", "x")[0] == 0
     assert not Path("x/README.txt").exists() and "verdict fail" not in Path("x/robot.urdf").read_text()
+
+
+def test_a_marginal_result_is_exported_with_what_made_it_marginal(cell, calib, fitted):
+    rows = [row | {"q3": row["q3"] + 0.3} for row in cell.measure(60)]
+    assert calib("fit", "source.urdf", cell.write("b.csv", rows), "--model", "geometry", "--out", "odd")[0] == 0
+    said = "verdict marginal: geometry: the fit moved "
+    code, out, _ = calib("export", "odd", "--into", "x")
+    assert code == 0 and out.startswith(said) and "do not use" not in out
+    assert Path("x/README.txt").read_text().startswith(said)
+    assert f"<!-- {said}" in Path("x/robot.urdf").read_text()
+    code, out, _ = calib("export", "odd", "--urdf", "source.urdf", "--out", "one.urdf", "--ur-kinematics", "k.txt")
+    assert code == 0 and said in out and f"<!-- {said}" in Path("one.urdf").read_text()
+    for name in ("k.txt", "x/ur_kinematics.yaml"):
+        assert Path(name).read_text().startswith(f"# {said}")
+    assert yaml.safe_load(Path("k.txt").read_text())["kinematics"]
+    with pytest.warns(UserWarning, match=said):
+        assert export("odd", "x")[0].startswith(said)
+    assert calib("export", fitted, "--into", "x")[0] == 0
+    assert not Path("x/README.txt").exists() and "verdict" not in Path("x/robot.urdf").read_text()

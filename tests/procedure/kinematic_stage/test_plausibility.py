@@ -73,13 +73,17 @@ def test_joints_that_turn_the_other_way_are_named(cell, calib, reversed_ones, mo
         assert calib("fit", "ur5", "m.csv", "--out", "o", "--model", model, "--options", "a.toml")[0] == 0
 
 
-def test_a_joint_counted_from_another_zero_is_told(cell, calib):
-    rows = [row | {"q3": row["q3"] + np.pi / 2} for row in cell.measure(COUNT)]
+@pytest.mark.parametrize("degrees, level", [(90, "fail"), (20, "marginal")])
+def test_a_joint_counted_from_another_zero_is_told(cell, calib, degrees, level):
+    rows = [row | {"q3": row["q3"] + np.radians(degrees)} for row in cell.measure(COUNT)]
     path = cell.write("m.csv", rows, [*(f"q{j + 1}" for j in range(6)), *"xyz"])
-    calib("fit", "ur5", path, "--out", "o", "--model", "geometry")
-    level, reason, odd = verdict()
-    assert (level, odd) == ("marginal", ["moved"])
-    assert reason.startswith("the fit moved ") and "-90°" in reason
+    code, out, _ = calib("fit", "ur5", path, "--out", "o", "--model", "geometry")
+    found, reason, odd = verdict()
+    assert (code, found, odd) == (int(level == "fail"), level, ["moved"])
+    assert reason.startswith("the fit moved ") and f"-{degrees}°" in reason and 'accept = ["moved"]' in out
+    Path("a.toml").write_text('accept = ["moved"]')
+    calib("fit", "ur5", "m.csv", "--out", "o", "--model", "geometry", "--options", "a.toml")
+    assert not verdict()[1].startswith("the fit moved ")
 
 
 @pytest.mark.parametrize(

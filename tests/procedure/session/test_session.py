@@ -219,6 +219,8 @@ def test_a_tolerance_of_the_session_decides_and_stands_on_the_certificate(finish
 def test_a_failed_robots_files_say_so_until_it_does_not_fail(finished: Session, capsys: pytest.CaptureFixture) -> None:
     place, settings = finished.path("6-export"), finished.path("session.toml")
     before = (place / "robot.urdf").read_bytes()
+    marginal = (place / "README.txt").read_text()
+    assert marginal.startswith("verdict marginal: geometry: no rigid geometry ") and marginal.strip() in before.decode()
     edit(settings, "tolerance_mm = 0.0", "tolerance_mm = 0.001")
     assert cli.run(["next", "--no-plots", str(finished.folder)]) == 1
     said = capsys.readouterr().out.strip().split("\n")[-1]
@@ -229,7 +231,8 @@ def test_a_failed_robots_files_say_so_until_it_does_not_fail(finished: Session, 
     load(place / "robot.urdf")
     edit(settings, "tolerance_mm = 0.001", "tolerance_mm = 0.0")
     assert cli.run(["next", "--no-plots", str(finished.folder)]) == 0
-    assert (place / "robot.urdf").read_bytes() == before and not (place / "README.txt").exists()
+    assert (place / "robot.urdf").read_bytes() == before and (place / "README.txt").read_text() == marginal
+    assert "(verdict marginal: 6-export/README.txt says why)" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("head", [b"", b"\xef\xbb\xbf", b'<?xml version="1.0"?>', b'\xef\xbb\xbf<?xml version="1.0"?>'])
