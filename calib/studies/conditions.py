@@ -50,7 +50,10 @@ from calib.identification.methods.registry import METHODS, method_named
 
 ROBOTS = ("tx40", "rv2sq")
 MISMATCHES = ("none", "geometry", "calibrated", "controller", "friction", "payload", "clock")
-TRIAL = 1  # raised whenever a trial of the same condition comes out otherwise: rows from before then do not count
+TRIAL = 1
+"""Raised whenever the trials of all methods come out otherwise: no row from before then counts.
+
+Where one method changes, its `calib.identification.methods.registry.MethodEntry.version` is raised."""
 
 _Few = Spread(words="a value, or a list of them")
 Robots = Annotated[

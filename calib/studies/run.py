@@ -72,7 +72,7 @@ def missing(study: Study, store: RowStore) -> Iterator[Trials]:
         for condition, runs, first in zip(study.conditions, study.runs, study.seeds):
             seed, digest = first + number, condition.digest
             wanted = [
-                name for name, count in runs.items() if number < count and (digest, name, seed) not in store.rows
+                name for name, count in runs.items() if number < count and not store.holds((digest, name, seed))
             ]  # fmt: skip
             yield from grouped(condition, wanted, seed)
 

@@ -6,7 +6,7 @@ rows.parquet   all rows before; made of both when a command ends, where pyarrow 
 study.lock     held while a command works on the folder
 
 A row's key is (digest of the condition, method, seed): rows of conditions that a study file no longer states stay, and
-are not counted.
+are not counted; so do those of a method that has changed since (`MethodEntry.version`), until it is run again.
 """
 
 from __future__ import annotations
@@ -49,13 +49,17 @@ class RowStore:
         self.rows.update((row.key, row) for row in journal)
         self._journal = _open_journal(folder / JOURNAL, good)
 
+    def holds(self, key: tuple[str, str, int]) -> bool:
+        """Tell whether a trial is there, by its method as it is now."""
+        return key in self.rows and self.rows[key].current
+
     def append(self, rows: Sequence[TrialRow]) -> None:
         """Keep rows, on the disk before this returns.
 
         Raises:
             CalibError: where the disk is full; rows of before are kept, none of these.
         """
-        fresh = [row for row in rows if row.key not in self.rows]
+        fresh = [row for row in rows if not self.holds(row.key)]
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows(("", *map(_cell, astuple(row))) for row in fresh)
         before = self._journal.tell()

@@ -107,12 +107,14 @@ class ConditionSummary:
 
 
 def summarise(study: Study, rows: Iterable[TrialRow]) -> list[ConditionSummary]:
-    """Return what rows say of a study's conditions, all methods that have any; rows of other conditions do not count.
+    """Return what rows say of a study's conditions, all methods that have any.
+
+    Rows of other conditions do not count, nor do those of a method that has changed since.
 
     What a study asks for is what is to be run; what is there stays in sight when a method is added or taken out.
     """
     kept: dict[str, dict[str, list[TrialRow]]] = {}
-    for row in rows:
+    for row in (one for one in rows if one.current):
         kept.setdefault(row.digest, {}).setdefault(row.method, []).append(row)
     result = []
     for condition, runs in zip(study.conditions, study.runs):

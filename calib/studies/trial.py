@@ -12,7 +12,7 @@ import numpy as np
 from calib.dynamics import base as bases
 from calib.errors import CalibError
 from calib.identification.methods.method import EstimateStatus, MethodEstimate
-from calib.identification.methods.registry import method_named
+from calib.identification.methods.registry import VERSIONS, method_named
 from calib.identification.prediction import Dynamics, predict
 from calib.simulation.cells import known_robots
 from calib.simulation.loop.closed_loop import Plant, Sensing, simulate
@@ -23,6 +23,7 @@ FOUND = EstimateStatus.FOUND.value
 NOT_RECORDED, FAILED = "not recorded", "failed"  # beside `EstimateStatus`: the true robot, or the method, raised
 WIDE = 1.959963984540054  # standard deviations that hold 95 %
 NAN = float("nan")
+_CHANGED = " method "
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class TrialRow:
         survey_q: the survey's d_q = 100 mean_k ‖q - q_s‖ / ‖q‖, q_s simulated with β̂ [%]; of the first seeds only.
         iterations, simulations: of the method.
         seconds, cpu: wall and processor time of the method [s].
-        version: of the toolkit.
+        version: of the toolkit; behind it that of the method, where it has changed: ``0.1.0``, ``0.1.0 method 2``.
     """
 
     condition: str
@@ -82,6 +83,16 @@ class TrialRow:
         return self.digest, self.method, self.seed
 
     @property
+    def toolkit(self) -> str:
+        """The toolkit's version that made it."""
+        return self.version.partition(_CHANGED)[0]
+
+    @property
+    def current(self) -> bool:
+        """Whether its method has not changed since; a row of a method that has does not count, and is run again."""
+        return (self.version.partition(_CHANGED)[2] or "1") == str(VERSIONS.get(self.method, 1))
+
+    @property
     def found(self) -> bool:
         return self.status == FOUND
 
@@ -111,13 +122,13 @@ def run_trial(condition: Condition, method: str, seed: int) -> TrialRow:
     try:
         data = make_experiment(condition, seed)
     except Exception as error:  # an unstable loop, a geometry that cannot be fitted: a finding, not an end
-        return TrialRow(status=NOT_RECORDED, message=_said(error), version=_version(), **head)
+        return TrialRow(status=NOT_RECORDED, message=_said(error), version=_version(method), **head)
     wall, cpu = time.perf_counter(), time.process_time()
     try:
         found, failure = own.estimate(data.problem), None
     except Exception as error:
         found, failure = None, error
-    times = {"seconds": time.perf_counter() - wall, "cpu": time.process_time() - cpu, "version": _version()}
+    times = {"seconds": time.perf_counter() - wall, "cpu": time.process_time() - cpu, "version": _version(method)}
     if found is None or not found.found:
         status = FAILED if found is None else found.status.value
         why = failure if found is None else found.failure
@@ -184,11 +195,12 @@ def _said(error: BaseException | None) -> str:
     return " ".join(words.split())[:300]
 
 
-def _version() -> str:
+def _version(method: str) -> str:
     try:
-        return version("armature-calib")
+        toolkit = version("armature-calib")
     except PackageNotFoundError:
-        return ""
+        toolkit = ""
+    return toolkit if VERSIONS[method] == 1 else f"{toolkit}{_CHANGED}{VERSIONS[method]}"
 
 
 def grouped(condition: Condition, methods: Sequence[str], seed: int) -> list[Trials]:

@@ -93,7 +93,7 @@ GROUPS = {"RV2SQ": ("rv2sq", 1), "TX40": ("tx40", 1), "TX40, decimated": ("tx40"
 def cost_table(rows: Iterable[TrialRow]) -> Iterator[str]:
     """Yield mean processor time per trial of each method; runs and failures over the 15 conditions."""
     digests = [one.digest for one in read_study(["MCS-*"]).conditions]
-    own = [row for row in rows if row.digest in digests]
+    own = [row for row in rows if row.digest in digests and row.current]
     yield f"| method | runs | without an estimate | {' | '.join(f'{name} [CPU s]' for name in GROUPS)} |"
     yield f"|---|{'---:|' * (2 + len(GROUPS))}"
     total = dict.fromkeys(GROUPS, 0.0)

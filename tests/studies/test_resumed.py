@@ -15,6 +15,7 @@ import pytest
 from study_rows import ROW
 
 from calib.errors import UsageError
+from calib.identification.methods.registry import VERSIONS
 from calib.procedure.study.outcome import run_study
 from calib.studies.conditions import read_study
 from calib.studies.store import JOURNAL, opened, read_rows
@@ -57,6 +58,27 @@ def test_rows_that_are_there_are_not_run_again(study: Path, tmp_path: Path):
     assert third.conditions[0].methods[0].trials == 1
     study.write_text(FILE)
     assert run_study([study], tmp_path / "out", runs=2, plots=False).progress.done == 0
+
+
+def test_a_method_that_changed_is_run_again_and_no_other(study: Path, tmp_path: Path, monkeypatch):
+    """Its old rows do not count, in a report alone neither; a row of today states the change."""
+    run_study([study], tmp_path / "out", runs=2, plots=False)
+    before = {row.key: row for row in read_rows(tmp_path / "out")}
+    (version,) = {row.version for row in before.values()}
+    assert "method" not in version
+    monkeypatch.setitem(VERSIONS, "wls", 2)
+    looked = run_study([study], tmp_path / "out", report_only=True, plots=False)
+    assert [(one.method, one.trials) for one in looked.conditions[0].methods] == [("ols", 2)]
+    assert "run again: 2 of wls" in " ".join(looked.notes)
+    found = run_study([study], tmp_path / "out", runs=2, plots=False)
+    assert found.progress.done == 2 and not any("run again" in note for note in found.notes)
+    assert {one.method: one.trials for one in found.conditions[0].methods} == {"ols": 2, "wls": 2}
+    after = {row.key: row for row in read_rows(tmp_path / "out")}
+    assert [row.version for row in after.values() if row.method == "wls"] == [f"{version} method 2"] * 2
+    assert after.keys() == before.keys()
+    assert timeless([row for row in after.values() if row.method == "ols"]) == timeless(
+        [row for row in before.values() if row.method == "ols"]
+    )
 
 
 def test_a_study_that_runs_may_be_looked_at(study: Path, tmp_path: Path):

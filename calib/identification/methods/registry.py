@@ -24,12 +24,15 @@ class MethodEntry:
         description: one line.
         source: whose it is.
         tunes: what of it is chosen beforehand and not told by the data; () for nothing.
+        version: raised whenever it gives another estimate, or another count of rounds, of the same data: what studies
+            have kept of it from before then does not count, and is run again.
     """
 
     method: Method
     description: str
     source: str
     tunes: tuple[str, ...] = ()
+    version: int = 1
 
     @property
     def name(self) -> str:
@@ -102,6 +105,7 @@ LISTING: tuple[MethodEntry, ...] = (
     MethodEntry(PC_DIDIM, "didim" + _CONSTRAINED, "Leboutet et al. 2021", ("tolerance 2.5 %", "10 rounds")),
 )  # fmt: skip
 METHODS: Mapping[str, Method] = {one.name: one.method for one in LISTING}
+VERSIONS: Mapping[str, int] = {one.name: one.version for one in LISTING}
 
 
 def method_named(name: str) -> Method:

@@ -8,6 +8,7 @@ report.html              tables, box plots, the decision rule; one file
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,25 +89,31 @@ def run_study(
             say("writing")
             store.settle()
             kept = list(store.rows.values())
-    own = {condition.digest for condition in study.conditions}
-    others = sum(row.digest not in own for row in kept)
+    digests = {condition.digest for condition in study.conditions}
+    own = [row for row in kept if row.digest in digests]
+    others, changed = len(kept) - len(own), Counter(row.method for row in own if not row.current)
+    own = [row for row in own if row.current]
     if others:
         notes.append(f"{others} rows are of conditions that are not of this study: kept, and not counted")
-    if not progress.lost and not any(row.digest in own for row in kept):
+    if changed:
+        named_rows = ", ".join(f"{count} of {name}" for name, count in changed.items())
+        notes.append(f"rows of methods that have changed since they ran do not count, and are run again: {named_rows}")
+    if not progress.lost and not own:
         told = f"{len(kept)} rows, none of them of this study's conditions" if kept else "no rows"
+        told = f"{len(kept)} rows; {notes[-1]}" if changed else told
         raise UsageError(
             f"nothing to report: {out} holds {told}; "
             + ("run the study first, or name its folder (--out)" if report_only else "ask for runs (--runs, runs)")
         )
-    if versions := sorted({row.version for row in kept if row.digest in own}):
+    if versions := sorted({row.toolkit for row in own}):
         notes += [f"rows were made by several versions: {', '.join(versions)}"] if len(versions) > 1 else []
     if progress.lost:
         notes.append(f"{progress.lost} trials were lost with their workers: the same command runs them again")
-    conditions = tuple(summary.summarise(study, kept))
+    conditions = tuple(summary.summarise(study, own))
     notes += report.reasons(conditions)
     header, lines = report.summary_table(conditions)
     files.write_table(out / SUMMARY, header, lines)
-    page = report.make_page(study, conditions, [row for row in kept if row.digest in own], notes, plots)
+    page = report.make_page(study, conditions, own, notes, plots)
     files.write(out / REPORT, page)
     return StudyOutcome(study, conditions, progress, tuple(notes), out)
 
