@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Iterator
+from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from types import CodeType
 
@@ -26,7 +27,7 @@ RESULTS = (
 def paths(source: Path) -> set[str]:
     """Return the names of files in a module's string constants; sentences that speak of one are none."""
     found = set()
-    for text in texts(compile(source.read_text(encoding="utf-8"), source, "exec", dont_inherit=True)):
+    for text in texts(SourceFileLoader(source.stem, str(source)).get_code(source.stem)):
         known = re.fullmatch(r"/?(?:[\w.*-]+/)*([\w-]+\.[a-z]+)", text)
         found |= {known[1]} if known else set()
     return found

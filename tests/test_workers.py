@@ -255,7 +255,9 @@ def assert_gone(pids: list[int]) -> None:
             raise AssertionError(f"process {pid} is still there")
 
 
-@pytest.mark.parametrize(("run", "kill"), [("map", os.killpg), ("completed", os.kill)])
+@pytest.mark.parametrize(
+    ("run", "kill"), [("map", os.killpg), pytest.param("completed", os.kill, marks=pytest.mark.slow)]
+)
 def test_after_ctrl_c_tasks_under_way_hand_back_what_they_have(tmp_path: Path, run: str, kill) -> None:
     """Whether the terminal's group gets it, or this process alone; no further task begins."""
     running = script(tmp_path, run)

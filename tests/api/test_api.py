@@ -256,10 +256,11 @@ def test_export_and_compensation_take_results_in_memory(fitted, model, cell, log
     assert commands.save(tmp_path / "commands.csv").is_file()
 
 
-def test_a_session_in_python_is_the_commands_session(tmp_path, monkeypatch, capsys):
+def test_a_session_in_python_is_the_commands_session(logs, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    made = calib.new_session("script", "ur5", "cmm", poses=20, validation=0, dynamics=False)
-    command = ["new", "command", "--robot", "ur5", "--instrument", "cmm", "--poses", "20", "--validation", "0"]
+    robot = str(logs / "robot.toml")
+    made = calib.new_session("script", robot, "cmm", poses=8, validation=0, dynamics=False)
+    command = ["new", "command", "--robot", robot, "--instrument", "cmm", "--poses", "8", "--validation", "0"]
     assert cli.run([*command, "--geometry-only"]) == 0
     own, other = (tomllib.loads((tmp_path / name / "session.toml").read_text()) for name in ("script", "command"))
     assert made == Path("script") and own | {"created": ""} == other | {"created": ""}

@@ -129,7 +129,7 @@ def by_session(session: Session) -> Judgement:
         (reversed_torque, "fail"),
         (swapped_columns, ""),
         pytest.param(another_joint_order, "fail", marks=pytest.mark.slow),
-        (copied, "marginal"),
+        pytest.param(copied, "marginal", marks=pytest.mark.slow),
         pytest.param(standing, "marginal", marks=pytest.mark.slow),
     ],
 )

@@ -114,7 +114,10 @@ def spoiled(files: Path, place: Path) -> tuple[Path, Path, Path]:
     return files / "robot.toml", place / "measured.csv", files / "validation.csv"
 
 
-@pytest.mark.parametrize("case", [clean, copied, swapped, moved, named_oddly, spoiled])
+@pytest.mark.parametrize(
+    "case",
+    [copied, swapped, *(pytest.param(case, marks=pytest.mark.slow) for case in (clean, moved, named_oddly, spoiled))],
+)
 def test_command_and_session_agree(files: Path, tmp_path: Path, case: Callable[[Path, Path], tuple[Path, ...]]) -> None:
     robot, fit, unseen = case(files, tmp_path)
     one = by_command(robot, tmp_path / "out", "geometry", fit, unseen)

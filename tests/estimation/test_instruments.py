@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.signal
 
 from calib.errors import Unidentifiable
 from calib.estimation.convex.constrained import within
@@ -128,10 +129,7 @@ def test_autocorrelated_noise_needs_the_inflation_to_keep_the_level():
         result = []
         for seed in range(150):
             rng = np.random.default_rng(seed)
-            draw = rng.normal(size=(7, 900))
-            for k in range(1, 900):
-                draw[:, k] += 0.9 * draw[:, k - 1]
-            slow = draw[:, 100:]
+            slow = scipy.signal.lfilter([1.0], [1.0, -0.9], rng.normal(size=(7, 900)))[:, 100:]
             w = slow[:3].T
             y = w @ TRUTH + slow[3]
             result.append(exogeneity(instrument(w + 0.5 * slow[4:].T, w, y), inflation=tau).p < 0.05)

@@ -58,7 +58,9 @@ def test_settled_standard_deviations_are_unbiased_where_parameters_are_many():
     assert 1.0 - 4 * np.std(found) / np.sqrt(600) > 25 / 30  # residuals without their degrees of freedom would fail
 
 
-@pytest.mark.parametrize("estimate, std", [(ols, np.array([1.0, 1.0, 1.0])), (wls, STD)])
+@pytest.mark.parametrize(
+    "estimate, std", [(ols, np.array([1.0, 1.0, 1.0])), pytest.param(wls, STD, marks=pytest.mark.slow)]
+)
 def test_the_covariance_is_true_over_many_data_sets(estimate, std):
     sizes = []
     for seed in range(300):

@@ -40,12 +40,14 @@ def test_they_show_the_api_alone():
         assert set(used) <= {"calib", "practice", "pathlib"}, path.name
 
 
-def test_01_fit_geometry(tmp_path):
-    before, after = figures(r"([\d.]+) mm (?:nominal|calibrated)", run("01_fit_geometry.py", tmp_path))
+def test_01_fit_geometry(tmp_path, capsys):
+    said = run_here(EXAMPLES / "01_fit_geometry.py", tmp_path, capsys=capsys)
+    before, after = figures(r"([\d.]+) mm (?:nominal|calibrated)", said)
     assert after < 0.3 * before
     assert (tmp_path / "fit/robot.urdf").is_file()
 
 
+@pytest.mark.slow
 def test_02_choose_poses(tmp_path, capsys):
     (share,) = figures(
         r"efficiency .*? ([\d.]+) \(", run_here(EXAMPLES / "02_choose_poses.py", tmp_path, capsys=capsys)

@@ -70,6 +70,7 @@ def test_its_script_runs(with_logs: Path, capsys: pytest.CaptureFixture) -> None
     assert all((with_logs / name).exists() for name in made)
 
 
+@pytest.mark.slow
 def test_its_session_begins(at_a_cell: Path, capsys: pytest.CaptureFixture) -> None:
     for arguments in commands(BLOCKS[2]):
         assert cli.run(arguments) == 0, (arguments, capsys.readouterr())

@@ -108,7 +108,7 @@ def test_whitening_by_what_an_image_shares_is_that_of_the_full_covariance():
     assert np.abs(matrix.T @ matrix - total).max() < 1e-8 * np.abs(total).max()
 
 
-@pytest.mark.parametrize("mounting", [IN_HAND, TO_HAND])
+@pytest.mark.parametrize("mounting", [IN_HAND, pytest.param(TO_HAND, marks=pytest.mark.slow)])
 def test_the_arm_is_recovered_with_lens_and_mounting_found(mounting):
     cell, block = study(mounting)
     block, start, candidates = started(cell, block)
@@ -231,7 +231,8 @@ def test_a_gross_corner_and_images_that_contradict_all_others_are_left_out_and_n
         complete_camera(cell.cell.nominal, replace(block, q=q, lens=cell.lens))
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
 def test_the_noise_of_images_settles_wherever_the_camera_stands(seed):
     """Far boards of small images: what an image is off by shrinks slowly from fit to fit; planted are encoders only."""
     lens = Lens("pinhole", np.array([1250.0, 1252.0, 640.0, 508.0, -0.12, 0.05, 4e-4, -3e-4, 0.0]), (1280, 1024))

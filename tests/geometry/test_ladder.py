@@ -48,7 +48,12 @@ def unseen(found, truth: Installation, known: bool) -> float:
 
 
 @pytest.mark.parametrize(
-    "robot, kind, count", [("ur5", "position", 150), ("lwr4plus", "pose", 120), ("ur5", "pose", 600)]
+    "robot, kind, count",
+    [
+        ("ur5", "position", 150),
+        ("lwr4plus", "pose", 120),
+        pytest.param("ur5", "pose", 600, marks=pytest.mark.slow),
+    ],
 )
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_a_rigid_truth_gives_the_geometry_and_no_effect(robot, kind, count, seed):
@@ -81,7 +86,7 @@ def test_joint_offsets_are_found_to_be_joint_offsets():
     assert found.chosen == "offsets"
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 @pytest.mark.parametrize("known", [True, False])
 def test_planted_compliance_is_found(seed, known):
     """With gravity torques as compliances, near the planted ones; without, as moments fitted with the geometry."""

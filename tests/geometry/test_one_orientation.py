@@ -47,7 +47,7 @@ def rms(cell: Installation, block: Positions) -> float:
     return float(np.sqrt(np.mean(errors(cell, [block]).main ** 2)))
 
 
-@pytest.mark.parametrize("tilt", [0.0, 1e-3])
+@pytest.mark.parametrize("tilt", [0.0, pytest.param(1e-3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", ["line", "curve", "surface"])
 def test_full_poses_of_one_orientation_are_placed_as_well_as_their_positions(kind, tilt):
     """They were placed 300 mm wrong: rotations alone tell nothing of where the instrument stands there."""

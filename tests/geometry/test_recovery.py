@@ -194,7 +194,7 @@ def test_the_order_of_rows_and_blocks_does_not_matter():
     assert position_error(one.cell, aligned, q).max() < 1e-3 * SIGMA
 
 
-@pytest.mark.parametrize("loss", ["huber", "cauchy"])
+@pytest.mark.parametrize("loss", [pytest.param("huber", marks=pytest.mark.slow), "cauchy"])
 def test_planted_outliers_are_named_with_file_and_row_and_hardly_any_others(loss):
     others = 0
     for seed in range(6):

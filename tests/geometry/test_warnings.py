@@ -38,7 +38,7 @@ def nearby(truth: Installation, centres: int, each: int, seed: int, sigma: float
     return Positions(q, truth.chain.joint_names, position=position, file="cluster.csv")
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3, 4))])
 def test_noise_alone_gives_no_warning(seed):
     for measured in (
         measure(truth_of(seed), "position", 150, seed, sigma=SIGMA, stated=seed % 2 == 0),
@@ -67,17 +67,19 @@ def test_rows_of_another_set_up_are_named(seed):
     assert abs(found.last - 40) <= 16  # a tenth of the rows
 
 
-def test_bad_rows_scattered_over_the_day_are_no_set_up():
+@pytest.mark.parametrize("seeds", [range(3), pytest.param(range(3, 12), marks=pytest.mark.slow)])
+def test_bad_rows_scattered_over_the_day_are_no_set_up(seeds):
     alarms = 0
-    for seed in range(12):
+    for seed in seeds:
         shuffled = replace(take(with_bad_rows(seed), np.random.default_rng(seed).permutation(160)), rows=None)
         alarms += bool(changes(calibrate(shuffled)))
     assert alarms == 0
 
 
-def test_noise_of_one_component_is_no_set_up():
+@pytest.mark.parametrize("seeds", [range(5), pytest.param(range(5, 20), marks=pytest.mark.slow)])
+def test_noise_of_one_component_is_no_set_up(seeds):
     alarms = 0
-    for seed in range(20):
+    for seed in seeds:
         found = calibrate(measure(truth_of(0), "distance", 160, seed, sigma=SIGMA))
         alarms += bool(changes(found))
     assert alarms == 0

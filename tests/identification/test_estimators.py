@@ -32,7 +32,7 @@ def away(found: dict[str, tuple[float, float]], sigma: dict[str, tuple[float, fl
     return float(np.sqrt(np.mean([((found[name][0] - x) / sigma[name][1]) ** 2 for name, x in truth.items()])))
 
 
-@pytest.mark.parametrize("method", ["ols", "irls", "tls"])
+@pytest.mark.parametrize("method", [pytest.param("ols", marks=pytest.mark.slow), "irls", "tls"])
 def test_all_methods_find_the_truth_of_a_clean_log(robot, tmp_path, capsys, method):
     log = planted.write(tmp_path, "train.npz", 0)
     found = identify(robot, log, method, tmp_path / "out")
@@ -42,6 +42,7 @@ def test_all_methods_find_the_truth_of_a_clean_log(robot, tmp_path, capsys, meth
     assert f"method {method}: takes for granted" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_robust_weights_gate_a_sensor_that_hangs(robot, tmp_path):
     """Torques frozen for a second here and there: least squares is off by many of its clean sigmas, irls by few.
 

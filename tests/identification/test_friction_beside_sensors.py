@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from calib.identification.identify import identify
 from calib.identification.identify_options import parse_options
@@ -17,6 +18,7 @@ from calib.simulation.cells.virtual_cells import virtual_cell
 from calib.simulation.loop.references import random_fourier
 
 
+@pytest.mark.slow
 def test_friction_with_memory_and_cables_of_a_simulated_arm() -> None:
     cell = virtual_cell("lwr4plus")
     arm = moving_arm(cell, "lwr4plus")  # 30 % of Fc has memory, cables pull, gears are warm: see its note

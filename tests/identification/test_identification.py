@@ -28,7 +28,7 @@ def errors(found) -> np.ndarray:
     return off @ np.linalg.solve(found.fitted.estimate.covariance, off) / len(off)
 
 
-@pytest.mark.parametrize("method", ["ols", "wls", "irls"])
+@pytest.mark.parametrize("method", [pytest.param("ols", marks=pytest.mark.slow), "wls", "irls"])
 def test_base_parameters_come_back_within_their_covariance(method):
     settings = IdentificationSettings(friction="standard", method=method, essential="none")
     size = [errors(identify(planted.arm(), [planted.case("a", seed)], settings)) for seed in range(5)]
@@ -53,8 +53,8 @@ def test_nothing_is_added_to_a_plain_robot():
     ("name", "terms", "size"),
     [
         ("load", friction.load_dependent(1), 0.1),
-        ("presliding", friction.presliding(1, [0.02]), 2.0),
-        ("asymmetric", friction.asymmetric(1), 0.5),
+        pytest.param("presliding", friction.presliding(1, [0.02]), 2.0, marks=pytest.mark.slow),
+        pytest.param("asymmetric", friction.asymmetric(1), 0.5, marks=pytest.mark.slow),
     ],
 )
 def test_the_ladder_takes_what_is_planted_and_only_there(name, terms, size):

@@ -131,6 +131,7 @@ def test_constraints_hold_in_every_round_and_the_folder_stays_readable(robot, tm
     assert np.isfinite(read.factor).all() and read.best >= 0.0
 
 
+@pytest.mark.slow
 def test_an_estimate_pulled_to_where_no_controller_holds_it_ends_and_says_so(robot, tmp_path, capsys):
     """M(q) barely definite is nothing that a sampled controller can hold: it is kept away from singular, and told."""
     train = log(tmp_path, "train.csv", 1, noise=1e-3)
@@ -158,7 +159,7 @@ def test_the_controller_may_be_read_from_the_log(robot, tmp_path, capsys):
     assert "controller read from train.csv" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("kind", ["csv", "npz"])
+@pytest.mark.parametrize("kind", ["csv", pytest.param("npz", marks=pytest.mark.slow)])
 def test_the_reference_may_be_a_file_of_its_own(robot, tmp_path, kind):
     train = log(tmp_path, "train.csv", 1, noise=1e-3, form="")
     asked = motion(1)

@@ -43,7 +43,7 @@ def explained(one: ripple.Ripple, where: GearTravel, torque: np.ndarray) -> floa
     return 1.0 - float(np.sum((torque - predicted) ** 2) / np.sum(torque**2))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_family_is_found_and_predicts_other_motion(seed):
     learnt, other = track(seed), track(seed + 100)
     noise = np.random.default_rng(seed).normal(scale=0.2, size=learnt.q.shape)

@@ -57,7 +57,7 @@ def identify(robot: Path, folder: Path, rows: str, *logs: str) -> tuple[int, Pat
     return run("identify", robot, *logs, "--options", options, "--out", out), out
 
 
-@pytest.mark.parametrize("rows, count", [("link", 34), ("both", 46), ("drive", 12)])
+@pytest.mark.parametrize("rows, count", [pytest.param("link", 34, marks=pytest.mark.slow), ("both", 46), ("drive", 12)])
 def test_models_1_to_3_recover_the_truth(robot, tmp_path, capsys, rows, count):
     """Model 2 has as many base parameters as Models 1 and 3 together, and all lie where their sigmas say."""
     logs = log(tmp_path, "empty.csv", 0, False), log(tmp_path, "loaded.csv", 1, True)

@@ -60,8 +60,17 @@ def starts(space: SearchSpace, count: int, seed: int = 0) -> np.ndarray:
     return draw_candidates(space.lower, space.upper, count, lambda q: is_feasible(space, q), seed=seed)
 
 
-@pytest.mark.parametrize("name", ARMS)
-@pytest.mark.parametrize("index", ["O1", "cond"])
+@pytest.mark.parametrize(
+    ("name", "index"),
+    [
+        ("4 joints", "cond"),
+        ("6 joints", "O1"),
+        pytest.param("4 joints", "O1", marks=pytest.mark.slow),
+        pytest.param("6 joints", "cond", marks=pytest.mark.slow),
+        pytest.param("7 joints", "O1", marks=pytest.mark.slow),
+        pytest.param("7 joints", "cond", marks=pytest.mark.slow),
+    ],
+)
 def test_the_local_search_moves_far_and_stays_feasible(name, index, file):
     space = space_of(name, file)
     q = starts(space, 12)

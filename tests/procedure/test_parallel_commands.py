@@ -115,21 +115,26 @@ def test_excite_writes_a_motion_within_the_limits(tmp_path):
     np.testing.assert_allclose(mean[:, 1:5], rows[:-1, 4:8], atol=1e-6)
 
 
-def test_plan_keeps_the_limits_and_passes_the_waypoints(folder, tmp_path, capsys):
-    for line in (False, True):
-        out = tmp_path / f"plan{line}"
-        assert calib("plan", "dualv", "--waypoints", folder / "way.csv", "--out", out, *(["--line"] * line)) == 0
-        metrics = json.loads((out / "metrics.json").read_text())
-        assert max(metrics["peak_torque"]) <= 127.0 and min(metrics["margins"]["torque"]) < 0.02
-        rows = np.loadtxt(out / "motion.csv", delimiter=",", skiprows=1)
-        for point in ([0.05, 0.04, np.radians(15)], [-0.06, 0.02, np.radians(-20)], [0.0, 0.0, 0.0]):
-            assert np.abs(rows[:, 1:4] - point).max(axis=1).min() < 2e-3
+@pytest.mark.parametrize("line", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_plan_keeps_the_limits_and_passes_the_waypoints(folder, tmp_path, line):
+    out = tmp_path / "plan"
+    assert calib("plan", "dualv", "--waypoints", folder / "way.csv", "--out", out, *(["--line"] * line)) == 0
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert max(metrics["peak_torque"]) <= 127.0 and min(metrics["margins"]["torque"]) < 0.02
+    rows = np.loadtxt(out / "motion.csv", delimiter=",", skiprows=1)
+    for point in ([0.05, 0.04, np.radians(15)], [-0.06, 0.02, np.radians(-20)], [0.0, 0.0, 0.0]):
+        assert np.abs(rows[:, 1:4] - point).max(axis=1).min() < 2e-3
 
 
-def test_the_api_takes_what_the_commands_take(folder, tmp_path):
+def test_the_api_fits_what_the_commands_fit(folder):
+    fitted = api.fit_geometry("dualv", folder / "poses.csv", api.FitSettings(holdout=0.3))
+    assert fitted.verdict.level == "pass" and "held out" in fitted.verdict.reason
+
+
+@pytest.mark.slow
+def test_the_api_identifies_and_plans_as_the_commands_do(folder, tmp_path):
     robot = api.load("dualv")
     fitted = api.fit_geometry(robot, folder / "poses.csv", api.FitSettings(holdout=0.3))
-    assert fitted.verdict.level == "pass" and "held out" in fitted.verdict.reason
     files = [folder / "empty.csv", folder / "load.csv"]
     model = api.identify_dynamics("dualv", files, options=folder / "options.toml")
     assert model.verdict.level == "marginal" and "no unseen motion" in str(model)
@@ -140,22 +145,33 @@ def test_the_api_takes_what_the_commands_take(folder, tmp_path):
     still = model.robot.known.home.q[:, robot.known.robot.actuated]
     assert np.abs(judged.torques(still, 0 * still, 0 * still)).max() < 1.0
     assert api.plan_motion(fitted.robot, folder / "way.csv", model=judged).duration > 0.1
-    for refused in (lambda: api.export(judged, tmp_path / "no"), lambda: api.select_poses(robot)):
-        with pytest.raises(api.CalibError):
-            refused()
+    with pytest.raises(api.CalibError):
+        api.export(judged, tmp_path / "no")
 
 
-def test_verdicts_fail_where_they_should(folder, tmp_path, capsys):
+def test_the_api_chooses_no_poses_for_a_parallel_robot():
+    with pytest.raises(api.CalibError):
+        api.select_poses(api.load("dualv"))
+
+
+def test_reversed_torques_fail(folder, tmp_path, capsys):
     log = np.loadtxt(folder / "empty.csv", delimiter=",", skiprows=1)
     log[:, 5] *= -1.0
     np.savetxt(tmp_path / "reversed.csv", log, delimiter=",", header=HEAD, comments="")
     words = ("--validate", folder / "other.csv", "--no-plots", "--out", tmp_path / "id")
     assert calib("identify", "dualv", tmp_path / "reversed.csv", *words) == 1
     assert "above 30 % fails" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_payload_that_is_not_there_is_told(folder, tmp_path, capsys):
     words = ("--options", folder / "options.toml", "--out", tmp_path / "none", "--no-plots")
     (tmp_path / "load.csv").write_text((folder / "empty.csv").read_text())
     assert calib("identify", "dualv", folder / "empty.csv", tmp_path / "load.csv", *words) == 0
     assert "move as if it were not there" in capsys.readouterr().out
+
+
+def test_a_fit_worse_than_the_nominal_fails(folder, tmp_path, capsys):
     table = np.loadtxt(folder / "poses.csv", delimiter=",", skiprows=1)
     table[:30, 4] += 20.0
     motors = "motor1 [deg],motor2 [deg],motor3 [deg],motor4 [deg],x [mm],y [mm],rz [deg]"

@@ -140,6 +140,7 @@ def test_a_free_period_is_shortened_down_to_a_limit():
     assert min(one.share for one in proof.margins) < 0.1
 
 
+@pytest.mark.slow
 def test_the_next_motion_complements_what_was_recorded():
     spot, first = designed()
     motion = spot.basis().motion(first.x)

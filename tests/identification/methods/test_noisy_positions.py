@@ -43,7 +43,7 @@ def errors(name: str, problem: IdentificationProblem) -> tuple[np.ndarray, np.nd
     return found.values - problem.base.transform @ planted.truth(), found.sigma
 
 
-@pytest.mark.parametrize("noise", [0.0, 1e-4, 3e-4])
+@pytest.mark.parametrize("noise", [*(pytest.param(noise, marks=pytest.mark.slow) for noise in (0.0, 1e-4)), 3e-4])
 def test_the_stated_sigma_of_maximum_likelihood_covers(noise):
     """Least squares' own is missed by several sigmas at the last level."""
     away = np.array([np.divide(*errors("ml", noisy(seed, noise))) for seed in range(6)])

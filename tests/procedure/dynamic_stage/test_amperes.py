@@ -109,7 +109,7 @@ def test_options_that_cannot_be_are_told(robot, tmp_path, capsys, text, said):
     assert said in " ".join(capsys.readouterr().err.split())
 
 
-@pytest.mark.parametrize("name", ["ZZ1R", "ZZ1"])
+@pytest.mark.parametrize("name", ["ZZ1R", pytest.param("ZZ1", marks=pytest.mark.slow)])
 def test_a_regrouped_parameter_has_two_names(robot, tmp_path, name):
     train, options, out = planted.write(tmp_path, "train.npz", 0), tmp_path / "options.toml", tmp_path / "out"
     options.write_text(f"drop = ['{name}']")

@@ -245,6 +245,7 @@ def test_tx40_richer_friction_pays_on_other_motion(data, tmp_path):
     assert total(rich, name, "filtered") < 0.9 * total(plain, name, "filtered")
 
 
+@pytest.mark.slow
 def test_lwr_with_one_sine_says_what_it_cannot_tell(data, tmp_path):
     folder = data / "kuka_lwr4plus_iit"
     log = folder / "measurements_1.npz"

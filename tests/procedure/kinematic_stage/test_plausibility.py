@@ -38,8 +38,12 @@ def test_sound_poses_are_not_remarked_upon(cell, calib):
     "change, name",
     [
         (lambda place: np.random.default_rng(0).permutation(place), "unexplained"),
-        (lambda place: np.random.default_rng(0).uniform(-0.8, 0.8, place.shape), "unexplained"),
-        (lambda place: place[:, [1, 1, 2]], "unexplained"),
+        pytest.param(
+            lambda place: np.random.default_rng(0).uniform(-0.8, 0.8, place.shape),
+            "unexplained",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(lambda place: place[:, [1, 1, 2]], "unexplained", marks=pytest.mark.slow),
         (lambda place: place * [1, -1, 1], "reflection"),
     ],
 )

@@ -112,6 +112,7 @@ def test_ur10_poses(data, capsys):
     assert calibrated["orientation_deg"]["rms"] < nominal["orientation_deg"]["rms"]
 
 
+@pytest.mark.slow
 def test_motoman_in_a_small_volume(data, capsys):
     chain, measured = motoman(data, "right_6x6x6_150.csv")
     found, nominal, calibrated = judged(chain, *holdout(measured, 50 / 150))
@@ -127,7 +128,10 @@ def test_motoman_in_the_whole_workspace(data, capsys):
     assert calibrated["position_mm"]["rms"] <= 1.3
 
 
-@pytest.mark.parametrize("name, consistency, distance", [("panda_2.csv", 0.79, 0.21), ("panda_3.csv", 0.23, 0.05)])
+@pytest.mark.parametrize(
+    "name, consistency, distance",
+    [pytest.param("panda_2.csv", 0.79, 0.21, marks=pytest.mark.slow), ("panda_3.csv", 0.23, 0.05)],
+)
 def test_mukca_sockets_at_other_places(data, capsys, name, consistency, distance):
     chain, fitted, unseen = mukca(data, name)
     found, nominal, calibrated = judged(chain, fitted, unseen)

@@ -151,9 +151,9 @@ def test_ways_keep_clear_and_their_order_takes_less_time(tmp_path):
     wall = '[[obstacle]]\nname = "wall"\nkind = "box"\nsize = [1.0, 0.04, 1.0]\nxyz = [0.7, 0.0, 0.3]\n'
     chain, found, seen = limits("6 joints", tmp_path, wall)
     space = found.space(seen)
-    q = draw_candidates(np.maximum(space.lower, -2.5), np.minimum(space.upper, 2.5), 8, lambda x: is_feasible(space, x))
+    q = draw_candidates(np.maximum(space.lower, -2.5), np.minimum(space.upper, 2.5), 5, lambda x: is_feasible(space, x))
     run = plan_run(chain, q, found, RunSettings(dwell=2.0))
-    assert (sorted(run.order) == list(range(8)) and run.seconds <= run.found + 1e-6) or run.around
+    assert (sorted(run.order) == list(range(5)) and run.seconds <= run.found + 1e-6) or run.around
     for k, way in enumerate(run.ways):
         assert np.array_equal(way[0], q[run.order[k]]) and np.array_equal(way[-1], q[run.order[k + 1]])
         if k not in run.blocked:

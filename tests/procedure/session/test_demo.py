@@ -20,6 +20,7 @@ from calib.robot.load import load
 README = (Path(__file__).parents[3] / "README.md").read_text()
 
 
+@pytest.mark.slow
 def test_demo_of_the_lwr4plus(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     out = tmp_path / "demo"
     assert run("demo", "--geometry-only", "--out", out) == 0

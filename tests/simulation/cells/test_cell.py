@@ -39,7 +39,7 @@ def study_poses(count: int, seed: int) -> np.ndarray:
     return q[lwr4plus.feasible(chain, lwr4plus.station(nominal), lwr4plus.tool(nominal), q)][:count]
 
 
-@pytest.mark.parametrize("robot", ["lwr4plus", "ur10"])
+@pytest.mark.parametrize("robot", ["lwr4plus", pytest.param("ur10", marks=pytest.mark.slow)])
 def test_planted_truth_is_recovered_within_its_covariance(robot: str) -> None:
     # Prediction errors at unseen poses against what the covariance says of them: their mean square in sigmas is 1.
     q, ratios = random_joints(load(robot), 60, 1), []

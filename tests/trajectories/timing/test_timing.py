@@ -27,7 +27,14 @@ def test_a_double_integrator_takes_its_known_shortest_time(velocity, expected):
     assert found.active_share > 0.999
 
 
-@pytest.mark.parametrize(("viscous", "coulomb"), [(0.0, 0.0), (0.0, 3.0), (1.5, 0.0), (12.0, 2.0), (80.0, 0.0)])
+@pytest.mark.parametrize(
+    ("viscous", "coulomb"),
+    [
+        *(pytest.param(*one, marks=pytest.mark.slow) for one in ((0.0, 0.0), (0.0, 3.0), (1.5, 0.0))),
+        (12.0, 2.0),
+        (80.0, 0.0),
+    ],
+)
 def test_a_cart_with_friction_takes_its_known_shortest_time(viscous, coulomb):
     """At 80 N s/m friction alone holds the speed for most of the way: a plain fixed point does not converge there."""
     cart = Cart(2.0, viscous, coulomb)
@@ -57,7 +64,7 @@ def test_planned_torques_by_pinocchio_keep_the_limits_and_reach_them():
     np.testing.assert_allclose(np.diff(motion.q, axis=0) * 1000, (motion.v[1:] + motion.v[:-1]) / 2, atol=5e-3)
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", [*range(4), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(4, 8))])
 def test_any_path_is_timed_with_no_limit_crossed_and_some_limit_active(seed):
     """Strong friction and accelerations limited, by turns; the sampling is other than that of the search."""
     from trajectories.timing.profile import dense
@@ -92,6 +99,7 @@ def test_shorter_than_any_slowed_down_polynomial_move():
     assert time_optimal(path, bounds, law).duration < 0.8 * quintic
 
 
+@pytest.mark.slow
 def test_viscous_friction_costs_time_and_finer_grids_agree():
     path = spline(WAYPOINTS)
     free = limits(velocity=np.full(7, np.inf))
