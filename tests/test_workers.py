@@ -37,11 +37,13 @@ from calib.workers.interrupts import finishing
 @pytest.fixture(scope="module")
 def crews(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Workers]]:
     with (
+        pytest.MonkeyPatch.context() as patch,
         dask_cluster.running(tmp_path_factory.mktemp("dask"), workers=2) as cluster,
         workers() as here,
         workers(2) as processes,
         workers(cluster.address) as dask,
     ):
+        patch.setenv("OPENBLAS_NUM_THREADS", "2")  # of this process: its workers get one, see below
         yield {"here": here, "processes": processes, "dask": dask}
 
 
@@ -107,10 +109,8 @@ def test_results_that_wait_for_their_turn_are_few(
 
 
 @IN_PARALLEL
-def test_workers_use_one_thread_each(crews: dict[str, Workers], where: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
-    with workers(2) as fresh:
-        found = list((fresh if where == "processes" else crews[where]).map(threads, range(2)))
+def test_workers_use_one_thread_each(crews: dict[str, Workers], where: str) -> None:
+    found = list(crews[where].map(threads, range(2)))
     assert all(len(counts) > 1 and set(counts) == {1} for counts in found)
     assert os.environ["OPENBLAS_NUM_THREADS"] == "2"
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 
@@ -56,16 +57,15 @@ class Wall:
 
 def signed_distance(obstacle: Obstacle, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the distances (...) [m] of points (..., 3) from an obstacle, and the outward normals (..., 3)."""
-    rotation = obstacle.placement[:3, :3]
-    local = (points - obstacle.placement[:3, 3]) @ rotation
+    rotation, local = obstacle.placement[:3, :3], _seen_from(obstacle, points)
     if obstacle.kind == "sphere":
         length = np.linalg.norm(local, axis=-1, keepdims=True)
         return length[..., 0] - obstacle.size[0], (local / np.maximum(length, 1e-12)) @ rotation.T
+    beyond = _beyond(obstacle, local)
     if obstacle.kind == "box":
-        beyond, slopes = np.abs(local) - np.array(obstacle.size) / 2, np.sign(local)
+        slopes = np.sign(local)
     else:
         across = np.linalg.norm(local[..., :2], axis=-1)
-        beyond = np.stack([across - obstacle.size[0], np.abs(local[..., 2]) - obstacle.size[1] / 2], axis=-1)
         slopes = np.concatenate(
             [local[..., :2] / np.maximum(across, 1e-12)[..., None], np.sign(local[..., 2:])], axis=-1
         )
@@ -78,13 +78,35 @@ def signed_distance(obstacle: Obstacle, points: np.ndarray) -> tuple[np.ndarray,
     return np.where(deepest > 0.0, length, deepest), (share * slopes) @ rotation.T
 
 
+def _seen_from(obstacle: Obstacle, points: np.ndarray) -> np.ndarray:
+    return (points - obstacle.placement[:3, 3]) @ obstacle.placement[:3, :3]
+
+
+def _beyond(obstacle: Obstacle, local: np.ndarray) -> np.ndarray:
+    """Return how far points (..., 3) in its own frame are beyond the faces (..., k) of a box or a cylinder."""
+    if obstacle.kind == "box":
+        return np.abs(local) - np.array(obstacle.size) / 2
+    across = np.linalg.norm(local[..., :2], axis=-1)
+    return np.stack([across - obstacle.size[0], np.abs(local[..., 2]) - obstacle.size[1] / 2], axis=-1)
+
+
+def _distance(obstacle: Obstacle, points: np.ndarray) -> np.ndarray:
+    """Return `signed_distance` without its normals, in a third of the time."""
+    local = _seen_from(obstacle, points)
+    if obstacle.kind == "sphere":
+        return np.linalg.norm(local, axis=-1) - obstacle.size[0]
+    faces = np.moveaxis(_beyond(obstacle, local), -1, 0)
+    deepest, outside = reduce(np.maximum, faces), np.maximum(faces, 0.0)
+    return np.where(deepest > 0.0, np.sqrt(sum(one * one for one in outside)), deepest)
+
+
 def nearest_on_lines(obstacle: Obstacle, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Return where (...), from 0 to 1, the lines from start to end (..., 3) are nearest to an obstacle."""
     low, high = np.zeros(start.shape[:-1]), np.ones(start.shape[:-1])
     along = end - start
 
     def far(place: np.ndarray) -> np.ndarray:
-        return signed_distance(obstacle, start + place[..., None] * along)[0]
+        return _distance(obstacle, start + place[..., None] * along)
 
     one, two = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
     far_one, far_two = far(one), far(two)

@@ -83,21 +83,22 @@ def test_correlated_joints_tell_more_together():
 
 
 @pytest.mark.parametrize(
-    "loss, gate",
+    "loss, gate, seeds",
     [
-        ("none", None),
-        pytest.param("huber", 0.999, marks=pytest.mark.slow),
-        pytest.param("cauchy", None, marks=pytest.mark.slow),
-        pytest.param("none", 0.99, marks=pytest.mark.slow),
+        ("none", None, 50),
+        pytest.param("none", None, 120, marks=pytest.mark.slow),
+        pytest.param("huber", 0.999, 120, marks=pytest.mark.slow),
+        pytest.param("cauchy", None, 120, marks=pytest.mark.slow),
+        pytest.param("none", 0.99, 120, marks=pytest.mark.slow),
     ],
 )
-def test_the_covariance_of_the_estimate_is_true_on_normal_noise(loss, gate):
+def test_the_covariance_of_the_estimate_is_true_on_normal_noise(loss, gate, seeds):
     sizes = []
-    for seed in range(120):
+    for seed in range(seeds):
         found = irls(stack(*planted(seed, 120)[:2]), loss, gate).estimate
         error = found.values - TRUTH
         sizes.append(error @ np.linalg.solve(found.covariance, error))
-    assert np.mean(sizes) == pytest.approx(4.0, abs=4 * np.sqrt(8 / 120) + 0.2)
+    assert np.mean(sizes) == pytest.approx(4.0, abs=4 * np.sqrt(8 / seeds) + 0.2)
 
 
 @pytest.mark.parametrize(

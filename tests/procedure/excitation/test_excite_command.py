@@ -251,9 +251,13 @@ def test_ctrl_c_keeps_the_best_motion_so_far(cell, calib, monkeypatch):
     assert metrics["history"][-1] < metrics["history"][0]
 
 
-def test_an_aim_in_place_of_condition_numbers_and_a_shorter_period(designed):
+@pytest.mark.slow
+def test_an_aim_in_place_of_condition_numbers(designed):
     told = design.excite("lwr4plus", replace(SHORT, goals=("logdet",), outlook=False))
     assert told.condition.raw > designed.condition.raw and told.found.merit < 0.0
+
+
+def test_a_shorter_period():
     short = design.excite("lwr4plus", replace(SHORT, goals=("duration=12",), shortest=10.0, outlook=False))
     samples = short.period * SHORT.rate
     assert 10.0 <= short.period < 16.0 and samples == pytest.approx(round(samples)) and short.proof.feasible

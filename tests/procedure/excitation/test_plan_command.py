@@ -101,15 +101,17 @@ def test_model_and_stated_drives_plan_the_same_motion(room):
     assert bare.track.duration < one.track.duration and "friction not known" in bare.notes[1]
 
 
-def test_lines_and_shapes(room):
-    given = {"model": room / "model", "limits": None}
-    straight = planning.plan("lwr4plus", room / "way.csv", PlanSettings(lines=True), **given)
+def test_lines(room):
+    straight = planning.plan("lwr4plus", room / "way.csv", PlanSettings(lines=True), model=room / "model")
     table = motion_folder.plan_metrics(straight)
     assert len(table["segments"]) == 2 and table["line_deviation"]["position"] <= 1e-6
     corner = forward(CHAIN, WAYPOINTS[1:2])[0, :3, 3]
     tool = forward(CHAIN, straight.track.q)[:, :3, 3]
     assert np.linalg.norm(tool - corner, axis=1).min() < 1e-4
-    shaped = planning.plan("lwr4plus", room / "way.csv", PlanSettings(shorten=4, stray=0.1), **given)
+
+
+def test_shapes(room):
+    shaped = planning.plan("lwr4plus", room / "way.csv", PlanSettings(shorten=4, stray=0.1), model=room / "model")
     found = motion_folder.plan_metrics(shaped)["shortened"]
     assert found["after"] <= found["before"] and found["evaluations"] >= 4
 

@@ -58,8 +58,15 @@ def test_frames_alone_are_judged_too(cell, calib, change, name):
     assert (again[0], verdict()[0]) == (0, "pass") and "(accepted by the options)" in again[1]
 
 
-@pytest.mark.parametrize("reversed_ones", [(1,), (4,), (2, 5)])
-@pytest.mark.parametrize("model", ["frames", "geometry"])
+@pytest.mark.parametrize(
+    ("model", "reversed_ones"),
+    [
+        ("frames", (2, 5)),
+        ("geometry", (4,)),
+        *(pytest.param("frames", joints, marks=pytest.mark.slow) for joints in ((1,), (4,))),
+        *(pytest.param("geometry", joints, marks=pytest.mark.slow) for joints in ((1,), (2, 5))),
+    ],
+)
 def test_joints_that_turn_the_other_way_are_named(cell, calib, reversed_ones, model):
     """The full geometry explains a reversed joint by axes turned by 180°, so that what it leaves tells nothing."""
     rows = cell.measure(COUNT)
