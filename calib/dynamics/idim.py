@@ -111,14 +111,14 @@ class IdentificationModel:
         """
         q, v, a = (shaped(x, (len(q), self.n), name) for x, name in ((q, "q"), (v, "v"), (a, "a")))
         loads = None if load is None else shaped(load, q.shape, "load").T
-        out = np.zeros((self.p, self.n, len(q)))
+        out = np.zeros((self.p, self.n * len(self.torque_rows.blocks), len(q)))
         if self.inertial:
             rigid_body.fill_regressor(self.bodies, q, v, a, out[: self.inertial])
             self._drop_absent(out, carried)
         motions = [np.ascontiguousarray(x.T) for x in (q, v, a)]
         states = drives.friction_states(self.columns, motions[0]) if states is None else states
         drives.fill(self.columns, out[self.inertial :], [*motions, loads], states)
-        return self.torque_rows.observe(out.transpose(2, 1, 0), self.sides, q, v)
+        return self.torque_rows.observe_in_place(out, self.sides, q, v)
 
     def regressor_gradient(
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray, columns: np.ndarray | None = None

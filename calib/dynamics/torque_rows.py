@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 
 import numpy as np
 
@@ -149,15 +150,28 @@ class TorqueRows:
             sides: (p,) of the columns: ``bodies``, ``link`` or ``motor``.
             q, v: (N, n) of the motion.
         """
-        seen = [np.array([side in block.sides for side in sides], dtype=bool) for block in self.blocks]
-        if len(seen) == 1 and seen[0].all():
-            stacked = torques
-        else:
-            samples, n, p = torques.shape
-            columns = np.zeros((p, len(seen) * n, samples))
-            for k, used in enumerate(seen):
-                columns[used, k * n : (k + 1) * n] = torques.transpose(2, 1, 0)[used]
-            stacked = columns.transpose(2, 1, 0)
+        if len(self.blocks) == 1 and set(sides) <= self.sides:
+            return torques if self.projection is None else self.projection.torques(q, v) @ torques
+        samples, n, p = torques.shape
+        columns = np.zeros((p, len(self.blocks) * n, samples))
+        columns[:, :n] = torques.transpose(2, 1, 0)
+        return self.observe_in_place(columns, sides, q, v)
+
+    def observe_in_place(self, columns: np.ndarray, sides: Sequence[str], q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Return the same from columns (p, n for each block, N) whose first n rows are the joints', others zero.
+
+        They are written over: a regressor is as large as memory is slow.
+        """
+        n = columns.shape[1] // len(self.blocks)
+        for k in reversed(range(len(self.blocks))):
+            at = 0
+            for seen, run in groupby(side in self.blocks[k].sides for side in sides):
+                part = slice(at, at := at + len(list(run)))
+                if k and seen:
+                    columns[part, k * n : (k + 1) * n] = columns[part, :n]
+                elif not k and not seen:
+                    columns[part, :n] = 0.0
+        stacked = columns.transpose(2, 1, 0)
         return stacked if self.projection is None else self.projection.torques(q, v) @ stacked
 
     def fold(self, weights: np.ndarray, sides: Sequence[str]) -> np.ndarray:
