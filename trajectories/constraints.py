@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -214,10 +214,36 @@ def box_limits(
     return tuple(limit for limit in found if len(limit.joints))
 
 
-def gathered(
+class Smoothed(NamedTuple):
+    """A constraint at a motion, smoothed.
+
+    Attributes:
+        constraint: which.
+        values: (r,) c of its groups.
+        excess: max g / scale + tightening.
+        shares: (N, k) of each sample and column in its group's slope.
+        own: (r, k) which columns are a group's.
+    """
+
+    constraint: MotionConstraint
+    values: np.ndarray
+    excess: float
+    shares: np.ndarray
+    own: np.ndarray
+
+    def slopes(self, motion: SampledMotion) -> np.ndarray:
+        """Return the slopes (r, 4, N, n) of the values by the motion they were found at."""
+        group, row = np.nonzero((self.own[:, None] & (self.shares > 1e-9)).any(axis=2))  # nine digits without the rest
+        weights = np.where(self.own[group], self.shares[row] / self.constraint.scale, 0.0)
+        result = np.zeros((len(self.own), 4, *motion.q.shape))
+        result[group, :, row] = self.constraint.slopes(motion.part(row), weights).transpose(1, 0, 2)
+        return result
+
+
+def smoothed(
     constraint: MotionConstraint, motion: SampledMotion, sharpness: float, tightening: float = 0.0
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the smoothed constraints c (r,), their slopes (r, 4, N, n) by the motion, and max g / scale + tightening.
+) -> Smoothed:
+    """Return the smoothed constraints of a motion, whose slopes are found where they are asked for.
 
     Args:
         sharpness: ρ.
@@ -230,8 +256,4 @@ def gathered(
     shares = np.exp(sharpness * (scaled - top[groups]))
     total = own @ shares.sum(axis=0)
     shares /= total[groups]
-    group, row = np.nonzero((own[:, None] & (shares > 1e-9)).any(axis=2))  # the others do not count to nine digits
-    weights = np.where(own[group], shares[row] / constraint.scale, 0.0)
-    slopes = np.zeros((count, 4, *motion.q.shape))
-    slopes[group, :, row] = constraint.slopes(motion.part(row), weights).transpose(1, 0, 2)
-    return top + np.log(total) / sharpness, slopes, float(top.max())
+    return Smoothed(constraint, top + np.log(total) / sharpness, float(top.max()), shares, own)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from differences import check
 
-from trajectories.constraints import BoxLimit, TorqueLimit, gathered
+from trajectories.constraints import BoxLimit, TorqueLimit, smoothed
 from trajectories.design.objectives import (  # fmt: skip
     Duration,
     Excitation,
@@ -117,7 +117,7 @@ def test_the_smoothed_constraint_lies_above_the_largest_value(constraint):
     motion = FAMILY.basis(np.linspace(0, 6, 60, endpoint=False)).motion(drawn())
     largest = (constraint.values(motion) / constraint.scale).max(axis=0)
     for sharpness in (20.0, 400.0):
-        c, _, excess = gathered(constraint, motion, sharpness)
+        _, c, excess, *_ = smoothed(constraint, motion, sharpness)
         groups = [largest[constraint.groups == r].max() for r in range(len(c))]
         assert (c >= np.array(groups) - 1e-12).all()
         assert (c <= np.array(groups) + np.log(120 * len(largest)) / sharpness).all()

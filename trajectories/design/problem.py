@@ -8,11 +8,12 @@ condition number are compared by logarithm: the same optimum, well scaled from 1
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from trajectories.basis import Basis, Family, SampledMotion, sample_times
-from trajectories.constraints import MotionConstraint, Product, Regressor, gathered
+from trajectories.constraints import MotionConstraint, Product, Regressor, Smoothed, smoothed
 from trajectories.design.objectives import Excitation, Objective, Observed, Value, observed
 from trajectories.errors import BadInput
 
@@ -89,29 +90,84 @@ class ExcitationProblem:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """A point: merit and objectives with gradients by the variables (x, the factor on the period).
+    """A point: its constraints, and on demand its merit and the gradients by the variables (x, factor on the period).
+
+    A step that is not taken needs no gradients, and a motion that is brought back inside its limits no merit: together
+    a third of what a search computes.
 
     Attributes:
-        values: (k,) of the objectives or goals, smoothed; `exact` (k,) not smoothed.
-        total: the weighted sum of the smoothed objectives; 0 where there are goals.
-        slopes: (k, p) of the goals, or (1, p) of the sum where there are none.
-        constraints: (r,) smoothed, feasible where ≤ 0; `rows` (r, p).
+        problem, basis: of the point.
+        motion: at the samples; `factor` on its period.
+        sharpness: p of the spectra.
+        smoothed: of each constraint.
+        constraints: (r,) smoothed, feasible where ≤ 0.
         excess: largest constraint value at the samples, over its scale.
     """
 
+    problem: ExcitationProblem
+    basis: Basis
     motion: SampledMotion
-    regressor: np.ndarray
-    values: np.ndarray
-    exact: np.ndarray
-    total: float
-    slopes: np.ndarray
+    factor: float
+    sharpness: float
+    smoothed: tuple[Smoothed, ...]
     constraints: np.ndarray
-    rows: np.ndarray
     excess: float
+
+    @property
+    def regressor(self) -> np.ndarray:
+        return self.motion.told(self.problem.regressor)
+
+    @property
+    def values(self) -> np.ndarray:
+        """(k,) of the objectives or goals, smoothed."""
+        return np.array([one.value for one in self._found[0]])
+
+    @property
+    def exact(self) -> np.ndarray:
+        """(k,) the same, not smoothed."""
+        return np.array([one.exact for one in self._found[0]])
+
+    @property
+    def total(self) -> float:
+        """The weighted sum of the smoothed objectives; 0 where there are goals."""
+        return 0.0 if self.problem.goals else _summed(self.problem, [one.value for one in self._found[0]])[0]
+
+    @property
+    def slopes(self) -> np.ndarray:
+        """(k, p) gradients of the goals, or (1, p) of the sum where there are none."""
+        return self._gradient[: len(self.problem.goals) or 1]
+
+    @property
+    def rows(self) -> np.ndarray:
+        """(r, p) gradients of the constraints."""
+        count = len(self.problem.goals) or 1
+        if "_found" in self.__dict__:  # whoever asked for the merit will ask for its gradient
+            return self._gradient[count:]
+        empty = [np.zeros((4, *self.motion.q.shape))] * count
+        return self._by_variables(empty, np.zeros(count))[count:]
+
+    @cached_property
+    def _found(self) -> tuple[list[Value], dict[tuple[int, int], Observed]]:
+        seen: dict[tuple[int, int], Observed] = {}
+        wanted = (_sharpened(one, self.sharpness) for one in terms(self.problem))
+        return [_value(one, self.motion, self.regressor, seen) for one in wanted], seen
+
+    @cached_property
+    def _gradient(self) -> np.ndarray:
+        found, seen = self._found
+        shares = np.eye(len(found))
+        if not self.problem.goals:
+            shares = _summed(self.problem, [one.value for one in found])[1]
+        slopes = [_slope(self.problem, self.motion, self.regressor, found, share, seen) for share in shares]
+        return self._by_variables(slopes, shares @ np.array([one.by_duration for one in found]))
+
+    def _by_variables(self, slopes: list[np.ndarray], by_duration: np.ndarray) -> np.ndarray:
+        stacked = np.concatenate([np.array(slopes), *(one.slopes(self.motion) for one in self.smoothed)])
+        return _by_variables(self.problem, self.basis, self.motion, stacked, self.factor, by_duration)
 
 
 def evaluate(problem: ExcitationProblem, basis: Basis, y: np.ndarray, sharpness: tuple[float, float]) -> Evaluation:
-    """Evaluate everything at y = (x, factor on the period if that is free).
+    """Evaluate the constraints at y = (x, factor on the period if that is free), and all else where it is asked for.
 
     Args:
         basis: `ExcitationProblem.basis`.
@@ -119,23 +175,11 @@ def evaluate(problem: ExcitationProblem, basis: Basis, y: np.ndarray, sharpness:
     """
     x, factor = (y[:-1], float(y[-1])) if problem.free_period else (y, problem.stretch[0])
     motion = stretched(basis.motion(x), factor)
-    Y = motion.told(problem.regressor)
-    seen: dict[tuple[int, int], Observed] = {}
-    found = [_value(_sharpened(one, sharpness[0]), motion, Y, seen) for one in terms(problem)]
-    if problem.goals:
-        total, shares = 0.0, np.eye(len(found))
-    else:
-        total, shares = _summed(problem, [one.value for one in found])
-    slopes = [_slope(problem, motion, Y, found, share, seen) for share in shares]
-    parts = [gathered(c, motion, sharpness[1], problem.tightening) for c in problem.constraints]
-    stacked = np.concatenate([np.array(slopes), *(part[1] for part in parts)])
-    by_duration = shares @ np.array([one.by_duration for one in found])
-    gradient = _by_variables(problem, basis, motion, stacked, factor, by_duration)
-    k = len(slopes)
+    parts = tuple(smoothed(c, motion, sharpness[1], problem.tightening) for c in problem.constraints)
     return Evaluation(
-        motion, Y, np.array([one.value for one in found]), np.array([one.exact for one in found]), total,
-        gradient[:k], np.concatenate([np.zeros(0), *(part[0] for part in parts)]), gradient[k:],
-        max((part[2] for part in parts), default=-np.inf),
+        problem, basis, motion, factor, sharpness[0], parts,
+        np.concatenate([np.zeros(0), *(part.values for part in parts)]),
+        max((part.excess for part in parts), default=-np.inf),
     )  # fmt: skip
 
 

@@ -219,7 +219,7 @@ class StartSearch:
         return self._evaluation
 
     def _remember(self, y: np.ndarray, found: Evaluation) -> None:
-        missed = unmet(self.problem, found.values)
+        missed = unmet(self.problem, found.values) if self.problem.goals else None
         lacking = (max(found.excess, 0.0), missed[0] if missed else 0.0)
         if lacking < self.least:
             self.least, self.nearest = lacking, y
@@ -289,11 +289,16 @@ class StartSearch:
         rows, size = self._count(start[: len(start) - bool(self.problem.goals)]), len(start)
         objective = self._last if self.problem.goals else self._sum
 
-        def value(y: np.ndarray) -> tuple[float, np.ndarray]:
+        def value(y: np.ndarray) -> float:
             if self.count >= last:
                 raise _Spent
-            self._tried, slope = np.array(y), np.zeros(size)
-            return objective(np.ascontiguousarray(y), slope), slope
+            self._tried = np.array(y)
+            return objective(np.ascontiguousarray(y), np.zeros(0))
+
+        def gradient(y: np.ndarray) -> np.ndarray:
+            slope = np.zeros(size)
+            objective(np.ascontiguousarray(y), slope)
+            return slope
 
         def inequalities(y: np.ndarray, slopes: np.ndarray) -> np.ndarray:
             found = np.empty(rows)
@@ -311,7 +316,7 @@ class StartSearch:
             bounds = np.column_stack(self._ends(size))
         try:
             found = minimize(
-                value, start, method="SLSQP", jac=True, bounds=bounds, constraints=[kept] if rows else (),
+                value, start, method="SLSQP", jac=gradient, bounds=bounds, constraints=[kept] if rows else (),
                 options={"maxiter": max(2, last - self.count), "ftol": tolerance},
             )  # fmt: skip
         except _Spent:
@@ -365,7 +370,7 @@ class StartSearch:
     def _rows(self, result: np.ndarray, y: np.ndarray, slope: np.ndarray) -> None:
         goals = self.problem.goals
         found = self.at(np.ascontiguousarray(y[:-1]) if goals else y)
-        k, size = len(goals), len(found.slopes[0]) if len(found.slopes) else len(y)
+        k, size = len(goals), len(y) - bool(goals)
         result[k:] = found.constraints
         if slope.size:
             slope[:] = 0.0
