@@ -6,6 +6,7 @@ reason, where the folder is absent.
 
 from __future__ import annotations
 
+import gc
 import signal
 from pathlib import Path
 
@@ -17,12 +18,20 @@ from recordings import DATA
 # a shell's job in the background inherits that Ctrl-C is ignored; tests send it to themselves and to their processes
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# as the command line does: thousands of tests and what they import are no garbage, and walked over at every collection
+gc.set_threshold(20_000, 10, 10)
+
 # the same inputs in every run; `pytest --hypothesis-profile=search` looks for new ones
 settings.register_profile(
     "fixed", deadline=None, max_examples=25, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.register_profile("search", deadline=None, max_examples=2000)
 settings.load_profile("fixed")
+
+
+def pytest_collection_finish() -> None:
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

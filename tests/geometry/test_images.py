@@ -134,6 +134,7 @@ def test_a_lens_that_was_given_stays():
     assert found.estimate.names[-1].endswith(".rz")
 
 
+@pytest.mark.slow
 def test_a_print_of_another_size_is_measured_beside_another_instrument():
     """Board scale and bending are fitted where tracker points tell the scale; pixels and points in one fit."""
     plain, _ = study()
@@ -222,8 +223,16 @@ def test_a_gross_corner_and_images_that_contradict_all_others_are_left_out_and_n
     assert "2 images are left out" in said[0] and "turned by 180°" in said[0]
     assert said[0].endswith("(0006.png, 0007.png)")
     assert said[1].startswith("1 of ") and said[1].endswith("left out: corner 10 of 0004.png")
-    done, start, candidates = started(cell, replace(block, pixel=pixel, q=q, lens=cell.lens))
+    done, _, _ = started(cell, replace(block, pixel=pixel, q=q, lens=cell.lens))
     assert set(done.rows) == set(block.rows) - {6, 7, 21, 31}
+
+
+@pytest.mark.slow
+def test_without_images_that_contradict_all_others_the_fit_is_good_and_half_of_them_are_too_many():
+    cell, block = study()
+    q = block.q.copy()
+    q[[20, 30]] = q[[30, 20]]
+    done, start, candidates = started(cell, replace(block, q=q, lens=cell.lens))
     found = fit(start, [done], candidates, settings=Settings(loss="none"))
     assert position_errors(cell.cell, found.cell, found.cell.chain)[1] < 0.05
     q = np.concatenate([block.q[:27], np.roll(block.q[27:], 3, axis=0)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -114,12 +115,18 @@ def _unseen_sag(found, truth: Installation) -> float:
     return float(np.sqrt(np.mean(np.sum(gap**2, axis=0))))
 
 
+@cache
+def climbed(seed: int) -> tuple:
+    """Return the ladder of a wavy UR5, and its geometry alone."""
+    measured = measure(wavy(seed), "position", 400, seed, sigma=SIGMA)
+    start = install(load("ur5"), [measured])
+    return select_model(start, [measured]), select_model(start, [measured], "geometry")
+
+
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_planted_harmonics_are_found(seed):
     truth, nominal = wavy(seed), load("ur5")
-    measured = measure(truth, "position", 400, seed, sigma=SIGMA)
-    start = install(nominal, [measured])
-    found, plain = select_model(start, [measured]), select_model(start, [measured], "geometry")
+    found, plain = climbed(seed)
     assert "harmonics" in found.chosen
     assert unseen(found.fit, truth, False) < 0.5 * unseen(plain.fit, truth, False)
     fitted = dict(zip(names(found.fit.cell.deflection, nominal), np.asarray(found.fit.cell.deflection.coefficients)))
@@ -130,9 +137,7 @@ def test_planted_harmonics_are_found(seed):
 
 
 def test_the_last_rung_kept_is_the_one_chosen_and_each_kept_rung_is_better():
-    truth = wavy(1)
-    measured = measure(truth, "position", 300, 1, sigma=SIGMA)
-    found = select_model(install(load("ur5"), [measured]), [measured])
+    found, _ = climbed(0)
     kept = [rung for rung in found.rungs if rung.kept]
     assert np.all(np.diff([rung.cross_validated for rung in kept]) < 0)
     assert found.chosen.split(" + ")[-1] == kept[-1].model.removeprefix("+ ")

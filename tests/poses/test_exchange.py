@@ -149,10 +149,11 @@ def test_choosing_all_candidates_is_allowed():
 
 
 def test_the_seed_repeats_every_bit():
-    one, two = select_poses(ARM, 17, SearchSettings(seed=5)), select_poses(ARM, 17, SearchSettings(seed=5))
+    few = ARM[:150]
+    one, two = select_poses(few, 17, SearchSettings(seed=5)), select_poses(few, 17, SearchSettings(seed=5))
     assert (one.indices == two.indices).all() and one.value == two.value
     assert (one.history == two.history).all() and one.random_baseline == two.random_baseline
-    assert random_baseline(ARM, 17, seed=6) != one.random_baseline
+    assert random_baseline(few, 17, seed=6) != one.random_baseline
 
 
 def test_interrupted_exchange_returns_the_best_so_far():

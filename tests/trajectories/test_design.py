@@ -257,6 +257,7 @@ def test_refusals(make, words):
         make()
 
 
+@pytest.mark.slow
 def test_stuck_is_not_found():
     run = one_start(problem(constraints=limits(lowest=1.5), samples=10), 10, "slsqp", 0, 0)
     assert isinstance(run, Stuck) and run.excess[0] > 0

@@ -48,7 +48,7 @@ all = 12.0
 Fv = [14.4, 15.3, 6.55, 11.0, 4.29, 2.26, 1.6]
 Fc = [11.9, 11.5, 8.98, 8.35, 8.31, 4.72, 6.04]
 """
-QUICK = ("--starts", 1, "--evaluations", 60, "--period", 16, "--harmonics", 4, "--rate", 100)
+QUICK = ("--starts", 1, "--evaluations", 60, "--period", 16, "--harmonics", 4, "--rate", 100, "--no-outlook")
 SHORT = ExcitationSettings(starts=1, evaluations=45, period=16.0, harmonics=4, rate=100.0, samples=120)
 
 
@@ -257,6 +257,7 @@ def test_an_aim_in_place_of_condition_numbers(designed):
     assert told.condition.raw > designed.condition.raw and told.found.merit < 0.0
 
 
+@pytest.mark.slow
 def test_a_shorter_period():
     short = design.excite("lwr4plus", replace(SHORT, goals=("duration=12",), shortest=10.0, outlook=False))
     samples = short.period * SHORT.rate
@@ -287,7 +288,7 @@ def test_ctrl_c_in_worker_processes(tmp_path, whom):
         ("[velocity]\nq3 = 0.0", (), "velocity limit of joint 3 is 0"),
         ("[velocity]\nq9 = 1.0", (), "there is no key 'q9'"),
         ('[frequency]\nresonance = "0.2 Hz"', (), "not below the resonance"),
-        ("[target]\nheight = 1.5", (), "breaks the workspace limit"),
+        pytest.param("[target]\nheight = 1.5", (), "breaks the workspace limit", marks=pytest.mark.slow),
         ("[torque]\nmargin = 1.5", (), "torque.margin: expected a share"),
         ("[joints]\nq2 = [-1.0, 1.0]", ("--start", "0,1.2,0,0,0,0,0"), "joint2 at 1.2 is beyond its limits -1 to 1"),
         ("", ("--start", "0,nan,0,0,0,0,0"), "joint2 at nan is beyond"),
@@ -326,7 +327,7 @@ def test_bad_input_is_refused_with_exit_code_2(cell, calib, extra, options, word
     ("extra", "changed", "words"),
     [
         ("[torque]\nall = 0.05", {}, "breaks the torque limit"),
-        ("", {"hard": ("wrist=0.9",)}, "hard goal torque slack of joints 6, 7"),
+        pytest.param("", {"hard": ("wrist=0.9",)}, "hard goal torque slack of joints 6, 7", marks=pytest.mark.slow),
     ],
 )
 def test_a_search_without_a_result_names_what_was_in_the_way(tmp_path, extra, changed, words):

@@ -18,7 +18,7 @@ from calib.procedure.excitation import folder as motion_folder
 from calib.procedure.excitation.settings import ExcitationSettings
 
 SHORT = ExcitationSettings(
-    starts=1, evaluations=60, period=10.0, harmonics=4, rate=100.0, samples=100, repeat=2,
+    starts=1, evaluations=30, period=10.0, harmonics=4, rate=100.0, samples=100, repeat=2,
     drives="Ia Fv Fc off",
 )  # fmt: skip
 

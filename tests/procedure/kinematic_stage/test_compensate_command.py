@@ -94,9 +94,9 @@ def off(one: np.ndarray, two: np.ndarray) -> tuple[float, float]:
 
 def test_poses_in_the_instruments_frame_are_met_by_the_true_tool(cell, fitted, here, calib):
     """Round trip against the hidden truth: what is left is the model's own error, as the held-out poses state it."""
-    wanted = true_poses(cell, drawn(cell, 300, 5))
+    wanted = true_poses(cell, drawn(cell, 120, 5))
     write(here / "t.csv", ["x [mm]", "y [mm]", "z [mm]", "qx", "qy", "qz", "qw", *Q], np.hstack(
-        [1e3 * wanted[:, :3, 3], to_quaternion(wanted), drawn(cell, 300, 5)]
+        [1e3 * wanted[:, :3, 3], to_quaternion(wanted), drawn(cell, 120, 5)]
     ))  # fmt: skip
     code, out, err = calib("compensate", fitted, "t.csv", "--frame", "seen", "--tool", "tool", "--out", "commands.csv")
     assert code == 0, err
@@ -152,7 +152,7 @@ def test_the_nominal_frame_moves_the_arm_least(cell, fitted, here, calib):
 
 
 def test_positions_alone_are_sought_near_a_start(cell, fitted, here, calib):
-    q = drawn(cell, 20, 8) * 0.3 + np.array([0.0, -1.2, 1.5, -1.0, -1.4, 0.3])
+    q = drawn(cell, 8, 8) * 0.3 + np.array([0.0, -1.2, 1.5, -1.0, -1.4, 0.3])
     poses = forward(cell.nominal, q)
     write(here / "t.csv", ["x", "y", "z"], poses[:, :3, 3])
     start = "0,-1.2,1.5,-1,-1.4,0.3"

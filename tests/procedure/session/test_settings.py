@@ -123,7 +123,7 @@ def test_a_step_is_not_stale_because_a_number_is_spelled_otherwise() -> None:
     assert _changes({"a.csv": "10"}, {"a.csv": "1e1"}) == "a.csv has changed", "a file's mark is no number"
 
 
-@settings(max_examples=60, deadline=None)
+@settings(deadline=None)
 @given(WORDS, WORDS, WORDS, st.dictionaries(WORDS, st.floats(1e-3, 1e3), max_size=3), st.integers(0, 2**63 - 1))
 def test_names_come_back_whatever_they_hold(name: str, given_as: str, link: str, loads: dict, seed: int) -> None:
     made = SessionSettings(
