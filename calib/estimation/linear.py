@@ -133,8 +133,8 @@ def _fit(data: Triangles, std: np.ndarray, inflation: np.ndarray | None, stated:
     values, inverse, conditions = solve_triangle(combine(data, std), data.names)
     covariance = inverse @ inverse.T
     if inflation is not None:
-        spread = data.factors[:, :, :-1] @ inverse * np.sqrt(tau)[:, None, None] / std[:, None, None]
-        covariance = inverse @ np.einsum("gij,gik->jk", spread, spread) @ inverse.T
+        spread = (data.factors[:, :, :-1] @ inverse * (np.sqrt(tau) / std)[:, None, None]).reshape(-1, len(inverse))
+        covariance = inverse @ (spread.T @ spread) @ inverse.T
     fit = _pack(data, values, covariance, std, tau, inverse, conditions)
     if stated:
         return fit
