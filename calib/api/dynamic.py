@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calib.api.reading import listed, optional
+from calib.api.given import listed, optional
 from calib.api.rendering import as_text, data_frame
 from calib.arguments import checked
 from calib.data.recordings.recording import Recording

@@ -6,9 +6,9 @@ import warnings
 from pathlib import Path
 
 from calib.api.dynamic import DynamicsModel
+from calib.api.given import optional, saved
 from calib.api.kinematic import GeometryFit
 from calib.api.parallel import ParallelDynamics, ParallelGeometry
-from calib.api.reading import optional, saved
 from calib.arguments import checked
 from calib.errors import RobotError, UsageError
 from calib.procedure.export import delivery, dynamics, geometry

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calib.api.reading import listed, optional, saved
+from calib.api.given import listed, optional, saved
 from calib.api.rendering import as_text, data_frame
 from calib.arguments import checked
 from calib.data.poses.fit_options import FitOptions, read_options
@@ -26,6 +26,7 @@ from calib.procedure.measuring.run import write_run
 from calib.procedure.parallel_stage.robots import FoundRobot, recognised, refuse_links, refuse_parallel
 from calib.procedure.report.fit_report import fit_metrics
 from calib.robot.calibrated import CalibratedChain
+from calib.robot.chain import joint_kinds
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -370,7 +371,7 @@ def compensate(
     chain = found.nominal.chain
     if not isinstance(targets, Targets):
         limits = (chain.lower, chain.upper)
-        targets = read_targets(Path(targets), chain.joint_names, kinds=inputs.joint_kinds(chain), limits=limits)
+        targets = read_targets(Path(targets), chain.joint_names, kinds=joint_kinds(chain), limits=limits)
     commands = compensation.compensate(
         found, targets, frame=frame, tool=tool, dof=dof, start=start, tolerance=tolerance, seed=seed, progress=progress
     )

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from calib.api.dynamic import DynamicsModel
+from calib.api.given import optional, saved
 from calib.api.parallel import ParallelDynamics
-from calib.api.reading import optional, saved
 from calib.arguments import checked
 from calib.errors import as_ours
 from calib.procedure.excitation import design, folder, planning

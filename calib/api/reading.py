@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, cast
 
+from calib.api.given import optional
 from calib.arguments import checked
 from calib.data.poses.fit_options import FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements
@@ -88,28 +86,6 @@ def read_recording(
 
         return read_file(path, actuators_of(robot.known.robot), options or RecordingOptions())
     return read_file(path, joints_of(_loaded(robot).chain), options or RecordingOptions())
-
-
-def listed(given: object | Sequence[object]) -> list:
-    """Return what was given, one or several, some of them several in turn, as a list."""
-    if isinstance(given, (str, Path)) or not isinstance(given, Sequence):
-        return [given]
-    return [one for each in given for one in listed(each)]
-
-
-def optional(path: str | Path | None) -> Path | None:
-    """Return a path that may be missing."""
-    return None if path is None else Path(path)
-
-
-@contextmanager
-def saved(result: Any) -> Iterator[Path]:
-    """Yield the folder of a result: a path as it is, a result in memory written for as long as it is needed."""
-    if isinstance(result, (str, Path)):
-        yield Path(result)
-    else:
-        with TemporaryDirectory() as place:
-            yield result.save(Path(place) / "result", plots=False)
 
 
 def _loaded(robot: str | Path | CalibratedChain) -> CalibratedChain:

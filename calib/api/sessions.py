@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from calib.api.reading import listed, optional
+from calib.api.given import listed, optional
 from calib.arguments import checked
 from calib.procedure.parallel_stage.robots import refuse_parallel
 from calib.procedure.session import commands, fleet

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, overload
 
 from calib.api.dynamic import DynamicsModel, Recorded
+from calib.api.given import listed
 from calib.api.kinematic import GeometryFit, Measured, Several
 from calib.api.parallel import ParallelDynamics, ParallelGeometry
-from calib.api.reading import listed
 from calib.arguments import checked
 from calib.errors import UsageError
 from calib.procedure.dynamic_stage import identify as arm_identify

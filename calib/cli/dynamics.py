@@ -35,13 +35,14 @@ def identify_dynamics(
 ) -> None:
     """Identify ROBOT's dynamics from recordings, and judge them. What counts is how well other motion is predicted."""
     from calib.api.dynamic import identify_dynamics as identified
-    from calib.procedure.excitation import prediction
     from calib.procedure.parallel_stage.destination import check_destination
     from calib.procedure.report import console as shown
     from calib.procedure.report import dynamics_section
 
     check_destination("identify", robot, out, [options, *recordings, *(validate or [])])
     if excitation is not None:
+        from calib.procedure.excitation import prediction
+
         prediction.check_folder(excitation)
 
     def read(given: Any) -> None:
@@ -55,5 +56,9 @@ def identify_dynamics(
         )  # fmt: skip
         show("writing")
         found.save(out, plots=plots)
-    compared = [] if excitation is None else prediction.compared_with_identification(excitation, found.outcome)
+    compared = []
+    if excitation is not None:
+        from calib.procedure.excitation import prediction
+
+        compared = prediction.compared_with_identification(excitation, found.outcome)
     say_written([*found.renderables(), *compared], out, found.verdict.level)

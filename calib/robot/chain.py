@@ -229,3 +229,12 @@ def stretched_length(chain: Chain) -> float:
     total = sum(abs(e.value) for e in chain.elements if e.axis[0] == "t" and e.joint is None)
     placed = sum(float(np.linalg.norm(e.placement[:3, 3])) for e in chain.elements if e.placement is not None)
     return max(total + placed + float(np.linalg.norm(chain.tail[:3, 3])), 0.1)
+
+
+def joint_kinds(chain: Chain) -> list[str]:
+    """Return URDF's names of the joints' kinds: a revolute joint of a URDF without limits is continuous there."""
+    return ["continuous" if chain.links and _unlimited(joint) else joint.kind for joint in chain.joints]
+
+
+def _unlimited(joint: Joint) -> bool:
+    return joint.kind == "revolute" and not np.isfinite([joint.lower, joint.upper]).any()

@@ -22,9 +22,8 @@ from calib.identification.identify_options import FileSettings, IdentifyOptions,
 from calib.identification.loop.loop_settings import check_lengths
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.gains import FoundGains, find_gains
-from calib.procedure.kinematic_stage.inputs import joint_kinds
 from calib.robot.calibrated import CalibratedChain, without_corrections
-from calib.robot.chain import Chain
+from calib.robot.chain import Chain, joint_kinds
 from calib.robot.load import load_calibrated, resolve
 
 LOST = 0.05  # of a recording may fall to the windows of the parallel decimation (our choice)

@@ -20,8 +20,7 @@ from calib.errors import UsageError
 from calib.geometry import inverse
 from calib.geometry.installation import Installation
 from calib.geometry.inverse import Goal
-from calib.procedure.kinematic_stage.inputs import joint_kinds
-from calib.robot.chain import Chain
+from calib.robot.chain import Chain, joint_kinds
 from calib.transforms import pose
 
 TRIES = 40  # random configurations from which a waypoint is sought (our choice)

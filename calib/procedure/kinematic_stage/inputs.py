@@ -23,7 +23,7 @@ from calib.geometry.images.camera_guess import complete_camera
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.robot import calibrated, description
 from calib.robot.calibrated import CalibratedChain
-from calib.robot.chain import Chain, Joint
+from calib.robot.chain import Chain, joint_kinds
 from calib.robot.deflection import Deflection
 from calib.robot.formats.markup import text
 from calib.robot.formats.urdf_tree import read as read_tree
@@ -251,15 +251,6 @@ def _checked(
         check_scale(block, forward(chain, block.q))  # unseen files, too: the fit looks at its own only
         check_orientations(chain, block)
     return blocks
-
-
-def joint_kinds(chain: Chain) -> list[str]:
-    """Return URDF's names of the joints' kinds: a revolute joint of a URDF without limits is continuous there."""
-    return ["continuous" if chain.links and _unlimited(joint) else joint.kind for joint in chain.joints]
-
-
-def _unlimited(joint: Joint) -> bool:
-    return joint.kind == "revolute" and not np.isfinite([joint.lower, joint.upper]).any()
 
 
 def hold_out(block: PoseMeasurements, share: float, seed: int) -> tuple[PoseMeasurements, PoseMeasurements | None]:

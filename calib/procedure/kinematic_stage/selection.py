@@ -14,7 +14,7 @@ from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.plans import read_poses, write_poses
 from calib.errors import UsageError
 from calib.geometry.observability import observation, targets_of
-from calib.procedure.kinematic_stage.inputs import joint_kinds, load_robot
+from calib.procedure.kinematic_stage.inputs import load_robot
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
 from calib.procedure.measuring.camera_view import ASSUMED, ImageObservation, image_observation
 from calib.procedure.measuring.drivable import Drivable, Exchange, drivable
@@ -27,7 +27,7 @@ from calib.procedure.measuring.run import lines as ways
 from calib.procedure.measuring.selection_prediction import NOISES, SelectionPrediction, beside
 from calib.procedure.measuring.selection_prediction import write as write_prediction
 from calib.robot.calibrated import CalibratedChain
-from calib.robot.chain import Chain
+from calib.robot.chain import Chain, joint_kinds
 from poses.candidates import draw_candidates
 from poses.errors import NothingFeasible
 from poses.indices import observability

@@ -32,8 +32,7 @@ from calib.procedure.dynamic_stage.metrics import (
     model_metrics,
 )
 from calib.procedure.dynamic_stage.tracking import KEYS
-from calib.procedure.report.geometry_section import relative_sigma
-from calib.procedure.report.page import Block, KeyFigure, Pictures, Section, Table, Text
+from calib.procedure.report.page import Block, KeyFigure, Pictures, Section, Table, Text, relative_sigma
 from calib.records import read_record, read_rows, typed_rows
 from calib.units import small
 

@@ -12,7 +12,7 @@ from calib.procedure.kinematic_stage.comparison import iso9283_sentence
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import ComparedRows, ErrorStatistics, FitMetrics, OutlierRow, RepeatedPose
 from calib.procedure.report.fit_report import Report
-from calib.procedure.report.page import Block, KeyFigure, Picture, Pictures, Section, Table, Text
+from calib.procedure.report.page import Block, KeyFigure, Picture, Pictures, Section, Table, Text, relative_sigma
 from calib.units import ERRORS, SMALL
 
 KINDS = {f"{nature}_{unit}": (nature, unit) for nature, (_, unit) in ERRORS.items()}
@@ -216,11 +216,6 @@ def _sigma_tables(metrics: FitMetrics) -> list[Table]:
     header = ("σ of", "unit", "how many", "predicted", "stated", "ratio", "eight in ten")
     return [Table("Predicted when the poses were chosen, and stated by the fit", header, rows, PREDICTION_NOTE,
                   numbers=range(2, 7))]  # fmt: skip
-
-
-def relative_sigma(percent: float | None) -> str:
-    """Return an RSD [%] with two digits; empty where it says nothing."""
-    return "" if percent is None or percent > 999 else f"{percent:.0f} %" if percent >= 10 else f"{percent:.2g} %"
 
 
 def _outlier_sentences(metrics: FitMetrics) -> list[str]:

@@ -130,3 +130,8 @@ class Page:
     def judged(self) -> list[Section]:
         """The sections with a verdict."""
         return [section for section in self.sections if section.verdict]
+
+
+def relative_sigma(percent: float | None) -> str:
+    """Return an RSD [%] with two digits; empty where it says nothing."""
+    return "" if percent is None or percent > 999 else f"{percent:.0f} %" if percent >= 10 else f"{percent:.2g} %"
