@@ -7,13 +7,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.data.poses.measurements import PoseMeasurements, take
+from calib.data.poses.measurements import PoseMeasurements, Positions, take
 from calib.errors import CalibError
 from calib.geometry.accuracy import errors
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation
 from calib.geometry.weighing import Settings
+from calib.robot.kinematics import forward
 
 LOOKED_AT = 200  # rows of a block (our choice)
 SHORT = Settings(limit=20, passes=1)  # where base and tool settle at all they do so sooner
@@ -51,13 +52,34 @@ def reversed_joints(
         for joint in np.flatnonzero(signs > 0.0).tolist():
             other = signs.copy()
             other[joint] = -1.0
-            tried[joint] = _rms(nominal, few, pulled, other)
-        best = min(tried, key=lambda joint: tried[joint])
-        if not tried[best] < FALLS * rms:
+            if _least(nominal, few, other) < FALLS * rms:
+                tried[joint] = _rms(nominal, few, pulled, other)
+        best = min(tried, key=lambda joint: tried[joint], default=-1)
+        if best < 0 or not tried[best] < FALLS * rms:
             break
         signs[best], rms = -1.0, tried[best]
     found = tuple(np.flatnonzero(signs < 0.0).tolist())
     return ReversedJoints(found, rms, before) if found else None
+
+
+def _least(nominal: Installation, blocks: Sequence[PoseMeasurements], signs: np.ndarray) -> float:
+    """Return what no placement of base and tool can leave less than [m]; 0 where that is not known without a search.
+
+    Positions y = B (R p + t) + b, with R, t the tip's by the joints and B, b, p the placements, are linear in B ⊗ p, B
+    and b: 13 numbers per axis of y, free of each other and of other axes here.
+    """
+    squares, count = 0.0, 0
+    for block in blocks:
+        if nominal.known.terms or not isinstance(block, Positions):
+            return 0.0
+        tip = forward(nominal.chain, block.q * signs)
+        columns = np.column_stack([tip[:, :3, :3].reshape(-1, 9), tip[:, :3, 3], np.ones(len(tip))])
+        for tool in np.unique(block.tool):
+            rows = block.tool == tool
+            W, y = columns[rows], block.position[rows]
+            squares += float(((y - W @ np.linalg.lstsq(W, y)[0]) ** 2).sum())
+        count += len(block)
+    return float(np.sqrt(squares / count))
 
 
 def _rms(
