@@ -34,7 +34,7 @@ from calib.procedure.session.settings import SessionSettings, example
 from calib.studies import conditions
 from calib.studies.conditions import StudyFile
 
-FEW = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+FEW = settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
 def documented(module: Any) -> dict[str, Any]:

@@ -115,6 +115,7 @@ def test_workers_use_one_thread_each(crews: dict[str, Workers], where: str) -> N
     assert os.environ["OPENBLAS_NUM_THREADS"] == "2"
 
 
+@pytest.mark.slow
 def test_a_task_whose_process_is_killed_is_tried_again(crews: dict[str, Workers], tmp_path: Path) -> None:
     tasks = [tmp_path / f"{x}" for x in range(3)]
     assert sorted(crews["processes"].completed(die_at_first, tasks)) == [(x, f"{x}") for x in range(3)]
@@ -185,6 +186,7 @@ def test_a_cluster_loses_workers_and_no_result(tmp_path: Path) -> None:
     assert time.monotonic() - started < SECONDS
 
 
+@pytest.mark.slow
 def test_a_cluster_without_workers_is_not_waited_for_long(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("calib.workers.cluster.NO_WORKERS", 1.0)
     alone = dask_cluster.running(tmp_path, workers=0)

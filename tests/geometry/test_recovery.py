@@ -52,7 +52,7 @@ SCENES = {
     "three reflectors": (three_reflectors, 1, 3),
     "poses and distances": (poses_and_distances, 1, 2),
 }
-QUICK = ("pose", "distance")
+QUICK = ("pose",)
 
 
 def planted(name: str, seed: int, robot: str = "ur5"):

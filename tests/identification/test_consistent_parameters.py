@@ -104,6 +104,7 @@ def test_planted_robots_come_back_within_their_covariance(seeds, outside):
     assert inside >= len(seeds) - outside
 
 
+@pytest.mark.slow
 def test_with_exact_data_the_torques_are_those_of_the_base_parameters():
     _, model, _, data = planted(3, noise=1e-5)
     found = solve.find_possible(data)

@@ -141,6 +141,7 @@ def test_an_estimate_pulled_to_where_no_controller_holds_it_ends_and_says_so(rob
     assert "times as far from singular as asked" in capsys.readouterr().out.replace("\n", " ")
 
 
+@pytest.mark.slow
 def test_without_noise_in_the_positions_least_squares_stands(robot, tmp_path):
     """What the test still sees is small: no parameter is off by three sigma."""
     code, out = identify(robot, tmp_path, log(tmp_path, "train.csv", 1), GAINS, "wls")

@@ -59,6 +59,7 @@ def test_the_replay_tells_how_the_true_robot_would_track(share):
     assert (found.rms[replays.FLOOR] < 0.1 * found.rms[replays.IDENTIFIED]).all()
 
 
+@pytest.mark.slow
 def test_better_models_track_better_and_cad_knows_no_friction():
     _, _, case = recorded()
     errors = []

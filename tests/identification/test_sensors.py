@@ -60,7 +60,8 @@ def identify(robot: Path, folder: Path, rows: str, *logs: str) -> tuple[int, Pat
 @pytest.mark.parametrize("rows, count", [pytest.param("link", 34, marks=pytest.mark.slow), ("both", 46), ("drive", 12)])
 def test_models_1_to_3_recover_the_truth(robot, tmp_path, capsys, rows, count):
     """Model 2 has as many base parameters as Models 1 and 3 together, and all lie where their sigmas say."""
-    logs = log(tmp_path, "empty.csv", 0, False), log(tmp_path, "loaded.csv", 1, True)
+    columns = ("tau_sensor", "tau") if rows == "both" else ("tau_l", "tau_m")  # motor torques may be called tau
+    logs = log(tmp_path, "empty.csv", 0, False, columns), log(tmp_path, "loaded.csv", 1, True, columns)
     code, out = identify(robot, tmp_path, rows, *logs)
     metrics = json.loads((out / "metrics.json").read_text())
     assert code == 0 and metrics["parameters"]["base"] == count
@@ -89,6 +90,7 @@ def test_a_missing_torque_is_named(robot, tmp_path, capsys, rows, columns, messa
     assert code == 2 and message in " ".join(capsys.readouterr().err.split()) and not out.exists()
 
 
+@pytest.mark.slow
 def test_motor_torques_may_be_called_tau(robot, tmp_path):
     code, out = identify(robot, tmp_path, "both", log(tmp_path, "empty.csv", 0, False, ("tau_sensor", "tau")))
     assert code == 0 and json.loads((out / "metrics.json").read_text())["parameters"]["base"] == 36

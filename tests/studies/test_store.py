@@ -92,6 +92,7 @@ def test_a_damaged_line_is_named(tmp_path: Path):
         pass
 
 
+@pytest.mark.slow
 def test_a_full_disk_loses_nothing_that_was_kept(tmp_path: Path):
     """Under a limit of the file's size a row is refused whole, and the rows before it stand."""
     script = f"""

@@ -126,9 +126,9 @@ def _nothing(problem: ExcitationProblem, stuck: list[Stuck], starts: int) -> Not
         if (missed := unmet(problem, values)) is not None:  # every limit was kept, so a hard goal stood in the way
             lacking, goal, value = missed
             return NothingFeasible(
-                f"the hard goal {goal.objective.name} ≤ {goal.goal:g} was not reached in {starts} starts, though all "
-                f"limits were kept: the nearest motion has {value:.4g}; ease it, give it a weight, or take a longer "
-                "period",
+                f"the hard goal {goal.objective.name} ≤ {goal.goal:g} was not reached in {_counted(starts)}, though "
+                f"all limits were kept: the nearest motion has {value:.4g}; ease it, give it a weight, or take a "
+                "longer period",
                 goal.objective.name, lacking, "of the goal",
             )  # fmt: skip
     worst = max(problem.constraints, key=lambda c: float((c.values(motion) / c.scale).max()), default=None)
@@ -138,8 +138,12 @@ def _nothing(problem: ExcitationProblem, stuck: list[Stuck], starts: int) -> Not
     row, column = np.unravel_index(np.argmax(values / worst.scale), values.shape)
     excess = float(values[row, column])
     return NothingFeasible(
-        f"no feasible motion in {starts} starts: the nearest one breaks the {worst.name} limit "
+        f"no feasible motion in {_counted(starts)}: the nearest one breaks the {worst.name} limit "
         f"({worst.labels[column]}) by {max(excess, 0.0):.3g} {worst.unit} at t = {motion.times[row]:.3g} s; widen that "
         "limit, take a longer period, or allow more starts",
         worst.name, excess, worst.unit,
     )  # fmt: skip
+
+
+def _counted(starts: int) -> str:
+    return f"{starts} start{'' if starts == 1 else 's'}"

@@ -185,6 +185,7 @@ def test_gains_stated_for_another_inertia_follow_the_estimate():
     assert np.all(scaled.distance < 1.05 * found(case).distance + 0.05)
 
 
+@pytest.mark.slow
 def test_several_recordings_tell_more():
     cases = [(log(1e-3, seed), Loop(PD, motion(), EVERY)) for seed in (1, 2)]
     _, model, base = arm()

@@ -180,6 +180,7 @@ def test_tiago_outliers_are_named(data, capsys):
     assert len({item[1] for item in named}) <= 35 // 3
 
 
+@pytest.mark.slow
 def test_motoman_in_a_small_volume_cannot_tell_base_from_tool(data):
     chain, measured = motoman(data, "right_6x6x6_150.csv")
     found = select_model(install(chain, [measured]), [measured], "geometry")

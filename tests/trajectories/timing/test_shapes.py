@@ -57,6 +57,7 @@ def test_a_line_out_of_reach_says_where_and_by_how_much():
         line(*kinematics(CHAIN), WAYPOINTS[0], forward(CHAIN, WAYPOINTS[:1])[0])
 
 
+@pytest.mark.slow
 def test_a_line_is_timed_like_any_path():
     goal = forward(CHAIN, WAYPOINTS[:1])[0].copy()
     goal[:3, 3] += [0.0, 0.3, -0.1]
