@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 
@@ -152,12 +152,3 @@ def _step(pool: Pool, design: Design, add: bool) -> Design:
     if add:
         return with_added(pool, design, best_addition(pool, design)[0])
     return with_removed(pool, design, best_removal(pool, design)[0])
-
-
-def starts(pool: Pool, m: int, weights: np.ndarray | None, count: int, seed: int) -> Iterator[Design]:
-    """Yield start designs: the rounded relaxation (its m largest weights), the greedy one, then random ones by seed."""
-    if weights is not None:
-        yield design_of(pool, tuple(int(i) for i in np.argsort(-weights, kind="stable")[:m]))
-    yield greedy(pool, m)
-    for generator in np.random.default_rng(seed).spawn(max(count - 2, 0)):
-        yield design_of(pool, tuple(int(i) for i in generator.choice(len(pool.z), m, replace=False)))

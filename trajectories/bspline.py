@@ -37,7 +37,7 @@ class BSpline:
 
     def basis(self, times: np.ndarray) -> Basis:
         """Return the family at times (N,) [s]."""
-        return assemble(times, [table(times, self.period, c, self.degree) for c in self.counts], self.freedoms)
+        return assemble(times, [_table(times, self.period, c, self.degree) for c in self.counts], self.freedoms)
 
     def coefficients(self, x: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return the control points (C,) of every joint [rad or m]."""
@@ -106,14 +106,14 @@ def bspline_family(
     freedoms = []
     counts, begin = holding(counts, 1, start, held)
     for count, first in zip(counts, begin):
-        at_start = table(np.zeros(1), period, count, degree)[:, 0]
+        at_start = _table(np.zeros(1), period, count, degree)[:, 0]
         orders = [0] * (first is not None) + ([1, 2] if rest and count > 1 else [])
         values = ([] if first is None else [first]) + [0.0] * (2 if rest and count > 1 else 0)
         freedoms.append(freedom(at_start[orders], np.array(values)))
     return BSpline(float(period), counts, degree, tuple(freedoms))
 
 
-def table(times: np.ndarray, period: float, count: int, degree: int) -> np.ndarray:
+def _table(times: np.ndarray, period: float, count: int, degree: int) -> np.ndarray:
     """Return the slopes (4, N, count) of q, v, a, jerk by the control points."""
     result = np.zeros((4, len(times), count))
     if count == 1:

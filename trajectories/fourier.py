@@ -36,7 +36,7 @@ class Fourier:
 
     def basis(self, times: np.ndarray) -> Basis:
         """Return the family at times (N,) [s]."""
-        return assemble(times, [table(times, self.period, count) for count in self.harmonics], self.freedoms)
+        return assemble(times, [_table(times, self.period, count) for count in self.harmonics], self.freedoms)
 
     def coefficients(self, x: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return q0, a, b (1 + 2 n_f,) of every joint."""
@@ -110,7 +110,7 @@ def fourier_family(
     return Fourier(float(period), counts, tuple(freedoms))
 
 
-def table(times: np.ndarray, period: float, count: int) -> np.ndarray:
+def _table(times: np.ndarray, period: float, count: int) -> np.ndarray:
     """Return the slopes (4, N, 1 + 2 count) of q, v, a, jerk by q0, a, b."""
     rates = 2 * np.pi / period * np.arange(1, count + 1)
     angle = np.outer(times, rates)

@@ -429,7 +429,7 @@ def _solve(matrix, vector):
 
 
 @njit(**OPTIONS)
-def workspace(bodies, n):
+def _workspace(bodies, n):
     """Return the scratch arrays of `_accelerate` for B bodies and n coordinates."""
     frames, motion, wrench = np.empty((bodies, 12)), np.zeros((bodies + 1, 9)), np.empty((bodies, 6))
     return frames, motion, wrench, np.empty((bodies, 10)), np.empty((n, n))
@@ -439,7 +439,7 @@ def workspace(bodies, n):
 def _accelerate(links, constants, parameters, added, q, v, tau, work, out):
     """Write the accelerations (n,) of one state: (M(q) + added) a = tau - c(q, v) - g(q).
 
-    Made to be called from other compiled loops: allocates nothing, `work` from `workspace`, `parameters` from
+    Made to be called from other compiled loops: allocates nothing, `work` from `_workspace`, `parameters` from
     `calib.dynamics.rigid_body.kernel_parameters`.
 
     Returns:
@@ -471,7 +471,7 @@ def _accelerate(links, constants, parameters, added, q, v, tau, work, out):
 @njit(**OPTIONS)
 def forward_dynamics(links, constants, parameters, added, q, v, tau, out):
     """Fill out (N, n) by `_accelerate`; return the first sample whose inertia is not positive definite, or -1."""
-    work = workspace(links.shape[0], q.shape[1])
+    work = _workspace(links.shape[0], q.shape[1])
     for sample in range(q.shape[0]):
         if not _accelerate(links, constants, parameters, added, q[sample], v[sample], tau[sample], work, out[sample]):
             return sample

@@ -52,13 +52,13 @@ def energies(bodies: Bodies, q: np.ndarray, v: np.ndarray) -> np.ndarray:
     still = np.zeros_like(np.asarray(v, dtype=float))
     moved = regressor(with_gravity(bodies, np.zeros(3)), q, still, v)
     result = 0.5 * np.einsum("nj,njc->nc", v, moved)
-    for i, frame in enumerate(frames(bodies, q)):
+    for i, frame in enumerate(_frames(bodies, q)):
         result[:, 10 * i + 6 : 10 * i + 9] -= np.einsum("nji,j->ni", frame[:, :3, :3], bodies.gravity)
         result[:, 10 * i + 9] -= frame[:, :3, 3] @ bodies.gravity
     return result
 
 
-def frames(bodies: Bodies, q: np.ndarray) -> np.ndarray:
+def _frames(bodies: Bodies, q: np.ndarray) -> np.ndarray:
     """Return the bodies' frames in the base, (B, N, 4, 4)."""
     result = np.empty((bodies.count, len(q), 4, 4))
     for i, parent in enumerate(bodies.parents):

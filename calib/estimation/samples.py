@@ -174,7 +174,7 @@ def _iterate(
     values = start.estimate.values
     for _ in range(ROUNDS):
         residual = np.where(data.present, data.target - data.matrix @ values, 0.0) / left
-        size = sizes(residual, covariance, data.present)
+        size = _sizes(residual, covariance, data.present)
         weights = robust.weigh(size, data.joints, loss, gate)
         if not how.stated:
             covariance = _scatter(data, residual, weights * _consistent(data, how), weights)
@@ -202,7 +202,7 @@ def _pack(
     return SampleFit(fit, frozen(noise), frozen(weights), frozen(outliers, bool), frozen(factor))
 
 
-def sizes(residual: np.ndarray, noise: np.ndarray, present: np.ndarray) -> np.ndarray:
+def _sizes(residual: np.ndarray, noise: np.ndarray, present: np.ndarray) -> np.ndarray:
     """Return Mahalanobis sizes (e_kᵀ S⁻¹ e_k)^½ (N,) of residuals (N, n), over the rows present."""
     patterns, which = _roots(noise, present)
     result = np.empty(len(residual))

@@ -55,7 +55,7 @@ def fit(
         settings: see `Settings`.
         torques: gravity torques (m, n) per block [N m], for compliance terms.
         drawn: keep all independent parameters, drawn to their nominal as strongly as the data themselves say
-            (`shrunk_fit`), in place of sending the untold ones back.
+            (`_shrunk_fit`), in place of sending the untold ones back.
         prior: standard deviations of the whole parameter vector about its present values, where something is known
             beforehand; infinite elsewhere. Parameters with a prior always take part.
 
@@ -77,7 +77,7 @@ def fit(
     stated = np.full(len(table.names), np.inf) if prior is None else prior
     if drawn:
         free = np.setdiff1d(free, _scale_reference(cell, split, candidates))
-        return replace(shrunk_fit(cell, blocks, free, settings, stated[free]), split=split, candidates=candidates)
+        return replace(_shrunk_fit(cell, blocks, free, settings, stated[free]), split=split, candidates=candidates)
     start, found = cell, None
     for attempt in range(1 + RETRIES):
         plausible = np.where(np.isfinite(stated[free]), np.inf, plausible_deviation(cell, free))
@@ -124,7 +124,7 @@ def _scale_reference(cell: Installation, split: ColumnSplit, candidates: np.ndar
     return candidates[split.kept[[int(np.argmax(total))]]] if total.max(initial=0.0) > 0.0 else candidates[:0]
 
 
-def shrunk_fit(
+def _shrunk_fit(
     cell: Installation, blocks: list[Block], free: np.ndarray, settings: Settings, stated: np.ndarray
 ) -> GeometricFit:
     """Fit with a prior about the nominal whose widths are the most probable ones (evidence; MacKay 1992).

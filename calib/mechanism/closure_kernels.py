@@ -17,7 +17,7 @@ KIND, SCALE, REVOLUTE = 1, 12, 1
 
 
 @njit(**OPTIONS)
-def invert(A, out):
+def _invert(A, out):
     """Write A⁻¹ (n, n) by Gauss and Jordan with row pivots; A is lost. A zero pivot becomes tiny: huge entries."""
     n = A.shape[0]
     for i in range(n):
@@ -123,7 +123,7 @@ def _one_leg(links, constants, tail, attachment, held, q, pose, full, inverse, c
                 total += full[m, i] * full[m, k]
             square[i, k] = total if held > n else full[i, k]
     back = np.empty((n, n))
-    invert(square, back)
+    _invert(square, back)
     for i in range(n):
         for m in range(held):
             if held > n:
@@ -246,7 +246,7 @@ def _freedoms(full, inverse, carried, held, starts, selected, D, back):
                 for b in range(r):
                     mixed[a, b] += rows[leg, i, others[a]] * rows[leg, i, selected[b]]
     solved = np.empty((6 - r, 6 - r))
-    invert(square, solved)
+    _invert(square, solved)
     for b in range(r):
         D[selected[b], b] = 1.0
         for a in range(6 - r):
@@ -309,7 +309,7 @@ def _leg_share(links, constants, parameters, drives, held, inverse, carried, shi
 
 
 @njit(**OPTIONS)
-def accelerate(robot, values, q, pose, rate, tau, rates, twist, change):
+def _accelerate(robot, values, q, pose, rate, tau, rates, twist, change):
     """Write v̇ (r,) into `change`, q̇ (n_t,) into `rates`, t (6,) into `twist`; close the gaps in q and pose on the way.
 
     Args:
@@ -368,7 +368,7 @@ def accelerate(robot, values, q, pose, rate, tau, rates, twist, change):
                 for m in range(r):
                     M[i, m] += D[a, i] * whole[a, b] * D[b, m]
     solved = np.empty((r, r))
-    invert(M, solved)
+    _invert(M, solved)
     for i in range(r):
         change[i] = 0.0
         for k in range(r):
@@ -425,7 +425,7 @@ def run(robot, values, q, pose, rate, plan, noise, limit, gains, step, far, read
                 total += back[k, i, j] * force
             held[k, j] = min(max(total, -limit[j]), limit[j])
         for half in range(2):  # one call of what is joined into this loop by the compiler: two take it twice as long
-            accelerate(robot, values, q2, pose2, rate2, held[k], rates, twist, change)
+            _accelerate(robot, values, q2, pose2, rate2, held[k], rates, twist, change)
             length = step if half else 0.5 * step
             if not half:
                 for i in range(3):

@@ -61,10 +61,10 @@ def read(path: str | Path) -> ParallelRobot:
     Raises:
         RobotError: naming the table, the key and what is wrong with it.
     """
-    return from_table(load(path), str(path))
+    return _from_table(load(path), str(path))
 
 
-def from_table(table: Mapping[str, Any], where: str) -> ParallelRobot:
+def _from_table(table: Mapping[str, Any], where: str) -> ParallelRobot:
     """Return the robot of a parsed table; `where` names it in messages."""
     check_keys(table, TOP, where)
     if table.get("kind") != KIND:
@@ -100,7 +100,7 @@ def write(
 
 
 def to_table(robot: ParallelRobot, source: str = "") -> dict[str, Any]:
-    """Return the table (schema above) that `from_table` reads back exactly."""
+    """Return the table (schema above) that `_from_table` reads back exactly."""
     table: dict[str, Any] = {"kind": KIND, "name": robot.name, "gravity": robot.gravity.tolist()}
     if source:
         table["source"] = source

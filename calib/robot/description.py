@@ -100,10 +100,10 @@ def write(path: str | Path, chain: Chain, extra: Mapping[str, Any] | None = None
         extra: tables by name, of `EXTRA`, kept as they are.
         source: where the numbers come from.
     """
-    return files.write(path, text(chain, extra, source))
+    return files.write(path, _text(chain, extra, source))
 
 
-def text(chain: Chain, extra: Mapping[str, Any] | None = None, source: str = "") -> str:
+def _text(chain: Chain, extra: Mapping[str, Any] | None = None, source: str = "") -> str:
     """Return what `write` writes."""
     check_keys(extra or {}, EXTRA, f"robot '{chain.name}', extra tables")
     as_rows = mdh.is_table(chain) and not chain.links

@@ -79,17 +79,17 @@ def spelled(angle: float) -> float | str:
     return _PI.get(angle, angle)
 
 
-def plain(value: Any) -> Any:
+def _plain(value: Any) -> Any:
     """Return `value` with arrays, tuples and numpy numbers as lists and Python numbers, Nones left out of tables."""
     if isinstance(value, Mapping):
-        return {str(key): plain(entry) for key, entry in value.items() if entry is not None}
+        return {str(key): _plain(entry) for key, entry in value.items() if entry is not None}
     if isinstance(value, np.ndarray):
         return value.tolist()
     if isinstance(value, (list, tuple)):
-        return [plain(entry) for entry in value]
+        return [_plain(entry) for entry in value]
     return value.item() if isinstance(value, np.generic) else value
 
 
 def dumps(table: Mapping[str, Any]) -> str:
     """Return TOML text; floats in full (repr), so that reading them back is exact."""
-    return tomlkit.dumps(plain(table))
+    return tomlkit.dumps(_plain(table))

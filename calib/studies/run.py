@@ -65,7 +65,7 @@ def span(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
-def missing(study: Study, store: RowStore) -> Iterator[Trials]:
+def _missing(study: Study, store: RowStore) -> Iterator[Trials]:
     """Yield the tasks whose rows a store lacks; data set by data set, so that all conditions fill up alike."""
     most = max((max(runs.values(), default=0) for runs in study.runs), default=0)
     for number in range(most):
@@ -86,7 +86,7 @@ def run(study: Study, store: RowStore, workers: Workers, say: Callable[[Progress
     Raises:
         CalibError: where rows cannot be kept, or the workers are gone.
     """
-    tasks = list(missing(study, store))
+    tasks = list(_missing(study, store))
     progress = Progress(sum(len(task.methods) for task in tasks))
     progress.left.update(name for task in tasks for name in task.methods)
     said = 0.0

@@ -149,7 +149,7 @@ class Evaluation:
     @cached_property
     def _found(self) -> tuple[list[Value], dict[tuple[int, int], Observed]]:
         seen: dict[tuple[int, int], Observed] = {}
-        wanted = (_sharpened(one, self.sharpness) for one in terms(self.problem))
+        wanted = (_sharpened(one, self.sharpness) for one in _terms(self.problem))
         return [_value(one, self.motion, self.regressor, seen) for one in wanted], seen
 
     @cached_property
@@ -216,7 +216,7 @@ def _slope(
     """Return the slopes (4, N, n) of Σ shares · objectives by q, v, a, jerk: one derivative product for all."""
     result, by_regressor = np.zeros((4, *motion.q.shape)), None
     by_information: dict[tuple[int, int], np.ndarray] = {}
-    for one, objective, share in zip(found, terms(problem), shares):
+    for one, objective, share in zip(found, _terms(problem), shares):
         if share == 0.0:
             continue
         if one.by_motion is not None:
@@ -234,7 +234,7 @@ def _slope(
     return result
 
 
-def terms(problem: ExcitationProblem) -> list[Objective]:
+def _terms(problem: ExcitationProblem) -> list[Objective]:
     """Return the objectives that are evaluated: those of the goals, or those of the sum."""
     return [goal.objective for goal in problem.goals] or [one for one, _ in problem.objectives]
 
@@ -249,7 +249,7 @@ def is_condition(objective: Objective) -> bool:
 
 def exact_values(problem: ExcitationProblem, motion: SampledMotion, regressor: np.ndarray) -> np.ndarray:
     """Return the unsmoothed objectives of a motion (k,)."""
-    return np.array([_sharpened(one, np.inf).evaluate(motion, regressor).value for one in terms(problem)])
+    return np.array([_sharpened(one, np.inf).evaluate(motion, regressor).value for one in _terms(problem)])
 
 
 def merit(problem: ExcitationProblem, values: np.ndarray) -> float:

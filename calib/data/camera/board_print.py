@@ -26,7 +26,7 @@ def dictionary(name: str) -> cv2.aruco.Dictionary:
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name.upper()}"))
 
 
-def black(board: Board) -> np.ndarray:
+def _black(board: Board) -> np.ndarray:
     """Return the black rectangles (N, 4) of a board: x, y, width, height [m] in its frame."""
     side, found = board.square, []
     if board.kind != "apriltag":
@@ -68,7 +68,7 @@ def raster(board: Board, pixels_per_metre: float, margin: float) -> np.ndarray:
     """
     width, height = (round((length + 2.0 * margin) * pixels_per_metre) for length in board.extent)
     image = np.ones((height, width), dtype=np.float32)
-    for x, y, w, h in black(board):
+    for x, y, w, h in _black(board):
         own = []
         for first, length, count in ((x, w, width), (y, h, height)):
             low, high = ((place + margin) * pixels_per_metre for place in (first, first + length))
@@ -152,7 +152,7 @@ def pdf(board: Board, size: tuple[float, float]) -> bytes:
 def _page(board: Board, size: tuple[float, float]) -> tuple[np.ndarray, list[tuple[float, float, str]]]:
     """Return black boxes (N, 4) and words of a page [m]: the board in its middle, a ruler below."""
     left, top = 0.5 * (size[0] - board.extent[0]), 0.5 * (size[1] - RULER - board.extent[1])
-    boxes = black(board) + np.array([left, top, 0.0, 0.0])
+    boxes = _black(board) + np.array([left, top, 0.0, 0.0])
     length = 0.01 * int(100 * min(board.extent[0], 0.2) + 1e-9)
     base, thin = size[1] - EDGE - 0.006, 0.0002
     ticks = [[left - thin / 2, base, length + thin, thin]]

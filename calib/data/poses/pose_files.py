@@ -68,7 +68,7 @@ def read_measurements(
         table, options, notes = robodk.read_robodk(path, len(joints), options)
     else:
         table, notes = read_table(path), ()
-    block = measurements(table, joints, options, kinds=kinds, limits=limits)
+    block = _measurements(table, joints, options, kinds=kinds, limits=limits)
     return [replace(block, notes=(*notes, *block.notes))]
 
 
@@ -86,7 +86,7 @@ def joint_columns(path: str | Path) -> tuple[str, ...]:
     )
 
 
-def measurements(
+def _measurements(
     table: Table,
     joints: Sequence[str],
     options: FileOptions,

@@ -65,7 +65,7 @@ def _check_finite(recording: Recording, most: float = np.inf) -> None:
             continue
         bad = np.argwhere(~(np.abs(values) < most).reshape(len(recording), -1))
         row, joint = (int(i) for i in bad[0])
-        where = "t" if name == "t" else column(recording, name, joint)
+        where = "t" if name == "t" else _column(recording, name, joint)
         many = f" (and in {len(np.unique(bad[:, 0])) - 1} more rows)" if len(bad) > 1 else ""
         message = f"found {values.reshape(len(recording), -1)[row, joint]:g}{many}; cut that part out, or leave the"
         raise MeasurementError(f"{message} rows out", recording.file, int(recording.rows[row]), where)
@@ -101,10 +101,10 @@ def _drop_spikes(recording: Recording, joints: Joints | None) -> Recording:
     if rows.sum() > few:
         message = f"{found}{more}, where {1 - MANY:.0%} of the rows are within {usual[j]:.4g} of its median"
         advice = "spikes of the log, too many to be left out? Cut those parts out"
-        place = column(recording, "effort", j)
+        place = _column(recording, "effort", j)
         raise MeasurementError(f"{message}: {advice}", recording.file, int(recording.rows[row]), place)
     note = (
-        f"row {recording.rows[row]}: the {column(recording, 'effort', j)} {found}{more}, the other rows are within "
+        f"row {recording.rows[row]}: the {_column(recording, 'effort', j)} {found}{more}, the other rows are within "
         f"{size[~rows, j].max():.4g} of its median: a spike of the log; left out"
     )
     return _noted(take(recording, ~rows), note)
@@ -167,7 +167,7 @@ def _check_size(recording: Recording, joints: Joints | None = None) -> None:
             f"{q[row]:g} {unit} is beyond what a {kind} joint does ({int(beyond.sum())} of {len(q)} rows): looks like "
             f"{other}; if so, say so (a header 'q{j + 1} [{other}]', or units: q = '{other}')"
         )
-        raise MeasurementError(message, recording.file, int(recording.rows[row]), column(recording, "q", j))
+        raise MeasurementError(message, recording.file, int(recording.rows[row]), _column(recording, "q", j))
 
 
 def _check_speed(recording: Recording) -> None:
@@ -183,7 +183,7 @@ def _check_speed(recording: Recording) -> None:
         for factor, wrong in ((1 / DEGREE, "the velocities look like deg/s"), (DEGREE, "the positions look like deg")):
             if abs(ratio[j] / factor - 1) < 0.1:
                 message = f"v is {ratio[j]:.3g} times the slope of q: {wrong}; if so, say so in the header or the units"
-                raise MeasurementError(message, recording.file, column=column(recording, "v", int(j)))
+                raise MeasurementError(message, recording.file, column=_column(recording, "v", int(j)))
 
 
 def _jumps(recording: Recording, joints: Joints | None) -> list[str]:
@@ -209,7 +209,7 @@ def _jumps(recording: Recording, joints: Joints | None) -> list[str]:
     return notes
 
 
-def column(recording: Recording, name: str, joint: int) -> str:
+def _column(recording: Recording, name: str, joint: int) -> str:
     """Return how a message calls a column: ``effort of elbow (joint 3)``."""
     label = recording.kind if name == "effort" else name
     return f"{label} of {recording.joint_names[joint]} (joint {joint + 1})"
@@ -223,7 +223,7 @@ def _still(recording: Recording) -> list[str]:
     for j, dead in enumerate(np.ptp(recording.effort, axis=0) == 0):
         if dead and not still[j]:
             message = f"is {recording.effort[0, j]:g} in all {len(recording)} rows while the joint moves: was it logged"
-            raise MeasurementError(message + "?", recording.file, column=column(recording, "effort", j))
+            raise MeasurementError(message + "?", recording.file, column=_column(recording, "effort", j))
         if still[j]:
             travel = "is one number" if np.ptp(recording.q[:, j]) < STILL else f"moves less than {MOVES:g}"
             own = f", and so is its {recording.kind}" if dead else ""
@@ -250,7 +250,7 @@ def _effort_notes(recording: Recording, joints: Joints | None) -> list[str]:
             f"{BEYOND:g} times its limit: are these N mm, or another robot's? If N mm, say so (a header 'tau_1 [Nmm]', "
             "or units: torque = 'Nmm'); if N m, correct the limits in the robot's file"
         )
-        raise MeasurementError(message, recording.file, column=column(recording, "effort", j))
+        raise MeasurementError(message, recording.file, column=_column(recording, "effort", j))
     high = known & (most > 1.2 * np.where(known, limit, np.inf))
     notes = [
         f"{recording.joint_names[j]}: |torque| reaches {most[j]:.3g}, its limit is {limit[j]:g}: another unit?"

@@ -51,13 +51,13 @@ Diagnosis = SetUpChange | SystematicResidual | BeyondStated
 def diagnose(found: GeometricFit) -> list[Diagnosis]:
     """Return findings on each block: rows that look like another set-up, and residuals that are not noise."""
     result = []
-    for block, part in lengths(found):
+    for block, part in _lengths(found):
         if part.value.shape[1] >= FEWEST:  # pairs of rows count once
             result += [*_setup_change(block, part), *_systematic(block, part)]
     return result
 
 
-def lengths(found: GeometricFit) -> list[tuple[Block, Part]]:
+def _lengths(found: GeometricFit) -> list[tuple[Block, Part]]:
     """Return per block its first part, which is in metres for every kind of measurement."""
     first = {piece.block: piece.part.per_row() for piece in reversed(found.pieces)}
     return [(block, first[number]) for number, block in enumerate(found.blocks)]

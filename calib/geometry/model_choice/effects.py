@@ -30,7 +30,7 @@ class Effect:
     terms: Callable[[Chain, bool], list[Term]]
 
 
-def stiffness(chain: Chain, known: bool) -> list[Term]:
+def _stiffness(chain: Chain, known: bool) -> list[Term]:
     """Return the deflection of each joint about its axis under gravity: by known torques, else by fitted moments."""
     names = chain.names
     if known:
@@ -38,7 +38,7 @@ def stiffness(chain: Chain, known: bool) -> list[Term]:
     return [term for k in chain.moving if chain.elements[k].axis[0] == "r" for term in _sag(chain, int(k))]
 
 
-def bending(chain: Chain, known: bool) -> list[Term]:
+def _bending(chain: Chain, known: bool) -> list[Term]:
     """Return the tilt of each joint's frame across its axis under gravity: bearings and links give way too."""
     moving = set(chain.moving.tolist())
     places = [k for k, e in enumerate(chain.elements) if e.axis[0] == "r" and k not in moving and e.owner < chain.n]
@@ -50,14 +50,14 @@ def _sag(chain: Chain, place: int) -> list[Term]:
     return [Term(element.name, "lever", i, a) for i in range(element.owner, chain.n) for a in range(3)]
 
 
-def coupling(chain: Chain, known: bool) -> list[Term]:
+def _coupling(chain: Chain, known: bool) -> list[Term]:
     """Return what a joint's own reading and its neighbours' add to it: gear ratio and coupled transmissions."""
     names = chain.names
     near = [(j, i) for j in range(chain.n) for i in (j - 1, j, j + 1) if 0 <= i < chain.n]
     return [Term(names[chain.moving[j]], "joint", i) for j, i in near]
 
 
-def harmonics(chain: Chain, known: bool) -> list[Term]:
+def _harmonics(chain: Chain, known: bool) -> list[Term]:
     """Return sin and cos of k q_j on each revolute joint, k = 1 … `MAX_ORDER`: encoder and gear errors."""
     return [
         Term(chain.names[k], basis, j, order)
@@ -68,7 +68,7 @@ def harmonics(chain: Chain, known: bool) -> list[Term]:
     ]
 
 
-def wobble(chain: Chain, known: bool) -> list[Term]:
+def _wobble(chain: Chain, known: bool) -> list[Term]:
     """Return low harmonics of q_j on every other element of joint j: its axis wobbles as it turns."""
     moving = set(chain.moving.tolist())
     return [
@@ -81,11 +81,11 @@ def wobble(chain: Chain, known: bool) -> list[Term]:
 
 
 EFFECTS = (
-    Effect("stiffness", "sag of the joints about their axes", stiffness),
-    Effect("bending", "sag across the axes: bearings and links", bending),
-    Effect("coupling", "gear ratios and coupling of neighbouring axes", coupling),
-    Effect("harmonics", "errors repeating with a joint's turn", harmonics),
-    Effect("wobble", "axes that wobble as they turn", wobble),
+    Effect("stiffness", "sag of the joints about their axes", _stiffness),
+    Effect("bending", "sag across the axes: bearings and links", _bending),
+    Effect("coupling", "gear ratios and coupling of neighbouring axes", _coupling),
+    Effect("harmonics", "errors repeating with a joint's turn", _harmonics),
+    Effect("wobble", "axes that wobble as they turn", _wobble),
 )
 MODELS = ("frames", "offsets", "geometry", *(effect.name for effect in EFFECTS))
 

@@ -132,7 +132,7 @@ class ErrorModel:
 
     def _sigma(self, own: np.ndarray, q: np.ndarray) -> np.ndarray:
         """Return that sigma (m,) [m], where the parameters' share is known: trace J Σ Jᵀ (m,) [m²]."""
-        found, parts = self.discrepancy, distances(q, self.learnt, np.array(self.discrepancy.levers))
+        found, parts = self.discrepancy, _distances(q, self.learnt, np.array(self.discrepancy.levers))
         plain = np.sqrt(found.parameters * own + found.floor + found.far * parts[0] + found.beyond * parts[1])
         return plain * np.interp(parts[0] + parts[1], found.reach, found.radii) / found.radius
 
@@ -141,7 +141,7 @@ class ErrorModel:
         return (q < self.learnt.min(axis=0)) | (q > self.learnt.max(axis=0))
 
 
-def distances(q: np.ndarray, learnt: np.ndarray, levers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _distances(q: np.ndarray, learnt: np.ndarray, levers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the squared distances (m,) [m²] of poses from the nearest learnt one, and from single joints' values.
 
     The latter is, joint by joint, the way to where `SOME` of the learnt poses are within reach: a few of them far off
@@ -307,7 +307,7 @@ class _Rows:
                     jacobian, value = both[:-1], both[-1]
                 error = value - np.einsum("f,fim->im", found.values, jacobian)
                 own = np.sum((root.T @ jacobian[alive].reshape(len(alive), -1)) ** 2, axis=0)
-                near = distances(self.measured[number].q[rows], learnt, levers)
+                near = _distances(self.measured[number].q[rows], learnt, levers)
                 result = np.stack([np.sum(error**2, axis=0), own.reshape(3, -1).sum(axis=0), *near], axis=1)
                 yield result[self.counts[number][rows]]
 

@@ -135,7 +135,7 @@ def find(joint: int, track: GearTravel, residual: np.ndarray, turns: Mapping[int
     bench = WaveCrossValidation(track, residual)
     others = {j: _lobes(coherence(track, j, residual))[turns[j] - TURNS[0]] for j in turns if j != joint}
     sources = [joint, *sorted(others, key=lambda j: -others[j])[:1]]
-    offers = [tuple((j, order) for order in one) for j in sources for one in family(turns[j])]
+    offers = [tuple((j, order) for order in one) for j in sources for one in _family(turns[j])]
     taken, best, ridge = _climb(bench, lambda rest: offers, PAYS)
     if not taken:
         taken, best, ridge = _climb(bench, lambda rest: _free(track, joint, rest), FREE, PAIRS)
@@ -146,10 +146,10 @@ def find(joint: int, track: GearTravel, residual: np.ndarray, turns: Mapping[int
     if share > best:
         nodes, best, ridge = FINE, share, level
     values = bench.fit(taken, nodes, ridge)[1]
-    return Ripple(joint, taken, terms(joint, taken, nodes, track), frozen(values), best)
+    return Ripple(joint, taken, _terms(joint, taken, nodes, track), frozen(values), best)
 
 
-def family(turns: int) -> tuple[tuple[int, ...], ...]:
+def _family(turns: int) -> tuple[tuple[int, ...], ...]:
     """Return the orders per turn at which a gear shows, in the sets that are offered together."""
     n = turns
     return tuple(
@@ -157,7 +157,9 @@ def family(turns: int) -> tuple[tuple[int, ...], ...]:
     )  # fmt: skip
 
 
-def terms(joint: int, waves: Sequence[Wave], nodes: Sequence[float], track: GearTravel | None) -> tuple[DriveTerm, ...]:
+def _terms(
+    joint: int, waves: Sequence[Wave], nodes: Sequence[float], track: GearTravel | None
+) -> tuple[DriveTerm, ...]:
     """Return the terms of the ripple in a joint's torque, wave after wave; without a track they reach everywhere."""
     edges = (0.0, *nodes, np.inf)
     found = []
@@ -186,10 +188,10 @@ class WaveCrossValidation:
         self._made: dict[tuple[Wave, tuple[float, ...]], np.ndarray] = {}
 
     def columns(self, waves: Sequence[Wave], nodes: tuple[float, ...]) -> np.ndarray:
-        """Return the columns (N, k), in the order of `terms`."""
+        """Return the columns (N, k), in the order of `_terms`."""
         for wave in waves:
             if (wave, nodes) not in self._made:
-                self._made[wave, nodes] = columns(self._track, wave, nodes)
+                self._made[wave, nodes] = _columns(self._track, wave, nodes)
         return np.hstack([self._made[wave, nodes] for wave in waves])
 
     def judge(self, waves: Sequence[Wave], nodes: tuple[float, ...]) -> tuple[float, float]:
@@ -217,11 +219,11 @@ class WaveCrossValidation:
         return self.residual - matrix @ x, x
 
 
-def columns(track: GearTravel, wave: Wave, nodes: Sequence[float]) -> np.ndarray:
-    """Return the columns (N, k) of a wave at the samples of a track, in the order of `terms`."""
+def _columns(track: GearTravel, wave: Wave, nodes: Sequence[float]) -> np.ndarray:
+    """Return the columns (N, k) of a wave at the samples of a track, in the order of `_terms`."""
     q, v = track.q[:, wave[0]], track.v[:, wave[0]]
     seen = Joined(q, v, np.zeros_like(q))
-    return np.stack([one.form.values(seen, one.settings) for one in terms(wave[0], (wave,), nodes, None)], axis=1)
+    return np.stack([one.form.values(seen, one.settings) for one in _terms(wave[0], (wave,), nodes, None)], axis=1)
 
 
 def coherence(track: GearTravel, source: int, residual: np.ndarray) -> np.ndarray:

@@ -150,7 +150,7 @@ def find_possible(information: Information, weight: float | None = None, prior: 
         values = border.nearest(problem, pull=gamma) if euclidean else solve(problem, gamma)
     curved_at = _reference(problem) if euclidean else values
     return PossibleBodies(
-        Dynamics(model, values), covariance(problem, gamma, curved_at), gamma, doubt,
+        Dynamics(model, values), _covariance(problem, gamma, curved_at), gamma, doubt,
         np.array([pseudo_inertia.margin(body) for body in _bodies(problem, values)]),
         information.distance(values), away, allowed, blamed, references.source, prior,
         (*references.notes, *_notes(model, information, problem, values, allowed)),
@@ -165,7 +165,7 @@ def _candidates(
     usual = [g for g in WEIGHTS if g >= LEAST] if references.cad else WEIGHTS[4::3]
     for gamma in usual if weight is None else [weight]:
         values = solve(doubted, gamma)
-        yield evidence(doubted, gamma, values), gamma, doubted, values, references
+        yield _evidence(doubted, gamma, values), gamma, doubted, values, references
 
 
 def solve(problem: BodyCost, gamma: float) -> np.ndarray:
@@ -246,7 +246,7 @@ def derivatives(problem: BodyCost, gamma: float, values: np.ndarray) -> tuple[np
     return slope, curvature
 
 
-def evidence(problem: BodyCost, gamma: float, values: np.ndarray) -> float:
+def _evidence(problem: BodyCost, gamma: float, values: np.ndarray) -> float:
     """Return log p(data | γ), Laplace's approximation, but for a constant."""
     free = problem.free
     curvature = derivatives(problem, gamma, values)[1][np.ix_(free, free)]
@@ -258,7 +258,7 @@ def evidence(problem: BodyCost, gamma: float, values: np.ndarray) -> float:
     return -cost(problem, gamma, values) - half + norm * float(problem.drawn.sum()) - scale
 
 
-def covariance(problem: BodyCost, gamma: float, values: np.ndarray) -> np.ndarray:
+def _covariance(problem: BodyCost, gamma: float, values: np.ndarray) -> np.ndarray:
     """Return the inverse of the cost's curvature (p, p), zero for what is fixed."""
     free = problem.free
     result = np.zeros((len(values), len(values)))

@@ -42,7 +42,7 @@ def write(outcome: IdentificationOutcome, folder: Path) -> None:
     files.write_table(folder / SENSITIVITY, ("name", *header), rows)
     files.write_table(folder / EFFECTS, GeometricEffect._fields, effects(carried))
     if outcome.geometries is not None:
-        table = geometries(outcome.geometries, _essential_names(outcome))
+        table = _geometries(outcome.geometries, _essential_names(outcome))
         files.write_table(folder / GEOMETRIES, TwoGeometries._fields, table)
 
 
@@ -81,7 +81,7 @@ def effects(carried: GeometryUncertainty) -> list[GeometricEffect]:
     return found
 
 
-def geometries(found: GeometryComparison, essential: Sequence[str]) -> list[TwoGeometries]:
+def _geometries(found: GeometryComparison, essential: Sequence[str]) -> list[TwoGeometries]:
     """Return the rows of ``geometries.csv``: each parameter on the nominal and on the calibrated geometry."""
     return [
         TwoGeometries(

@@ -203,12 +203,12 @@ def _found_of(
     `said` is what keeps rigid geometries from explaining the rows, `notes` are those of moved instruments etc.
     """
     long = stretched_length(inputs.chain)
-    left = cross_validated(found)
+    left = _cross_validated(found)
     odd = plausibility.findings(found.nominal.cell, found.fit, inputs.fit, torques, left, long)
     return Findings(
         model=found.chosen,
         loss=found.loss,
-        cross_validated=cross_validated(found),
+        cross_validated=_cross_validated(found),
         nominal_cross_validated=next((r.cross_validated for r in found.rungs if r.model == "frames"), None),
         outlier_share=len({(each.file, each.row) for each in named}) / sum(len(block) for block in inputs.fit),
         unexplained=said if remains(found, long) else "",
@@ -228,7 +228,7 @@ def _blind_note(blind: Sequence[str]) -> list[str]:
     ]
 
 
-def cross_validated(found: ModelSelection) -> float:
+def _cross_validated(found: ModelSelection) -> float:
     """Return the error of the chosen model on rows left out [m]: that of the last rung kept."""
     return [rung.cross_validated for rung in found.rungs if rung.kept][-1]
 

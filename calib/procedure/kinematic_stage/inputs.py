@@ -261,7 +261,7 @@ def hold_out(block: PoseMeasurements, share: float, seed: int) -> tuple[PoseMeas
     """
     if share == 0.0:
         return block, None
-    unit = units(block)
+    unit = _units(block)
     count = int(unit.max()) + 1
     held = round(share * count)
     order = np.random.default_rng(seed).permutation(count)
@@ -271,7 +271,7 @@ def hold_out(block: PoseMeasurements, share: float, seed: int) -> tuple[PoseMeas
     return take(block, np.flatnonzero(~aside)), take(block, np.flatnonzero(aside))
 
 
-def units(block: PoseMeasurements) -> np.ndarray:
+def _units(block: PoseMeasurements) -> np.ndarray:
     """Return for each row the number (m,) of the pose (or measured pair) it belongs to, counted from 0.
 
     Cycles of one repeated pose are one pose.

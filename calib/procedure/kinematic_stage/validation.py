@@ -125,7 +125,7 @@ def assess(
     blocks = (*inputs.fit, *(unseen.block for unseen in inputs.unseen.values()))
     warnings = (
         *loud, *(one.told for one in findings.odd),
-        *inputs.notes, *(note for block in blocks for note in block.notes), *elsewhere(fitted, validation),
+        *inputs.notes, *(note for block in blocks for note in block.notes), *_elsewhere(fitted, validation),
         *findings.notes, *_doubtful(validation), *_unsettled(validation), *_interval_notes(validation),
     )  # fmt: skip
     return Assessment(fitted, validation, verdict, tuple(dict.fromkeys(warnings)))
@@ -175,7 +175,7 @@ def urdf_alone(fit: Comparison, validation: Mapping[str, Comparison]) -> tuple[s
     return (f"its URDF alone, without joint_corrections.csv, leaves {there}" if words else ""), warnings
 
 
-def elsewhere(fit: Comparison, validation: Mapping[str, Comparison]) -> list[str]:
+def _elsewhere(fit: Comparison, validation: Mapping[str, Comparison]) -> list[str]:
     """Name validation files whose errors look like another placement of the instrument, not like an arm's."""
     usual = float(np.median(fit.errors[0].main)) if len(fit.errors[0].main) else np.inf
     return [

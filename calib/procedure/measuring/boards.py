@@ -70,7 +70,7 @@ def look(folder: Path, show: Show) -> list[str]:
     board = read_own_board(folder)
     names = joint_table(folder).texts("image") if (folder / JOINTS).exists() else _images(folder)
     found = find_corners(folder, board, names, lambda done, total, name: show(f"{done} of {total}: {name}"))
-    return summary(found, board, names)
+    return _summary(found, board, names)
 
 
 def _images(folder: Path) -> list[str]:
@@ -82,7 +82,7 @@ def _images(folder: Path) -> list[str]:
     return names
 
 
-def summary(found: Found, board: Board, names: Iterable[str]) -> list[str]:
+def _summary(found: Found, board: Board, names: Iterable[str]) -> list[str]:
     """Return what was found in images, in sentences: how many are of use, why others are not, what they cover.
 
     Raises:
@@ -128,5 +128,5 @@ def from_bag(
     made = boards.read_board(board)
     found = read_image_bag(bag, made, image_topic or "", joint_topic or "", lambda k, name: show(f"image {k}: {name}"))
     write_image_folder(found, made, out)
-    lines = summary(found.corners, made, found.names)
+    lines = _summary(found.corners, made, found.names)
     return [*lines, *found.notes, f"written to {out}; calib fit ROBOT {out} --out FOLDER fits it"]

@@ -128,7 +128,7 @@ def plan_parallel(
         raise UsageError("limits and drives are in a parallel robot's own file (velocity, effort) and in its model")
     law, notes = _law(robot, model, settings)
     bounds = _bounds(known, law)
-    points = read_waypoints(waypoints, known)
+    points = _read_waypoints(waypoints, known)
     say("the path")
     paths = _paths(known, points, settings.lines)
     for path in paths:
@@ -141,7 +141,7 @@ def plan_parallel(
     return ParallelPlan(robot, timings, motion, coordinates_of(known, locate(known, motion.q)), notes)
 
 
-def read_waypoints(path: Path, known: ClosedRobot) -> np.ndarray:
+def _read_waypoints(path: Path, known: ClosedRobot) -> np.ndarray:
     """Return the platform coordinates (m, r) of waypoints in a CSV (see the module).
 
     Raises:

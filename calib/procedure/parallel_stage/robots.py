@@ -41,7 +41,7 @@ def path_of(robot: object) -> Path | None:
     return library.path(str(robot)) if str(robot) in library.names() else None
 
 
-def find(robot: object) -> FoundRobot | None:
+def _find(robot: object) -> FoundRobot | None:
     """Return the parallel robot that `robot` is or names; None where it is another kind of robot, or none.
 
     Raises:
@@ -55,7 +55,7 @@ def find(robot: object) -> FoundRobot | None:
 
 def recognised(robot: T) -> T | FoundRobot:
     """Return the parallel robot that `robot` is or names; another one as it is."""
-    return find(robot) or robot
+    return _find(robot) or robot
 
 
 def refuse_parallel(robot: object, what: str, instead: str = "") -> None:

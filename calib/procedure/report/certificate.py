@@ -92,7 +92,7 @@ def certificate(
         title,
         subtitle,
         issued,
-        [(label, shortened(value, most)) for label, value in first.items()],
+        [(label, _shortened(value, most)) for label, value in first.items()],
         behind,
         marks,
     )
@@ -100,13 +100,13 @@ def certificate(
 
 def _fitting(section: Section) -> Section:
     """Return a section whose reason fits the first sheet; the whole of a longer one comes first among its blocks."""
-    short = shortened(section.reason, REASON)
+    short = _shortened(section.reason, REASON)
     if short == section.reason:
         return section
     return replace(section, reason=short, blocks=[Text("Reason in full", [section.reason]), *section.blocks])
 
 
-def shortened(text: str, most: int) -> str:
+def _shortened(text: str, most: int) -> str:
     """Return a text cut at a word, with an ellipsis, where it is longer than `most` letters."""
     return text if len(text) <= most else f"{text[: most - 1].rsplit(' ', 1)[0]} …"
 

@@ -151,7 +151,7 @@ def certificate_section(
     blocks += [*pictures("errors"), *pictures("torques"), *pictures("excitation")]
     if len(metrics.ladder) > 1:
         blocks.append(_friction_table(metrics))
-    blocks += [Text("The model", _model_sentences(metrics)), Text("What the motion can tell", identifiability(found))]
+    blocks += [Text("The model", _model_sentences(metrics)), Text("What the motion can tell", _identifiability(found))]
     blocks += [*_geometry_blocks(metrics, found.effects), *pictures("geometry")]
     blocks += [*pictures("parameters"), _parameter_table(found)]
     if metrics.loop:
@@ -380,7 +380,7 @@ def tracking_blocks(replays: Mapping[str, ReplayMetrics], failure: str = "") -> 
     return [Table(title, ("fed forward", *joints), rows, numbers=range(1, 1 + len(joints))), Text("", lines)]
 
 
-def identifiability(found: DynamicReport) -> list[str]:
+def _identifiability(found: DynamicReport) -> list[str]:
     """Return what the motion can and cannot tell, in sentences."""
     lines = []
     weak = [row.name for row in found.estimate if row.rsd is not None and row.rsd > TOLD]

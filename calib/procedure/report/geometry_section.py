@@ -79,7 +79,7 @@ def certificate_section(report: Report, drawn: Mapping[str, Picture]) -> Section
     blocks.append(_pictures("What the camera saw", drawn, [name for name in drawn if name.startswith("coverage")]))
     if any(step.cross_validated_mm is not None for step in metrics.ladder):
         blocks += [_ladder_table(metrics), _pictures("", drawn, ("ladder",))]
-    blocks.append(Text("What the poses can tell", identifiability(report)))
+    blocks.append(Text("What the poses can tell", _identifiability(report)))
     blocks.append(_pictures("Parameters", drawn, ("parameters", "singular_values", "correlations")))
     blocks += [_parameter_table(report), *_sigma_tables(metrics)]
     if metrics.outliers:
@@ -252,7 +252,7 @@ def _outlier_table(metrics: FitMetrics) -> Table:
     return Table("Rows that do not fit", header, rows, note, numbers=(1, 3, 4))
 
 
-def identifiability(report: Report) -> list[str]:
+def _identifiability(report: Report) -> list[str]:
     """Return what the poses can and cannot tell, in sentences."""
     values, rank, lines = report.singular_values, report.rank, []
     unclear, fitted = report.metrics.not_identifiable, report.metrics.fit.parameters

@@ -136,7 +136,10 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
         tuple(meshes),
         tuple(_joined(_measured(place), ValidationFolder(folder / VALIDATED).errors) for place in fits),
         tuple((path.stem, _chosen(path, chain)) for path in plans if not is_run(path)) if chain else (),
-        (*(rehearsed(path, chain) for path in plans if chain and is_run(path)), *(_played(p, folder) for p in motions)),
+        (
+            *(_rehearsed(path, chain) for path in plans if chain and is_run(path)),
+            *(_played(path, folder) for path in motions),
+        ),
         tuple(_torques(path, folder, chain) for path in torques),
         tuple(notes),
     )
@@ -157,7 +160,7 @@ def _of_poses(path: Path, robot: str | None) -> Scene:
     chain, source = load(robot), resolve(robot)
     meshes, notes = _meshes(chain, source)
     if is_run(path):
-        return Scene(path.stem, chain, tuple(meshes), played=(rehearsed(path, chain),), notes=tuple(notes))
+        return Scene(path.stem, chain, tuple(meshes), played=(_rehearsed(path, chain),), notes=tuple(notes))
     return Scene(path.stem, chain, tuple(meshes), chosen=((path.stem, _chosen(path, chain)),), notes=tuple(notes))
 
 
@@ -265,7 +268,7 @@ def _points(cell: Installation, q: np.ndarray, station: int, tool: int) -> np.nd
     return see(cell, q, station, tool, evaluate(cell.deflection, q, torque) if terms else None).point.T
 
 
-def rehearsed(path: Path, chain: Chain) -> Played:
+def _rehearsed(path: Path, chain: Chain) -> Played:
     """Return a measuring run as it will play, poses and ways between them."""
     return Played(path.stem, *rehearsed_samples(path, chain))
 

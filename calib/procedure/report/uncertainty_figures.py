@@ -78,7 +78,7 @@ def from_folder(folder: Path) -> dict[str, Picture]:
             "torque noise; calibrated: with the geometry's uncertainty). Below: how far the nominal one's estimate "
             "is off, in the calibrated one's sigmas."
         )
-        result["geometries"] = picture(partial(geometries, rows), words, True)
+        result["geometries"] = picture(partial(_geometries, rows), words, True)
     known = [row for row in _read(GeometricEffect, folder / EFFECTS) if row.sigma is not None]
     if known:
         words = (
@@ -86,7 +86,7 @@ def from_folder(folder: Path) -> dict[str, Picture]:
             "it moves most, in that parameter's sigma from torque noise. Below the dashed line no sigma grows by more "
             "than 1 %."
         )
-        result["effects"] = picture(partial(effects, known[:TOP]), words)
+        result["effects"] = picture(partial(_effects, known[:TOP]), words)
     return result
 
 
@@ -98,7 +98,7 @@ def write(folder: Path) -> None:
             files.write(folder / file, drawn[name].png)
 
 
-def geometries(rows: Sequence[TwoGeometries]) -> Figure:
+def _geometries(rows: Sequence[TwoGeometries]) -> Figure:
     """Draw each parameter on both geometries with error bars, and the difference in sigmas."""
     table = np.array([(row.nominal, row.sigma_nominal, row.calibrated, row.sigma_calibrated) for row in rows])
     nominal, s_nominal, own, s_own = table.T
@@ -145,7 +145,7 @@ def _symlog(axes: Axes, linear: float) -> None:
     axes.yaxis.set_minor_locator(NullLocator())
 
 
-def effects(rows: Sequence[GeometricEffect]) -> Figure:
+def _effects(rows: Sequence[GeometricEffect]) -> Figure:
     """Draw the ranked geometric errors by the largest shift they cause."""
     labels = [f"{row.element} ({_milli(row)})" for row in rows]
     size = np.array([row.shift_sigma or 0.0 for row in rows])

@@ -54,7 +54,7 @@ def certify(session: Session, say: Say) -> list[str]:
         section = dynamics_section.certificate_section(dynamics, drawn, exported, tolerance)
         judged.append(_with_arrival(section, _arrival_notes(session, "7-recorded", "predict")))
         notes.append(f"dynamics {section.verdict}: {section.reason}")
-    lines = simulated(session)
+    lines = _simulated(session)
     page = certificate.certificate(
         f"{'Simulated calibration' if lines else 'Calibration'} of {session.settings.name}",
         f"{'SIMULATED: ' if lines else ''}{session.settings.instrument.name}, {session.settings.created[:10]}",
@@ -96,7 +96,7 @@ def _with_arrival(section: Section, lines: list[str]) -> Section:
     return replace(section, blocks=[*section.blocks, Text("What was noticed when the files came", fresh)])
 
 
-def simulated(session: Session) -> list[tuple[str, str]]:
+def _simulated(session: Session) -> list[tuple[str, str]]:
     """Return lines under Setup of a session whose files a simulated cell brought; none of a real one."""
     path = session.path(MARK)
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
@@ -110,7 +110,7 @@ def _setup(session: Session, found: fit_report.Report) -> list[tuple[str, str]]:
     stated = f", σ {1e6 * instrument.sigma_position:g} µm" if instrument.sigma_position else ", σ estimated"
     turning = f", {1e3 * instrument.sigma_orientation:g} mrad" if instrument.sigma_orientation else ""
     return [
-        *simulated(session),
+        *_simulated(session),
         ("robot", f"{found.robot}, {found.base} to {found.tip}, {len(found.joints)} joints"),
         ("description", settings.robot.given),
         ("instrument", f"{instrument.name}, {_used(session, found.metrics)}{stated}{turning}"),

@@ -112,10 +112,10 @@ def run(
     if waiting is not None:
         if not guided:
             raise SessionError(f"the demonstration stopped at {waiting.step.name}: {waiting.words}")
-        return DemoResult(session, "", (), time.perf_counter() - started, stopped(session, waiting))
+        return DemoResult(session, "", (), time.perf_counter() - started, _stopped(session, waiting))
     before, after = _compare_with_truth(session, cell, say)
     seconds = time.perf_counter() - started
-    return DemoResult(session, verdict_of(session), results(session), seconds, (), before, after, _largest_memory())
+    return DemoResult(session, verdict_of(session), _results(session), seconds, (), before, after, _largest_memory())
 
 
 def _largest_memory() -> float:
@@ -123,7 +123,7 @@ def _largest_memory() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2.0**20 if sys.platform == "darwin" else 2.0**10)
 
 
-def stopped(session: Session, waiting: steps.State) -> tuple[str, ...]:
+def _stopped(session: Session, waiting: steps.State) -> tuple[str, ...]:
     """Return what an engineer would be asked, and how to let the simulated cell do it."""
     from calib.procedure.session.instructions import asks
 
@@ -135,7 +135,7 @@ def stopped(session: Session, waiting: steps.State) -> tuple[str, ...]:
     )
 
 
-def results(session: Session) -> tuple[tuple[str, str], ...]:
+def _results(session: Session) -> tuple[tuple[str, str], ...]:
     """Return what to look at."""
     found = [
         ("certificate", CERTIFICATE),

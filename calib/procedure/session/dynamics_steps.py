@@ -50,7 +50,7 @@ def _is_log(path: Path) -> bool:
     return (path / "metadata.yaml").exists() if path.is_dir() else path.suffix.lower() in SUFFIXES
 
 
-def calibrated(session: Session) -> Chain:
+def _calibrated(session: Session) -> Chain:
     """Return the geometry that dynamics are identified on: the calibrated one, without joint corrections."""
     return load_calibrated(session.fit.path).chain
 
@@ -133,7 +133,7 @@ def _check_recording(session: Session, path: Path, name: str) -> tuple[list[floa
     Raises:
         MeasurementError: for what cannot be right: units, order of joints, another motion, reversed torques.
     """
-    chain, options = calibrated(session), options_of(session)
+    chain, options = _calibrated(session), options_of(session)
     own = file_settings(options, str(path))
     recording = read_recording(str(path), inputs.joints_of(chain), own.recording)
     rate = 1.0 / max(float(np.median(np.diff(recording.t))), 1e-9)  # as identification takes it

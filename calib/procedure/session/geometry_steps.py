@@ -132,7 +132,7 @@ def select(session: Session, say: Say) -> list[str]:
     return notes
 
 
-def planned(session: Session, chain: Chain, name: str) -> np.ndarray | None:
+def _planned(session: Session, chain: Chain, name: str) -> np.ndarray | None:
     """Return the planned poses in ``2-poses``; None where there is no plan."""
     path = session.path(f"2-poses/{name}.csv")
     if not session.settings.poses.plan or not path.exists():
@@ -140,7 +140,7 @@ def planned(session: Session, chain: Chain, name: str) -> np.ndarray | None:
     return read_poses(path, chain.joint_names, kinds=[joint.kind for joint in chain.joints])
 
 
-def selection_prediction(session: Session) -> SelectionPrediction | None:
+def _selection_prediction(session: Session) -> SelectionPrediction | None:
     """Return what was predicted when the poses were chosen; None where they were not, or by an earlier version."""
     path = session.path(f"2-poses/{POSES}")
     return read_prediction(path) if session.settings.poses.plan and beside(path).exists() else None
@@ -150,7 +150,7 @@ def arrive(session: Session, say: Say) -> list[str]:
     """Check the files that were brought for the fit."""
     chain, notes = chain_of(session), []
     fit, _ = measured_files(session)
-    plan = planned(session, chain, "poses")
+    plan = _planned(session, chain, "poses")
     for path in fit:
         notes += check_file(session, chain, path, plan)
     notes += _drifts(session, chain)
@@ -215,7 +215,7 @@ def _gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
 
 def fit(session: Session, say: Say) -> list[str]:
     """Fit the geometry to the measured files; validation files are not looked at."""
-    selection = selection_prediction(session)
+    selection = _selection_prediction(session)
     outcome = fitting.run(_gathered(session), _options_of(session), _fit_settings(session), say, selection)
     draw = partial(certificate.write_fit, plots=session.plots)
     outputs.write_folder(outcome, session.fit.path, draw, owned=True)
@@ -244,7 +244,7 @@ def validate(session: Session, say: Say) -> list[str]:
     if not session.settings.poses.validation and not unseen:
         fit_report.write(fit_report.with_unseen(report, out.take_over(before), []), out.report)
         return ["no validation asked for: judged by cross-validation only"]
-    plan = planned(session, chain, "validation")
+    plan = _planned(session, chain, "validation")
     like = _gathered(session).fit if any(path.is_dir() for path in unseen) else ()
     for path in unseen:
         notes += check_file(session, chain, path, plan, like)

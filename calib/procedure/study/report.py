@@ -60,13 +60,13 @@ def overview(conditions: Sequence[ConditionSummary]) -> Table:
     lines = []
     for one in conditions:
         if not one.methods:
-            lines.append((one.condition.name, described(one.condition), "no rows yet", "", "", "", ""))
+            lines.append((one.condition.name, _described(one.condition), "no rows yet", "", "", "", ""))
             continue
         best, chosen = one.best, one.chosen
         failed = ", ".join(f"{m.method} {sum(m.failures.values())}/{m.trials}" for m in one.methods if m.failures)
         lines.append(
             (
-                one.condition.name, described(one.condition), chosen.method if chosen else "none",
+                one.condition.name, _described(one.condition), chosen.method if chosen else "none",
                 _short(chosen.figures["torque_error"].median) if chosen else "",
                 f"{best.method} {_short(best.figures['torque_error'].median)}" if best else "",
                 ", ".join(m.method for m in one.methods if m.as_good and m is not chosen), failed,
@@ -110,7 +110,7 @@ def reasons(conditions: Sequence[ConditionSummary]) -> list[str]:
     ]
 
 
-def described(one: Condition) -> str:
+def _described(one: Condition) -> str:
     """Return a condition in a line."""
     filtered = f"{one.cutoff:g} Hz" if one.cutoff else "unfiltered"
     wrong = "" if one.mismatch == "none" else f", {one.mismatch}"
@@ -123,7 +123,7 @@ def _condition_table(one: ConditionSummary) -> Table:
     rows = [_line(method) for method in one.methods]
     strong = frozenset(k for k, method in enumerate(one.methods) if method.chosen)
     return Table(
-        f"Methods on {one.condition.name}", HEADER, rows, described(one.condition), strong, range(1, len(HEADER) - 1)
+        f"Methods on {one.condition.name}", HEADER, rows, _described(one.condition), strong, range(1, len(HEADER) - 1)
     )
 
 

@@ -154,7 +154,7 @@ def simulate(
     out = np.empty((5, len(tick), n))
     model = np.empty((0, 0)) if controller.model is None else _body(plant.bodies, controller.model)
     status, reached = loop_kernels.closed_loop(
-        *packed(plant), model, controller.rows, controller.sampled(reference), drawn["sigma_q"],
+        *_packed(plant), model, controller.rows, controller.sampled(reference), drawn["sigma_q"],
         np.ascontiguousarray(np.broadcast_to(sensing.quantum, (n,)), dtype=float), drawn["push"], reference.period,
         controller.smoothing(reference.period), controller.delay, float(sensing.every), q, v, out,
     )  # fmt: skip
@@ -253,7 +253,7 @@ def simulate_tangents(
     model = np.empty((0, 0)) if controller.model is None else _body(plant.bodies, controller.model)
     scale = np.zeros((n, c)) if relative is None else np.ascontiguousarray(shaped(relative, (n, c), "relative"))
     status, reached = tangent_kernels.closed_loop_tangent(
-        packed(plant), (*_layout_of(plant), find), model, controller.rows, scale, controller.sampled(reference),
+        _packed(plant), (*_layout_of(plant), find), model, controller.rows, scale, controller.sampled(reference),
         np.empty((0, n)), reference.period, controller.smoothing(reference.period), controller.delay, float(every),
         np.array(reference.q[0]), np.array(reference.v[0]), count, out, slopes,
     )  # fmt: skip
@@ -292,7 +292,7 @@ def forward_dynamics(
     out, count = np.empty_like(q), len(plant.parameters)
     values = np.empty((0, count)) if parameters is None else shaped(parameters, (len(q), count), "parameters")
     layout = _layout_of(plant)
-    failed = loop_kernels.forward_dynamics(*packed(plant), *layout, np.ascontiguousarray(values), q, v, tau, out)
+    failed = loop_kernels.forward_dynamics(*_packed(plant), *layout, np.ascontiguousarray(values), q, v, tau, out)
     if failed >= 0:
         raise CannotSimulate(f"sample {failed}: the inertia matrix is not positive definite")
     return out
@@ -346,7 +346,7 @@ def stepper(plant: Plant, columns: np.ndarray) -> Stepper:
     """Return a plant made ready to be advanced, with slopes by the parameters `columns` (c,)."""
     find = np.full(len(plant.parameters), -1)
     find[np.asarray(columns, dtype=int)] = 2 * plant.bodies.n + np.arange(len(columns))
-    return Stepper(packed(plant), (*_layout_of(plant), find))
+    return Stepper(_packed(plant), (*_layout_of(plant), find))
 
 
 def with_parameters(plant: Plant, parameters: np.ndarray) -> Plant:
@@ -382,7 +382,7 @@ def _coloured(white: np.ndarray, step: float) -> np.ndarray:
 
 
 def _layout_of(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return where each parameter goes in what `packed` returns: order, entries, shares, owners of `loop_kernels`."""
+    """Return where each parameter goes in what `_packed` returns: order, entries, shares, owners of `loop_kernels`."""
     n, first = plant.bodies.n, plant.inertial
     order = np.ascontiguousarray(np.broadcast_to(plant.bodies.order, (plant.bodies.count, 10)), dtype=np.int64)
     entries: list[tuple[int, int, int]] = []
@@ -400,7 +400,7 @@ def _layout_of(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
     return order, np.array(entries, dtype=np.int64).reshape(-1, 3), np.array(shares), np.array(owners, dtype=np.int64)
 
 
-def packed(plant: Plant) -> Packed:
+def _packed(plant: Plant) -> Packed:
     """Return tree, body, linear, kinds and acts as the kernels lay them out."""
     bodies, n = plant.bodies.count, plant.bodies.n
     parents = np.where(plant.bodies.parents < 0, bodies, plant.bodies.parents)

@@ -225,7 +225,7 @@ def seen(acts, t, motion):
 
 
 @njit(**JOINED)
-def stop(memory, t, place, width):
+def _stop(memory, t, place, width):
     """Return the stop operator's state at a place, from its last state and place."""
     return min(1.0, max(-1.0, memory[t, 0] + (place - memory[t, 1]) / width))
 
@@ -253,9 +253,9 @@ def shape(code, acts, t, memory, q, v):
     if code == POSITION:
         return place
     if code == STOP:
-        return stop(memory, t, place, last)
+        return _stop(memory, t, place, last)
     if code == PRESLIDING:
-        return stop(memory, t, place, acts[t, 6]) - _smooth_sign(rate / last)
+        return _stop(memory, t, place, acts[t, 6]) - _smooth_sign(rate / last)
     if code in (SINE, COSINE):
         gain = 1.0 / (1.0 + (rate / last) ** 2)
         return gain * (sin(acts[t, 6] * place) if code == SINE else cos(acts[t, 6] * place))
@@ -271,7 +271,7 @@ def shape(code, acts, t, memory, q, v):
 
 
 @njit(**JOINED)
-def friction(linear, kinds, acts, memory, q, v, out):
+def _friction(linear, kinds, acts, memory, q, v, out):
     """Take off out (n,) what the drives' friction and offsets need, but for what depends on loads; True: some does."""
     n, loaded = v.shape[0], False
     for j in range(n):
@@ -300,7 +300,7 @@ def _under_load(linear, kinds, acts, memory, q, v, tau, matrix, loads, out):
     n = out.shape[0]
     plain, extra, change = out.copy(), np.zeros(n), np.empty(n)
     left = tau.copy()
-    friction(linear, kinds, acts, memory, q, v, left)
+    _friction(linear, kinds, acts, memory, q, v, left)
     for _ in range(200):
         size, moved = 0.0, 0.0
         for j in range(n):
@@ -370,7 +370,7 @@ def accelerate(tree, body, linear, kinds, acts, memory, loads, q, v, tau, work, 
     for j in range(q.shape[0]):
         out[j] = tau[j]
     dynamics(tree, body, linear, q, v, work, matrix, out)
-    loaded = friction(linear, kinds, acts, memory, q, v, out)
+    loaded = _friction(linear, kinds, acts, memory, q, v, out)
     if not _factorise(matrix):
         return False
     substitute(matrix, out)
@@ -380,20 +380,20 @@ def accelerate(tree, body, linear, kinds, acts, memory, loads, q, v, tau, work, 
 
 
 @njit(**OPTIONS)
-def unstressed(kinds, acts, q, memory):
+def _unstressed(kinds, acts, q, memory):
     """Set the friction that depends on the past to rest at q (n,)."""
     for t in range(kinds.shape[0]):
         memory[t, 0], memory[t, 1] = 0.0, seen(acts, t, q)
 
 
 @njit(**JOINED)
-def remember(kinds, acts, q, memory):
+def _remember(kinds, acts, q, memory):
     """Move the friction that depends on the past to q (n,)."""
     for t in range(kinds.shape[0]):
         if kinds[t, 1] == STOP or kinds[t, 1] == PRESLIDING:
             place = seen(acts, t, q)
             width = acts[t, 7] if kinds[t, 1] == STOP else acts[t, 6]
-            memory[t, 0], memory[t, 1] = stop(memory, t, place, width), place
+            memory[t, 0], memory[t, 1] = _stop(memory, t, place, width), place
 
 
 @njit(**OPTIONS)
@@ -432,7 +432,7 @@ def forward_dynamics(tree, body, linear, kinds, acts, order, entries, shares, ow
 
 
 @njit(**OPTIONS)
-def advance(
+def _advance(
     tree, body, linear, kinds, acts, memory, loads, q, v, tau, period, slopes, work, matrix, at, rate
 ):  # fmt: skip
     """Advance q, v (n,) by one control period under constant torques (Runge & Kutta's classical form).
@@ -466,7 +466,7 @@ def advance(
             first, inner, last = slopes[0, j], slopes[1, j] + slopes[2, j], slopes[3, j]
             q[j] += span * (v[j] + span / 6.0 * (first + inner))
             v[j] += span / 6.0 * (first + 2.0 * inner + last)
-        remember(kinds, acts, q, memory)
+        _remember(kinds, acts, q, memory)
     return FINE
 
 
@@ -474,7 +474,7 @@ def advance(
 def _advance_midpoint(
     tree, body, linear, kinds, acts, memory, loads, q, v, tau, period, slopes, work, matrix, at, rate
 ):  # fmt: skip
-    """Advance q, v (n,) by the midpoint rule: half of the work of `advance`, for periods short against the motion.
+    """Advance q, v (n,) by the midpoint rule: half of the work of `_advance`, for periods short against the motion.
 
     In steps of at most `BRISK` reciprocals of friction's fastest decay: the rule's 1 + z + z²/2 has no zero, so that
     the velocity does not change its sign, and is 0.625 there.
@@ -495,7 +495,7 @@ def _advance_midpoint(
         for j in range(n):
             q[j] += span * rate[j]
             v[j] += span * slopes[1, j]
-        remember(kinds, acts, q, memory)
+        _remember(kinds, acts, q, memory)
     return FINE
 
 
@@ -511,7 +511,7 @@ def advance_points(tree, body, linear, kinds, acts, order, entries, shares, owne
     plant = (tree, body, linear, kinds, acts, memory, loads)
     for k in range(q.shape[0]):
         set_parameters(values[k], order, entries, shares, owners, body, linear, acts)
-        unstressed(kinds, acts, q[k], memory)
+        _unstressed(kinds, acts, q[k], memory)
         if not accelerate(*plant, q[k], v[k], tau, work, matrix, slopes[0]):
             return SINGULAR, k
         if k == 0:
@@ -572,7 +572,7 @@ def closed_loop(
     at, rate, speed, read, before = np.empty(n), np.empty(n), np.zeros(n), np.empty(n), np.empty(n)
     integral, wish, tau, waiting = np.zeros(n), np.empty(n), np.empty(n), np.zeros((late + 1, n))
     memory, loads = np.zeros((kinds.shape[0], 2)), np.zeros(n)
-    unstressed(kinds, acts, q, memory)
+    _unstressed(kinds, acts, q, memory)
     sample = 0
     for k in range(count):
         for j in range(n):
@@ -611,7 +611,7 @@ def closed_loop(
             else:
                 here, fast, first, past = q.copy(), v.copy(), slopes.copy(), memory.copy()
                 args = (tree, body, linear, kinds, acts, past, loads)
-                status = advance(*args, here, fast, wish, part * period, first, work, matrix, at, rate)
+                status = _advance(*args, here, fast, wish, part * period, first, work, matrix, at, rate)
                 if status != FINE:
                     return status, k
                 if not accelerate(*args, here, fast, wish, work, matrix, first[0]):
@@ -626,7 +626,7 @@ def closed_loop(
             sample += 1
         if k + 1 < count:
             args = (tree, body, linear, kinds, acts, memory, loads)
-            status = advance(*args, q, v, wish, period, slopes, work, matrix, at, rate)
+            status = _advance(*args, q, v, wish, period, slopes, work, matrix, at, rate)
             if status != FINE:
                 return status, k
         for j in range(n):

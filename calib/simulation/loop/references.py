@@ -50,7 +50,7 @@ class Reference:
         return q, v, a
 
 
-def fourier(
+def _fourier(
     centre: np.ndarray, sines: np.ndarray, cosines: np.ndarray, base: float, duration: float, rate: float
 ) -> Reference:
     """Return q_i = q_i0 + Σ_k [a_ik sin(k ω t) + b_ik cos(k ω t)] (Swevers et al. 1997; Kolyubin et al. 2019, eq. 23).
@@ -90,7 +90,7 @@ def random_fourier(
     for rows, across in ((sines, order), (cosines, order**2)):
         rows -= np.outer(rows @ across, across) / (across @ across)
     base = 2 * np.pi / duration
-    raw = fourier(np.zeros(n), sines, cosines, base, duration, rate)
+    raw = _fourier(np.zeros(n), sines, cosines, base, duration, rate)
     low, high = raw.q.min(axis=0), raw.q.max(axis=0)
     shares = [
         (upper - lower) / (high - low),
@@ -99,7 +99,7 @@ def random_fourier(
     ]
     scale = np.min(shares, axis=0)
     centre = 0.5 * (lower + upper) - 0.5 * scale * (low + high)
-    return fourier(centre, scale[:, None] * sines, scale[:, None] * cosines, base, duration, rate)
+    return _fourier(centre, scale[:, None] * sines, scale[:, None] * cosines, base, duration, rate)
 
 
 def trapezoidal(

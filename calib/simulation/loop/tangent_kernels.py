@@ -281,7 +281,7 @@ def _act_slopes(code, acts, t, q, v):
 
 
 @njit(**OPTIONS)
-def linearise(
+def _linearise(
     tree, body, linear, kinds, acts, order, entries, shares, owners, find, memory, q, v, a, work, own, more, ten,
     by_q, by_v, out,
 ):  # fmt: skip
@@ -377,7 +377,7 @@ def _advance_tangent(
                 if not accelerate(tree, body, linear, kinds, acts, memory, loads, *state):
                     return SINGULAR
             where = (at, rate, slopes[stage], work, own, more, ten, by_q, by_v, columns)
-            linearise(tree, body, linear, kinds, acts, *layout, memory, *where)  # pyright: ignore[reportCallIssue]
+            _linearise(tree, body, linear, kinds, acts, *layout, memory, *where)  # pyright: ignore[reportCallIssue]
             _solve(matrix, by_q, by_v, columns, dat, drate, dtau, dslopes[stage])
         for j in range(n):
             first, inner, last = slopes[0, j], slopes[1, j] + slopes[2, j], slopes[3, j]
@@ -391,7 +391,7 @@ def _advance_tangent(
 
 
 @njit(**OPTIONS)
-def workspace(bodies, n, c):
+def _workspace(bodies, n, c):
     """Return the arrays that `_advance_tangent` works in."""
     own, more, ten = np.empty((bodies, 10)), np.empty((bodies + 1, 36)), np.empty(10)
     square, wide = (np.empty((n, n)), np.empty((n, n))), np.empty((n, c))
@@ -412,7 +412,7 @@ def advance_linearised(plant, layout, values, q, v, tau, period, gain, dq, dv):
     work, matrix = np.empty((tree.shape[0] + 1, 46)), np.empty((n, n))
     slopes, dslopes = np.empty((4, n)), np.empty((4, n, c))
     memory, loads, dtau = np.zeros((kinds.shape[0], 2)), np.zeros(n), np.zeros((n, c))
-    rooms = workspace(tree.shape[0], n, c)
+    rooms = _workspace(tree.shape[0], n, c)
     dq[:] = 0.0
     dv[:] = 0.0
     for j in range(n):
@@ -455,7 +455,7 @@ def _command_tangent(
         order, entries, shares, owners, find = layout
         where = (read, speed, at, work, own, more, ten, by_q, by_v, columns)
         none = (np.zeros((0, 2), dtype=np.int64), np.zeros((0, 8 + n)))
-        linearise(tree, model, bare, none[0], none[1], order, entries, shares, owners, empty, np.zeros((0, 2)), *where)
+        _linearise(tree, model, bare, none[0], none[1], order, entries, shares, owners, empty, np.zeros((0, 2)), *where)
         for j in range(n):
             for m in range(c):
                 dat[j, m] = 0.0
@@ -484,7 +484,7 @@ def closed_loop_tangent(
     n, c = relative.shape
     work, matrix = np.empty((tree.shape[0] + 1, 46)), np.empty((n, n))
     slopes, dslopes = np.zeros((4, n)), np.zeros((4, n, c))
-    rooms, empty = workspace(tree.shape[0], n, c), np.empty(0, dtype=np.int64)
+    rooms, empty = _workspace(tree.shape[0], n, c), np.empty(0, dtype=np.int64)
     memory, loads = np.zeros((kinds.shape[0], 2)), np.zeros(n)
     speed, before, integral, wish, feedback = np.zeros(n), np.empty(n), np.zeros(n), np.empty(n), np.empty(n)
     tau, acting, waiting = np.empty(n), np.empty(n), np.zeros((late + 1, n))
