@@ -205,7 +205,7 @@ class Whole:
 
 
 @dataclass(frozen=True)
-class Index:
+class _Index:
     """A whole number counted from 1 in the file, from 0 here."""
 
     most: int = 99
@@ -384,7 +384,7 @@ Names = Annotated[tuple[str, ...], Expect("a list of names")]
 Label = Annotated[str, Checked(_label, {"type": ["string", "number"]})]
 Positive = Annotated[float, Real(above=0)]
 NotNegative = Annotated[float, Real(least=0)]
-JointNumber = Annotated[int, Index()]
+JointNumber = Annotated[int, _Index()]
 Length = Annotated[float, Real(quantity="length")]
 Angle = Annotated[float, Real(quantity="angle")]
 Numeric = Annotated[Any, Checked(_numeric, {"type": ["number", "string"]})]

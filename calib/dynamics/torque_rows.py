@@ -27,7 +27,7 @@ Map = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
-class JointBlock:
+class _JointBlock:
     """One torque row per joint.
 
     Attributes:
@@ -72,7 +72,7 @@ class TorqueRows:
     """
 
     name: str
-    blocks: tuple[JointBlock, ...]
+    blocks: tuple[_JointBlock, ...]
     drives: str
     projection: Projection | None = None
 
@@ -232,17 +232,17 @@ def torque_rows(name: str) -> TorqueRows:
 
 
 _LINK, _MOTOR = frozenset({BODIES, "link"}), frozenset({"motor"})
-MOTOR = TorqueRows("motor", (JointBlock("", _LINK | _MOTOR, motor=1.0),), "Ia Fv Fc off")
-LINK = TorqueRows("link", (JointBlock("", _LINK, sensor=1.0, suffix=" sensor"),), "Fvl Fcl offl")
+MOTOR = TorqueRows("motor", (_JointBlock("", _LINK | _MOTOR, motor=1.0),), "Ia Fv Fc off")
+LINK = TorqueRows("link", (_JointBlock("", _LINK, sensor=1.0, suffix=" sensor"),), "Fvl Fcl offl")
 BOTH = TorqueRows(
     "both",
     (
-        JointBlock("l", _LINK, sensor=1.0, suffix=" sensor"),
-        JointBlock("m", _LINK | _MOTOR, motor=1.0, suffix=" motor"),
+        _JointBlock("l", _LINK, sensor=1.0, suffix=" sensor"),
+        _JointBlock("m", _LINK | _MOTOR, motor=1.0, suffix=" motor"),
     ),
     "Ia Fvl Fcl offl Fvm Fcm offm",
 )
-DRIVE = TorqueRows("drive", (JointBlock("", _MOTOR, motor=1.0, sensor=-1.0),), "Ia Fvm Fcm offm")
+DRIVE = TorqueRows("drive", (_JointBlock("", _MOTOR, motor=1.0, sensor=-1.0),), "Ia Fvm Fcm offm")
 MODELS = {1: LINK, 2: BOTH, 3: DRIVE}  # as the 2019 paper numbers them
 
 POWER = projected("power", Projection(("power",), ("W",), lambda q, v: v[:, None, :]))

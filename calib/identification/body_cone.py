@@ -29,7 +29,7 @@ TOUCHES = 1e-6  # of the gradient, from which on the cone holds the optimum
 
 
 @dataclass(frozen=True, eq=False)
-class Plane:
+class _Plane:
     """Where the cone holds an optimum: normal (p,) ν and bound νᵀ β*, with the labels of bodies on the border."""
 
     normal: np.ndarray
@@ -55,7 +55,7 @@ class BodyCone:
         object.__setattr__(self, "transform", frozen(self.transform))
         object.__setattr__(self, "positive", frozen(self.positive, bool))
 
-    def touching(self, factor: np.ndarray, matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> Plane | None:
+    def touching(self, factor: np.ndarray, matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> _Plane | None:
         """Return the plane that holds argmin ½ ‖R β - z‖² on the cone and lower <= A β <= upper; None where none does.
 
         Args:
@@ -109,7 +109,7 @@ class BodyCone:
             for label, body in zip(self.labels, bodies)
             if (eigen := np.linalg.eigvalsh(body.value))[0] < BORDER * max(eigen[-1], BORDER)
         ]
-        return Plane(normal * unit / size, float(normal @ b.value), tuple(border))
+        return _Plane(normal * unit / size, float(normal @ b.value), tuple(border))
 
 
 def cone_of(model: RegressorModel, base: Base) -> BodyCone:

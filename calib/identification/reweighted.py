@@ -18,7 +18,7 @@ from calib.robot.chain import Chain
 
 
 @dataclass(frozen=True, eq=False)
-class Estimator:
+class _Estimator:
     """An estimate as a function of its rows: A φ = Wᵀ R⁻¹ y + pull, A = Wᵀ R⁻¹ W + LᵀL.
 
     Attributes:
@@ -32,21 +32,21 @@ class Estimator:
     pull: np.ndarray
 
 
-def estimator(found: Identification) -> Estimator:
+def estimator(found: Identification) -> _Estimator:
     """Return how an identification weighed its rows, and what it knew beforehand."""
     fitted = found.fitted
     p = fitted.pooled.parameters
     deviation = np.array(fitted.std) if fitted.weighted else np.ones(len(fitted.std))
     if fitted.beforehand is None:
-        return Estimator(deviation, np.zeros((0, p)), np.zeros(p))
+        return _Estimator(deviation, np.zeros((0, p)), np.zeros(p))
     deviation = deviation * np.sqrt(fitted.inflation)
     factors = (fitted.pooled.factors / deviation[:, None, None]).reshape(-1, p + 1)
     known, values = fitted.beforehand, fitted.estimate.values
     pull = factors[:, :p].T @ (factors[:, :p] @ values - factors[:, p]) + known.T @ (known @ values)
-    return Estimator(deviation, known, pull)
+    return _Estimator(deviation, known, pull)
 
 
-def estimate(how: Estimator, all_rows: Sequence[ObservationRows]) -> tuple[np.ndarray, np.ndarray]:
+def estimate(how: _Estimator, all_rows: Sequence[ObservationRows]) -> tuple[np.ndarray, np.ndarray]:
     """Return φ (p,) from rows, and A⁻¹ (p, p); by QR of the whitened rows."""
     p = len(how.pull)
     factor = np.hstack([how.beforehand, np.zeros((len(how.beforehand), 1))])
@@ -95,6 +95,6 @@ def stacked(rows: ObservationRows) -> np.ndarray:
     return rows.matrix.reshape(-1, rows.matrix.shape[2])
 
 
-def weights(how: Estimator, rows: ObservationRows, by: np.ndarray | None = None) -> np.ndarray:
+def weights(how: _Estimator, rows: ObservationRows, by: np.ndarray | None = None) -> np.ndarray:
     """Return 1 / deviation (or 1 / `by`) of each row, all stacked; zero where nothing was learnt."""
     return (rows.present / (how.deviation if by is None else by)).ravel()

@@ -39,7 +39,7 @@ def usual_radius(chain: Chain) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Lines:
+class _Lines:
     """The middle lines of the capsules in m poses.
 
     Attributes:
@@ -115,7 +115,7 @@ class Capsules:
             unsure = np.flatnonzero(good)
             lines = self._lines(q[unsure])
             near = ~np.all(beside._measured(lines, rough=True)[0] > margin, axis=1)
-            some = Lines(*(part[near] for part in (lines.start, lines.end, lines.axes, lines.places)))
+            some = _Lines(*(part[near] for part in (lines.start, lines.end, lines.axes, lines.places)))
             good[unsure[near]] = np.all(beside._measured(some)[0] > margin, axis=1)
         return good
 
@@ -167,12 +167,12 @@ class Capsules:
         gradient = gradient - (1.0 - along)[..., None] * (normal @ slope)
         return distance - self.radii[others], gradient
 
-    def _lines(self, q: np.ndarray) -> Lines:
+    def _lines(self, q: np.ndarray) -> _Lines:
         q = shaped(q, (None, self.chain.n), f"joint values of '{self.chain.name}'")
         walked = sweep(self.chain, q)
         return _lines_of(self.chain, walked, q, self.targets)
 
-    def _measured(self, lines: Lines, rough: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def _measured(self, lines: _Lines, rough: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return distances (m, P + W), normals (m, P + W, 3) towards the second body, and the nearest points.
 
         For the W pairs with the world the second body is the arm's. `rough` takes from obstacles what they are at least
@@ -222,7 +222,7 @@ class Capsules:
     def _rates(self) -> np.ndarray:
         return self._moving[1]
 
-    def _closing(self, lines: Lines, normal: np.ndarray, point: np.ndarray, bodies: np.ndarray) -> np.ndarray:
+    def _closing(self, lines: _Lines, normal: np.ndarray, point: np.ndarray, bodies: np.ndarray) -> np.ndarray:
         """Return normal · velocity (m, P, K) of points (m, P, 3) on bodies (P,), per unit of each moving element."""
         z, o = lines.axes.transpose(0, 2, 1), np.cross(lines.axes, lines.places).transpose(0, 2, 1)
         turned = np.cross(point, normal) @ z - normal @ o  # u · (z × (p - o))
@@ -290,7 +290,7 @@ def from_chain(
     return replace(found, own=found.own[~gone[: len(own)]], world=found.world[~gone[len(own) :]], excluded=excluded)
 
 
-def _lines_of(chain: Chain, walked: Sweep, q: np.ndarray, targets: np.ndarray) -> Lines:
+def _lines_of(chain: Chain, walked: Sweep, q: np.ndarray, targets: np.ndarray) -> _Lines:
     """Return the lines of base (from what it stands on), moving bodies and targets."""
     moving = [k for k, element in enumerate(chain.elements) if element.joint is not None]
     axes, places = (part[moving].transpose(2, 0, 1) for part in (walked.directions, walked.origins))
@@ -303,7 +303,7 @@ def _lines_of(chain: Chain, walked: Sweep, q: np.ndarray, targets: np.ndarray) -
     seen = tip + np.einsum("tc,cdm->mtd", targets, walked.rotation)
     stand = np.broadcast_to([0.0, 0.0, min(chain.floor, 0.0)], (m, 1, 3))
     start = np.concatenate([stand, begins, np.repeat(tip, len(targets), axis=1)], axis=1)
-    return Lines(start, np.concatenate([places, tip, seen], axis=1), axes, places)
+    return _Lines(start, np.concatenate([places, tip, seen], axis=1), axes, places)
 
 
 def _nearest(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

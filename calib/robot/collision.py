@@ -30,7 +30,7 @@ from calib.transforms import pose
 
 
 @dataclass(frozen=True)
-class Column:
+class _Column:
     """Where value + ratio · q of a joint goes in Pinocchio's configuration, and its rate in the velocity."""
 
     place: int
@@ -57,7 +57,7 @@ class Collision:
     _model: Any
     _geometry: Any
     _chain: Chain
-    _columns: tuple[Column, ...]
+    _columns: tuple[_Column, ...]
     _links: int
 
     def distances(self, q: np.ndarray) -> np.ndarray:
@@ -273,17 +273,19 @@ def _solid(obstacle: Obstacle) -> Any:
     return makers[obstacle.kind](*map(float, obstacle.size))
 
 
-def _columns(model: Any, chain: Chain) -> tuple[Column, ...]:
+def _columns(model: Any, chain: Chain) -> tuple[_Column, ...]:
     """Return how q fills Pinocchio's configuration; continuous joints have cosine and sine there."""
     columns = []
     for element in chain.elements:
         if element.joint is not None:
             joint = model.joints[model.getJointId(element.name.removesuffix(".offset"))]
-            columns.append(Column(joint.idx_q, element.joint, element.ratio, element.value, joint.nq == 2, joint.idx_v))
+            columns.append(
+                _Column(joint.idx_q, element.joint, element.ratio, element.value, joint.nq == 2, joint.idx_v)
+            )
     return tuple(columns)
 
 
-def _configurations(model: Any, columns: Sequence[Column], q: np.ndarray) -> np.ndarray:
+def _configurations(model: Any, columns: Sequence[_Column], q: np.ndarray) -> np.ndarray:
     """Return Pinocchio's configurations (m, nq)."""
     pin, _ = _libraries()
     result = np.tile(pin.neutral(model), (len(q), 1))

@@ -29,7 +29,7 @@ Forward = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
+class _Line:
     """A tool line as a joint path.
 
     Attributes:
@@ -41,7 +41,7 @@ class Line:
     deviation: np.ndarray
 
 
-def line(forward: Forward, jacobian: Forward, start: np.ndarray, goal: np.ndarray) -> Line:
+def line(forward: Forward, jacobian: Forward, start: np.ndarray, goal: np.ndarray) -> _Line:
     """Return the joint path on which the tool runs straight from its pose at `start` to the pose `goal`.
 
     Args:
@@ -67,7 +67,7 @@ def line(forward: Forward, jacobian: Forward, start: np.ndarray, goal: np.ndarra
         error = np.abs(_error(forward(path(between * length)), _targets(first, goal, between)))
         deviation = np.array([np.linalg.norm(error[:, :3], axis=1).max(), np.linalg.norm(error[:, 3:], axis=1).max()])
         if deviation.max() <= KEPT or 2 * count > MOST:
-            return Line(path, deviation)
+            return _Line(path, deviation)
         count = 2 * count - 1
 
 

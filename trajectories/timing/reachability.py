@@ -26,7 +26,7 @@ UNBOUNDED = 100.0  # [rad/s or m/s] of the fastest joint: a bound where no joint
 
 
 @dataclass(frozen=True, eq=False)
-class Bounded:
+class _Bounded:
     """Rows |a u + b x + c| ≤ 1 for each of K intervals, both ends, and 0 ≤ x ≤ top.
 
     Attributes:
@@ -80,7 +80,7 @@ class ConstraintRows:
             ends = ((self.limits.velocity * tight / np.abs(self.slope)) ** 2).min(axis=2)
         return np.minimum(np.minimum(np.append(ends[0], np.inf), np.append(np.inf, ends[1])), self.speed(UNBOUNDED))
 
-    def bounded(self, friction: tuple[np.ndarray, np.ndarray], tight: Mapping[str, np.ndarray]) -> Bounded:
+    def bounded(self, friction: tuple[np.ndarray, np.ndarray], tight: Mapping[str, np.ndarray]) -> _Bounded:
         """Return the rows as shares of the limits.
 
         Args:
@@ -96,7 +96,7 @@ class ConstraintRows:
             (self.G + friction[1], np.zeros_like(self.q)),
         )
         a, b, c = (np.concatenate([one[..., pushing] / torque, two[..., turning] / bend], axis=2) for one, two in parts)
-        return Bounded(a, b, c, self.top(tight["velocity"]))
+        return _Bounded(a, b, c, self.top(tight["velocity"]))
 
     def friction(
         self, law: Law | None, x: np.ndarray | None, before: np.ndarray | None
@@ -129,7 +129,7 @@ class ConstraintRows:
         return law.friction(q, slope * np.sqrt(x)[:, None], slope * pull + curvature * x[:, None])
 
 
-def fastest(rows: Bounded, s: np.ndarray) -> Profile:
+def fastest(rows: _Bounded, s: np.ndarray) -> Profile:
     """Return the fastest profile from rest to rest.
 
     Raises:
@@ -155,7 +155,7 @@ def fastest(rows: Bounded, s: np.ndarray) -> Profile:
     return Profile(s, x)
 
 
-def _largest(rows: Bounded, k: int, x: float, step: float) -> float:
+def _largest(rows: _Bounded, k: int, x: float, step: float) -> float:
     """Return the largest u on interval k at speed x."""
     a = np.concatenate([rows.a[0, k], rows.a[1, k] + 2 * step * rows.b[1, k]])
     rest = np.concatenate([rows.b[0, k] * x + rows.c[0, k], rows.b[1, k] * x + rows.c[1, k]])
@@ -164,7 +164,7 @@ def _largest(rows: Bounded, k: int, x: float, step: float) -> float:
     return float(min(upper.min(initial=np.inf), (rows.top[k + 1] - x) / (2 * step)))
 
 
-def _controllable(rows: Bounded, s: np.ndarray) -> np.ndarray:
+def _controllable(rows: _Bounded, s: np.ndarray) -> np.ndarray:
     """Return the largest x (K + 1,) at each grid point from which the end is reached at rest; NaN where there is none.
 
     u and x are handed over in units of a typical x, without which the linear programs fail where speeds are large.
@@ -177,7 +177,7 @@ def _controllable(rows: Bounded, s: np.ndarray) -> np.ndarray:
         ) from error
     size = np.abs(rows.b).max(axis=(0, 2), initial=1e-12)
     unit = float(np.median(np.minimum(rows.top[1:], 2.0 / size)))
-    scaled = Bounded(unit * rows.a, unit * rows.b, rows.c, rows.top / unit)
+    scaled = _Bounded(unit * rows.a, unit * rows.b, rows.c, rows.top / unit)
     quiet = logging.getLogger("toppra")
     level = quiet.level
     quiet.setLevel(logging.CRITICAL)
@@ -199,7 +199,7 @@ class _Interval:
         self.duration = float(s[-1])
 
 
-def _constraint(rows: Bounded, s: np.ndarray) -> Any:
+def _constraint(rows: _Bounded, s: np.ndarray) -> Any:
     """Return the rows as toppra's canonical constraint."""
     from toppra.constraint import LinearConstraint
 

@@ -15,7 +15,7 @@ from calib.geometry.checks.repeatability import SAME
 MOST = 0.5  # of a validation file's rows that are the fit's: from there on it proves nothing (our choice)
 
 
-class Aside(Protocol):
+class _Aside(Protocol):
     """Rows kept from the fit, `calib.procedure.kinematic_stage.inputs.Unseen`."""
 
     @property
@@ -24,7 +24,7 @@ class Aside(Protocol):
     def held_out(self) -> bool: ...
 
 
-def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, Aside]) -> tuple[set[str], list[str]]:
+def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, _Aside]) -> tuple[set[str], list[str]]:
     """Find rows with the joint values and the measured numbers of another, and unseen ones at joints of the fit.
 
     Args:

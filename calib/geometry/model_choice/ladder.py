@@ -4,8 +4,8 @@
 
 Every rung is judged on rows it was not fitted to (`calib.geometry.model_choice.folds`). Of the effects, the one that
 lowers that error most is taken up, then the one that pays most beside it, until none pays: sag may show only once gear
-errors are gone. Without an instrument (sockets, planes, distances) the geometry is drawn to its nominal as strongly as the data
-say (`calib.geometry.fit`).
+errors are gone. Without an instrument (sockets, planes, distances) the geometry is drawn to its nominal as strongly as
+the data say (`calib.geometry.fit`).
 """
 
 from __future__ import annotations

@@ -132,7 +132,7 @@ def find(joint: int, track: GearTravel, residual: np.ndarray, turns: Mapping[int
     """
     if not residual.any():
         return None
-    bench = WaveCrossValidation(track, residual)
+    bench = _WaveCrossValidation(track, residual)
     others = {j: _lobes(coherence(track, j, residual))[turns[j] - TURNS[0]] for j in turns if j != joint}
     sources = [joint, *sorted(others, key=lambda j: -others[j])[:1]]
     offers = [tuple((j, order) for order in one) for j in sources for one in _family(turns[j])]
@@ -176,7 +176,7 @@ def _terms(
     return tuple(found)
 
 
-class WaveCrossValidation:
+class _WaveCrossValidation:
     """A joint's residual and the columns offered for it: how much of it they explain on blocks left out.
 
     Columns of a wave are made once.
@@ -252,7 +252,7 @@ def _lobes(power: np.ndarray) -> np.ndarray:
 
 
 def _climb(
-    bench: WaveCrossValidation, offer: Callable[[np.ndarray], Sequence[tuple[Wave, ...]]], pays: float, most: int = 12
+    bench: _WaveCrossValidation, offer: Callable[[np.ndarray], Sequence[tuple[Wave, ...]]], pays: float, most: int = 12
 ) -> tuple[tuple[Wave, ...], float, float]:
     """Return the waves taken one set after the other as long as left-out blocks gain, their share, and the ridge."""
     taken: tuple[Wave, ...] = ()

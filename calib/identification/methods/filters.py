@@ -41,7 +41,7 @@ LOST = 30.0  # times the stated mean square: innovations of a filter that has lo
 
 
 @dataclass(frozen=True)
-class KalmanFilter(Method):
+class _KalmanFilter(Method):
     """A method that carries parameters along as states; see the module.
 
     Attributes:
@@ -240,6 +240,6 @@ _ASSUMES = (
     "the model's friction is that of the robot"
 )
 EKF, SREKF, UKF, SRUKF, CDKF, SRCDKF = (
-    KalmanFilter(("sr" if root else "") + rule, _ASSUMES, Filter(rule, root))
+    _KalmanFilter(("sr" if root else "") + rule, _ASSUMES, Filter(rule, root))
     for rule in ("ekf", "ukf", "cdkf") for root in (False, True)
 )  # fmt: skip

@@ -48,7 +48,7 @@ RETREATS = 6  # halvings of a step to parameters that cannot be simulated
 
 
 @dataclass(frozen=True)
-class RoundEstimator:
+class _RoundEstimator:
     """What a round makes of the triangles of [Z W y].
 
     Attributes:
@@ -115,7 +115,7 @@ class Instrumental:
     distance: np.ndarray
     constrained: Held | None
     problem: Instruments
-    estimator: RoundEstimator
+    estimator: _RoundEstimator
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -226,7 +226,7 @@ class _Fixed:
     cases: Sequence[tuple[Case, Loop]]
     decimator: Decimator
     observed: Sequence[ObservationRows]
-    estimator: RoundEstimator
+    estimator: _RoundEstimator
     constraints: Constraints | None = None
 
     def after(self, found: _Found) -> _Fixed:
@@ -260,7 +260,7 @@ class _Found:
 
 def _task(
     model: IdentificationModel, base: Base, cases: Sequence[tuple[Case, Loop]], decimator: Decimator,
-    estimator: RoundEstimator, columns: np.ndarray | None,
+    estimator: _RoundEstimator, columns: np.ndarray | None,
 ) -> _Fixed:  # fmt: skip
     kept = np.arange(base.b) if columns is None else np.asarray(columns, dtype=int)
     observed = [observe(model, base.kept[kept], case, decimator) for case, _ in cases]
@@ -461,7 +461,7 @@ def _distance(runs: Runs) -> np.ndarray:
 ROUNDS = {
     one.name: one
     for one in (
-        RoundEstimator("iv", instrumental_variables.iv, instrumental_variables.projected, True),
-        RoundEstimator("didim", _from_simulation, lambda problem, std: combine(_simulated(problem), std), False),
+        _RoundEstimator("iv", instrumental_variables.iv, instrumental_variables.projected, True),
+        _RoundEstimator("didim", _from_simulation, lambda problem, std: combine(_simulated(problem), std), False),
     )
 }

@@ -31,7 +31,7 @@ class _Solve(Protocol):
 
 
 @dataclass(frozen=True)
-class LeastSquares(Method):
+class _LeastSquares(Method):
     """A method that solves the rows directly.
 
     Attributes:
@@ -142,7 +142,7 @@ def _driving(problem: IdentificationProblem, values: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class ConstrainedLeastSquares(Method):
+class _ConstrainedLeastSquares(Method):
     """A method that solves the rows directly, under constraints: physically consistent least squares.
 
     Weights are those that the residuals of the free estimate tell; only IRLS weighs by those of the constrained one,
@@ -153,7 +153,7 @@ class ConstrainedLeastSquares(Method):
     """
 
     takes_constraints: bool = field(default=True, kw_only=True)
-    free: LeastSquares
+    free: _LeastSquares
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
         """Return the estimate under the problem's constraints; its covariance takes those that bind as equalities.
@@ -195,26 +195,26 @@ def samples_of(problem: IdentificationProblem) -> Samples:
 
 
 _STACKED = ("matrix", "target", "present")
-OLS = LeastSquares(
+OLS = _LeastSquares(
     "ols", "the torques of all joints are equally noisy, q, v and a exact",
     lambda problem, std, tau: ols(problem.pooled, tau), weighted=False,
 )  # fmt: skip
-WLS = LeastSquares(
+WLS = _LeastSquares(
     "wls", "each joint's torque is as noisy as its own residuals say, q, v and a exact",
     lambda problem, std, tau: wls(problem.pooled, std, tau), takes_prior=True,
 )  # fmt: skip
-IRLS = LeastSquares(
+IRLS = _LeastSquares(
     "irls",
     "torques are noisy together across joints, and samples that do not fit at all are gated out; q, v, a exact",
     _irls,
 )
-TLS = LeastSquares(
+TLS = _LeastSquares(
     "tls",
     f"columns of W are noisy too: each by {COLUMN_NOISE:.0%} of its rms where a joint's torque is noisy by its "
     "residuals, all up to one factor that the data tell, independently from row to row; offsets and signs are exact",
     lambda problem, std, tau: scaled_tls(problem.pooled, std, problem.exact),
 )
 _CONSISTENT = "; parameters satisfy [constraints]"
-PC_OLS = ConstrainedLeastSquares("pc-ols", OLS.assumes + _CONSISTENT, OLS)
-PC_WLS = ConstrainedLeastSquares("pc-wls", WLS.assumes + _CONSISTENT, WLS)
-PC_IRLS = ConstrainedLeastSquares("pc-irls", IRLS.assumes + _CONSISTENT, IRLS)
+PC_OLS = _ConstrainedLeastSquares("pc-ols", OLS.assumes + _CONSISTENT, OLS)
+PC_WLS = _ConstrainedLeastSquares("pc-wls", WLS.assumes + _CONSISTENT, WLS)
+PC_IRLS = _ConstrainedLeastSquares("pc-irls", IRLS.assumes + _CONSISTENT, IRLS)

@@ -42,7 +42,7 @@ BLOCK = 1000  # samples at a time
 
 
 @dataclass(frozen=True)
-class MaximumLikelihood(Method):
+class _MaximumLikelihood(Method):
     """Errors in variables; see the module."""
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
@@ -254,7 +254,7 @@ def _packed(problem: IdentificationProblem, found: _Round, noise: np.ndarray) ->
     return LinearFit(estimate, np.sqrt(noise), *condition_numbers(np.concatenate(found.white).reshape(-1, p)))
 
 
-ML = MaximumLikelihood(
+ML = _MaximumLikelihood(
     "ml",
     "positions have white noise of the level that each log's spectrum shows, torques of the level that is left; both "
     "small enough for the torque to be linear in them",

@@ -16,7 +16,7 @@ Train = Callable[[IdentificationProblem, np.ndarray, np.ndarray], tuple[LinearFi
 
 
 @dataclass(frozen=True)
-class Network(Method):
+class _Network(Method):
     """A method that comes to rest at weighted least squares.
 
     Attributes:
@@ -36,11 +36,11 @@ class Network(Method):
 
 
 _LIKE_WLS = "each joint's torque is as noisy as its own residuals say, q, v and a exact"
-ADALINE = Network(
+ADALINE = _Network(
     "adaline", f"{_LIKE_WLS}; samples in random order",
     lambda problem, std, tau: adaline(samples_of(problem), problem.pooled, std, tau),
 )  # fmt: skip
-HOPFIELD = Network(
+HOPFIELD = _Network(
     "hopfield", f"{_LIKE_WLS}; no parameter is near the bound of its neuron",
     lambda problem, std, tau: hopfield(problem.pooled, std, tau),
 )  # fmt: skip

@@ -42,7 +42,7 @@ IMPOSSIBLE = 1e60  # residual of parameters that cannot be simulated: any step t
 
 
 @dataclass(frozen=True)
-class OutputError(Method):
+class _OutputError(Method):
     """A method that fits the simulated closed loop to the recorded one; see the module.
 
     Attributes:
@@ -198,5 +198,5 @@ def _packed(
 
 
 _LOOP = "controller and reference are those of the loop, the model's friction that of the robot; "
-CLOE = OutputError("cloe", _LOOP + "no measured torque takes part", False)
-CLIE = OutputError("clie", _LOOP + "no measured position takes part", True)
+CLOE = _OutputError("cloe", _LOOP + "no measured torque takes part", False)
+CLIE = _OutputError("clie", _LOOP + "no measured position takes part", True)

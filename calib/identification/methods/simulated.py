@@ -14,7 +14,7 @@ from calib.identification.methods.method import IdentificationProblem, Method, M
 
 
 @dataclass(frozen=True)
-class Simulated(Method):
+class _Simulated(Method):
     """A method that simulates.
 
     Attributes:
@@ -64,14 +64,14 @@ class Simulated(Method):
         )  # fmt: skip
 
 
-IV = Simulated(
+IV = _Simulated(
     "iv", "the controller and its reference are those of the loop, the model's friction that of the robot"
 )  # fmt: skip
-DIDIM = Simulated(
+DIDIM = _Simulated(
     "didim",
     "the simulated robot moves as the real one: controller and reference are those of the loop, the model's friction "
     "that of the robot; no measured position takes part",
     "didim",
 )
-PC_IV = Simulated("pc-iv", f"{IV.assumes}; parameters satisfy [constraints]", "iv", takes_constraints=True)
-PC_DIDIM = Simulated("pc-didim", f"{DIDIM.assumes}; parameters satisfy [constraints]", "didim", takes_constraints=True)
+PC_IV = _Simulated("pc-iv", f"{IV.assumes}; parameters satisfy [constraints]", "iv", takes_constraints=True)
+PC_DIDIM = _Simulated("pc-didim", f"{DIDIM.assumes}; parameters satisfy [constraints]", "didim", takes_constraints=True)

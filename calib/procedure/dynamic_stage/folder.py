@@ -63,7 +63,7 @@ class IdentificationMetrics:
 
 
 @dataclass(frozen=True)
-class StoredVerdict:
+class _StoredVerdict:
     """What ``report.json`` of unseen motion says of the verdict."""
 
     verdict: str
@@ -142,9 +142,9 @@ class UnseenFolder:
             _write_torques(case, predicted, expected, self.path / f"torques_{number}.csv")
         files.write_json(self.report, report(inputs, found))
 
-    def verdict(self) -> StoredVerdict:
+    def verdict(self) -> _StoredVerdict:
         """Read what was judged."""
-        return _read(StoredVerdict, self.report)
+        return _read(_StoredVerdict, self.report)
 
 
 def _read(kind: type[T], path: Path) -> T:

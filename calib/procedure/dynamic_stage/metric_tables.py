@@ -31,7 +31,7 @@ OFF = 1e-9  # σ of a friction term below which it is the ridge's floor, not a m
 
 
 @dataclass(frozen=True)
-class StoredController:
+class _StoredController:
     """A controller as JSON holds it, see `calib.simulation.loop.controllers.Controller`."""
 
     kp: tuple[float, ...]
@@ -44,7 +44,7 @@ class StoredController:
     cutoff: float | None = None
 
     @classmethod
-    def of(cls, controller: Controller | None) -> StoredController | None:
+    def of(cls, controller: Controller | None) -> _StoredController | None:
         """Return what is to be stored; None without a controller, or with torques or a model of its own."""
         if controller is None or controller.ahead is not None or controller.model is not None:
             return None
@@ -64,7 +64,7 @@ class StoredFindings:
 
     rests: Resting
     notes: tuple[str, ...]
-    controller: StoredController | None = None
+    controller: _StoredController | None = None
     errors: TorqueDiscrepancy | None = None
     contradiction: Contradiction | None = None
 
@@ -136,7 +136,7 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
             StoredFindings(
                 outcome.findings.rests,
                 outcome.findings.notes,
-                StoredController.of(outcome.findings.controller),
+                _StoredController.of(outcome.findings.controller),
                 outcome.findings.errors and outcome.findings.errors.discrepancy,
                 outcome.findings.contradiction,
             )

@@ -12,7 +12,7 @@ Numbers = tuple[float | None, ...]
 
 
 @dataclass(frozen=True)
-class RelativeErrors:
+class _RelativeErrors:
     """100 ‖τ - τ̂‖ / ‖τ‖ over all rows, and of each [%]."""
 
     total: float | None
@@ -20,16 +20,16 @@ class RelativeErrors:
 
 
 @dataclass(frozen=True)
-class PredictionErrors:
+class _PredictionErrors:
     """Errors on one set of samples; rms of each torque row in its unit."""
 
-    relative_error_percent: RelativeErrors
+    relative_error_percent: _RelativeErrors
     rms: Numbers
     samples: int = 0
 
 
 @dataclass(frozen=True)
-class RowWhiteness:
+class _RowWhiteness:
     """Of one row's residual: the share of its autocorrelations beyond the bounds of white noise."""
 
     outside: float
@@ -64,18 +64,18 @@ class RecordingErrors:
         interval95: how the errors that the model stated held here.
     """
 
-    raw: PredictionErrors
-    filtered: PredictionErrors
-    moving: PredictionErrors
-    standing: PredictionErrors
+    raw: _PredictionErrors
+    filtered: _PredictionErrors
+    moving: _PredictionErrors
+    standing: _PredictionErrors
     above_band_percent: Numbers
-    whiteness: tuple[RowWhiteness | None, ...]
+    whiteness: tuple[_RowWhiteness | None, ...]
     evidence: bool = True
     interval95: TorqueCoverage | None = None
 
 
 @dataclass(frozen=True)
-class ParameterCounts:
+class _ParameterCounts:
     """How many parameters the model has, the torques of any motion tell, and were kept."""
 
     standard: int
@@ -84,7 +84,7 @@ class ParameterCounts:
 
 
 @dataclass(frozen=True)
-class ColumnCounts:
+class _ColumnCounts:
     """Standard parameters without effect on any torque, and those regrouped into others."""
 
     without_effect: int
@@ -92,7 +92,7 @@ class ColumnCounts:
 
 
 @dataclass(frozen=True)
-class ConditionNumber:
+class _ConditionNumber:
     """Of the observation matrix, in its units and with columns of unit norm."""
 
     raw: float | None
@@ -100,7 +100,7 @@ class ConditionNumber:
 
 
 @dataclass(frozen=True)
-class FrictionStep:
+class _FrictionStep:
     """One friction model tried, with its error on time left out [%]."""
 
     model: str
@@ -113,7 +113,7 @@ class FrictionStep:
 
 
 @dataclass(frozen=True)
-class GearWave:
+class _GearWave:
     """An order per turn of a gear's joint."""
 
     gear: int
@@ -121,16 +121,16 @@ class GearWave:
 
 
 @dataclass(frozen=True)
-class TorqueRipple:
+class _TorqueRipple:
     """Ripple found at a joint, counted from one."""
 
     joint: int
-    waves: tuple[GearWave, ...]
+    waves: tuple[_GearWave, ...]
     explained_share_on_unseen_blocks: float
 
 
 @dataclass(frozen=True)
-class EliminatedParameter:
+class _EliminatedParameter:
     """A parameter that the data do not tell, with its RSD [%] when it went."""
 
     name: str
@@ -138,7 +138,7 @@ class EliminatedParameter:
 
 
 @dataclass(frozen=True)
-class DurbinWuHausman:
+class _DurbinWuHausman:
     """The test of least squares against instrumental variables."""
 
     f: float | None
@@ -154,7 +154,7 @@ class LoopMetrics:
     failure: str = ""
     notes: tuple[str, ...] = ()
     rounds: int = 0
-    durbin_wu_hausman: DurbinWuHausman | None = None
+    durbin_wu_hausman: _DurbinWuHausman | None = None
     largest_shift_sigma: float = 0.0
     cragg_donald: float | None = None
     instruments_weak: bool = False
@@ -183,7 +183,7 @@ class ReplayMetrics:
 
 
 @dataclass(frozen=True)
-class TiltEffect:
+class _TiltEffect:
     """The parameter that 1 mrad of the base's tilt moves most, and by how many of its sigmas of torque noise."""
 
     parameter: str
@@ -191,13 +191,13 @@ class TiltEffect:
 
 
 @dataclass(frozen=True)
-class GeometryMetrics:
+class _GeometryMetrics:
     """What the geometry's uncertainty adds to the estimate."""
 
     propagated: bool
     summary: str
     changed: tuple[str, ...]
-    moved_by_1_mrad_of_tilt: TiltEffect
+    moved_by_1_mrad_of_tilt: _TiltEffect
 
 
 @dataclass(frozen=True)
@@ -206,16 +206,16 @@ class ModelMetrics:
 
     identification: Mapping[str, RecordingErrors]
     validation: Mapping[str, RecordingErrors]
-    parameters: ParameterCounts
-    counts: ColumnCounts
+    parameters: _ParameterCounts
+    counts: _ColumnCounts
     rows: tuple[str, ...]
-    condition_number: ConditionNumber
+    condition_number: _ConditionNumber
     friction: str
     method: str
     method_assumes: str
-    ladder: tuple[FrictionStep, ...]
-    ripple: tuple[TorqueRipple, ...]
-    elimination: tuple[EliminatedParameter, ...]
+    ladder: tuple[_FrictionStep, ...]
+    ripple: tuple[_TorqueRipple, ...]
+    elimination: tuple[_EliminatedParameter, ...]
     warnings: tuple[str, ...]
     verdict: str
     reason: str
@@ -223,7 +223,7 @@ class ModelMetrics:
     loop: LoopMetrics | None = None
     tracking: Mapping[str, ReplayMetrics] = field(default_factory=dict)
     tracking_failure: str = ""
-    geometry: GeometryMetrics | None = None
+    geometry: _GeometryMetrics | None = None
     repeated: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -240,7 +240,7 @@ def model_metrics(content: Mapping[str, Any]) -> ModelMetrics:
 
 
 @dataclass(frozen=True)
-class TorqueCurves:
+class _TorqueCurves:
     """Measured and predicted torques of one recording, per row, thinned for drawing; times [s]."""
 
     name: str
@@ -250,7 +250,7 @@ class TorqueCurves:
 
 
 @dataclass(frozen=True)
-class Autocorrelations:
+class _Autocorrelations:
     """Of the residual of each row below the band, with the bounds of white noise; None for short ones."""
 
     bound: Numbers
@@ -269,8 +269,8 @@ class UnseenReport:
     units: tuple[str, ...]
     fit: Mapping[str, RecordingErrors]
     validation: Mapping[str, RecordingErrors]
-    curves: tuple[TorqueCurves, ...]
-    autocorrelation: Mapping[str, Autocorrelations]
+    curves: tuple[_TorqueCurves, ...]
+    autocorrelation: Mapping[str, _Autocorrelations]
 
     @property
     def proofs(self) -> dict[str, RecordingErrors]:

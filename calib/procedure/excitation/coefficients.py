@@ -40,7 +40,7 @@ Numbers = Annotated[tuple[float, ...], Expect("a list of finite numbers")]
 
 
 @dataclass(frozen=True)
-class JointTable:
+class _JointTable:
     """[[joint]], see the module."""
 
     name: Name
@@ -57,7 +57,7 @@ class TrajectoryFile:
     family: Annotated[str, OneOf(("fourier", "bspline"))]
     period: Positive
     rate: Positive
-    joint: Annotated[tuple[JointTable, ...], Filled()]
+    joint: Annotated[tuple[_JointTable, ...], Filled()]
     repeat: Annotated[int, Whole(1)] = 1
     degree: Annotated[int, Whole(1, 20)] = 5
 

@@ -204,7 +204,7 @@ class Points:
 
 
 @dataclass(frozen=True, eq=False)
-class PoseLimit:
+class _PoseLimit:
     """A constraint of pose selection, kept along a motion."""
 
     of: PoseConstraint
@@ -247,7 +247,7 @@ def _places(stated: LimitsFile, found: Limits, points: Points) -> list[MotionCon
         result.append(Workspace(points, points.product, names, radius, lowest, highest))
     others = [one for one in found.constraints if one.name not in ("height", "distance from the axis")]
     still = np.zeros((1, len(found.lower)))
-    return result + [PoseLimit(one, np.asarray(one.function(still)).shape[1]) for one in others]
+    return result + [_PoseLimit(one, np.asarray(one.function(still)).shape[1]) for one in others]
 
 
 def _clearance(found: Limits) -> Clearance:

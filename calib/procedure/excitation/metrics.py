@@ -26,7 +26,7 @@ class DesignCondition:
 
 
 @dataclass(frozen=True)
-class DesignSetting:
+class _DesignSetting:
     """What was asked for: period [s], the columns to tell, and how many instants were verified."""
 
     period: float
@@ -35,7 +35,7 @@ class DesignSetting:
 
 
 @dataclass(frozen=True)
-class LimitMargin:
+class _LimitMargin:
     """What is left of a limit, as a share of its scale."""
 
     share: float
@@ -46,5 +46,5 @@ class DesignMetrics:
     """The content of ``metrics.json``: condition number, what was asked for, the smallest margin of each limit."""
 
     condition_number: DesignCondition
-    setting: DesignSetting
-    margins: Mapping[str, LimitMargin]
+    setting: _DesignSetting
+    margins: Mapping[str, _LimitMargin]

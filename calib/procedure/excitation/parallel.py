@@ -32,7 +32,7 @@ INSTANTS = 1000  # over the period, at which condition numbers and torques are r
 
 
 @dataclass(frozen=True, eq=False)
-class ActuatorLimit:
+class _ActuatorLimit:
     """|τ| ≤ (1 - margin) τ_max of each actuator; a `trajectories.constraints.MotionConstraint`.
 
     Attributes:
@@ -137,7 +137,7 @@ def design_parallel(
         constraints.append(BoxLimit(2, -np.asarray(acceleration), np.asarray(acceleration)))
     effort = np.array([joint.effort for joint in robot.joints])
     if values is not None and np.isfinite(effort).all():
-        constraints.append(ActuatorLimit(plan, robot.joint_names, effort, margin))
+        constraints.append(_ActuatorLimit(plan, robot.joint_names, effort, margin))
     family = fourier_family(settings.harmonics or COARSE, settings.period, robot.r, rate=settings.rate)
     problem = ExcitationProblem(
         family, plan.regressor,

@@ -45,7 +45,7 @@ PerJoint = Annotated[tuple[float, ...], Expect("a list of numbers, one per joint
 
 @strict
 @dataclass(frozen=True)
-class DrivesTable:
+class _DrivesTable:
     """[drives]: parameters one per joint (SI, joint side)."""
 
     Ia: PerJoint | None = None
@@ -56,10 +56,10 @@ class DrivesTable:
 
 @strict
 @dataclass(frozen=True)
-class DrivesFile:
+class _DrivesFile:
     """The file of ``calib plan --drives``."""
 
-    drives: DrivesTable = field(default_factory=DrivesTable)
+    drives: _DrivesTable = field(default_factory=_DrivesTable)
 
 
 COARSE = 150  # grid of the outer loop
@@ -181,7 +181,7 @@ def _timed(
 
 def _read_drives(path: Path, chain: Chain) -> dict[str, np.ndarray]:
     """Read drive parameters from TOML, one per joint: ``[drives]`` with any of Ia, Fv, Fc, off (SI, joint side)."""
-    own = parse(DrivesFile, read_toml(path), str(path)).drives
+    own = parse(_DrivesFile, read_toml(path), str(path)).drives
     stated = {key: value for key in DRIVES if (value := getattr(own, key)) is not None}
     return {key: np.array(numbers(value, chain.n, f"{path}: drives.{key}")) for key, value in stated.items()}
 

@@ -21,7 +21,7 @@ class ErrorStatistics:
 
 
 @dataclass(frozen=True)
-class ArmErrors:
+class _ArmErrors:
     """Errors of one arm by nature; None where nothing of the kind was measured."""
 
     position_mm: ErrorStatistics | None = None
@@ -35,7 +35,7 @@ class ArmErrors:
 
 
 @dataclass(frozen=True)
-class MeanAndMax:
+class _MeanAndMax:
     """Of some sizes."""
 
     mean: float
@@ -43,11 +43,11 @@ class MeanAndMax:
 
 
 @dataclass(frozen=True)
-class BothArms:
+class _BothArms:
     """The same of the nominal and of the calibrated arm."""
 
-    nominal: MeanAndMax
-    calibrated: MeanAndMax
+    nominal: _MeanAndMax
+    calibrated: _MeanAndMax
 
 
 @dataclass(frozen=True)
@@ -68,13 +68,13 @@ class RepeatedPoses:
 
     poses: int
     cycles: tuple[int, int]
-    repeatability_mm: MeanAndMax
-    accuracy_mm: BothArms
+    repeatability_mm: _MeanAndMax
+    accuracy_mm: _BothArms
     each: tuple[RepeatedPose, ...] = ()
 
 
 @dataclass(frozen=True)
-class IntervalCoverage:
+class _IntervalCoverage:
     """How many errors were within the 95 % interval that the fit states, how wide that was, where it extrapolated."""
 
     coverage_percent: float
@@ -103,14 +103,14 @@ class ComparedRows:
 
     poses: int
     frames: str
-    nominal: ArmErrors
-    calibrated: ArmErrors
-    urdf_alone: ArmErrors | None = None
+    nominal: _ArmErrors
+    calibrated: _ArmErrors
+    urdf_alone: _ArmErrors | None = None
     pair_distance_mm: Mapping[str, ErrorStatistics] = field(default_factory=dict)
     iso9283: RepeatedPoses | None = None
     unseen: bool = True
     parameters: int = 0
-    interval95: IntervalCoverage | None = None
+    interval95: _IntervalCoverage | None = None
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ SEEN = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Behind:
+class _Behind:
     """What links of the arm take from a line of sight: `BEAM` less the distances of the nearest, (m, `NEAREST`).
 
     Attributes:
@@ -130,7 +130,7 @@ def sight_of(
         facing: (T, 3) the direction each target faces, in its own frame; a single one for all.
         half_angle: of the cone of acceptance [rad]; None: all around.
         span: least and largest distance [m].
-        arm: what may stand in the way (`Behind`); None: nothing does.
+        arm: what may stand in the way (`_Behind`); None: nothing does.
     """
     directions = [*facing] * (len(cell.tools) if len(facing) == 1 else 1)
     found = []
@@ -142,7 +142,7 @@ def sight_of(
             parts.append(constraints.distance(target, span[0] or -np.inf, span[1], instrument, velocity))
         if arm is not None:
             links = _beside(arm, cell.chain, target)
-            behind = Behind(arm, target, velocity, np.asarray(instrument, dtype=float), links)
+            behind = _Behind(arm, target, velocity, np.asarray(instrument, dtype=float), links)
             parts.append(PoseConstraint("view past the arm", behind, behind.gradient))
         found.append(tuple(parts))
     return Sight(tuple(found)) if found and found[0] else None

@@ -35,7 +35,7 @@ _NOT_YET = ("model", "loss", "folds", "stations", "tools", "refit_frames")
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class _Rows:
     """Encoder readings (m, n), with platform coordinates (m, r) or None."""
 
     readings: np.ndarray
@@ -44,9 +44,9 @@ class Rows:
     def __len__(self) -> int:
         return len(self.readings)
 
-    def part(self, rows: np.ndarray) -> Rows:
+    def part(self, rows: np.ndarray) -> _Rows:
         """Return some of the rows."""
-        return Rows(self.readings[rows], None if self.coordinates is None else self.coordinates[rows])
+        return _Rows(self.readings[rows], None if self.coordinates is None else self.coordinates[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ class ParallelFit:
 
     nominal: FoundRobot
     files: tuple[Path, ...]
-    rows: Rows
+    rows: _Rows
     found: LoopFit
     own: np.ndarray
     unseen: Mapping[str, np.ndarray]
@@ -180,7 +180,7 @@ def with_unseen(fitted: ParallelFit, validate: Sequence[Path]) -> ParallelFit:
     return replace(fitted, unseen=proofs, verdict=verdict, files=(*fitted.files, *validate))
 
 
-def read_rows(path: Path, robot: ParallelRobot) -> Rows:
+def read_rows(path: Path, robot: ParallelRobot) -> _Rows:
     """Return readings (m, n) and platform coordinates (m, r), None where the file has no such columns.
 
     Raises:
@@ -191,8 +191,8 @@ def read_rows(path: Path, robot: ParallelRobot) -> Rows:
     present = [name for name in robot.freedom if name in table]
     _refuse_others(table, robot, path)
     if not present:
-        return Rows(np.column_stack(readings), None)
-    return Rows(np.column_stack(readings), read_coordinates(table, robot))
+        return _Rows(np.column_stack(readings), None)
+    return _Rows(np.column_stack(readings), read_coordinates(table, robot))
 
 
 def read_coordinates(table: Table, robot: ParallelRobot) -> np.ndarray:
@@ -234,30 +234,30 @@ def _refuse_others(table: Table, robot: ParallelRobot, path: Path) -> None:
             )
 
 
-def _stacked(parts: Sequence[Rows], paths: Sequence[Path]) -> Rows:
+def _stacked(parts: Sequence[_Rows], paths: Sequence[Path]) -> _Rows:
     with_poses = [own.coordinates is not None for own in parts]
     if any(with_poses) != all(with_poses):
         bare = paths[with_poses.index(False)]
         raise UsageError(f"{bare} has no platform coordinates, other files have: fit them apart")
     readings = np.concatenate([own.readings for own in parts])
     coordinates = [own.coordinates for own in parts if own.coordinates is not None]
-    return Rows(readings, np.concatenate(coordinates) if coordinates else None)
+    return _Rows(readings, np.concatenate(coordinates) if coordinates else None)
 
 
-def _check_alike(rows: Rows, unseen: Mapping[str, Rows]) -> None:
+def _check_alike(rows: _Rows, unseen: Mapping[str, _Rows]) -> None:
     for name, own in unseen.items():
         if (own.coordinates is None) != (rows.coordinates is None):
             raise UsageError(f"{name}: platform coordinates are in it or in the fitted files, not in both")
 
 
-def _errors(nominal: ClosedRobot, calibrated: ClosedRobot, rows: Rows) -> np.ndarray:
+def _errors(nominal: ClosedRobot, calibrated: ClosedRobot, rows: _Rows) -> np.ndarray:
     """Return the errors of both robots (2, m, k): platform coordinates, or the encoders' contradictions."""
     if rows.coordinates is None:
         return np.array([contradictions(known, rows.readings) for known in (nominal, calibrated)])
     return np.array([platform_errors(known, rows.readings, rows.coordinates) for known in (nominal, calibrated)])
 
 
-def _cross_validated(known: ClosedRobot, rows: Rows, held: Sequence[str], seed: int) -> dict[str, np.ndarray]:
+def _cross_validated(known: ClosedRobot, rows: _Rows, held: Sequence[str], seed: int) -> dict[str, np.ndarray]:
     """Return errors of all rows, each by a fit that has not seen it; nothing where a fold cannot be fitted."""
     folds = np.array_split(np.random.default_rng(seed).permutation(len(rows)), FOLDS)
     found = []
@@ -276,7 +276,7 @@ def _positions(robot: ParallelRobot) -> np.ndarray:
 
 
 def _judge(
-    robot: ParallelRobot, rows: Rows, own: np.ndarray, proofs: Mapping[str, np.ndarray], tolerance: float | None
+    robot: ParallelRobot, rows: _Rows, own: np.ndarray, proofs: Mapping[str, np.ndarray], tolerance: float | None
 ) -> Verdict:
     """Return the verdict by the rules of the module."""
     kinds = {"": (np.ones(own.shape[2], dtype=bool), 1e3, "mrad (or mm)")}

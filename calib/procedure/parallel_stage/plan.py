@@ -37,7 +37,7 @@ SHARP = 1e-9  # smoothing of Coulomb's sign: along a path its direction is known
 
 
 @dataclass(frozen=True, eq=False)
-class PlatformDynamics:
+class _PlatformDynamics:
     """Actuator torques along a path of their own joints; a `trajectories.timing.limits.Law`.
 
     Attributes:
@@ -163,7 +163,7 @@ def _read_waypoints(path: Path, known: ClosedRobot) -> np.ndarray:
 
 def _law(
     robot: FoundRobot, folder: Path | None, settings: PlanSettings
-) -> tuple[PlatformDynamics | None, tuple[str, ...]]:
+) -> tuple[_PlatformDynamics | None, tuple[str, ...]]:
     """Return the dynamics: identified, or the file's inertias; None without any."""
     if folder is None:
         if settings.payloads:
@@ -172,7 +172,7 @@ def _law(
         values = model.known_parameters()
         if values is None:
             return None, ("the robot's masses are not known: torques are not limited",)
-        return PlatformDynamics(model, values), (
+        return _PlatformDynamics(model, values), (
             "friction not known (no model): planned without, a real robot needs more torque",
         )
     model, values = read_model(robot, folder)
@@ -181,10 +181,10 @@ def _law(
             f"{folder}: no payload '{unknown[0]}' was identified; it knows {', '.join(model.payloads) or 'none'}"
         )
     terms = tuple(replace(one, settings=(SHARP,)) if one.shape == "sign" else one for one in model.terms)
-    return PlatformDynamics(replace(model, terms=terms), values, settings.payloads), ()
+    return _PlatformDynamics(replace(model, terms=terms), values, settings.payloads), ()
 
 
-def _bounds(known: ClosedRobot, law: PlatformDynamics | None) -> TimingLimits:
+def _bounds(known: ClosedRobot, law: _PlatformDynamics | None) -> TimingLimits:
     joints = known.robot.joints
     torque = np.array([joint.effort if law is not None else np.inf for joint in joints])
     velocity = np.array([joint.velocity for joint in joints])

@@ -26,7 +26,7 @@ if TYPE_CHECKING:  # the figures of a fit are drawn without loading the dynamics
 DRAWN = 300  # points per curve of the excitation
 
 
-class Captioned(NamedTuple):
+class _Captioned(NamedTuple):
     """What makes a figure, what it shows in a sentence, and whether it takes the page's width."""
 
     make: Callable[[], Figure]
@@ -39,44 +39,44 @@ def draw(report: Report) -> dict[str, Picture]:
     return {name: picture(*found) for name, found in captioned(report).items()}
 
 
-def captioned(report: Report) -> dict[str, Captioned]:
+def captioned(report: Report) -> dict[str, _Captioned]:
     """Return the figures by name; those that the data do not give are left out."""
-    result: dict[str, Captioned] = {}
+    result: dict[str, _Captioned] = {}
     proof = next((rows for rows in report.sets if rows.unseen), report.sets[0])
     label = f"{proof.poses} {'unseen' if proof.unseen else 'fitted'} poses ({proof.name})"
     for nature in ("position", "orientation", "distance"):
         if nature in proof.calibrated:
             sizes = [np.array(arm[nature]) for arm in (proof.nominal, proof.calibrated)]
             make = partial(geometry_figures.error_histogram, sizes[0], sizes[1], nature, report.noise.get(nature))
-            result[nature] = Captioned(make, f"{nature.capitalize()} errors before and after, {label}; dashed: rms.")
+            result[nature] = _Captioned(make, f"{nature.capitalize()} errors before and after, {label}; dashed: rms.")
     rungs = [rung for rung in report.metrics.ladder if rung.cross_validated_mm is not None]
     if len(rungs) > 1:
         result["ladder"] = _ladder(report, rungs)
     if report.singular_values:
         make = partial(geometry_figures.singular_values, np.array(report.singular_values), report.rank)
         words = "Singular values of the scaled observation matrix: filled ones carry a parameter, open ones none."
-        result["singular_values"] = Captioned(make, words)
+        result["singular_values"] = _Captioned(make, words)
     if proof.q:
         result |= _over_workspace(report, proof, label)
     for number, seen in enumerate(report.images, 1):
         make = partial(geometry_figures.image_coverage, seen.size, np.array(seen.count), np.array(seen.rms))
         words = f"Where in the image corners were seen, and how well they are predicted there ({seen.file})."
-        result["coverage" if number == 1 else f"coverage_{number}"] = Captioned(make, words, True)
+        result["coverage" if number == 1 else f"coverage_{number}"] = _Captioned(make, words, True)
     arm = [row for row in report.parameters if row.group == "arm"]
     if arm:
         change = np.array([row.value - row.nominal for row in arm])
         sigma = np.array([row.sigma for row in arm])
         names, units = [row.name for row in arm], [row.unit for row in arm]
         make = partial(geometry_figures.parameter_changes, names, units, change, sigma)
-        result["parameters"] = Captioned(make, "What the fit changed in the arm. Grey: less than two sigmas.", True)
+        result["parameters"] = _Captioned(make, "What the fit changed in the arm. Grey: less than two sigmas.", True)
     if len(report.correlated.names) > 1:
         matrix = np.array(report.correlated.matrix)
         make = partial(geometry_figures.correlation_map, report.correlated.names, matrix, 0.0)
-        result["correlations"] = Captioned(make, "Parameters that the data tell apart least.")
+        result["correlations"] = _Captioned(make, "Parameters that the data tell apart least.")
     return result
 
 
-def _ladder(report: Report, rungs: Sequence[LadderStep]) -> Captioned:
+def _ladder(report: Report, rungs: Sequence[LadderStep]) -> _Captioned:
     make = partial(
         geometry_figures.ladder,
         [rung.model for rung in rungs],
@@ -85,20 +85,20 @@ def _ladder(report: Report, rungs: Sequence[LadderStep]) -> Captioned:
         [not rung.note for rung in rungs],
         report.noise.get("position"),
     )
-    return Captioned(make, "The ladder of models: error on rows left out. Filled: kept; open: left out.", True)
+    return _Captioned(make, "The ladder of models: error on rows left out. Filled: kept; open: left out.", True)
 
 
-def _over_workspace(report: Report, proof: RowErrors, label: str) -> dict[str, Captioned]:
+def _over_workspace(report: Report, proof: RowErrors, label: str) -> dict[str, _Captioned]:
     """Return the figures that need one error per pose: against the joints, and over the workspace."""
     nature = "position" if "position" in proof.calibrated else "distance"
     before, after = (np.array(arm[nature]) for arm in (proof.nominal, proof.calibrated))
     q, points = np.array(proof.q), np.array(proof.points)
     joints = partial(geometry_figures.residuals_by_joint, q, before, after, report.joints, report.prismatic, nature)
     return {
-        "joints": Captioned(
+        "joints": _Captioned(
             joints, f"Errors against each joint, {label}: a trend is something no parameter holds.", True
         ),
-        "map": Captioned(
+        "map": _Captioned(
             partial(geometry_figures.error_map, points, after, expected=np.array(proof.expected)),
             f"Remaining error over the workspace, {label}"
             + ("; below: 95 % are expected within." if proof.expected else "."),

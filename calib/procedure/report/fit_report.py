@@ -31,7 +31,7 @@ READ = (1, SCHEMA)  # 1 kept the findings here, too
 NATURES = ("position", "orientation", "distance")
 
 
-class FittedParameter(NamedTuple):
+class _FittedParameter(NamedTuple):
     """One parameter of the fit; `rsd` in percent, `group` arm, station, tool or deflection."""
 
     name: str
@@ -43,7 +43,7 @@ class FittedParameter(NamedTuple):
     group: str
 
 
-class CorrelatedPair(NamedTuple):
+class _CorrelatedPair(NamedTuple):
     """Two parameters that go together."""
 
     first: str
@@ -52,7 +52,7 @@ class CorrelatedPair(NamedTuple):
 
 
 @dataclass(frozen=True)
-class CorrelationMatrix:
+class _CorrelationMatrix:
     """Of those parameters that go together most."""
 
     names: tuple[str, ...]
@@ -107,10 +107,10 @@ class Report:
     joints: tuple[str, ...]
     prismatic: tuple[bool, ...]
     metrics: FitMetrics
-    parameters: tuple[FittedParameter, ...]
+    parameters: tuple[_FittedParameter, ...]
     kept: tuple[str, ...]
-    correlations: tuple[CorrelatedPair, ...]
-    correlated: CorrelationMatrix
+    correlations: tuple[_CorrelatedPair, ...]
+    correlated: _CorrelationMatrix
     singular_values: tuple[float, ...]
     rank: int
     sets: tuple[RowErrors, ...]
@@ -140,9 +140,9 @@ def collect(outcome: Outcome) -> Report:
         joints=tuple(chain.joint_names),
         prismatic=tuple(joint.kind == "prismatic" for joint in chain.joints),
         metrics=fit_metrics(outcome),
-        parameters=tuple(FittedParameter(*row, groups[row[0]]) for row in table.rows()),
+        parameters=tuple(_FittedParameter(*row, groups[row[0]]) for row in table.rows()),
         kept=tuple(name for name in chain.names if name not in fitted),
-        correlations=tuple(CorrelatedPair(*pair) for pair in strong_correlations(fit.estimate, 0.9)),
+        correlations=tuple(_CorrelatedPair(*pair) for pair in strong_correlations(fit.estimate, 0.9)),
         correlated=_correlated(table.names, table.covariance),
         singular_values=tuple(values),
         rank=len(values) if fit.split is None else fit.split.rank,
@@ -185,13 +185,13 @@ def _points(comparison: Comparison) -> np.ndarray:
     return np.concatenate(points)
 
 
-def _correlated(names: Sequence[str], covariance: np.ndarray, most: int = 12) -> CorrelationMatrix:
+def _correlated(names: Sequence[str], covariance: np.ndarray, most: int = 12) -> _CorrelationMatrix:
     """Return those parameters that go together most, and their correlation matrix."""
     sigma = np.sqrt(np.clip(np.diag(covariance), 1e-300, None))
     matrix = covariance / np.outer(sigma, sigma)
     off = np.abs(matrix - np.diag(np.diag(matrix))).max(axis=1, initial=0.0)
     chosen = np.sort(np.argsort(-off, kind="stable")[:most])
-    return CorrelationMatrix(tuple(str(names[k]) for k in chosen), _plain(matrix[np.ix_(chosen, chosen)]))
+    return _CorrelationMatrix(tuple(str(names[k]) for k in chosen), _plain(matrix[np.ix_(chosen, chosen)]))
 
 
 def _noise(blocks: Sequence[PoseMeasurements]) -> dict[str, float | None]:

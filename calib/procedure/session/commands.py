@@ -45,7 +45,7 @@ COLOURS = {"done": "green", "kept": "green", "ready": "cyan", "stale": "yellow",
 
 
 @dataclass(frozen=True)
-class Stop:
+class _Stop:
     """Where `go_on` stopped: lines that say what to do now, and the verdict once there is one."""
 
     lines: tuple[str, ...]
@@ -123,7 +123,7 @@ def _limits(stated: Path | Mapping[str, Any] | None, chain: Chain, source: Path)
     return {LIMITS: f"{HEAD}{dumps(tables)}", **copied}, LIMITS
 
 
-def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", plots: bool = True) -> Stop:
+def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", plots: bool = True) -> _Stop:
     """Run what can be run, and say what to do then.
 
     Args:
@@ -139,8 +139,8 @@ def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", 
             steps.forget(session, steps.find(session, again))
         state = steps.run_next(session, say, progress, command)
     if state is not None:
-        return Stop(("", *instructions.asks(session, state)))
-    return Stop(_ending(session), verdict_of(session))
+        return _Stop(("", *instructions.asks(session, state)))
+    return _Stop(_ending(session), verdict_of(session))
 
 
 def _ending(session: Session) -> tuple[str, ...]:

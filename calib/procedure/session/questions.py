@@ -98,7 +98,7 @@ class Answers:
 
 
 @dataclass(frozen=True)
-class Question:
+class _Question:
     """One question: which answer it is about, its words, what an empty answer means, and when it is put."""
 
     name: str
@@ -136,72 +136,72 @@ def _of_the_camera(name: str, mounting: str = "") -> Callable[[Answers], bool]:
 
 CELL = ("instrument_at", "cone", "facing", "box", "obstacles", *CAMERA)
 QUESTIONS = (
-    Question("robot", f"robot (.urdf, .toml, or {' '.join(library.names())})", "", _unanswered("robot")),
-    Question("instrument", f"instrument ({' '.join(INSTRUMENTS)})", "tracker", _unanswered("instrument")),
-    Question(
+    _Question("robot", f"robot (.urdf, .toml, or {' '.join(library.names())})", "", _unanswered("robot")),
+    _Question("instrument", f"instrument ({' '.join(INSTRUMENTS)})", "tracker", _unanswered("instrument")),
+    _Question(
         "tool", "where the target sits in the tip's frame, x,y,z [m]", "0.05,0,0.05",
         lambda given: given.tool is None and not given.by_camera,
     ),
-    Question(
+    _Question(
         "limits", "file that states the cell: instrument, obstacles, speeds (none: asked for now)", "none",
         lambda given: given.limits is None and not given.cell and not given.by_camera,
     ),
-    Question(
+    _Question(
         "limits", "file that states the cell, [camera] with it: lens, board, roughly where both are (none: asked for "
         "now)", "none", lambda given: given.limits is None and not given.cell and given.by_camera,
     ),
-    Question(
+    _Question(
         "mounting", "what the arm carries: the camera (in hand), or the board (to hand); unknown: whether poses see "
         "the board is not checked", "unknown", _of_the_camera("mounting"),
     ),
-    Question("lens", "the lens: a camera_info YAML, roughly right (unknown)", "unknown", _of_the_camera("lens")),
-    Question("board", "the board's board.toml, of calib board (unknown)", "unknown", _of_the_camera("board")),
-    Question(
+    _Question("lens", "the lens: a camera_info YAML, roughly right (unknown)", "unknown", _of_the_camera("lens")),
+    _Question("board", "the board's board.toml, of calib board (unknown)", "unknown", _of_the_camera("board")),
+    _Question(
         "carried", "where the camera roughly sits in the tip's frame, and looks: x,y,z facing z [m] (unknown)",
         "unknown", _of_the_camera("carried", "in hand"),
     ),
-    Question(
+    _Question(
         "carried", "where the board's middle roughly sits in the tip's frame, and faces: x,y,z facing z [m] (unknown)",
         "unknown", _of_the_camera("carried", "to hand"),
     ),
-    Question(
+    _Question(
         "stands", "where the board's middle roughly is in the robot's base frame, and faces: 0.5,0,0 facing z [m] "
         "(unknown)", "unknown", _of_the_camera("stands", "in hand"),
     ),
-    Question(
+    _Question(
         "stands", "where the camera roughly stands in the robot's base frame, and looks: 1.5,0,0.5 facing -x [m] "
         "(unknown)", "unknown", _of_the_camera("stands", "to hand"),
     ),
-    Question(
+    _Question(
         "instrument_at", "where the instrument roughly stands, x,y,z [m] in the robot's base frame (unknown; none: "
         "it sees from everywhere)", "unknown", _of_the_cell("instrument_at"),
     ),
-    Question(
+    _Question(
         "cone", "half angle of the cone in which the target sees it [deg] (a reflector: 30; unknown)", "unknown",
         _of_the_cell("cone"),
     ),
-    Question("facing", "the direction the target faces in the tip's frame (x, -z …)", "z", _of_the_cell("facing")),
-    Question(
+    _Question("facing", "the direction the target faces in the tip's frame (x, -z …)", "z", _of_the_cell("facing")),
+    _Question(
         "box", "box that no part of the arm leaves, x,x,y,y,z,z [m] in its base frame (unknown; none)", "unknown",
         _of_the_cell("box"),
     ),
-    Question(
+    _Question(
         "obstacles", "what stands there: table box 1.2,0.8,0.05 at 0.7,0,-0.03; … [m], middles (unknown; none)",
         "unknown", _of_the_cell("obstacles"),
     ),
-    Question("dynamics", "identify the dynamics, too (yes, no)", "yes", _unanswered("dynamics")),
-    Question(
+    _Question("dynamics", "identify the dynamics, too (yes, no)", "yes", _unanswered("dynamics")),
+    _Question(
         "torques", "torques in the log (motor, link, both)", "motor",
         lambda given: given.dynamics is not False and given.torques is None,
     ),
-    Question(
+    _Question(
         "payloads", "payloads to record with as well, label=kg (none)", "none",
         lambda given: given.dynamics is not False and not given.payloads,
     ),
 )  # fmt: skip
 
 
-def with_answer(given: Answers, question: Question, text: str) -> Answers:
+def with_answer(given: Answers, question: _Question, text: str) -> Answers:
     """Return the answers with one more.
 
     Raises:
