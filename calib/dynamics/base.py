@@ -89,6 +89,12 @@ class Base:
     def units(self) -> tuple[str, ...]:
         return tuple(self.standard_units[k] for k in self.kept)
 
+    def to_standard(self, values: np.ndarray) -> np.ndarray:
+        """Return standard parameters (p,) with the same torques: base values at the kept ones, zero at the others."""
+        result = np.zeros(len(self.standard))
+        result[self.kept] = shaped(values, (self.b,), "base parameters")
+        return result
+
 
 @dataclass(frozen=True, eq=False)
 class BaseModel:
@@ -231,13 +237,6 @@ def expressions(base: Base, digits: int = 5, smallest: float = SMALLEST) -> tupl
 def standard_name(name: str, standard: Collection[str]) -> str:
     """Return the standard parameter that a base parameter of a file is named after: ``ZZ1R`` stands at ``ZZ1``."""
     return name[:-1] if name.endswith("R") and name not in standard and name[:-1] in standard else name
-
-
-def to_standard(base: Base, values: np.ndarray) -> np.ndarray:
-    """Return standard parameters (p,) with the same torques: base values at the kept ones, zero at the others."""
-    result = np.zeros(len(base.standard))
-    result[base.kept] = shaped(values, (base.b,), "base parameters")
-    return result
 
 
 def _updated(triangle: np.ndarray, columns: np.ndarray) -> np.ndarray:

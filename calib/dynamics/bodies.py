@@ -76,6 +76,13 @@ class Bodies:
     def units(self) -> tuple[str, ...]:
         return UNITS * self.count
 
+    def with_gravity(self, gravity: np.ndarray) -> Bodies:
+        """Return the bodies under another gravity vector (3,) in the base frame [m/s²]."""
+        gravity = shaped(gravity, (3,), "gravity")
+        constants = np.array(self.constants)
+        constants[-1, :3] = gravity
+        return replace(self, gravity=frozen(gravity), constants=frozen(constants))
+
 
 def bodies_of(chain: Chain) -> Bodies:
     """Return the bodies of a chain: one behind each moving element (a mimic joint's followers are bodies, too).
@@ -132,14 +139,6 @@ def with_payload(bodies: Bodies, placement: np.ndarray, label: str | None = None
         bodies.gravity,
         bodies.n,
     )
-
-
-def with_gravity(bodies: Bodies, gravity: np.ndarray) -> Bodies:
-    """Return the bodies under another gravity vector (3,) in the base frame [m/s²]."""
-    gravity = shaped(gravity, (3,), "gravity")
-    constants = np.array(bodies.constants)
-    constants[-1, :3] = gravity
-    return replace(bodies, gravity=frozen(gravity), constants=frozen(constants))
 
 
 def standard_parameters(chain: Chain) -> np.ndarray:

@@ -77,6 +77,17 @@ class DriveTerm:
     def unit(self) -> str:
         return self.form.unit_linear if self.linear else self.form.unit
 
+    def acting(self, motions: Sequence[np.ndarray | None], states: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+        """Yield each torque row that a term acts on, and its column there (N,).
+
+        Args:
+            motions: as in `fill`.
+            states: (s, N) of this term alone, see `friction_states`.
+        """
+        for k, (row, motion) in enumerate(self.acts):
+            seen = _join(self, motion, motions, states[k] if self.form.remembers else None)
+            yield row, self.form.values(seen, self.settings)
+
 
 def term(name: str, shape: str, joint: int, *settings: float, side: str = "motor", linear: bool = False) -> DriveTerm:
     """Return the term of one joint that sees its own motion."""
@@ -154,7 +165,7 @@ def fill(terms: Sequence[DriveTerm], out: np.ndarray, motions: Sequence[np.ndarr
     state = 0
     for column, one in zip(out, terms, strict=True):
         own = len(one.acts) if one.form.remembers else 0
-        for row, values in acting(one, motions, states[state : state + own]):
+        for row, values in one.acting(motions, states[state : state + own]):
             column[row] += values
         state += own
 
@@ -165,20 +176,6 @@ def fill_energies(terms: Sequence[DriveTerm], out: np.ndarray, v: np.ndarray) ->
         for row, motion in one.acts if one.shape == "acceleration" else ():
             for joint, weight in motion:
                 column += 0.5 * weight * v[row] * v[joint]
-
-
-def acting(
-    one: DriveTerm, motions: Sequence[np.ndarray | None], states: np.ndarray
-) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield each torque row that a term acts on, and its column there (N,).
-
-    Args:
-        motions: as in `fill`.
-        states: (s, N) of this term alone, see `friction_states`.
-    """
-    for k, (row, motion) in enumerate(one.acts):
-        seen = _join(one, motion, motions, states[k] if one.form.remembers else None)
-        yield row, one.form.values(seen, one.settings)
 
 
 def slopes(

@@ -199,7 +199,7 @@ class IdentificationModel:
         motions = [q.T, v.T, a.T, None if load is None else load.T]
         for one, value in zip(self.columns, values[self.inertial :]):
             own, used = parts.setdefault(one.side, np.zeros(np.shape(q))), len(one.acts) if one.form.remembers else 0
-            for row, column in drives.acting(one, motions, states[state : state + used]):
+            for row, column in one.acting(motions, states[state : state + used]):
                 own[:, row] += value * column
             state += used
         result = np.zeros((len(q), self.rows))
@@ -273,6 +273,14 @@ class IdentificationModel:
             index = self.bodies.labels.index(label)
             out[10 * index : 10 * index + 10] = 0.0
 
+    def with_load(self) -> tuple[str, ...]:
+        """Return the names of the terms that need `load`."""
+        return tuple(one.name for one in self.columns if one.form.loaded)
+
+    def with_terms(self, *terms: DriveTerm) -> IdentificationModel:
+        """Return the model with more drive terms behind its own."""
+        return replace(self, terms=(*self.terms, *terms))
+
 
 def from_chain(
     chain: Chain,
@@ -300,13 +308,3 @@ def from_chain(
 def friction_states(model: RegressorModel, q: np.ndarray) -> np.ndarray:
     """Return the states (s, N) of friction with memory along one uninterrupted record q (N, n), to slice in blocks."""
     return drives.friction_states(model.columns, np.ascontiguousarray(shaped(q, (None, model.n), "q").T))
-
-
-def with_terms(model: IdentificationModel, *terms: DriveTerm) -> IdentificationModel:
-    """Return the model with more drive terms behind its own."""
-    return replace(model, terms=(*model.terms, *terms))
-
-
-def with_load(model: IdentificationModel) -> tuple[str, ...]:
-    """Return the names of the terms that need `load`."""
-    return tuple(one.name for one in model.columns if one.form.loaded)

@@ -18,7 +18,7 @@ import numpy as np
 
 from calib.arrays import frozen, shaped
 from calib.dynamics import drives, rigid_body
-from calib.dynamics.base import BaseModel, to_standard
+from calib.dynamics.base import BaseModel
 from calib.dynamics.bodies import Bodies
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
@@ -118,7 +118,7 @@ def of_base(model: BaseModel, values: np.ndarray) -> PathDynamics:
     if mixed.max(initial=0.0) > MIXED:
         name = model.names[int(mixed.max(axis=1).argmax())]
         raise CalibError(f"base parameter {name} holds friction and other effects: their torques cannot be told apart")
-    standard = to_standard(model.base, values)
+    standard = model.base.to_standard(values)
     bodies = standard[: model.model.inertial]
     terms, amounts = _valued(model.model, standard)
     return PathDynamics(model.regressor, np.where(kept, 0.0, values), terms, amounts, model.model.bodies, bodies)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib.arrays import shaped
-from calib.dynamics.bodies import PRISMATIC, REVOLUTE, Bodies, with_gravity
+from calib.dynamics.bodies import PRISMATIC, REVOLUTE, Bodies
 from calib.errors import CalibError
 
 
@@ -50,7 +50,7 @@ def energies(bodies: Bodies, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         q, v: (N, n) [rad or m, and per s].
     """
     still = np.zeros_like(np.asarray(v, dtype=float))
-    moved = regressor(with_gravity(bodies, np.zeros(3)), q, still, v)
+    moved = regressor(bodies.with_gravity(np.zeros(3)), q, still, v)
     result = 0.5 * np.einsum("nj,njc->nc", v, moved)
     for i, frame in enumerate(_frames(bodies, q)):
         result[:, 10 * i + 6 : 10 * i + 9] -= np.einsum("nji,j->ni", frame[:, :3, :3], bodies.gravity)

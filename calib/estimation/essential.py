@@ -11,7 +11,7 @@ from scipy.special import fdtrc
 
 from calib.errors import CalibError, Unidentifiable
 from calib.estimation.linear import LinearFit, settled_std, wls
-from calib.estimation.triangles import Triangles, select
+from calib.estimation.triangles import Triangles
 
 
 class Rule(Enum):
@@ -106,7 +106,7 @@ def eliminate(
         worst = _next(current, keep, drop)
         if worst is None or len(kept) == 1:
             return Elimination(base, current, np.array(kept), tuple(steps), None)
-        smaller = wls(select(data, np.delete(kept, worst)), sigma, inflation)
+        smaller = wls(data.select(np.delete(kept, worst)), sigma, inflation)
         step = _step(base, current, smaller, worst, [*gone, kept[worst]], current.estimate.names[worst] in drop)
         if not step.listed and _refused(step, rule, ratio, level):
             return Elimination(base, current, np.array(kept), tuple(steps), step)

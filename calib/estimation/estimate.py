@@ -43,14 +43,13 @@ class Estimate:
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(self.values == 0.0, np.inf, 100.0 * self.sigma / np.abs(self.values))
 
-
-def strong_correlations(estimate: Estimate, threshold: float = 0.95) -> list[tuple[str, str, float]]:
-    """Return pairs of parameters whose estimates correlate by more than `threshold`, strongest first."""
-    sigma = np.where(estimate.sigma > 0, estimate.sigma, 1.0)
-    correlation = estimate.covariance / np.outer(sigma, sigma)
-    rows, columns = np.triu_indices(len(sigma), 1)
-    strong = np.abs(correlation[rows, columns]) > threshold
-    pairs = [
-        (estimate.names[i], estimate.names[j], float(correlation[i, j])) for i, j in zip(rows[strong], columns[strong])
-    ]
-    return sorted(pairs, key=lambda pair: -abs(pair[2]))
+    def strong_correlations(self, threshold: float = 0.95) -> list[tuple[str, str, float]]:
+        """Return pairs of parameters whose estimates correlate by more than `threshold`, strongest first."""
+        sigma = np.where(self.sigma > 0, self.sigma, 1.0)
+        correlation = self.covariance / np.outer(sigma, sigma)
+        rows, columns = np.triu_indices(len(sigma), 1)
+        strong = np.abs(correlation[rows, columns]) > threshold
+        pairs = [
+            (self.names[i], self.names[j], float(correlation[i, j])) for i, j in zip(rows[strong], columns[strong])
+        ]
+        return sorted(pairs, key=lambda pair: -abs(pair[2]))

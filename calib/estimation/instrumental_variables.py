@@ -28,9 +28,7 @@ from calib.estimation.triangles import (
     condition_numbers,
     empty,
     require_rank,
-    residual_squares,
     retriangulate,
-    select,
     solve_triangle,
 )
 
@@ -90,6 +88,29 @@ class Instruments:
     def names(self) -> tuple[str, ...]:
         return self.data.names[len(self.data.names) // 2 :]
 
+    def least_squares(self) -> Triangles:
+        """Return the triangles of [W y] alone, for `linear.ols` and `linear.wls`."""
+        p = len(self.names)
+        return self.data.select(np.arange(p, 2 * p))
+
+    def testable(self, fit: LinearFit, std: np.ndarray | None = None) -> Triangles:
+        """Return triangles [A b; 0 ‖ρ‖] of one group, on which least squares gives the IV estimate and its covariance.
+
+        ρ = y - W x_IV, whitened. With it tests of nested models are those of two-stage least squares (Wooldridge 2010,
+        section 5.2.3): differences of ‖P_Z (y - W x)‖² against the variance of ρ.
+
+        Args:
+            std: as in `iv`.
+            fit: what `iv` made of them.
+        """
+        p = len(self.names)
+        sigma = np.ones(self.data.groups) if std is None else std
+        squares = self.data.residual_squares(np.concatenate([np.zeros(p), fit.estimate.values]))
+        factor = np.zeros((1, p + 1, p + 1))
+        factor[0, :p] = projected(self, sigma)[:p]
+        factor[0, p, p] = np.sqrt(np.sum(squares / sigma**2))
+        return replace(empty(self.names, self.data.units[p:], 1), factors=factor, rows=self.data.rows.sum()[None])
+
 
 def instrument(
     instruments: np.ndarray,
@@ -123,12 +144,6 @@ def unseen(names: Sequence[str], units: Sequence[str], groups: int) -> Instrumen
     return Instruments(empty([*(f"Z {name}" for name in names), *names], [*units, *units], groups))
 
 
-def least_squares(problem: Instruments) -> Triangles:
-    """Return the triangles of [W y] alone, for `linear.ols` and `linear.wls`."""
-    p = len(problem.names)
-    return select(problem.data, np.arange(p, 2 * p))
-
-
 def iv(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1.0) -> LinearFit:
     """Estimate x = (Zᵀ Ω⁻¹ W)⁻¹ Zᵀ Ω⁻¹ y, covariance σ² (ZᵀΩ⁻¹W)⁻¹ (ZᵀΩ⁻¹Z) (WᵀΩ⁻¹Z)⁻¹, Ω = diag(σ_g² I).
 
@@ -148,7 +163,7 @@ def iv(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1
     sigma = np.ones(problem.data.groups) if std is None else shaped(std, (problem.data.groups,), "std per group")
     factor = combine(problem.data, sigma)
     values, inverse, _ = solve_triangle(_projected(factor, problem.names), problem.names)
-    squares = residual_squares(problem.data, np.concatenate([np.zeros(p), values]))
+    squares = problem.data.residual_squares(np.concatenate([np.zeros(p), values]))
     left = problem.data.rows - inflation * p * problem.data.rows / problem.data.rows.sum()
     dof = int(problem.data.rows.sum() / inflation) - p
     if dof <= 0:
@@ -240,25 +255,6 @@ def projected(problem: Instruments, std: np.ndarray | None = None) -> np.ndarray
     Zᵀ W, which need not be.
     """
     return _projected(combine(problem.data, std), problem.names)
-
-
-def testable(problem: Instruments, fit: LinearFit, std: np.ndarray | None = None) -> Triangles:
-    """Return triangles [A b; 0 ‖ρ‖] of one group, on which least squares gives the IV estimate and its covariance.
-
-    ρ = y - W x_IV, whitened. With it tests of nested models are those of two-stage least squares (Wooldridge 2010,
-    section 5.2.3): differences of ‖P_Z (y - W x)‖² against the variance of ρ.
-
-    Args:
-        problem, std: as in `iv`.
-        fit: what `iv` made of them.
-    """
-    p = len(problem.names)
-    sigma = np.ones(problem.data.groups) if std is None else std
-    squares = residual_squares(problem.data, np.concatenate([np.zeros(p), fit.estimate.values]))
-    factor = np.zeros((1, p + 1, p + 1))
-    factor[0, :p] = projected(problem, sigma)[:p]
-    factor[0, p, p] = np.sqrt(np.sum(squares / sigma**2))
-    return replace(empty(problem.names, problem.data.units[p:], 1), factors=factor, rows=problem.data.rows.sum()[None])
 
 
 def _projected(factor: np.ndarray, names: Sequence[str]) -> np.ndarray:

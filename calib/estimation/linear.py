@@ -18,7 +18,7 @@ from calib.arrays import frozen, shaped
 from calib.errors import CalibError, NotConverged, Unidentifiable
 from calib.estimation.base_columns import split_columns
 from calib.estimation.estimate import Estimate
-from calib.estimation.triangles import Triangles, combine, residual_squares, retriangulate, solve_triangle
+from calib.estimation.triangles import Triangles, combine, retriangulate, solve_triangle
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +116,7 @@ def settled_std(data: Triangles, tolerance: float = 1e-6, limit: int = 200) -> n
     for _ in range(limit):
         values, inverse, _ = solve_triangle(combine(data, std), data.names)
         left = data.rows - leverage(data, std, inverse)
-        new = _floored(np.sqrt(residual_squares(data, values) / np.maximum(left, 1e-9)))
+        new = _floored(np.sqrt(data.residual_squares(values) / np.maximum(left, 1e-9)))
         change, std = float(np.max(np.abs(new / std - 1.0))), new
         if change < tolerance:
             return std
@@ -151,7 +151,7 @@ def _pack(
     conditions: tuple[float, float],
 ) -> LinearFit:
     """Return the fit with its residuals' sizes, degrees of freedom counted with the inflation τ."""
-    squares = residual_squares(data, values)
+    squares = data.residual_squares(values)
     left = data.rows - tau * leverage(data, std, inverse)
     dof = int(np.round(np.sum(left / tau), 6))
     if dof <= 0 or left.sum() <= 0:

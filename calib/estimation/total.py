@@ -13,7 +13,7 @@ from calib.arrays import shaped
 from calib.errors import CalibError, Unidentifiable
 from calib.estimation.estimate import Estimate
 from calib.estimation.linear import LinearFit
-from calib.estimation.triangles import Triangles, combine, condition_numbers, residual_squares, retriangulate
+from calib.estimation.triangles import Triangles, combine, condition_numbers, retriangulate
 
 
 def tls(data: Triangles, noise: np.ndarray, std: np.ndarray | None = None) -> LinearFit:
@@ -48,7 +48,7 @@ def tls(data: Triangles, noise: np.ndarray, std: np.ndarray | None = None) -> Li
         raise Unidentifiable(f"{count} rows for {p} parameters leave nothing to judge them by", data.names)
     covariance = _covariance(factor[:p, :p], noise, values, variance, count, data.names)
     estimate = Estimate(data.names, data.units, values, covariance, float(np.sqrt(variance)), count - p)
-    group_std = np.sqrt(residual_squares(data, values) / np.maximum(data.rows * (1.0 - p / count), 1e-300))
+    group_std = np.sqrt(data.residual_squares(values) / np.maximum(data.rows * (1.0 - p / count), 1e-300))
     return LinearFit(estimate, group_std, *condition_numbers(factor[:p, :p]))
 
 

@@ -47,6 +47,18 @@ class Triangles:
     def parameters(self) -> int:
         return len(self.names)
 
+    def residual_squares(self, values: np.ndarray) -> np.ndarray:
+        """Return ‖y_g - W_g x‖² of every group (g,), from the triangles alone."""
+        return np.sum((self.factors @ np.append(values, -1.0)) ** 2, axis=1)
+
+    def select(self, columns: np.ndarray) -> Triangles:
+        """Return the triangles of the model with only these columns, in the order given."""
+        columns = np.asarray(columns, dtype=int)
+        wanted = np.append(columns, self.parameters)
+        factors = [retriangulate(factor[:, wanted]) for factor in self.factors]
+        names = tuple(self.names[k] for k in columns)
+        return Triangles(names, tuple(self.units[k] for k in columns), frozen(np.stack(factors)), self.rows)
+
 
 def empty(names: Sequence[str], units: Sequence[str] | None = None, groups: int = 1) -> Triangles:
     """Return triangles that have seen no rows."""
@@ -107,15 +119,6 @@ def merge(first: Triangles, second: Triangles) -> Triangles:
     return replace(first, factors=frozen(np.stack(factors)), rows=frozen(first.rows + second.rows, int))
 
 
-def select(data: Triangles, columns: np.ndarray) -> Triangles:
-    """Return the triangles of the model with only these columns, in the order given."""
-    columns = np.asarray(columns, dtype=int)
-    wanted = np.append(columns, data.parameters)
-    factors = [retriangulate(factor[:, wanted]) for factor in data.factors]
-    names = tuple(data.names[k] for k in columns)
-    return Triangles(names, tuple(data.units[k] for k in columns), frozen(np.stack(factors)), data.rows)
-
-
 def tie(data: Triangles, sets: Sequence[Sequence[str]]) -> Triangles:
     """Return the triangles with the parameters of each set equal: one column, their sum, at the first one's place.
 
@@ -145,11 +148,6 @@ def combine(data: Triangles, std: np.ndarray | None = None) -> np.ndarray:
         raise CalibError(f"standard deviations per group must be positive, found {scale.min()}")
     size = data.parameters + 1
     return retriangulate((data.factors / scale[:, None, None]).reshape(data.groups * size, size))
-
-
-def residual_squares(data: Triangles, values: np.ndarray) -> np.ndarray:
-    """Return ‖y_g - W_g x‖² of every group (g,), from the triangles alone."""
-    return np.sum((data.factors @ np.append(values, -1.0)) ** 2, axis=1)
 
 
 def retriangulate(stacked: np.ndarray) -> np.ndarray:

@@ -57,6 +57,19 @@ class Errors:
         chosen = self.position if self.position is not None else self.distance
         return np.zeros(0) if chosen is None else chosen
 
+    def summary(self) -> dict[str, dict[str, float] | None]:
+        """Return ``position_mm``, ``orientation_deg`` and, where distances are measured, ``distance_mm``.
+
+        Each holds mean, rms, p95 and max; None where nothing of the kind was measured.
+        """
+        result: dict[str, dict[str, float] | None] = {
+            "position_mm": statistics(self.position, ERRORS["position"][0]),
+            "orientation_deg": statistics(self.orientation, ERRORS["orientation"][0]),
+        }
+        if self.distance is not None:
+            result["distance_mm"] = statistics(self.distance, 1e3)
+        return result
+
 
 def errors(cell: Installation, measured: Sequence[PoseMeasurements], torques: Torques = None) -> Errors:
     """Return the size of every error.
@@ -74,20 +87,6 @@ def errors(cell: Installation, measured: Sequence[PoseMeasurements], torques: To
             found["distance"].append(_socket_spread(predict(cell, block).point, block.measured))
     joined = {name: np.concatenate(sizes) if sizes else np.zeros(0) for name, sizes in found.items()}
     return Errors(**{name: sizes if len(sizes) else None for name, sizes in joined.items()})
-
-
-def summary(found: Errors) -> dict[str, dict[str, float] | None]:
-    """Return ``position_mm``, ``orientation_deg`` and, where distances are measured, ``distance_mm``.
-
-    Each holds mean, rms, p95 and max; None where nothing of the kind was measured.
-    """
-    result: dict[str, dict[str, float] | None] = {
-        "position_mm": statistics(found.position, ERRORS["position"][0]),
-        "orientation_deg": statistics(found.orientation, ERRORS["orientation"][0]),
-    }
-    if found.distance is not None:
-        result["distance_mm"] = statistics(found.distance, 1e3)
-    return result
 
 
 def statistics(sizes: np.ndarray | None, factor: float = 1.0) -> dict[str, float] | None:

@@ -42,15 +42,14 @@ class Installation:
         object.__setattr__(self, "stations", frozen(self.stations))
         object.__setattr__(self, "tools", frozen(self.tools))
 
-
-def merged(cell: Installation) -> Installation:
-    """Return the same installation with known and fitted deflections as one."""
-    if not cell.known.terms:
-        return cell
-    terms = (*cell.known.terms, *cell.deflection.terms)
-    values = np.concatenate([np.asarray(cell.known.coefficients), np.asarray(cell.deflection.coefficients)])
-    reference = cell.known.reference if cell.deflection.reference is None else cell.deflection.reference
-    return replace(cell, deflection=Deflection(terms, values, reference), known=Deflection())
+    def merged(self) -> Installation:
+        """Return the same installation with known and fitted deflections as one."""
+        if not self.known.terms:
+            return self
+        terms = (*self.known.terms, *self.deflection.terms)
+        values = np.concatenate([np.asarray(self.known.coefficients), np.asarray(self.deflection.coefficients)])
+        reference = self.known.reference if self.deflection.reference is None else self.deflection.reference
+        return replace(self, deflection=Deflection(terms, values, reference), known=Deflection())
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.data.camera.board import corners
-from calib.data.camera.lens import project_with_slopes
 from calib.data.poses.pixels import IN_HAND, Pixels
 from calib.errors import MeasurementError, UsageError
 from calib.geometry.images.image_noise import ImageNoise, OwnPoses
@@ -190,7 +189,7 @@ def _pixels(measured: Pixels, seen: Seen, jacobian: np.ndarray) -> list[Part]:
     point = turned + origin[image]
     aside = np.maximum(np.linalg.norm(point[:, :2], axis=1), 1e-3)
     point[:, 2] = np.maximum(point[:, 2], aside / STEEPEST[view.lens.model])  # of a wild guess, behind the camera
-    pixel, by_point, by_lens = project_with_slopes(view.lens, point)
+    pixel, by_point, by_lens = view.lens.project_with_slopes(point)
     local = np.empty((len(image), 2, 6 + len(view.own)))
     local[:, :, :3] = by_point
     local[:, :, 3:6] = np.cross(turned[:, None, :], by_point)  # g · (ω × c) = (c × g) · ω

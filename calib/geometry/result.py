@@ -12,7 +12,7 @@ from calib.estimation.base_columns import ColumnSplit
 from calib.estimation.estimate import Estimate
 from calib.estimation.nonlinear import Solution
 from calib.geometry.images.image_noise import ImageNoise
-from calib.geometry.installation import Installation, merged
+from calib.geometry.installation import Installation
 from calib.geometry.observation import Block
 from calib.geometry.pixel_residuals import PixelPart
 from calib.geometry.residuals import Part
@@ -71,6 +71,44 @@ class GeometricFit:
         """The calibrated robot of a fit without joint corrections; with some, see `calibrated_chain`."""
         return calibrated_chain(self)
 
+    def outliers(self, threshold: float = 4.0) -> list[tuple[str, int, str, float]]:
+        """Return (file, row, label, size in robust sigmas) of rows that do not fit, worst first.
+
+        Sizes are measured against the robust spread of their own part (1.4826 · median), not against stated sigmas, so
+        that an optimistic instrument does not make every row an outlier.
+        """
+        result = []
+        for piece in self.pieces:
+            measured, part = self.blocks[piece.block].measured, piece.part.per_row()
+            size = np.sqrt(np.mean(part.value**2, axis=0)) / max(robust.spread(part.value), 1e-15)
+            rows = measured.rows[part.index]
+            result += [
+                (measured.file, int(rows[i]), part.label, float(size[i])) for i in np.flatnonzero(size > threshold)
+            ]
+        return sorted(result, key=lambda item: -item[3])
+
+    def row_weights(self) -> list[np.ndarray]:
+        """Return per block the smallest robust weight of each row's parts (m,); 1 without a robust loss."""
+        result = [np.ones(len(block.measured)) for block in self.blocks]
+        for piece in self.pieces:
+            np.minimum.at(result[piece.block], *piece.part.row_weights(piece.weight))
+        return result
+
+    def used_noises(self) -> list[ImageNoise | None]:
+        """Return per block the noise of its images; None where there are none."""
+        result: list[ImageNoise | None] = [None] * len(self.blocks)
+        for piece in self.pieces:
+            if isinstance(piece.part, PixelPart):
+                result[piece.block] = piece.part.noise
+        return result
+
+    def used_sigmas(self) -> list[dict[str, float]]:
+        """Return per block the rms standard deviation used for each label [m or rad]."""
+        result: list[dict[str, float]] = [{} for _ in self.blocks]
+        for piece in self.pieces:
+            result[piece.block][piece.part.label] = float(np.sqrt(np.mean(piece.sigma**2)))
+        return result
+
 
 def calibrated_chain(
     found: GeometricFit, rigid: GeometricFit | None = None, nominal: Chain | None = None
@@ -85,7 +123,7 @@ def calibrated_chain(
     Raises:
         UsageError: for a fit with joint corrections and no rigid one: without them its geometry is no robot's.
     """
-    whole, nominal = merged(found.cell), nominal or found.start.chain
+    whole, nominal = found.cell.merged(), nominal or found.start.chain
     if not whole.deflection.terms:
         rigid = found
     if rigid is None:
@@ -99,43 +137,3 @@ def calibrated_chain(
         covariance[np.ix_(where, where)] = rigid.estimate.covariance[np.ix_(own, own)]
     corrections = CorrectedChain(whole.chain, whole.deflection) if whole.deflection.terms else None
     return CalibratedChain(chain, nominal, covariance, corrections)
-
-
-def used_sigmas(found: GeometricFit) -> list[dict[str, float]]:
-    """Return per block the rms standard deviation used for each label [m or rad]."""
-    result: list[dict[str, float]] = [{} for _ in found.blocks]
-    for piece in found.pieces:
-        result[piece.block][piece.part.label] = float(np.sqrt(np.mean(piece.sigma**2)))
-    return result
-
-
-def used_noises(found: GeometricFit) -> list[ImageNoise | None]:
-    """Return per block the noise of its images; None where there are none."""
-    result: list[ImageNoise | None] = [None] * len(found.blocks)
-    for piece in found.pieces:
-        if isinstance(piece.part, PixelPart):
-            result[piece.block] = piece.part.noise
-    return result
-
-
-def row_weights(found: GeometricFit) -> list[np.ndarray]:
-    """Return per block the smallest robust weight of each row's parts (m,); 1 without a robust loss."""
-    result = [np.ones(len(block.measured)) for block in found.blocks]
-    for piece in found.pieces:
-        np.minimum.at(result[piece.block], *piece.part.row_weights(piece.weight))
-    return result
-
-
-def outliers(found: GeometricFit, threshold: float = 4.0) -> list[tuple[str, int, str, float]]:
-    """Return (file, row, label, size in robust sigmas) of rows that do not fit, worst first.
-
-    Sizes are measured against the robust spread of their own part (1.4826 · median), not against stated sigmas, so
-    that an optimistic instrument does not make every row an outlier.
-    """
-    result = []
-    for piece in found.pieces:
-        measured, part = found.blocks[piece.block].measured, piece.part.per_row()
-        size = np.sqrt(np.mean(part.value**2, axis=0)) / max(robust.spread(part.value), 1e-15)
-        rows = measured.rows[part.index]
-        result += [(measured.file, int(rows[i]), part.label, float(size[i])) for i in np.flatnonzero(size > threshold)]
-    return sorted(result, key=lambda item: -item[3])

@@ -45,17 +45,16 @@ class Settings:
     limit: int = 300
     passes: int = 3
 
+    def combine(self, **changes: object) -> Settings:
+        """Return settings with some fields changed.
 
-def combine(settings: Settings, **changes: object) -> Settings:
-    """Return settings with some fields changed.
-
-    Raises:
-        UsageError: for a loss that does not exist.
-    """
-    result = replace(settings, **changes)  # type: ignore[arg-type]
-    if result.loss not in ("auto", *robust.LOSSES):
-        raise UsageError(f"loss '{result.loss}' is none of auto, {', '.join(robust.LOSSES)}")
-    return result
+        Raises:
+            UsageError: for a loss that does not exist.
+        """
+        result = replace(self, **changes)  # type: ignore[arg-type]
+        if result.loss not in ("auto", *robust.LOSSES):
+            raise UsageError(f"loss '{result.loss}' is none of auto, {', '.join(robust.LOSSES)}")
+        return result
 
 
 class Weigher:

@@ -13,7 +13,7 @@ from calib.dynamics import base as bases
 from calib.dynamics.base import Base
 from calib.dynamics.bodies import standard_parameters
 from calib.dynamics.drives import DriveTerm
-from calib.dynamics.idim import IdentificationModel, with_terms
+from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.regressor_model import RegressorModel, States
 from calib.dynamics.torque_rows import POWER
 from calib.errors import MeasurementError, UsageError
@@ -187,8 +187,8 @@ def identify_model(
     if settings.loop is not None and not method.needs_controller:
         say("simulating the closed loop")
     bias = compare_with_loop(problem, found)
-    richer = with_terms(model, *friction.terms) if _sees_drives(model) else model
-    dynamics = Dynamics(richer, np.concatenate([bases.to_standard(base, values[: base.b]), values[base.b :]]))
+    richer = model.with_terms(*friction.terms) if _sees_drives(model) else model
+    dynamics = Dynamics(richer, np.concatenate([base.to_standard(values[: base.b]), values[base.b :]]))
     dynamics, ripples = _with_ripple(dynamics, cases, settings, say)
     dynamics = _with_payloads(dynamics, cases, settings)
     say("essential parameters")
@@ -237,7 +237,7 @@ def _richer_friction(
     if not _sees_drives(model):
         return FrictionSelection((), (), ()), nothing
     std, tau, values = first
-    plain = Dynamics(model, bases.to_standard(base, values))
+    plain = Dynamics(model, base.to_standard(values))
     loads = nothing if settings.friction in ("standard", "ripple") else [transmitted(plain, case) for case in cases]
     candidates = FrictionCandidates(
         cases, rows, loads, decimator, std, tau, np.array(per_joint(settings.v0, model.n, "v0")), model.prismatic,
@@ -255,7 +255,7 @@ def _with_ripple(
         return dynamics, ()
     say("ripple")
     ripples = tuple(find_all(cases, [case.target - predict(dynamics, case) for case in cases]))
-    richer = with_terms(model, *(one for ripple in ripples for one in ripple.terms))
+    richer = model.with_terms(*(one for ripple in ripples for one in ripple.terms))
     return Dynamics(richer, np.concatenate([dynamics.values, *(ripple.values for ripple in ripples)])), ripples
 
 

@@ -42,7 +42,7 @@ import numpy as np
 
 from calib import estimate_files
 from calib.dynamics.base import Base, expressions
-from calib.dynamics.bodies import bodies_of, with_gravity, with_payload
+from calib.dynamics.bodies import bodies_of, with_payload
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.torque_rows import torque_rows
@@ -156,7 +156,7 @@ def _regrouping(base: Base) -> dict[str, dict[str, float]]:
 
 def from_table(chain: Chain, table: Mapping[str, Any]) -> Dynamics:
     """Return the model of a table that `to_table` made, on the chain it was made for."""
-    bodies = with_gravity(bodies_of(chain), np.array(table["gravity"], dtype=float))
+    bodies = bodies_of(chain).with_gravity(np.array(table["gravity"], dtype=float))
     for label in table.get("payloads", ()):
         bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1)
     terms = tuple(_term(entry) for entry in table["terms"])

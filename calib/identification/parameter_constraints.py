@@ -28,7 +28,7 @@ from calib.estimation.convex.constraint_relations import contradicting, restrict
 from calib.estimation.convex.definite import Definite
 from calib.estimation.convex.interior_point import Constrained
 from calib.estimation.linear import LinearFit
-from calib.estimation.triangles import Triangles, residual_squares
+from calib.estimation.triangles import Triangles
 from calib.identification.body_cone import BodyCone, cone_of
 
 POSTURES = 50  # at which M(q) must be positive definite (our choice)
@@ -338,7 +338,7 @@ def hold(
     constraints = constraints.touched(factor)
     found = constraints.solve(factor)
     normals = found.normals[found.binding]
-    before, after = (residual_squares(data, values) for values in (free.values, found.values))
+    before, after = (data.residual_squares(values) for values in (free.values, found.values))
     dof = free.dof + int(np.linalg.matrix_rank(normals)) if len(normals) else free.dof
     ratio = float(np.sum(after / std**2) / dof / max(np.sum(before / std**2) / free.dof, 1e-300))
     covariance = restricted(np.asarray(free.covariance), factor, normals) * (1.0 if stated else ratio)

@@ -102,7 +102,7 @@ def term_columns(one: DriveTerm, case: Case, load: np.ndarray | None = None) -> 
     """Yield the torque rows that a drive term acts on, each with its column (N,) at the full rate."""
     motion = case.motion
     motions = [motion.q.T, motion.v.T, motion.a.T, None if load is None else load.T]
-    return drives.acting(one, motions, segmented_states([one], case))
+    return one.acting(motions, segmented_states([one], case))
 
 
 def segmented_states(terms: Sequence[DriveTerm], case: Case) -> np.ndarray:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.data.signals.motion import in_band, moving
+from calib.data.signals.motion import moving
 from calib.estimation.whiteness import Whiteness, examine, r_squared
 from calib.identification.cases import Case
 from calib.identification.rows import segments
@@ -129,7 +129,7 @@ class _Row:
 
 def _row(case: Case, predicted: np.ndarray, k: int, known: np.ndarray, moves: np.ndarray) -> _Row:
     motion, target = case.motion, case.target[:, k]
-    low = in_band(motion, np.stack([target, predicted], axis=1))
+    low = motion.in_band(np.stack([target, predicted], axis=1))
     residual, own = target - predicted, low[:, 0] - low[:, 1]
     sums = [_sums(target, residual, known), _sums(low[:, 0], own, known)]
     sums += [_sums(target, residual, known & moves), _sums(target, residual, known & ~moves)]

@@ -11,7 +11,7 @@ import numpy as np
 from calib.config import strict
 from calib.config_types import Expect, JointNumber, Real, Text
 from calib.dynamics import drives
-from calib.dynamics.bodies import bodies_of, with_gravity, with_payload
+from calib.dynamics.bodies import bodies_of, with_payload
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.shapes import V0
@@ -106,7 +106,7 @@ def make_model(chain: Chain, settings: IdentificationSettings) -> Identification
         raise UsageError(f"passive = '{settings.passive}': a serial arm has no passive joints")
     bodies = bodies_of(chain)
     if settings.gravity is not None:
-        bodies = with_gravity(bodies, np.array(settings.gravity))
+        bodies = bodies.with_gravity(np.array(settings.gravity))
     for label in settings.payloads:
         bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1)
     _check_joints(chain.n, settings)

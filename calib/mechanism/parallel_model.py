@@ -134,7 +134,7 @@ class ParallelModel:
         self._fill_platform(out, first, (J.platform.transpose(0, 2, 1) @ own).transpose(2, 1, 0), carried)
         motions = [motion.posture.q.T, motion.v.T, motion.a.T, None]
         for k, one in enumerate(self.terms):
-            for joint, column in drives.acting(one, motions, np.zeros((0, len(motion.v)))):
+            for joint, column in one.acting(motions, np.zeros((0, len(motion.v)))):
                 out[self.inertial + k] += J.joints[:, joint].T * column
         return out.transpose(2, 1, 0)
 
@@ -159,7 +159,7 @@ class ParallelModel:
             parts.append(rigid_body.inverse_dynamics(bodies, parameters, *(x[:, a:b] for x in own)))
         result = np.concatenate(parts, axis=1)
         for one, value in zip(self.terms, values[self.inertial :]):
-            for joint, column in drives.acting(one, [*(x.T for x in own), None], np.zeros((0, len(result)))):
+            for joint, column in one.acting([*(x.T for x in own), None], np.zeros((0, len(result)))):
                 result[:, joint] += value * column
         return result
 

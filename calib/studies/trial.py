@@ -9,7 +9,6 @@ from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
 
-from calib.dynamics import base as bases
 from calib.errors import CalibError
 from calib.identification.methods.method import EstimateStatus, MethodEstimate
 from calib.identification.methods.registry import VERSIONS, method_named
@@ -165,7 +164,7 @@ def _percent(error: np.ndarray, size: np.ndarray) -> float:
 
 def _survey_tau(data: Experiment, values: np.ndarray) -> float:
     case, problem = data.problem.cases[0], data.problem
-    predicted = predict(Dynamics(problem.model, bases.to_standard(problem.base, values)), case)
+    predicted = predict(Dynamics(problem.model, problem.base.to_standard(values)), case)
     rest = np.linalg.norm(case.target - predicted, axis=1)
     return float(100.0 * np.mean(rest / np.maximum(np.linalg.norm(case.target, axis=1), 1e-12)))
 
@@ -175,7 +174,7 @@ def _resimulated(condition: Condition, data: Experiment, values: np.ndarray, see
     if seed >= condition.resimulated:
         return NAN
     setup, problem, model = set_up(condition.robot, condition.duration), data.problem, data.model
-    plant = Plant(model.bodies, model.terms, bases.to_standard(problem.base, values))
+    plant = Plant(model.bodies, model.terms, problem.base.to_standard(values))
     controller, sensing = known_robots.controller(condition.robot), Sensing(every=setup.every)
     try:
         run = simulate(plant, controller, setup.reference, sensing)

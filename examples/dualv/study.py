@@ -19,7 +19,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from calib.data.recordings.recording import Recording
-from calib.data.signals.motion import FilterOptions, in_band, make_motion
+from calib.data.signals.motion import FilterOptions, make_motion
 from calib.estimation.essential import Rule, eliminate
 from calib.estimation.triangles import tie
 from calib.identification.cases import Case, make_case
@@ -151,7 +151,7 @@ class Method:
 
     def errors(self, case: Case, estimate) -> list[float]:
         """Return ‖ρ‖/‖y‖ by row, both sides in the identification band."""
-        y, found = (in_band(case.motion, x) for x in (case.target, self.predicted(case, estimate)))
+        y, found = (case.motion.in_band(x) for x in (case.target, self.predicted(case, estimate)))
         return [float(x) for x in np.linalg.norm(y - found, axis=0) / np.linalg.norm(y, axis=0)]
 
 
@@ -269,18 +269,18 @@ def _cell(value: float, percent: float) -> str:
 def figures(robot: Robot, idim: Method, pim: Method, out: Path) -> None:
     """Draw the papers' figures for the loaded robot on the other motion: forces, torques, overconstraint, power."""
     case = idim.unseen[-1]
-    y, found = (in_band(case.motion, x) for x in (case.target, idim.predicted(case, idim.nine)))
+    y, found = (case.motion.in_band(x) for x in (case.target, idim.predicted(case, idim.nine)))
     span = case.motion.t < case.motion.t[0] + 3.0
     t = case.motion.t[span]
     _draw(t, y[span], found[span], [f"F{c} [N]" if c != "rz" else "Mz [N m]" for c in COORDINATES], out / "forces.png")
     motion = idim.model.moved(case.motion.q[span], case.motion.v[span], case.motion.a[span])
-    tau = in_band(case.motion, np.array(case.motion.effort))[span]
+    tau = case.motion.in_band(np.array(case.motion.effort))[span]
     c = overconstraint(robot.known, motion.jacobians, tau)
     rebuilt = distributed(robot.known, motion.jacobians, found[span], c)
     _draw(t, tau, rebuilt, [f"{name} [N m]" for name in robot.known.robot.joint_names], out / "torques.png")
     _draw(t, c, np.full_like(c, PRELOAD), ["overconstraint [N m]"], out / "overconstraint.png")
     power = pim.unseen[-1]
-    P, model = (in_band(power.motion, x) for x in (power.target, pim.predicted(power, pim.nine)))
+    P, model = (power.motion.in_band(x) for x in (power.target, pim.predicted(power, pim.nine)))
     _draw(t, P[span], model[span], ["power [W]"], out / "power.png")
 
 

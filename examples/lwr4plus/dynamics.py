@@ -32,7 +32,7 @@ from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics import base as bases
 from calib.dynamics import drives
 from calib.dynamics.base import Base
-from calib.dynamics.bodies import bodies_of, standard_parameters, with_gravity, with_payload
+from calib.dynamics.bodies import bodies_of, standard_parameters, with_payload
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.torque_rows import BOTH, LINK, MODELS, MOTOR, TorqueRows
 from calib.estimation.essential import Elimination, Rule, eliminate
@@ -92,7 +92,7 @@ def model(
     bodies = with_payload(
         bodies_of(chain), pose(position=np.array([0.0, 0.0, known_robots.truth("lwr4plus")["payload"]["r"]]))
     )
-    bodies = bodies if gravity is None else with_gravity(bodies, gravity)
+    bodies = bodies if gravity is None else bodies.with_gravity(gravity)
     terms = drives.standard([" ".join(known_robots.SIDED)] * chain.n, v0)
     return IdentificationModel(bodies, (*terms, *drives.without_effect(PAYLOAD)), kind)
 
@@ -259,7 +259,7 @@ def tracking(chain: Chain, fits: dict[str, Fit], reference: Reference) -> dict[s
     bare = replace(controller(robot, reference), ahead=None)
     result = {"feedback alone": tracking_error(robot, None, bare, reference)}
     for name, found in fits.items():
-        believed = Plant(found.model.bodies, whole.terms, bases.to_standard(found.base, values_of(found)))
+        believed = Plant(found.model.bodies, whole.terms, found.base.to_standard(values_of(found)))
         result[name] = tracking_error(robot, believed, bare, reference)
     return {name: (1e3 * error).tolist() for name, error in result.items()}
 

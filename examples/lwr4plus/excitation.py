@@ -44,7 +44,7 @@ from calib.dynamics.base import Base
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.torque_rows import BOTH, MOTOR
 from calib.estimation.linear import settled_std, wls
-from calib.estimation.triangles import combine, select
+from calib.estimation.triangles import combine
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit
 from calib.procedure.excitation.limits import Points
@@ -137,7 +137,7 @@ def estimate(seed: int) -> Arm:
     )
     own, base = Arm(chain, np.zeros(0)).observed
     rows = dynamics.collected(own, base, dynamics.record(truth().chain, slow, [seed, 3]))
-    return Arm(chain, bases.to_standard(base, wls(rows, settled_std(rows)).estimate.values))
+    return Arm(chain, base.to_standard(wls(rows, settled_std(rows)).estimate.values))
 
 
 def table_4(base: Base) -> np.ndarray:
@@ -238,7 +238,7 @@ def fitted(arm: Arm, data: dynamics.Data) -> dict[str, Any]:
     true = (truth().observed[1].transform @ truth().values)[table_4(base)]
     whole = dynamics.collected(own, base, data)
     result: dict[str, Any] = {"truth": true.tolist(), "rows": int(whole.rows[0])}
-    for name, rows in (("102 fitted", whole), ("44 fitted", select(whole, table_4(base)))):
+    for name, rows in (("102 fitted", whole), ("44 fitted", whole.select(table_4(base)))):
         std = settled_std(rows)
         found, size = wls(rows, std).estimate, np.linalg.norm(combine(rows, std)[:, :-1], axis=0)
         index = [found.names.index(one) for one in TABLE_4]

@@ -21,7 +21,7 @@ import study_options
 import study_tables
 
 from calib import files
-from calib.geometry.accuracy import errors, summary
+from calib.geometry.accuracy import errors
 from calib.geometry.first_guess import install
 from calib.geometry.fit import GeometricFit, Settings, fit, fit_with_prior, parameter_values, polish_frames
 from calib.geometry.installation import Installation, see
@@ -271,9 +271,9 @@ def run(seed: int, quick: bool, seeds: int = 3, seconds: float = 3.0, workers: i
         },
         "table_3": {
             "paper": lwr4plus.TABLE_3,
-            "nominal": {name: summary(errors(one, [validation])) for name, one in readings.items()},
-            "calibrated, unseen poses": summary(errors(found.cell, [validation])),
-            "calibrated, the 17 fitted poses": summary(errors(found.cell, [measured])),
+            "nominal": {name: errors(one, [validation]).summary() for name, one in readings.items()},
+            "calibrated, unseen poses": errors(found.cell, [validation]).summary(),
+            "calibrated, the 17 fitted poses": errors(found.cell, [measured]).summary(),
             "unseen_poses": len(unseen),
             "remark": "the paper does not say whose frames its nominal row uses, nor on which poses its rows rest",
         },

@@ -35,7 +35,6 @@ from calib.dynamics.base import Base
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import CalibError, NotConverged
 from calib.estimation.essential import Rule, eliminate
-from calib.estimation.instrumental_variables import least_squares
 from calib.estimation.linear import LinearFit, subsystem_std
 from calib.estimation.triangles import collect, combine
 from calib.estimation.whiteness import examine
@@ -148,7 +147,7 @@ def with_measured(study: Study, log: Log, values: np.ndarray) -> tuple[np.ndarra
 
 def with_simulated(study: Study, log: Log, values: np.ndarray, controller: Controller) -> tuple[np.ndarray, np.ndarray]:
     """Return decimated torque and prediction Z x, Z from a noise-free simulation with x itself."""
-    plant = Plant(study.model.bodies, study.model.terms, bases.to_standard(study.base, values))
+    plant = Plant(study.model.bodies, study.model.terms, study.base.to_standard(values))
     loop = Loop(controller, log.reference, EVERY)
     own = simulated_case(log.case, simulate(plant, controller, log.reference, Sensing(every=EVERY)), loop)
     rows = observe(study.model, study.base.kept, own, log.case.motion.decimator)
@@ -195,7 +194,7 @@ def judge(
 
 def consistent(result: Instrumental) -> LinearFit:
     """Return least squares of the same rows under the signs of PC-IV (PC-IDIM-LS)."""
-    data, std = least_squares(result.problem), result.ordinary.group_std
+    data, std = result.problem.least_squares(), result.ordinary.group_std
     asked = signed(result.names, signs(result.names))
     return hold(result.ordinary, combine(data, std), data, std, asked, stated=True)[0]
 

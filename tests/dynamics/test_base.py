@@ -9,7 +9,7 @@ from differences import check
 
 from calib.dynamics import base, drives, model, rigid_body
 from calib.dynamics import drives as friction
-from calib.dynamics.bodies import bodies_of, standard_parameters, with_gravity, with_payload
+from calib.dynamics.bodies import bodies_of, standard_parameters, with_payload
 from calib.dynamics.idim import IdentificationModel, from_chain
 from calib.dynamics.torque_rows import BOTH, DRIVE, LINK, MODELS, MOTOR
 from calib.errors import CalibError
@@ -24,7 +24,7 @@ def arm(rows, tilted=False):
     """The study's model: seven joints with torque sensors, payload as body 8, its drive parameters counted too."""
     chain = load("lwr4plus")
     bodies = with_payload(bodies_of(chain), chain.tail)
-    bodies = with_gravity(bodies, np.array([1.0, 2.0, -9.5])) if tilted else bodies
+    bodies = bodies.with_gravity(np.array([1.0, 2.0, -9.5])) if tilted else bodies
     return IdentificationModel(bodies, drives.standard([SENSED] * 7) + drives.without_effect("8"), rows)
 
 
@@ -128,7 +128,7 @@ def test_base_parameters_predict_what_the_standard_ones_do(rows):
     reduced = base.BaseModel(full, result)
     beta = result.transform @ chi
     assert np.allclose(reduced.regressor(q, v, a) @ beta, wanted, rtol=0, atol=1e-11)
-    assert np.allclose(full.regressor(q, v, a) @ base.to_standard(result, beta), wanted, rtol=0, atol=1e-11)
+    assert np.allclose(full.regressor(q, v, a) @ result.to_standard(beta), wanted, rtol=0, atol=1e-11)
     assert reduced.names == result.names and len(reduced.units) == result.b
 
 
@@ -139,7 +139,7 @@ def test_inertia_matrix_survives_the_regrouping():
     result, chi = base.find(full), standard_parameters(chain)
     q = states(6)[0]
     wanted = rigid_body.mass_matrix(full.bodies, chi, q)
-    values = base.to_standard(result, result.transform @ chi)
+    values = result.to_standard(result.transform @ chi)
     assert np.allclose(rigid_body.mass_matrix(full.bodies, values, q), wanted, rtol=0, atol=1e-12)
 
 
@@ -189,7 +189,7 @@ def test_regrouping_on_the_calibrated_geometry():
 def test_a_leaning_axis_adds_weak_directions_and_the_remainder_says_what_they_carry():
     """Axis 1 at 1 mrad from the vertical: rank 43 -> 45 by columns of 0.01 N m per kg m, left out and reported."""
     chain = load("lwr4plus")
-    leaning = IdentificationModel(with_gravity(bodies_of(chain), 9.81 * np.array([np.sin(1e-3), 0.0, -np.cos(1e-3)])))
+    leaning = IdentificationModel(bodies_of(chain).with_gravity(9.81 * np.array([np.sin(1e-3), 0.0, -np.cos(1e-3)])))
     first = base.find(IdentificationModel(bodies_of(chain)))
     second = base.regroup(first, leaning)
     assert base.find(leaning).b == 45

@@ -7,7 +7,7 @@ from differences import check
 
 from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of
-from calib.dynamics.idim import IdentificationModel, friction_states, from_chain, with_load, with_terms
+from calib.dynamics.idim import IdentificationModel, friction_states, from_chain
 from calib.dynamics.torque_rows import BOTH, DRIVE, LINK, MOTOR, torque_rows
 from calib.errors import CalibError
 from calib.robot.load import load
@@ -93,8 +93,8 @@ def test_gradient_of_every_smooth_term():
 
 def test_terms_that_depend_on_more_say_so():
     q, v, a = states(6)
-    model = with_terms(IdentificationModel(bodies_of(TX40)), *drives.load_dependent(1, viscous=True))
-    assert with_load(model) == ("Ft2", "Fvt2")
+    model = IdentificationModel(bodies_of(TX40)).with_terms(*drives.load_dependent(1, viscous=True))
+    assert model.with_load() == ("Ft2", "Fvt2")
     with pytest.raises(CalibError, match="'Ft2' needs the transmitted torque"):
         model.regressor(q, v, a)
     with pytest.raises(CalibError, match="no slopes"):

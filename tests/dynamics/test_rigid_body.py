@@ -7,7 +7,7 @@ from closed_tree import from_inertia
 from differences import check
 
 from calib.dynamics import model, rigid_body
-from calib.dynamics.bodies import bodies_of, standard_parameters, with_gravity, with_payload
+from calib.dynamics.bodies import bodies_of, standard_parameters, with_payload
 from calib.dynamics.gravity import gravity_torques
 from calib.errors import CalibError, RobotError
 from calib.robot.chain import Chain, Element, Joint
@@ -196,7 +196,7 @@ def test_angles_of_many_turns():
 def test_gravity_is_a_parameter():
     chain = ARMS["lwr4plus"]
     q, v, a = states(7)
-    still = with_gravity(bodies_of(chain), np.zeros(3))
+    still = bodies_of(chain).with_gravity(np.zeros(3))
     chi = standard_parameters(chain)
     assert np.abs(rigid_body.inverse_dynamics(still, chi, q, 0 * v, 0 * a)).max() == 0.0
 

@@ -9,7 +9,7 @@ import scipy.stats
 from calib.errors import CalibError
 from calib.estimation.essential import Rule, eliminate, nested_test
 from calib.estimation.linear import ols, wls
-from calib.estimation.triangles import Triangles, collect, residual_squares, select
+from calib.estimation.triangles import Triangles, collect
 
 TRUTH = np.array([5.0, -2.0, 1.0, 3.0, -4.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 NAMES = [f"s{k}" for k in range(5)] + [f"z{k}" for k in range(5)]
@@ -66,9 +66,9 @@ def test_the_statistic_is_the_f_test_of_two_residual_sums():
     data = planted(5)
     base = ols(data)
     gone, rest = [6, 8, 9], [0, 1, 2, 3, 4, 5, 7]
-    before = residual_squares(data, base.estimate.values).sum()
-    smaller = select(data, np.array(rest))
-    after = residual_squares(smaller, ols(smaller).estimate.values).sum()
+    before = data.residual_squares(base.estimate.values).sum()
+    smaller = data.select(np.array(rest))
+    after = smaller.residual_squares(ols(smaller).estimate.values).sum()
     expected = (after - before) / 3 / (before / 390)
     # the covariance of wls is stated, so a unit residual is planted
     f, p = nested_test(wls(data, np.full(2, base.estimate.residual_std)), gone)
@@ -79,7 +79,7 @@ def test_the_statistic_is_the_f_test_of_two_residual_sums():
 def test_the_essential_estimate_is_that_of_the_kept_columns_with_the_base_weights():
     data = planted(6)
     found = eliminate(data)
-    direct = wls(select(data, found.kept), found.base.group_std)
+    direct = wls(data.select(found.kept), found.base.group_std)
     assert found.essential.estimate.names == tuple(NAMES[k] for k in found.kept)
     assert found.essential.estimate.values == pytest.approx(direct.estimate.values, rel=1e-5)
 

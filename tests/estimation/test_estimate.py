@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from calib.estimation.estimate import Estimate, strong_correlations
+from calib.estimation.estimate import Estimate
 from calib.estimation.nonlinear import covariance, solve
 
 TRUTH = np.array([2.0, 1.5, 0.4])
@@ -50,10 +50,10 @@ def test_strong_correlations_name_the_planted_pairs_strongest_first():
     matrix[:, 4] = -matrix[:, 1] + 0.2 * rng.normal(size=500)
     scale = np.diag([1.0, 1e3, 1.0, 1e-3, 1.0])
     c = scale @ np.linalg.inv(matrix.T @ matrix) @ scale
-    pairs = strong_correlations(Estimate(tuple("abcde"), ("m",) * 5, np.ones(5), c, 1.0, 495))
+    pairs = Estimate(tuple("abcde"), ("m",) * 5, np.ones(5), c, 1.0, 495).strong_correlations()
     assert [pair[:2] for pair in pairs] == [("a", "d"), ("b", "e")]
     assert pairs[0][2] < -0.99 and 0.95 < pairs[1][2] < 0.99
-    assert strong_correlations(Estimate(("a", "b"), ("m", "m"), np.ones(2), np.diag([1.0, 0.0]), 1.0, 9)) == []
+    assert Estimate(("a", "b"), ("m", "m"), np.ones(2), np.diag([1.0, 0.0]), 1.0, 9).strong_correlations() == []
 
 
 def test_arrays_of_an_estimate_are_read_only():

@@ -13,7 +13,6 @@ from calib.estimation.instrumental_variables import (
     exogeneity,
     instrument,
     iv,
-    least_squares,
     projected,
     settled,
     strength,
@@ -61,12 +60,12 @@ def test_blocks_equal_the_whole_and_least_squares_is_in_the_same_triangles():
     both = instrument(z[150:], w[150:], y[150:], before=half)
     assert iv(both).estimate.values == pytest.approx(iv(whole).estimate.values, rel=1e-11)
     assert iv(both).estimate.names == ("a", "b", "c")
-    assert ols(least_squares(both)).estimate.values == pytest.approx(np.linalg.lstsq(w, y)[0], rel=1e-10)
+    assert ols(both.least_squares()).estimate.values == pytest.approx(np.linalg.lstsq(w, y)[0], rel=1e-10)
 
 
 def test_instruments_equal_to_the_columns_give_least_squares():
     _, w, y = planted(3)
-    found, ordinary = iv(instrument(w, w, y)).estimate, ols(least_squares(instrument(w, w, y))).estimate
+    found, ordinary = iv(instrument(w, w, y)).estimate, ols(instrument(w, w, y).least_squares()).estimate
     assert found.values == pytest.approx(ordinary.values, rel=1e-10)
     assert found.covariance == pytest.approx(ordinary.covariance, rel=1e-9)
 
@@ -78,7 +77,7 @@ def test_it_is_unbiased_where_least_squares_is_not_and_its_covariance_is_true():
         found = iv(problem).estimate
         errors.append(found.values - TRUTH)
         sizes.append(errors[-1] @ np.linalg.solve(found.covariance, errors[-1]))
-        naive.append(ols(least_squares(problem)).estimate.values - TRUTH)
+        naive.append(ols(problem.least_squares()).estimate.values - TRUTH)
     standard = np.std(errors, axis=0) / np.sqrt(300)
     assert np.all(np.abs(np.mean(errors, axis=0)) < 4 * standard)
     assert np.abs(np.mean(naive, axis=0)[:2]).min() > 20 * standard.max()
@@ -93,7 +92,7 @@ def test_noise_in_the_columns_themselves_is_cured_too():
         y = clean @ TRUTH + 0.1 * rng.normal(size=500)
         problem = instrument(clean, clean + 0.5 * rng.normal(size=(500, 3)), y)
         cured.append(iv(problem).estimate.values - TRUTH)
-        naive.append(ols(least_squares(problem)).estimate.values - TRUTH)
+        naive.append(ols(problem.least_squares()).estimate.values - TRUTH)
     assert np.abs(np.mean(naive, axis=0)[0]) > 0.3  # 2.0 shrinks by 1 / (1 + 0.25)
     assert np.abs(np.mean(cured, axis=0)).max() < 4 * np.std(cured) / np.sqrt(60)
 

@@ -8,7 +8,7 @@ from linear_problems import noisy
 
 from calib.errors import CalibError
 from calib.estimation.linear import wls
-from calib.estimation.triangles import absorb, collect, combine, empty, merge, residual_squares, select
+from calib.estimation.triangles import absorb, collect, combine, empty, merge
 
 STD = np.array([0.1, 1.0, 5.0])
 
@@ -59,7 +59,7 @@ def test_parts_merge_to_the_whole_and_only_like_parts_merge():
 
 def test_selected_columns_equal_a_model_without_the_others():
     matrix, target, group = noisy(4, STD)
-    chosen = select(collect(matrix, target, group, names=list("abcde")), np.array([4, 0, 2]))
+    chosen = collect(matrix, target, group, names=list("abcde")).select(np.array([4, 0, 2]))
     assert chosen.names == ("e", "a", "c")
     assert gram(chosen, STD) == pytest.approx(gram(collect(matrix[:, [4, 0, 2]], target, group), STD), rel=1e-11)
 
@@ -67,7 +67,7 @@ def test_selected_columns_equal_a_model_without_the_others():
 def test_residuals_of_every_group_are_read_from_the_triangles():
     matrix, target, group = noisy(5, STD)
     x = np.array([1.0, -2.0, 0.0, 0.5, 9.0])
-    squares = residual_squares(collect(matrix, target, group), x)
+    squares = collect(matrix, target, group).residual_squares(x)
     assert squares == pytest.approx([np.sum((target - matrix @ x)[group == g] ** 2) for g in range(3)], rel=1e-11)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib.data.poses.measurements import KINDS, PoseMeasurements, Sockets
-from calib.geometry.accuracy import errors, pair_errors, statistics, summary
+from calib.geometry.accuracy import errors, pair_errors, statistics
 from calib.geometry.installation import Installation, see
 from calib.robot.load import load
 from calib.transforms import from_xyz_rpy, to_quaternion
@@ -30,7 +30,7 @@ def block(kind: str, **values) -> PoseMeasurements:
 def test_position_and_orientation_are_lengths_of_vectors():
     shift = np.tile([3e-3, 0.0, 4e-3], (24, 1))
     turned = EXACT @ from_xyz_rpy([0, 0, 0], [np.radians(2.0), 0, 0])
-    found = summary(errors(CELL, [block("pose", position=EXACT[:, :3, 3] + shift, quaternion=to_quaternion(turned))]))
+    found = errors(CELL, [block("pose", position=EXACT[:, :3, 3] + shift, quaternion=to_quaternion(turned))]).summary()
     for name in ("mean", "rms", "p95", "max"):
         assert found["position_mm"][name] == pytest.approx(5.0)
         assert found["orientation_deg"][name] == pytest.approx(2.0)
@@ -44,14 +44,14 @@ def test_rms_is_that_of_the_norm():
 
 
 def test_positions_alone_have_no_orientation():
-    found = summary(errors(CELL, [block("position", position=EXACT[:, :3, 3])]))
+    found = errors(CELL, [block("position", position=EXACT[:, :3, 3])]).summary()
     assert found["orientation_deg"] is None
     assert found["position_mm"]["max"] < 1e-9
 
 
 def test_distances_have_no_position():
     known = np.linalg.norm(IN_BASE[0::2] - IN_BASE[1::2], axis=1) + 2e-3
-    found = summary(errors(CELL, [block("distance", distance=np.repeat(known, 2), group=np.repeat(np.arange(12), 2))]))
+    found = errors(CELL, [block("distance", distance=np.repeat(known, 2), group=np.repeat(np.arange(12), 2))]).summary()
     assert found["position_mm"] is None
     assert found["distance_mm"]["mean"] == pytest.approx(2.0)
 

@@ -14,7 +14,6 @@ from calib.geometry.first_guess import install
 from calib.geometry.fit import fit, polish_frames
 from calib.geometry.installation import Installation
 from calib.geometry.parameters import layout
-from calib.geometry.result import outliers
 from calib.geometry.weighing import Settings
 
 SIGMA = 5e-5
@@ -210,7 +209,7 @@ def test_planted_outliers_are_named_with_file_and_row_and_hardly_any_others(loss
         position[hit] += rng.choice([-1, 1], (10, 3)) * rng.uniform(1e-3, 2e-2, (10, 3))
         dirty = replace(clean, position=position)
         found = calibrate(nominal, [dirty], Settings(loss=loss, passes=15))
-        named = outliers(found)
+        named = found.outliers()
         assert {item[0] for item in named} == {"tracker.csv"} and {item[2] for item in named} == {"position"}
         rows = {item[1] for item in named}
         assert set(hit + 1) <= rows
@@ -228,7 +227,7 @@ def test_a_clean_measurement_has_no_outliers():
     named = 0
     for seed in range(6):
         nominal, _, measured, _ = planted("position", seed)
-        named += len(outliers(calibrate(nominal, measured)))
+        named += len(calibrate(nominal, measured).outliers())
     assert named == 0
 
 
@@ -240,7 +239,7 @@ def test_a_row_is_an_outlier_beyond_four_robust_sigmas_per_component():
         value = piece.part.value.copy()
         value[:, 7] = size * robust.spread(value) * np.array([1.0, -1.0, 1.0])
         changed = replace(found, pieces=[replace(piece, part=replace(piece.part, value=value))])
-        assert [item[1] for item in outliers(changed)] == expected
+        assert [item[1] for item in changed.outliers()] == expected
 
 
 def test_a_prior_holds_where_it_is_tight_and_is_not_felt_where_it_is_loose():

@@ -62,7 +62,7 @@ def planted(seed: int, noise: float = 0.02) -> tuple[np.ndarray, IdentificationM
 def told(
     chain: Chain, model: IdentificationModel, base: bases.Base, values: np.ndarray, covariance: np.ndarray
 ) -> Information:
-    dynamics = Dynamics(model, bases.to_standard(base, values))
+    dynamics = Dynamics(model, base.to_standard(values))
     return Information(
         chain, dynamics, base.names, base.units, values, covariance, base.transform, whitened(values, covariance), False
     )

@@ -92,7 +92,7 @@ def test_an_element_is_a_joint_that_nobody_moves():
     states = [np.zeros((len(case.motion), count)) for _ in range(3)]
     states[0] += arm.values
     values = np.zeros((count, 10))
-    standard = bases.to_standard(found.base, found.fitted.estimate.values)[:30].reshape(3, 10)
+    standard = found.base.to_standard(found.fitted.estimate.values)[:30].reshape(3, 10)
     for row, k in enumerate(arm.moving):
         values[k] = standard[row]
         for state, given in zip(states, (case.motion.q, case.motion.v, case.motion.a)):

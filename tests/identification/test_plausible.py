@@ -10,7 +10,7 @@ import planted_motion as planted
 import pytest
 
 from calib.data.recordings.checks import check_recording
-from calib.data.recordings.recording import Joints, Recording, earlier, take
+from calib.data.recordings.recording import Joints, Recording, earlier
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.errors import MeasurementError
 from calib.identification.cases import Case, make_case
@@ -180,7 +180,7 @@ def test_an_exchange_that_leaves_the_torques_unexplained_is_not_told() -> None:
 def test_a_gap_of_the_log_is_no_slope() -> None:
     log = recorded()
     gap = (log.t > 4.0) & (log.t < 7.0)
-    assert found(take(log, ~gap)) == []
+    assert found(log.take(~gap)) == []
 
 
 def away(recording: Recording) -> Contradiction:

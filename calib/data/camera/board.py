@@ -88,14 +88,13 @@ class Board:
         what = {"charuco": "ChArUco", "chessboard": "chessboard", "apriltag": "AprilTag grid"}[self.kind]
         return f"{what} {self.columns} x {self.rows}, {1e3 * self.square:g} mm"
 
+    def checked(self) -> Board:
+        """Return a board made by hand, checked as one from a file.
 
-def checked(board: Board) -> Board:
-    """Return a board made by hand, checked as one from a file.
-
-    Raises:
-        ValueError: where a value cannot be.
-    """
-    return parse(Board, asdict(board), "board", _Refused)
+        Raises:
+            ValueError: where a value cannot be.
+        """
+        return parse(Board, asdict(self), "board", _Refused)
 
 
 class _Refused(UsageError, ValueError):

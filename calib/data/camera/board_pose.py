@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.data.camera.board import Board, corners
-from calib.data.camera.lens import Lens, project_with_slopes, rays
+from calib.data.camera.lens import Lens, rays
 from calib.transforms import orthonormal, pose
 
 STEPS = 12  # of Gauss–Newton
@@ -120,7 +120,7 @@ def _normal(
     point = turned + poses[:, None, :3, 3]
     aside = np.maximum(np.linalg.norm(point[:, :, :2], axis=2), 1e-3)
     point[:, :, 2] = np.maximum(point[:, :, 2], 0.3 * aside)
-    flat, by_point, _ = project_with_slopes(lens, point.reshape(-1, 3))
+    flat, by_point, _ = lens.project_with_slopes(point.reshape(-1, 3))
     residual = np.where(seen[:, :, None], pixel - flat.reshape(pixel.shape), 0.0)
     by_point = np.where(seen[:, :, None, None], by_point.reshape(*pixel.shape, 3), 0.0)
     slope = np.concatenate([by_point, np.cross(turned[:, :, None, :], by_point)], axis=3).reshape(len(poses), -1, 6)

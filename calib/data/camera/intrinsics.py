@@ -14,7 +14,7 @@ import numpy as np
 
 from calib.data.camera.board import Board, corners
 from calib.data.camera.board_pose import board_poses
-from calib.data.camera.lens import Lens, project_with_slopes
+from calib.data.camera.lens import Lens
 from calib.errors import CalibError, MeasurementError
 
 MOST = 30  # images that a first lens is found from (our choice)
@@ -132,7 +132,7 @@ def _beside_poses(lens: Lens, board: Board, pixel: np.ndarray) -> np.ndarray:
     for where, own in zip(board_poses(lens, board, pixel).poses, pixel):
         seen = ~np.isnan(own[:, 0])
         turned = table[seen] @ where[:3, :3].T
-        flat, by_point, by_lens = project_with_slopes(lens, turned + where[:3, 3])
+        flat, by_point, by_lens = lens.project_with_slopes(turned + where[:3, 3])
         parts = [by_point, np.cross(turned[:, None], by_point), by_lens[:, :, :FITTED], (own[seen] - flat)[:, :, None]]
         rows.append(np.asarray(np.linalg.qr(np.concatenate(parts, axis=2).reshape(-1, 7 + FITTED), mode="r"))[6:, 6:])
     return np.concatenate(rows)

@@ -56,6 +56,27 @@ class Lens:
         """Return the lens with other values."""
         return replace(self, values=values)
 
+    def in_sight(self, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
+        """Say which points (N, 3) [m] fall into the image, `margin` [px] inside its edge: (N,) bool.
+
+        A point beyond the angle at which the distortion's polynomial turns back is out of sight, wherever it falls.
+        """
+        ahead = points[:, 2] > 1e-6
+        safe = np.where(ahead[:, None], points, [0.0, 0.0, 1.0])
+        pixel, size = self.project(safe), np.array(self.size)
+        inside = np.all((pixel >= margin) & (pixel <= size - 1 - margin), axis=1)
+        plane = safe[:, :2] / safe[:, 2:]
+        back = rays(self, np.where(inside[:, None], pixel, self.values[2:4]))
+        return ahead & inside & (np.abs(back - plane).max(axis=1) < 1e-6 * (1.0 + np.abs(plane).max(axis=1)))
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Return pixels (N, 2) of points (N, 3) [m] before the camera."""
+        return _projected(self, points, False)[0]
+
+    def project_with_slopes(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return pixels (N, 2), ∂pixel/∂point (N, 2, 3) [px/m] and ∂pixel/∂values (N, 2, k)."""
+        return _projected(self, points, True)
+
 
 def pinhole(focal: float, size: tuple[int, int], distortion: tuple[float, ...] = ()) -> Lens:
     """Return a pinhole with square pixels and its principal point in the middle.
@@ -67,16 +88,6 @@ def pinhole(focal: float, size: tuple[int, int], distortion: tuple[float, ...] =
     """
     middle = 0.5 * (size[0] - 1), 0.5 * (size[1] - 1)
     return Lens("pinhole", np.array([focal, focal, *middle, *distortion, *[0.0] * (5 - len(distortion))]), size)
-
-
-def project(lens: Lens, points: np.ndarray) -> np.ndarray:
-    """Return pixels (N, 2) of points (N, 3) [m] before the camera."""
-    return _projected(lens, points, False)[0]
-
-
-def project_with_slopes(lens: Lens, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return pixels (N, 2), ∂pixel/∂point (N, 2, 3) [px/m] and ∂pixel/∂values (N, 2, k)."""
-    return _projected(lens, points, True)
 
 
 def _projected(lens: Lens, points: np.ndarray, slopes: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -170,17 +181,3 @@ def rays(lens: Lens, pixels: np.ndarray) -> np.ndarray:
         if np.nanmax(np.abs(error), initial=0.0) < 1e-12:
             break
     return plane
-
-
-def in_sight(lens: Lens, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
-    """Say which points (N, 3) [m] fall into the image, `margin` [px] inside its edge: (N,) bool.
-
-    A point beyond the angle at which the distortion's polynomial turns back is out of sight, wherever it would fall.
-    """
-    ahead = points[:, 2] > 1e-6
-    safe = np.where(ahead[:, None], points, [0.0, 0.0, 1.0])
-    pixel, size = project(lens, safe), np.array(lens.size)
-    inside = np.all((pixel >= margin) & (pixel <= size - 1 - margin), axis=1)
-    plane = safe[:, :2] / safe[:, 2:]
-    back = rays(lens, np.where(inside[:, None], pixel, lens.values[2:4]))
-    return ahead & inside & (np.abs(back - plane).max(axis=1) < 1e-6 * (1.0 + np.abs(plane).max(axis=1)))

@@ -23,7 +23,7 @@ from typing import IO
 import numpy as np
 from numpy.lib import format as npy
 
-from calib.data.recordings.recording import Joints, Recording, cut, read_only, span
+from calib.data.recordings.recording import Joints, Recording, read_only, span
 from calib.data.recordings.recording_options import (
     OWN,
     RATES,
@@ -160,7 +160,7 @@ def _range(
         ordered = np.maximum.accumulate(np.nan_to_num(t, nan=-np.inf))  # time that runs back is refused later
         first, end = span(ordered, *ends)
         if first >= end:
-            cut(Recording(t, np.zeros((len(t), 0)), np.zeros((len(t), 0)), "torque", (), file=str(path)), *ends)
+            Recording(t, np.zeros((len(t), 0)), np.zeros((len(t), 0)), "torque", (), file=str(path)).cut(*ends)
         return slice(first, end), []
     stated = _few(archive, members, "use_range", path, 2) if options.use_range else None
     if stated is None:

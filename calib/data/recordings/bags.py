@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from calib.data.recordings.archives import Ends
-from calib.data.recordings.recording import Joints, Recording, cut
+from calib.data.recordings.recording import Joints, Recording
 from calib.data.recordings.recording_options import RecordingOptions
 from calib.errors import MeasurementError, suggestion
 
@@ -133,4 +133,4 @@ def _assemble(
         file=str(path),
         notes=tuple(notes),
     )
-    return recording if ends == (None, None) else cut(recording, *ends)
+    return recording if ends == (None, None) else recording.cut(*ends)

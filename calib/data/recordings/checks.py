@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib.data.poses.plausible import DEGREE, FAR, SLACK, STILL, TURN
-from calib.data.recordings.recording import Joints, Recording, take
+from calib.data.recordings.recording import Joints, Recording
 from calib.errors import MeasurementError
 
 FEWEST = 100  # samples; filters at both ends eat some 50
@@ -107,7 +107,7 @@ def _drop_spikes(recording: Recording, joints: Joints | None) -> Recording:
         f"row {recording.rows[row]}: the {_column(recording, 'effort', j)} {found}{more}, the other rows are within "
         f"{size[~rows, j].max():.4g} of its median: a spike of the log; left out"
     )
-    return _noted(take(recording, ~rows), note)
+    return _noted(recording.take(~rows), note)
 
 
 def _drop_repeats(recording: Recording) -> Recording:
@@ -118,7 +118,7 @@ def _drop_repeats(recording: Recording) -> Recording:
     if not same.any():
         return recording
     first = int(recording.rows[int(np.argmax(same)) + 1])
-    kept = take(recording, np.concatenate([[True], ~same]))
+    kept = recording.take(np.concatenate([[True], ~same]))
     return _noted(kept, f"{int(same.sum())} rows repeat the one before, stamp and all (first: row {first}); dropped")
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from calib.data.csv_table import Table, read_table
 from calib.data.recordings.archives import Ends
-from calib.data.recordings.recording import Joints, Recording, cut, named
+from calib.data.recordings.recording import Joints, Recording, named
 from calib.data.recordings.recording_options import SYNONYMS, RecordingOptions, check_units, one_effort, scale
 from calib.errors import MeasurementError, UsageError, suggestion
 
@@ -61,7 +61,7 @@ def read_log(
         notes=tuple(notes),
         **series,
     )
-    return recording if ends == (None, None) else cut(recording, *ends)
+    return recording if ends == (None, None) else recording.cut(*ends)
 
 
 def read_positions(

@@ -121,6 +121,24 @@ class Recording:
         """Time from the first to the last sample [s]."""
         return float(self.t[-1] - self.t[0]) if len(self) else 0.0
 
+    def cut(self, start: float | None = None, stop: float | None = None) -> Recording:
+        """Return the samples with start ≤ t < stop [s]; None leaves that end open.
+
+        Raises:
+            MeasurementError: where nothing is left.
+        """
+        first, end = span(self.t, start, stop)
+        if first >= end:
+            low, high = "" if start is None else f"{start:g}", "" if stop is None else f"{stop:g}"
+            last = f"{self.t[-1]:.4g} s" if len(self) else "nothing"
+            raise MeasurementError(f"the cut @{low}:{high} leaves no sample; the recording ends at {last}", self.file)
+        return self.take(slice(first, end))
+
+    def take(self, index: slice | np.ndarray) -> Recording:
+        """Return the samples at `index`, a slice or a mask (N,); they keep their times and row numbers."""
+        picked = {name: None if (value := getattr(self, name)) is None else value[index] for name in SERIES}
+        return replace(self, t=self.t[index], rows=self.rows[index], **picked)
+
 
 def settled(values: np.ndarray) -> np.ndarray:
     """Return `values` themselves where they are read-only floats already, else a frozen copy: logs are large."""
@@ -133,26 +151,6 @@ def read_only(values: np.ndarray) -> np.ndarray:
     """Return `values`, which nobody else holds, locked."""
     values.flags.writeable = False
     return values
-
-
-def take(recording: Recording, index: slice | np.ndarray) -> Recording:
-    """Return the samples at `index`, a slice or a mask (N,); they keep their times and row numbers."""
-    picked = {name: None if (value := getattr(recording, name)) is None else value[index] for name in SERIES}
-    return replace(recording, t=recording.t[index], rows=recording.rows[index], **picked)
-
-
-def cut(recording: Recording, start: float | None = None, stop: float | None = None) -> Recording:
-    """Return the samples with start ≤ t < stop [s]; None leaves that end open.
-
-    Raises:
-        MeasurementError: where nothing is left.
-    """
-    first, end = span(recording.t, start, stop)
-    if first >= end:
-        low, high = "" if start is None else f"{start:g}", "" if stop is None else f"{stop:g}"
-        last = f"{recording.t[-1]:.4g} s" if len(recording) else "nothing"
-        raise MeasurementError(f"the cut @{low}:{high} leaves no sample; the recording ends at {last}", recording.file)
-    return take(recording, slice(first, end))
 
 
 def earlier(recording: Recording, lag: float) -> Recording:
@@ -176,7 +174,7 @@ def earlier(recording: Recording, lag: float) -> Recording:
         if (value := getattr(recording, name)) is not None
     }
     notes = (*recording.notes, f"torques are taken {1e3 * lag:g} ms earlier, as asked for")
-    return take(replace(recording, notes=notes, **moved), inside)
+    return replace(recording, notes=notes, **moved).take(inside)
 
 
 def span(t: np.ndarray, start: float | None, stop: float | None) -> tuple[int, int]:

@@ -112,6 +112,28 @@ class Motion:
         """The number of joints."""
         return self.q.shape[1]
 
+    def in_band(self, values: np.ndarray) -> np.ndarray:
+        """Return `values` (N, ...) below the identification band at the full rate, without phase shift; by segments."""
+        parts = [
+            low_pass(values[self.segment == i], self.rate, min(self.band, USABLE * self.rate / 2))
+            for i in np.unique(self.segment)
+        ]
+        return np.concatenate(parts)
+
+    def standstill(self, slow: float | Sequence[float] = SLOW) -> np.ndarray:
+        """Return (N,) whether all joints stand: friction is then any value up to Coulomb's, unknown."""
+        return np.asarray(~moving(self, slow).any(axis=1))
+
+    def velocity_noise(self, cutoff: float | None = None) -> np.ndarray:
+        """Return (n,) the standard deviation of white position noise in the filtered velocities [rad/s or m/s].
+
+        With `cutoff` [Hz], in those of positions filtered to less than the motion's.
+
+        σ_v² = σ_q² (2/f_s) ∫ (2πf)² |H(f)|⁴ df with |H|² of the two passes, about σ_q² (2/f_s) (2π)² f_q³/3.
+        """
+        at = self.cutoff if cutoff is None else cutoff
+        return self.cutoffs.noise * 2 * np.pi * np.sqrt(2 * at**3 / (3 * self.rate))
+
 
 ROWS = (
     "t", "q", "v", "a", "effort", "weight", "segment", "tau_link", "tau_motor", "q_link", "q_ref", "tau_ff",
@@ -188,37 +210,12 @@ def thin(motion: Motion) -> Motion:
     return replace(motion, **(picked | efforts | {"weight": weight}), rate=rate, decimator=whole)
 
 
-def in_band(motion: Motion, values: np.ndarray) -> np.ndarray:
-    """Return `values` (N, ...) below the identification band at the full rate, without phase shift; by segments."""
-    parts = [
-        low_pass(values[motion.segment == i], motion.rate, min(motion.band, USABLE * motion.rate / 2))
-        for i in np.unique(motion.segment)
-    ]
-    return np.concatenate(parts)
-
-
 def moving(motion: Motion, slow: float | Sequence[float] = SLOW) -> np.ndarray:
     """Return (N, n) whether each joint moves: |v_j| at or above `slow`, a share of its peak or (n,) [rad/s or m/s]."""
     peak = np.abs(motion.v).max(axis=0)
     threshold = slow * peak if isinstance(slow, (int, float)) else np.asarray(slow, dtype=float)
-    noise = 3 * velocity_noise(motion)
+    noise = 3 * motion.velocity_noise()
     return np.abs(motion.v) >= np.maximum(np.maximum(threshold, noise), CREEP)
-
-
-def standstill(motion: Motion, slow: float | Sequence[float] = SLOW) -> np.ndarray:
-    """Return (N,) whether all joints stand: friction is then any value up to Coulomb's, unknown."""
-    return np.asarray(~moving(motion, slow).any(axis=1))
-
-
-def velocity_noise(motion: Motion, cutoff: float | None = None) -> np.ndarray:
-    """Return (n,) the standard deviation of white position noise in the filtered velocities [rad/s or m/s].
-
-    With `cutoff` [Hz], in those of positions filtered to less than the motion's.
-
-    σ_v² = σ_q² (2/f_s) ∫ (2πf)² |H(f)|⁴ df with |H|² of the two passes, about σ_q² (2/f_s) (2π)² f_q³/3.
-    """
-    at = motion.cutoff if cutoff is None else cutoff
-    return motion.cutoffs.noise * 2 * np.pi * np.sqrt(2 * at**3 / (3 * motion.rate))
 
 
 def _derive(

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from calib.arrays import frozen
 from calib.data.signals.filtering import hann
-from calib.data.signals.motion import Motion, standstill
+from calib.data.signals.motion import Motion
 
 LINE = 3e-3  # of the strongest line's power: a line that counts; Hann's side lobes are at 7e-4
 SINE = 0.98  # of the variance: a joint that moves as one sine
@@ -86,7 +86,7 @@ def repeats(training: Motion, other: Motion) -> float:
         return 0.0
     states = []
     for motion, most in ((training, MOST), (other, MOST // 10)):
-        own = np.flatnonzero(~standstill(motion))
+        own = np.flatnonzero(~motion.standstill())
         own = own[:: max(1, len(own) // most)]
         states.append(np.hstack([motion.q[own], motion.v[own]]))
     spread = np.hstack([training.q.std(axis=0), training.v.std(axis=0)])

@@ -14,7 +14,6 @@ import numpy as np
 
 from calib.data.camera.board import corners
 from calib.data.camera.board_pose import board_poses
-from calib.data.camera.lens import project
 from calib.data.poses.image_folders import listed
 from calib.data.poses.measurements import PoseMeasurements, Poses, take
 from calib.data.poses.pixels import IN_HAND, TO_HAND, Pixels
@@ -108,7 +107,7 @@ def _without_gross_corners(block: Pixels, poses: np.ndarray) -> Pixels:
     off, stale = np.full(before.shape, np.nan), np.arange(len(block))
     for _ in range(ROUNDS):
         point = np.einsum("mij,kj->mki", poses[:, :3, :3], table) + poses[:, None, :3, 3]
-        flat = project(lens, point.reshape(-1, 3)).reshape(*point.shape[:2], 2)
+        flat = lens.project(point.reshape(-1, 3)).reshape(*point.shape[:2], 2)
         off[stale] = np.linalg.norm(block.pixel[stale] - flat, axis=2)
         gross = off > ODD * np.nanmedian(off) / MEDIAN
         gross &= off >= 0.5 * np.nanmax(off, axis=1, keepdims=True, initial=0.0)

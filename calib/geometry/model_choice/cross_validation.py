@@ -21,7 +21,7 @@ from calib.geometry.model_choice.folds import Folds
 from calib.geometry.observation import observe, prepare
 from calib.geometry.parameters import layout
 from calib.geometry.pixel_residuals import PixelPart
-from calib.geometry.result import GeometricFit, row_weights, used_noises, used_sigmas
+from calib.geometry.result import GeometricFit
 from calib.robot.chain import Chain
 from calib.robot.deflection import Deflection, Term
 
@@ -150,8 +150,8 @@ def fold_statistics(
     """
     cell = replace(found.cell, deflection=Deflection(terms, np.zeros(len(terms)), reference))
     free = np.concatenate([found.free, layout(cell).term_index])
-    scales, weights = used_sigmas(found), row_weights(found)
-    noises = used_noises(found)
+    scales, weights = found.used_sigmas(), found.row_weights()
+    noises = found.used_noises()
     rigid = len(found.free)
     each: list[Gram] = []
     held_out, rows = [], []
@@ -206,7 +206,7 @@ def blind_folds(
     for piece in nominal.pieces:
         sigmas[piece.block][piece.part.label] = max(float(np.sqrt(np.mean(piece.part.value**2))), 1e-9)
     known = np.array([LOOSE if k >= table.arm else w for k, w in zip(free, plausible_deviation(nominal.cell, free))])
-    weights = row_weights(nominal)
+    weights = nominal.row_weights()
     each, squares, none, moved = [], [], [None] * len(measured), [True] * len(measured)
     for fold in range(folds.count):
         inside = [np.flatnonzero(members == fold) for members in folds.members]

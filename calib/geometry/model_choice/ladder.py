@@ -24,7 +24,7 @@ from calib.geometry.model_choice.effects import EFFECTS, MODELS, Effect, term_gr
 from calib.geometry.model_choice.folds import Folds, divide, transfer_folds
 from calib.geometry.observation import prepare
 from calib.geometry.parameters import layout
-from calib.geometry.result import GeometricFit, outliers
+from calib.geometry.result import GeometricFit
 from calib.geometry.weighing import Settings
 from calib.robot.deflection import Deflection, Term
 
@@ -80,6 +80,16 @@ class ModelSelection:
     loss: str = "none"
     offered: tuple[Term, ...] = ()
 
+    def rigid_fit(self, measured: Sequence[PoseMeasurements], settings: Settings) -> GeometricFit:
+        """Return the best fit without any corrections, those that came with the robot included: for a URDF."""
+        if not self.rigid.cell.known.terms:
+            return self.rigid
+        bare = polish_frames(replace(self.nominal.cell, known=Deflection()), measured, settings).cell
+        drawn = not all(block.has_instrument for block in measured)
+        table = layout(bare)
+        every = np.concatenate([table.arm_index, table.frame_index])
+        return fit(bare, measured, every, settings=settings, drawn=drawn)
+
 
 def select_model(
     cell: Installation,
@@ -118,7 +128,7 @@ def select_model(
     folds, settings = folds or transfer_folds(measured, seed), settings or Settings()
     climber = _Climber(cell, measured, settings, torques, fixed, prior, folds, tell, seed)
     climber.rigid(model)
-    if settings.loss == "auto" and outliers(climber.best, GROSS):
+    if settings.loss == "auto" and climber.best.outliers(GROSS):
         climber = _Climber(cell, measured, replace(settings, loss="cauchy"), torques, fixed, prior, folds, tell, seed)
         climber.rigid(model)
     if model == "auto" or model in [effect.name for effect in EFFECTS]:
@@ -325,14 +335,3 @@ def _places(offered: dict[str, list[Term]]) -> dict[str, np.ndarray]:
     """Return where each effect's terms stand among all of them."""
     edges = np.cumsum([0, *(len(terms) for terms in offered.values())])
     return {name: np.arange(edges[k], edges[k + 1]) for k, name in enumerate(offered)}
-
-
-def rigid_fit(found: ModelSelection, measured: Sequence[PoseMeasurements], settings: Settings) -> GeometricFit:
-    """Return the best fit without any corrections, those that came with the robot included: for a URDF."""
-    if not found.rigid.cell.known.terms:
-        return found.rigid
-    bare = polish_frames(replace(found.nominal.cell, known=Deflection()), measured, settings).cell
-    drawn = not all(block.has_instrument for block in measured)
-    table = layout(bare)
-    every = np.concatenate([table.arm_index, table.frame_index])
-    return fit(bare, measured, every, settings=settings, drawn=drawn)

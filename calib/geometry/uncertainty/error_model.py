@@ -29,7 +29,6 @@ from calib.geometry.model_choice.folds import Folds, random_folds
 from calib.geometry.model_choice.ladder import GROSS, ModelSelection
 from calib.geometry.observation import observe, prepare
 from calib.geometry.parameters import layout
-from calib.geometry.result import outliers, row_weights, used_sigmas
 from calib.geometry.uncertainty.spread import pose_sigmas
 from calib.robot.chain import Chain
 from calib.robot.deflection import Deflection
@@ -233,7 +232,7 @@ class _Rows:
         every = max(1, -(-sum(map(len, measured)) // MOST))
         self.chosen = [np.arange(0, len(block), every) for block in measured]
         self.measured = [take(block, rows) for block, rows in zip(measured, self.chosen)]
-        gross = set() if selected.loss == "none" else {(file, row) for file, row, *_ in outliers(found, GROSS)}
+        gross = set() if selected.loss == "none" else {(file, row) for file, row, *_ in found.outliers(GROSS)}
         self.counts = [np.array([(b.file, int(row)) not in gross for row in b.rows], bool) for b in self.measured]
         torques = [None] * len(measured) if torques is None else torques
         given = [None if torque is None else torque[rows] for torque, rows in zip(torques, self.chosen)]
@@ -250,7 +249,7 @@ class _Rows:
         if found.prior is not None:
             wide = np.minimum(wide, found.prior[own])
         self.prior = np.where(np.isfinite(wide), wide, UNTOLD)
-        scales, weights = used_sigmas(found), row_weights(found)
+        scales, weights = found.used_sigmas(), found.row_weights()
         self.whitened: list[list[tuple[np.ndarray, np.ndarray]]] = []
         self.metric: list[tuple[np.ndarray, np.ndarray]] = []
         for number, ready in enumerate(prepare(cell, self.measured, given)):

@@ -14,7 +14,7 @@ from scipy.optimize import linear_sum_assignment
 
 from calib.data.recordings.recording import Recording
 from calib.data.signals.filtering import moving_cubics
-from calib.dynamics.bodies import bodies_of, standard_parameters, with_gravity
+from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.rigid_body import inverse_dynamics
 from calib.robot.chain import Chain
 from trajectories.errors import BadInput
@@ -194,7 +194,7 @@ def share_of_nominal(
     torque, place = _smooth(_sampled(t, effort, grid)), _sampled(t, q, grid)
     q, v, a = (_smooth(place, order) for order in range(3))
     bodies, parameters = bodies_of(chain), standard_parameters(chain)
-    bodies = bodies if gravity is None else with_gravity(bodies, np.asarray(gravity, dtype=float))
+    bodies = bodies if gravity is None else bodies.with_gravity(np.asarray(gravity, dtype=float))
     rigid = inverse_dynamics(bodies, parameters, q, v, a)
     other = None
     if static:

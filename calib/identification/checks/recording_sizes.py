@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.dynamics.bodies import Bodies, bodies_of, with_gravity
+from calib.dynamics.bodies import Bodies, bodies_of
 from calib.identification.cases import Case
 from calib.identification.checks.motion_samples import MotionSamples, basis, left_share, take_samples
 from calib.identification.checks.recorded_motion import share_of_nominal
@@ -142,4 +142,4 @@ def _lag_of(samples: MotionSamples, rate: float) -> Lag | None:
 
 def _under(chain: Chain, gravity: Sequence[float] | None) -> Bodies:
     bodies = bodies_of(chain)
-    return bodies if gravity is None else with_gravity(bodies, np.asarray(gravity, dtype=float))
+    return bodies if gravity is None else bodies.with_gravity(np.asarray(gravity, dtype=float))

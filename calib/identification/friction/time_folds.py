@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from calib.estimation.relevance import Gram, relevance
-from calib.estimation.triangles import Triangles, select
+from calib.estimation.triangles import Triangles
 from calib.identification.rows import pool
 
 ITERATIONS = 12
@@ -68,7 +68,7 @@ class CrossValidation:
 
     def _fitted(self, columns: np.ndarray, runs: list[np.ndarray]) -> list[np.ndarray]:
         """Return least squares on the blocks beside each run, from their triangles."""
-        chosen, group = select(self.data, columns), self.group[columns]
+        chosen, group = self.data.select(columns), self.group[columns]
         prior = None if self.prior is None else self.prior[:, np.append(columns, -1)]
         folds = [[other for other in range(self.blocks) if other not in run] for run in runs]
         pooled = (pool(chosen, self.rows, others) for others in folds)

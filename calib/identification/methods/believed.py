@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.dynamics.idim import IdentificationModel, with_terms
+from calib.dynamics.idim import IdentificationModel
 from calib.errors import CalibError, CannotSimulate, UsageError
 from calib.identification.cases import Case
 from calib.identification.methods.method import IdentificationProblem
@@ -80,7 +80,7 @@ def believed_robot(problem: IdentificationProblem, method: str) -> BelievedRobot
 def with_friction(problem: IdentificationProblem, model: IdentificationModel) -> tuple[IdentificationModel, np.ndarray]:
     """Return a problem's model with its richer friction, and the place (p,) of each of its columns there."""
     extra = [one for one in problem.terms[problem.base.b :] if one is not None]
-    model = with_terms(model, *extra)
+    model = model.with_terms(*extra)
     return model, np.array([*problem.base.kept, *range(model.p - len(extra), model.p)], dtype=int)
 
 

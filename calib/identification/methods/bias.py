@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.data.signals.motion import velocity_noise
 from calib.errors import CalibError, UsageError
 from calib.identification.loop.loop_recordings import ClosedLoops
 from calib.identification.methods.instrumental import Instrumental
@@ -137,7 +136,7 @@ def _blurred(test: LoopTest) -> list[str]:
     if test.found is None or test.loops is None:
         return []
     case = test.loops.pairs[0][0]
-    noise = velocity_noise(case.motion)
+    noise = case.motion.velocity_noise()
     widths = {one.acts[0][0]: one.settings[-1] for one in test.found.plant.terms if one.shape == "sign"}
     wide = [f"{noise[j] / width:.2g} at joint {j + 1}" for j, width in widths.items() if noise[j] > BLUR * width]
     if not wide or not test.found.estimator.measured:

@@ -21,7 +21,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from calib.data.signals.motion import velocity_noise
 from calib.errors import CalibError, CannotSimulate, Diverged
 from calib.estimation.linear import LinearFit
 from calib.estimation.sequential.kalman import Belief, Filter, believe, corrected, linearly_predicted, points, predicted
@@ -150,7 +149,7 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
     seen = np.maximum(motion.cutoffs.noise / np.sqrt(thin), 1e-9 * np.ptp(motion.q, axis=0).max())
     period = thin / motion.rate
     torque = noise * np.sqrt(1.0 / thin)
-    moving = np.maximum(velocity_noise(motion), 1e-3 * np.abs(motion.v).max(axis=0))
+    moving = np.maximum(motion.velocity_noise(), 1e-3 * np.abs(motion.v).max(axis=0))
     first = np.concatenate([motion.q[part.start], motion.v[part.start], before.mean])
     belief = believe(first, np.concatenate([seen, moving, np.ones(p)]), before.kind)
     belief = replace(belief, spread=_joined(belief, before.covariance, 2 * n))

@@ -23,8 +23,6 @@ import numpy as np
 from calib.arrays import frozen
 from calib.data.signals.decimation import Decimator
 from calib.data.signals.filtering import low_pass, slope
-from calib.data.signals.motion import velocity_noise
-from calib.dynamics import base as bases
 from calib.dynamics.base import Base
 from calib.dynamics.drives import standard
 from calib.dynamics.idim import IdentificationModel
@@ -32,7 +30,7 @@ from calib.errors import CalibError, CannotSimulate, Diverged, NotConverged, Usa
 from calib.estimation import instrumental_variables
 from calib.estimation.instrumental_variables import ExogeneityTest, Instruments, InstrumentStrength
 from calib.estimation.linear import LinearFit, settled_std, wls
-from calib.estimation.triangles import Triangles, absorb, combine, empty, residual_squares, select
+from calib.estimation.triangles import Triangles, absorb, combine, empty
 from calib.estimation.whiteness import inflation
 from calib.identification.cases import Case
 from calib.identification.loop.loop_recordings import Loop
@@ -127,7 +125,7 @@ class Instrumental:
         """(n,) 100 ‖y - Z x‖ / ‖y‖ [%]: the torque of the simulated robot against the recorded, joint by joint."""
         p = len(self.names)
         values = np.concatenate([self.fit.estimate.values, np.zeros(p)])
-        rest, size = (residual_squares(self.problem.data, x) for x in (values, np.zeros(2 * p)))
+        rest, size = (self.problem.data.residual_squares(x) for x in (values, np.zeros(2 * p)))
         return 100.0 * np.sqrt(rest / np.where(size > 0.0, size, np.inf))
 
     @property
@@ -239,7 +237,7 @@ class _Fixed:
         """Return standard parameters with the values of those base parameters that are estimated."""
         whole = np.zeros(self.base.b)
         whole[self.kept] = values
-        return bases.to_standard(self.base, whole)
+        return self.base.to_standard(whole)
 
     def plant(self, old: Plant, found: _Found) -> Plant:
         """Return the robot of a round's estimate."""
@@ -295,7 +293,7 @@ def _with_signs(
     motion, band = case.motion, 0.5 * case.motion.band
     measured, expected = (slope(low_pass(one.motion.q, motion.rate, band), motion.rate) for one in (case, moved))
     away = np.sqrt(np.nanmean((measured - expected) ** 2, axis=0))
-    followed = away <= FOLLOWED * velocity_noise(motion, band)
+    followed = away <= FOLLOWED * motion.velocity_noise(band)
     if not followed.all():
         speed = np.where(followed | np.isnan(measured), moved.motion.v, measured)
         seen = observe(task.model, columns[drowned], replace(case, motion=replace(motion, v=speed)), task.decimator)
@@ -306,7 +304,7 @@ def _with_signs(
 
 def _drowned_signs(model: IdentificationModel, columns: np.ndarray, case: Case) -> np.ndarray:
     """Return (p,) which columns are Coulomb signs of a joint whose measured speed is noisier than their smoothing."""
-    noise, found = velocity_noise(case.motion), np.zeros(len(columns), dtype=bool)
+    noise, found = case.motion.velocity_noise(), np.zeros(len(columns), dtype=bool)
     for place, k in enumerate(columns - model.inertial):
         if k < 0 or model.columns[k].shape != "sign":
             continue
@@ -422,7 +420,7 @@ def _from_simulation(problem: Instruments, std: np.ndarray, tau: float) -> Linea
 
 def _simulated(problem: Instruments) -> Triangles:
     """Return the triangles of [Z y]."""
-    return replace(select(problem.data, np.arange(len(problem.names))), names=problem.names)
+    return replace(problem.data.select(np.arange(len(problem.names))), names=problem.names)
 
 
 def _inflation(observed: Sequence[ObservationRows], fit: LinearFit) -> float:
@@ -437,7 +435,7 @@ def _held_fit(task: _Fixed, problem: Instruments, std: np.ndarray, tau: float) -
     fit, own = task.estimator.fit(problem, std, tau), task.estimator
     if task.constraints is None:
         return fit, None
-    data = instrumental_variables.least_squares(problem) if own.measured else _simulated(problem)
+    data = problem.least_squares() if own.measured else _simulated(problem)
     return hold(fit, own.triangle(problem, std), data, std, task.constraints, stated=not own.measured)
 
 

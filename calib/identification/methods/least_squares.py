@@ -9,8 +9,7 @@ from typing import Protocol
 import numpy as np
 import scipy.linalg
 
-from calib.dynamics.base import to_standard
-from calib.dynamics.idim import IdentificationModel, with_terms
+from calib.dynamics.idim import IdentificationModel
 from calib.estimation.linear import LinearFit, ols, ridge, settled_std, wls
 from calib.estimation.samples import SampleFit, Samples, irls, stack
 from calib.estimation.total import tls
@@ -132,8 +131,8 @@ def _driving(problem: IdentificationProblem, values: np.ndarray) -> np.ndarray:
     model, own = problem.model, problem.base.b
     if not isinstance(model, IdentificationModel) or not model.torque_rows.motors_alone:
         return np.zeros(len(values), dtype=bool)
-    richer = with_terms(model, *(one for one in problem.terms[own:] if one is not None))
-    standard = np.concatenate([to_standard(problem.base, values[:own]), values[own:]])
+    richer = model.with_terms(*(one for one in problem.terms[own:] if one is not None))
+    standard = np.concatenate([problem.base.to_standard(values[:own]), values[own:]])
     wrong = driving(Dynamics(richer, standard), problem.cases)
     return np.array(
         [one is not None and one.form.dissipative and any(wrong[row] for row, _ in one.acts) for one in problem.terms],

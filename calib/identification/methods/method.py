@@ -21,7 +21,6 @@ from calib.dynamics.base import Base
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import CannotSimulate, Diverged, NotConverged, Unidentifiable
-from calib.estimation import instrumental_variables
 from calib.estimation.estimate import Estimate
 from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import Triangles, empty, retriangulate
@@ -189,7 +188,7 @@ class MethodEstimate:
             )  # fmt: skip
             return data, np.append(self.std, 1.0), np.append(self.inflation, 1.0)
         own = self.instrumental
-        data = instrumental_variables.testable(own.problem, own.fit, own.std)
+        data = own.problem.testable(own.fit, own.std)
         return data, np.ones(1), np.array([own.inflation])
 
 

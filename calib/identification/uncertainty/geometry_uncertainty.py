@@ -32,7 +32,6 @@ from scipy.spatial.transform import Rotation
 
 from calib.arrays import frozen
 from calib.data.signals.decimation import Decimator, decimate, kept, spread
-from calib.dynamics import base as bases
 from calib.dynamics import rigid_body
 from calib.dynamics.bodies import Bodies
 from calib.dynamics.torque_rows import BODIES
@@ -231,7 +230,7 @@ def _differences(
     model, motion, b = found.dynamics.model, case.motion, found.base.b
     bodies = model.inertial
     onboard = model.carried_columns(case.carried)
-    parameters = bases.to_standard(found.base, found.fitted.estimate.values[:b])[:bodies] * onboard
+    parameters = found.base.to_standard(found.fitted.estimate.values[:b])[:bodies] * onboard
     q, v, a = (np.asarray(x[span]) for x in (motion.q, motion.v, motion.a))
     felt = model.torque_rows.fold(spread(residual, decimator, len(q))[:, :, None], (BODIES,))[:, :, 0]
     change = np.empty((len(moved), model.bodies.n, len(q)))

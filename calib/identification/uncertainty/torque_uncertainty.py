@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.dynamics.base import standard_name
-from calib.dynamics.idim import friction_states, with_load
+from calib.dynamics.idim import friction_states
 from calib.errors import UsageError
 from calib.identification.model_file import read_covariance
 from calib.identification.prediction import Dynamics
@@ -63,7 +63,7 @@ def parameter_variances(
         states: (s, N) of friction with memory; None: q is one uninterrupted record.
     """
     model, result = dynamics.model, []
-    loaded = bool(with_load(model))
+    loaded = bool(model.with_load())
     states = friction_states(model, q) if states is None else states
     unit = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))

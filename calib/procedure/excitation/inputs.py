@@ -11,7 +11,7 @@ import numpy as np
 from calib.dynamics import base as base_parameters
 from calib.dynamics import drives
 from calib.dynamics.base import BaseModel, columns_at_rest, information
-from calib.dynamics.bodies import bodies_of, standard_parameters, with_gravity
+from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.shapes import V0
@@ -169,7 +169,7 @@ def _identified(chain: Chain, folder: Path) -> ExcitedModel:
             message = f"{folder} is of a robot with {theirs.n} joints ({theirs.name}), {chain.name} has {chain.n}"
             raise UsageError(message) from error
         raise UsageError(f"{folder}/dynamics.json does not fit robot '{chain.name}': {error!r}") from error
-    bodies = with_gravity(bodies_of(chain), np.asarray(found.model.bodies.gravity))
+    bodies = bodies_of(chain).with_gravity(np.asarray(found.model.bodies.gravity))
     numbers = found.values[: 10 * bodies.count]
     terms = list(zip(found.model.columns, found.values[found.model.inertial :]))
     kept = [(one, value) for one, value in terms if one.form.slopes is not None]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.dynamics.bodies import Bodies, bodies_of, with_gravity
+from calib.dynamics.bodies import Bodies, bodies_of
 from calib.identification.friction.drive_table import Drives, drive_table
 from calib.identification.model_file import MODEL, refuse_currents
 from calib.identification.possible.information import Information
@@ -43,7 +43,7 @@ class IdentifiedRobot:
     @property
     def arm(self) -> Bodies:
         """The arm's bodies under the gravity it was identified with."""
-        return with_gravity(bodies_of(self.chain), self.found.dynamics.model.bodies.gravity)
+        return bodies_of(self.chain).with_gravity(self.found.dynamics.model.bodies.gravity)
 
 
 def is_identified(folder: Path) -> bool:

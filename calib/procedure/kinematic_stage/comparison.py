@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements, Positions
-from calib.geometry.accuracy import Errors, Torques, errors, pair_errors, statistics, summary
+from calib.geometry.accuracy import Errors, Torques, errors, pair_errors, statistics
 from calib.geometry.checks.repeatability import SAME, Repeats, repeats
 from calib.geometry.fit import placed_on
 from calib.geometry.installation import Installation
@@ -98,9 +98,9 @@ class Comparison:
         """Return the comparison as ``metrics.json`` holds it."""
         arms = ("nominal", "calibrated")
         result: dict[str, object] = {"poses": self.poses, "frames": self.frames, "unseen": self.proves}
-        result |= {arm: summary(found) for arm, found in zip(arms, self.errors)}
+        result |= {arm: found.summary() for arm, found in zip(arms, self.errors)}
         if self.alone is not None:
-            result["urdf_alone"] = summary(self.alone)
+            result["urdf_alone"] = self.alone.summary()
         if len(self.pairs[0]):
             result["pair_distance_mm"] = {arm: statistics(sizes, 1e3) for arm, sizes in zip(arms, self.pairs)}
         if self.reprojection is not None:

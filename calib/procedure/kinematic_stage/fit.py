@@ -18,11 +18,11 @@ from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.folds import folds_by_name
-from calib.geometry.model_choice.ladder import ModelSelection, rigid_fit, select_model
+from calib.geometry.model_choice.ladder import ModelSelection, select_model
 from calib.geometry.parameters import fixed_parameters, stated_prior
 from calib.geometry.result import GeometricFit, calibrated_chain
 from calib.geometry.uncertainty.error_model import ErrorModel, learn_errors
-from calib.geometry.weighing import Settings, combine
+from calib.geometry.weighing import Settings
 from calib.procedure.findings import Verdict, settled
 from calib.procedure.kinematic_stage import plausibility
 from calib.procedure.kinematic_stage.comparison import (
@@ -122,7 +122,7 @@ def run(
         NotConverged: where the chosen model's fit did not come to an end.
     """
     options, wanted, say = options or FitOptions(), wanted or FitSettings(), progress or (lambda words: None)
-    settings = combine(Settings(), loss=wanted.loss or options.loss, loss_scale=options.loss_scale)
+    settings = Settings().combine(loss=wanted.loss or options.loss, loss_scale=options.loss_scale)
     asked, seed = wanted.model or options.model, wanted.seed
     if selection is not None:
         check_robot(selection, inputs.chain.joint_names)
@@ -151,8 +151,8 @@ def run(
     if said and settings.loss in HEEDS_ALL:
         said = gross_rows(found, climb("geometry", settings=replace(settings, loss="cauchy")), long) or said
     say("comparing on unseen poses")
-    settings = combine(settings, loss=found.loss)
-    rigid = rigid_fit(found, inputs.fit, settings)
+    settings = settings.combine(loss=found.loss)
+    rigid = found.rigid_fit(inputs.fit, settings)
     named = named_outliers(found.fit)
     told = *map(remark, diagnose(found.fit)), *image_notes(found.fit)
     notes = *_moved_between(found.nominal.cell, inputs.fit, settings), *told
@@ -184,7 +184,7 @@ def _compared(selection: SelectionPrediction, found: GeometricFit) -> tuple[Sigm
 
 def assessed(outcome: Outcome, inputs: Inputs, options: FitOptions, wanted: FitSettings) -> Outcome:
     """Return an outcome judged anew on the unseen rows of `inputs`; nothing is fitted."""
-    settings = combine(Settings(), loss=wanted.loss or options.loss, loss_scale=options.loss_scale)
+    settings = Settings().combine(loss=wanted.loss or options.loss, loss_scale=options.loss_scale)
     fits = outcome.selection
     arms = Arms(fits.nominal.cell, fits.fit.cell, outcome.rigid.cell.chain, outcome.expected)
     asked = wanted.model or options.model

@@ -20,7 +20,7 @@ from calib.folders import CERTIFICATE, METRICS, REPORT, check_target, write_stag
 from calib.geometry import installation_file
 from calib.geometry.installation import Installation
 from calib.geometry.uncertainty.error_model import ErrorModel
-from calib.geometry.weighing import Settings, combine
+from calib.geometry.weighing import Settings
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import Findings, FitMetrics, ValidationMetrics
@@ -114,7 +114,7 @@ class FitFolder:
 
     def arms(self, inputs: Inputs, settings: Settings) -> Arms:
         """Read both arms; the nominal one's frames are fitted to the fit's rows again."""
-        chosen = combine(settings, loss=self.findings().loss or settings.loss)
+        chosen = settings.combine(loss=self.findings().loss or settings.loss)
         cell = installation_file.read(self.path)
         rigid = calibrated.read(self.path).chain
         return Arms(nominal_arm(inputs, chosen), cell, rigid, self._expected(cell, inputs))

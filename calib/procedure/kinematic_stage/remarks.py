@@ -22,7 +22,7 @@ from calib.geometry.checks.unidentified import (
 )
 from calib.geometry.model_choice.ladder import GROSS, ModelSelection
 from calib.geometry.observation import observe
-from calib.geometry.result import GeometricFit, outliers
+from calib.geometry.result import GeometricFit
 from calib.units import ERRORS
 
 FLOOR = 4e-4  # rms per metre of reach: more is not left by a rigid geometry of a sound arm (our choice)
@@ -118,7 +118,7 @@ def named_outliers(found: GeometricFit) -> list[Outlier]:
                 key = block.measured.file, int(row), part.label
                 sizes[key] = max(float(size), sizes.get(key, 0.0))
     result: dict[tuple[str, int, str], Outlier] = {}
-    for file, row, label, sigmas in outliers(found):
+    for file, row, label, sigmas in found.outliers():
         result.setdefault((file, row, label), Outlier(file, row, NATURE[label], sigmas, sizes[file, row, label]))
     return list(result.values())
 

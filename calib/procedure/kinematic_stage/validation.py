@@ -20,7 +20,7 @@ from calib.geometry.fit import polish_frames, without_corrections
 from calib.geometry.installation import Installation
 from calib.geometry.observation import predict, prepare
 from calib.geometry.uncertainty.error_model import ErrorModel
-from calib.geometry.weighing import Settings, combine
+from calib.geometry.weighing import Settings
 from calib.procedure.findings import Verdict, held_by
 from calib.procedure.kinematic_stage.comparison import (
     Comparison,
@@ -104,7 +104,7 @@ def assess(
         tolerance: largest rms on unseen poses that is good enough [m].
         seed: of the pairs whose distances are compared.
     """
-    both, settings = (arms.nominal, arms.calibrated), combine(settings, loss=findings.loss or settings.loss)
+    both, settings = (arms.nominal, arms.calibrated), settings.combine(loss=findings.loss or settings.loss)
     torques = [gravity_of(inputs.chain, block) for block in inputs.fit]
     alone = without_corrections(arms.calibrated, arms.rigid, inputs.fit, settings)
     fitted = compare(*both, inputs.fit, torques, "fitted on these rows", False, seed, alone=alone)

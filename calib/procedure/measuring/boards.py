@@ -47,7 +47,7 @@ def make(
     usual, share, across = USUAL[kind]
     try:
         side, between = square / 1e3, (share * square if marker is None else marker) / 1e3
-        made = boards.checked(Board(kind, columns or across, rows, side, between, words or usual))
+        made = Board(kind, columns or across, rows, side, between, words or usual).checked()
         if (count := len(boards.corners(made))) < FEWEST:
             raise UsageError(f"a {made.words} has {count} corners; an image counts from {FEWEST} on: more squares")
         size = board_print.page_size(made, (paper or "").lower())

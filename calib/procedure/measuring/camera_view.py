@@ -17,7 +17,7 @@ from calib.config import strict
 from calib.config_types import Checked, Expect, Name, OneOf, Real, shown
 from calib.data.camera.board import Board, corners, read_board
 from calib.data.camera.camera_info import read_lens
-from calib.data.camera.lens import Lens, project
+from calib.data.camera.lens import Lens
 from calib.data.poses.pixels import IN_HAND, TO_HAND, Pixels
 from calib.errors import UsageError
 from calib.geometry.identifiability import base_columns
@@ -113,7 +113,7 @@ class CameraView:
         point = np.einsum("mij,kj->mki", poses[:, :3, :3], edge) + poses[:, None, :3, 3]
         aside = np.maximum(np.linalg.norm(point[:, :, :2], axis=2), 1e-3)
         ahead = np.concatenate([point[:, :, :2], np.maximum(point[:, :, 2:], aside[:, :, None] / 2.0)], axis=2)
-        pixel = project(self.lens, ahead.reshape(-1, 3)).reshape(len(q), -1, 2)
+        pixel = self.lens.project(ahead.reshape(-1, 3)).reshape(len(q), -1, 2)
         outside = np.concatenate([self.margin - pixel, pixel + self.margin + 1 - size], axis=2) / size[0]
         middle = poses[:, :3, :3] @ (0.5 * np.array([*self.board.extent, 0.0])) + poses[:, :3, 3]
         far = np.linalg.norm(middle, axis=1)

@@ -17,7 +17,7 @@ import numpy as np
 from calib import files
 from calib.errors import UsageError
 from calib.geometry.parameters import layout
-from calib.geometry.result import GeometricFit, used_sigmas
+from calib.geometry.result import GeometricFit
 from calib.geometry.uncertainty.spread import pose_sigmas
 from calib.procedure.sigma_comparison import SigmaComparison, compare_sigmas
 from calib.records import read_record
@@ -137,6 +137,6 @@ def _rms(sigmas: np.ndarray) -> float:
 
 def _noise(fit: GeometricFit) -> dict[str, float]:
     """Return the sigma that the fit takes a measurement of each nature to have, rms over its files [m or rad]."""
-    found = [each for each in used_sigmas(fit) if each]
+    found = [each for each in fit.used_sigmas() if each]
     return {label: _rms(np.array([each[label] for each in found if label in each])) for label in NOISES
             if any(label in each for each in found)}  # fmt: skip

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calib import files
-from calib.data.signals.motion import in_band
 from calib.dynamics.base import expressions
 from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
 from calib.folders import METRICS, check_target, write_staged
@@ -274,7 +273,7 @@ def figures(outcome: ParallelOutcome) -> dict[str, Figure]:
 
     drawn = {}
     for number, case in enumerate((*outcome.cases, *outcome.unseen), 1):
-        y, model = (in_band(case.motion, x) for x in (case.target, predict(outcome.found.dynamics, case)))
+        y, model = (case.motion.in_band(x) for x in (case.target, predict(outcome.found.dynamics, case)))
         labels = [f"{a} [{b}]" for a, b in zip(case.torque_rows.numbered(case.motion.n), _units(outcome, case))]
         figure, axes = plt.subplots(len(labels), 1, figsize=(8, 1.9 * len(labels) + 0.6), sharex=True, squeeze=False)
         for axis, label, one, two in zip(axes[:, 0], labels, y.T, model.T):

@@ -14,7 +14,6 @@ from calib import files
 from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.pixels import Pixels
 from calib.errors import UsageError
-from calib.estimation.estimate import strong_correlations
 from calib.geometry.observation import predict, prepare
 from calib.geometry.parameters import layout
 from calib.procedure.kinematic_stage.comparison import Comparison
@@ -142,7 +141,7 @@ def collect(outcome: Outcome) -> Report:
         metrics=fit_metrics(outcome),
         parameters=tuple(_FittedParameter(*row, groups[row[0]]) for row in table.rows()),
         kept=tuple(name for name in chain.names if name not in fitted),
-        correlations=tuple(_CorrelatedPair(*pair) for pair in strong_correlations(fit.estimate, 0.9)),
+        correlations=tuple(_CorrelatedPair(*pair) for pair in fit.estimate.strong_correlations(0.9)),
         correlated=_correlated(table.names, table.covariance),
         singular_values=tuple(values),
         rank=len(values) if fit.split is None else fit.split.rank,

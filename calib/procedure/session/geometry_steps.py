@@ -18,7 +18,7 @@ from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.data.poses.pixels import Pixels
 from calib.data.poses.plans import check_against, read_poses, write_poses
 from calib.errors import RobotError, UsageError
-from calib.geometry.weighing import Settings, combine
+from calib.geometry.weighing import Settings
 from calib.procedure.kinematic_stage import fit as fitting
 from calib.procedure.kinematic_stage import folder as outputs
 from calib.procedure.kinematic_stage import inputs
@@ -250,7 +250,7 @@ def validate(session: Session, say: Say) -> list[str]:
         notes += check_file(session, chain, path, plan, like)
     say("comparing on unseen poses")
     given, options, wanted = _gathered(session, unseen), _options_of(session), _fit_settings(session)
-    settings = combine(Settings(), loss=wanted.loss or options.loss, loss_scale=options.loss_scale)
+    settings = Settings().combine(loss=wanted.loss or options.loss, loss_scale=options.loss_scale)
     found = assess(
         fit.arms(given, settings), given, fit.findings(), settings, asked=wanted.model or options.model,
         tolerance=wanted.tolerance, seed=wanted.seed,

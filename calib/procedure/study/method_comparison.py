@@ -19,7 +19,6 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
-from calib.data.signals.motion import in_band
 from calib.errors import CalibError, UsageError
 from calib.identification.cases import Case
 from calib.identification.identify import Identification, identify
@@ -185,7 +184,7 @@ def _sums(found: Identification, cases: Sequence[Case]) -> _Sums:
     for case in cases:
         motion, known = case.motion, case.motion.weight > 0.5
         predicted = predict(found.dynamics, case)
-        low, target = in_band(motion, predicted), in_band(motion, np.asarray(case.target))
+        low, target = motion.in_band(predicted), motion.in_band(np.asarray(case.target))
         starts = np.linspace(0, len(known), BLOCKS, endpoint=False).astype(int)
         parts.append(
             [

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from calib import files
 from calib.data.camera import board as boards
 from calib.data.camera.board import Board, corners
-from calib.data.camera.lens import Lens, in_sight, project
+from calib.data.camera.lens import Lens
 from calib.data.poses.image_folders import JOINTS
 from calib.data.poses.pixels import IN_HAND, Pixels
 from calib.errors import CannotSimulate
@@ -188,7 +188,7 @@ def visible(found: CameraCell, q: np.ndarray) -> np.ndarray:
     poses = board_poses(found, q)
     flat = _points(found, poses).reshape(-1, 3)
     facing = np.einsum("mi,mi->m", poses[:, :3, 2], poses[:, :3, 3]) > 0.0
-    return in_sight(found.lens, flat, 6.0).reshape(len(q), len(corners(found.board))) & facing[:, None]
+    return found.lens.in_sight(flat, 6.0).reshape(len(q), len(corners(found.board))) & facing[:, None]
 
 
 def _points(found: CameraCell, poses: np.ndarray) -> np.ndarray:
@@ -206,7 +206,7 @@ def photograph(
     rng, names = np.random.default_rng(seed), found.cell.truth
     seen, points = visible(found, q), _points(found, board_poses(found, q))
     flat = np.where(seen.reshape(-1, 1), points.reshape(-1, 3), [0.0, 0.0, 1.0])
-    pixel = project(found.lens, flat).reshape(*seen.shape, 2)
+    pixel = found.lens.project(flat).reshape(*seen.shape, 2)
     pixel = np.where(seen[:, :, None], pixel + rng.normal(0.0, noise, pixel.shape), np.nan)
     own = q + rng.normal(0.0, found.cell.instrument.encoder_sigma, q.shape)
     free = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")

@@ -16,7 +16,7 @@ import numpy as np
 
 from calib.data.camera.board import Board
 from calib.data.camera.board_print import raster
-from calib.data.camera.lens import Lens, project, rays
+from calib.data.camera.lens import Lens, rays
 from calib.geometry.images.optics import BoardShape, shaped_points
 
 SUB = 3  # sub-pixels each way
@@ -86,7 +86,7 @@ def _reflectance(board: Board, lens: Lens, pose: np.ndarray, background: float, 
     seen = shaped_points(board, shape, outline) @ pose[:3, :3].T + pose[:3, 3]
     if np.any(seen[:, 2] < 0.02):
         return result
-    pixel = project(lens, seen)
+    pixel = lens.project(seen)
     low = np.maximum(np.floor(pixel.min(axis=0)) - 2, 0).astype(int)
     high = np.minimum(np.ceil(pixel.max(axis=0)) + 3, lens.size).astype(int)
     if np.any(high <= low):

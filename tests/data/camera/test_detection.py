@@ -15,7 +15,7 @@ from calib.data.camera.board import Board, corners
 from calib.data.camera.corner_file import Detection
 from calib.data.camera.detection import detect
 from calib.data.camera.images import decode, read_image
-from calib.data.camera.lens import Lens, project
+from calib.data.camera.lens import Lens
 from calib.errors import MeasurementError
 from calib.simulation.cells.rendered_camera import Imaging, render
 from calib.transforms import pose
@@ -40,7 +40,7 @@ def image(kind: str, *angles: float, imaging: Imaging | None = None) -> np.ndarr
 
 def errors(found: Detection, kind: str, *angles: float) -> np.ndarray:
     where = placed(*angles)
-    return (found.pixel - project(LENS, corners(BOARDS[kind]) @ where[:3, :3].T + where[:3, 3]))[found.seen]
+    return (found.pixel - LENS.project(corners(BOARDS[kind]) @ where[:3, :3].T + where[:3, 3]))[found.seen]
 
 
 @pytest.mark.parametrize("angles", [(), (10.0, 20.0, 170.0)])

@@ -8,7 +8,7 @@ import pytest
 from differences import check
 
 from calib.data.camera import camera_info
-from calib.data.camera.lens import Lens, in_sight, pinhole, project, project_with_slopes, rays
+from calib.data.camera.lens import Lens, pinhole, rays
 from calib.errors import CalibError, MeasurementError
 
 SIZE = (800, 600)
@@ -32,24 +32,24 @@ def test_pixels_are_opencvs(name):
         theirs = cv2.fisheye.projectPoints(place[:, None], np.zeros(3), np.zeros(3), matrix, lens.values[4:])[0]
     else:
         theirs = cv2.projectPoints(place, np.zeros(3), np.zeros(3), matrix, lens.values[4:])[0]
-    assert project(lens, place) == pytest.approx(theirs.reshape(-1, 2), abs=1e-9)
+    assert lens.project(place) == pytest.approx(theirs.reshape(-1, 2), abs=1e-9)
 
 
 @pytest.mark.parametrize("name", LENSES)
 def test_derivatives_and_the_inverse(name):
     lens, place = LENSES[name], points()
-    pixel, by_point, by_value = project_with_slopes(lens, place)
+    pixel, by_point, by_value = lens.project_with_slopes(place)
     for k in range(0, 25, 6):
-        check(lambda x: project(lens, x[None])[0], by_point[k], place[k])
-        check(lambda v: project(lens.with_values(v), place[k : k + 1])[0], by_value[k], lens.values, tolerance=1e-6)  # noqa: B023
+        check(lambda x: lens.project(x[None])[0], by_point[k], place[k])
+        check(lambda v: lens.with_values(v).project(place[k : k + 1])[0], by_value[k], lens.values, tolerance=1e-6)  # noqa: B023
     assert rays(lens, pixel) == pytest.approx(place[:, :2] / place[:, 2:], abs=1e-12)
 
 
 def test_a_point_where_the_distortion_turns_back_is_out_of_sight():
     strong = pinhole(400.0, SIZE, (-0.4,))  # r (1 - 0.4 r²) falls again beyond r = 0.91
     inside, beyond = np.array([[0.3, 0.0, 1.0]]), np.array([[1.5, 0.0, 1.0]])
-    assert np.all(project(strong, beyond) < SIZE)
-    assert in_sight(strong, np.concatenate([inside, beyond, -inside])).tolist() == [True, False, False]
+    assert np.all(strong.project(beyond) < SIZE)
+    assert strong.in_sight(np.concatenate([inside, beyond, -inside])).tolist() == [True, False, False]
 
 
 @pytest.mark.parametrize("name", LENSES)

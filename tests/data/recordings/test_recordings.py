@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.data.recordings.recording import Joints, Recording, cut, parse_cut
+from calib.data.recordings.recording import Joints, Recording, parse_cut
 from calib.data.recordings.recording_files import read_recording
 from calib.data.recordings.recording_options import RecordingOptions
 from calib.errors import MeasurementError, UsageError
@@ -59,7 +59,7 @@ def test_a_rate_stands_in_for_stamps(archive):
 def test_cuts(archive, recording):
     part = read_recording(f"{archive()}@2:4.5", ROBOT)
     assert part.t[0] == 2.0 and len(part) == 500 and part.rows[0] == 401
-    np.testing.assert_array_equal(part.q, cut(recording, 2.0, 4.5).q)
+    np.testing.assert_array_equal(part.q, recording.cut(2.0, 4.5).q)
     assert len(read_recording(f"{archive()}@10:")) == 400
     assert parse_cut("a@b.npz") == ("a@b.npz", None, None) and parse_cut("x.npz@:3") == ("x.npz", None, 3.0)
     refused(f"{archive()}@20:30", r"the cut @20:30 leaves no sample; the recording ends at 11.99 s")

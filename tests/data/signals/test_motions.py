@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from calib.data.recordings.clock import find_clock
-from calib.data.recordings.recording import Recording, take
+from calib.data.recordings.recording import Recording
 from calib.data.signals.bandwidth import propose_cutoffs, spectrum
 from calib.data.signals.decimation import decimate, decimate_regressor
-from calib.data.signals.motion import FilterOptions, in_band, make_motion, moving, standstill, thin
+from calib.data.signals.motion import FilterOptions, make_motion, moving, thin
 from calib.data.signals.persistency import repeats, report_excitation
 from calib.data.signals.resampling import resample
 from calib.errors import MeasurementError, UsageError
@@ -104,7 +104,7 @@ def test_short_gaps_are_bridged_and_long_ones_split():
     keep = np.ones(len(t), dtype=bool)
     keep[1000:1004] = False  # 10 ms
     keep[2500:3500] = False  # 2 s
-    sampled = resample(take(recorded(t, t), keep))
+    sampled = resample(recorded(t, t).take(keep))
     report = sampled.report
     assert report.lost == 4 and len(report.gaps) == 1 and not report.dropped
     start, length = report.gaps[0]
@@ -112,7 +112,7 @@ def test_short_gaps_are_bridged_and_long_ones_split():
     assert any(line == "gap of 2 s at 4.998 s: split there" for line in report.lines())
     assert sampled.weight[1000:1004].max() == 0 and sampled.weight.sum() == keep.sum()
     np.testing.assert_allclose(sampled.series["q"][1000:1004], waves(t)[0][1000:1004], atol=1e-6)
-    motion = make_motion(take(recorded(t, t), keep))
+    motion = make_motion(recorded(t, t).take(keep))
     assert sorted(set(motion.segment)) == [0, 1]
     assert not ((motion.t > t[2499] - 0.05) & (motion.t < t[3500] + 0.05)).any()
     index = thin(motion)
@@ -123,10 +123,10 @@ def test_crumbs_between_gaps_are_left_out():
     t = even()
     keep = np.ones(len(t), dtype=bool)
     keep[2000:2500] = keep[2530:3000] = False
-    report = resample(take(recorded(t, t), keep)).report
+    report = resample(recorded(t, t).take(keep)).report
     assert len(report.gaps) == 2 and len(report.dropped) == 1
     with pytest.raises(MeasurementError, match="none longer than 50 samples"):
-        resample(take(recorded(t, t), np.arange(len(t)) % 400 < 40))
+        resample(recorded(t, t).take(np.arange(len(t)) % 400 < 40))
 
 
 @pytest.mark.parametrize(
@@ -195,7 +195,7 @@ def test_standing_and_moving_samples():
     q[:, 0] = s**3 * (10 - 15 * s + 6 * s**2)
     recording = Recording(t, q, np.ones_like(q) + q, "torque", ("a", "b"))
     motion = make_motion(recording, FilterOptions(cutoff=20.0))
-    stands = standstill(motion)
+    stands = motion.standstill()
     assert stands[motion.t < 2.9].all() and stands[motion.t > 9.1].all() and not stands[abs(motion.t - 6) < 2].any()
     assert not moving(motion)[:, 1].any()
     fast = moving(motion, [0.2, 0.2])[:, 0]
@@ -209,7 +209,7 @@ def test_the_signal_in_the_band():
     motion = make_motion(rippled, FilterOptions(cutoff=30.0, band=20.0))
     inner = slice(100, -100)
     clear = 20 * np.cos(waves(motion.t)[0]) + 2 * waves(motion.t)[1] + 0.5 * waves(motion.t)[2]
-    np.testing.assert_allclose(in_band(motion, motion.effort)[inner], clear[inner], atol=0.05)
+    np.testing.assert_allclose(motion.in_band(motion.effort)[inner], clear[inner], atol=0.05)
 
 
 def one_sine(t: np.ndarray) -> Recording:

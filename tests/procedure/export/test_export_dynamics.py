@@ -71,7 +71,7 @@ def write_identification(folder: Path, source: str, seed: int = 0, factor: float
     files.write_table(folder / "estimate.csv", ("name", "unit", "value"), rows)
     lines = [[name, *map(float, row)] for name, row in zip(base.names, covariance)]
     files.write_table(folder / "covariance.csv", ("name", *base.names), lines)
-    files.write_json(folder / "dynamics.json", to_table(Dynamics(model, bases.to_standard(base, found)), base))
+    files.write_json(folder / "dynamics.json", to_table(Dynamics(model, base.to_standard(found)), base))
     return folder
 
 

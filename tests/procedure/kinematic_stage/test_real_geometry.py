@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions, Sockets, take
-from calib.geometry.accuracy import errors, summary
+from calib.geometry.accuracy import errors
 from calib.geometry.checks.diagnosis import SetUpChange, SystematicResidual, diagnose
 from calib.geometry.checks.unidentified import LoosePlacement, unidentified
 from calib.geometry.first_guess import install
 from calib.geometry.model_choice.ladder import ModelSelection, select_model
-from calib.geometry.result import outliers
 from calib.geometry.weighing import Settings
 from calib.robot.formats import urdf
 
@@ -81,7 +80,7 @@ def judged(chain, fitted: PoseMeasurements, unseen: PoseMeasurements) -> tuple[M
     """Return the climb, and the errors on unseen rows of the nominal and the calibrated arm."""
     found = select_model(install(chain, [fitted]), [fitted])
     assert found.fit.solution.status.good
-    return found, *(summary(errors(cell, [unseen])) for cell in (found.nominal.cell, found.fit.cell))
+    return found, *(errors(cell, [unseen]).summary() for cell in (found.nominal.cell, found.fit.cell))
 
 
 def report(
@@ -168,7 +167,7 @@ def test_tiago_outliers_are_named(data, capsys):
     assert chain.joints[0].kind == "prismatic"
     settings = Settings(loss="cauchy", passes=10)
     found = select_model(install(chain, [measured]), [measured], "offsets", settings=settings)
-    named = outliers(found.fit)
+    named = found.fit.outliers()
     sizes = 1e3 * errors(found.fit.cell, [measured]).position
     with capsys.disabled():
         rows = list(dict.fromkeys(item[1] for item in named))
