@@ -1,6 +1,8 @@
 """How the errors that fits and identifications state hold: one row per recording and split, and simulated parameters.
 
-CALIB_DATA=... python examples/interval_coverage.py [torques] [parameters] [positions]
+CALIB_DATA=... python examples/interval_coverage.py [torques] [parameters] [positions [ROW ...]]
+
+A ROW of the positions is named by its first cells: "Motoman small | each region". Without any all are made.
 """
 
 from __future__ import annotations
@@ -8,7 +10,7 @@ from __future__ import annotations
 import os
 import sys
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -112,18 +114,25 @@ def torque_row(name: str, train: str, unseen: str, options: dict) -> str:
     )
 
 
-def positions() -> None:
-    """Print the table of positions."""
-    print("| recording | split | unseen rows | rms [mm] | within 95 % interval | median interval [mm] | extrapolated |")
-    print("|---|---|---|---|---|---|---|", flush=True)
+def position_rows() -> Iterator[tuple[str, str, Callable[[], list[GeometryFit]]]]:
+    """Yield recording and split of each row of the positions' table, and what makes its fits."""
     for name, (robot, file, share) in RECORDINGS.items():
-        held_out = calib.fit_geometry(robot, file, FitSettings(holdout=share))
-        print(row(name, f"{100 * share:.0f} % at random", [held_out]), flush=True)
-        print(row(name, "each region left out", list(regions(robot, file))), flush=True)
+        settings = FitSettings(holdout=share)
+        yield name, f"{100 * share:.0f} % at random", lambda: [calib.fit_geometry(robot, file, settings)]  # noqa: B023
+        yield name, "each region left out", lambda: list(regions(robot, file))  # noqa: B023
     for one, other in STATIONS:
         robot, file, _ = RECORDINGS[one]
-        fit = calib.fit_geometry(robot, file, FitSettings(refit_frames=True), validate=RECORDINGS[other][1])
-        print(row(one, f"→ {other}", [fit]), flush=True)
+        settings, unseen = FitSettings(refit_frames=True), RECORDINGS[other][1]
+        yield one, f"→ {other}", lambda: [calib.fit_geometry(robot, file, settings, validate=unseen)]  # noqa: B023
+
+
+def positions(chosen: Sequence[str] = ()) -> None:
+    """Print the table of positions, all rows or those whose first cells, as in ``Motoman small | →``, are chosen."""
+    print("| recording | split | unseen rows | rms [mm] | within 95 % interval | median interval [mm] | extrapolated |")
+    print("|---|---|---|---|---|---|---|", flush=True)
+    for name, split, fits in position_rows():
+        if not chosen or f"{name} | {split}".startswith(tuple(chosen)):
+            print(row(name, split, fits()), flush=True)
 
 
 def torques() -> None:
@@ -171,12 +180,14 @@ def parameters(seeds: int = SEEDS) -> None:
 
 def main() -> None:
     wanted = sys.argv[1:] or ["torques", "parameters", "positions"]
+    place = wanted.index("positions") + 1 if "positions" in wanted else len(wanted)
+    wanted, chosen = wanted[:place], wanted[place:]
     if "torques" in wanted:
         torques()
     if "parameters" in wanted:
         parameters()
     if "positions" in wanted:
-        positions()
+        positions(chosen)
 
 
 if __name__ == "__main__":

@@ -14,6 +14,10 @@ from recordings import DATA
 ROOT = Path(__file__).parents[2]
 TABLE = (ROOT / "examples/real_recordings.md").read_text()
 MISSED = {"Panda, first 4 s": 89.0, "Panda, last 8.8 s": 91.5}  # told in the table's text, with why
+CHEAP = ("UR5 | 25 %", "Motoman small | 33 %", "TIAGo, three markers")  # of the positions, four rows
+POSITIONS = re.compile(
+    r"^\| (.+?) \| (.+?) \| (\d+) \| ([\d.]+) \| \**([\d.]+) %\** \| ([\d.]+) \| (\d+) % \|", re.MULTILINE
+)
 ROW = re.compile(r"^\| (.+?) \| (.+?) \| ([\d.]+) % \| ([\d.]+) % \|", re.MULTILINE)
 
 
@@ -21,9 +25,9 @@ def rows(said: str) -> dict[tuple[str, str], tuple[float, float]]:
     return {(name, unseen): (float(error), float(share)) for name, unseen, error, share in ROW.findall(said)}
 
 
-def run(part: str) -> str:
+def run(*parts: str) -> str:
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), "CALIB_DATA": str(DATA)}
-    command = [sys.executable, str(ROOT / "examples/interval_coverage.py"), part]
+    command = [sys.executable, str(ROOT / "examples/interval_coverage.py"), *parts]
     return subprocess.run(command, capture_output=True, text=True, env=environment, check=True).stdout
 
 
@@ -34,3 +38,17 @@ def test_torques_on_unseen_real_motion(data):
     for key, (error, share) in found.items():
         assert error == pytest.approx(told[key][0], abs=0.1) and share == pytest.approx(told[key][1], abs=0.5), key
         assert share >= MISSED.get(key[0], 93.0), key
+
+
+@pytest.mark.slow
+def test_positions_on_unseen_real_poses(data):
+    """Four of the table's rows, by the function that prints them all."""
+    found, told = (
+        {cells[:2]: tuple(map(float, cells[2:])) for cells in POSITIONS.findall(text)}
+        for text in (run("positions", *CHEAP), TABLE)
+    )
+    assert len(found) == 4 and len(told) == 16
+    for key, (count, rms, share, width, beyond) in found.items():
+        assert told[key][0] == count and told[key][4] == pytest.approx(beyond, abs=1), key
+        assert told[key][1] == pytest.approx(rms, rel=0.03) and told[key][3] == pytest.approx(width, rel=0.03), key
+        assert told[key][2] == pytest.approx(share, abs=1.0), key
