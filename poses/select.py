@@ -98,6 +98,17 @@ class Selection:
     method: Method
     interrupted: bool = False
 
+    @property
+    def joints(self) -> np.ndarray:
+        """The joint values (m, n) [rad or m] of poses chosen by them.
+
+        Raises:
+            BadInput: where candidates came without joint values.
+        """
+        if self.q is None:
+            raise BadInput("the candidates came without joint values: the chosen ones are `indices`")
+        return self.q
+
 
 @dataclass(frozen=True)
 class _Chosen:

@@ -14,6 +14,7 @@ import numpy as np
 
 from calib.data.camera.board import corners
 from calib.data.camera.board_pose import board_poses
+from calib.data.camera.lens import Lens
 from calib.data.poses.image_folders import listed
 from calib.data.poses.measurements import PoseMeasurements, Poses, take
 from calib.data.poses.pixels import IN_HAND, TO_HAND, Pixels
@@ -90,11 +91,17 @@ def complete_camera(chain: Chain, block: Pixels, others: Sequence[PoseMeasuremen
     return _without_gross_corners(block, poses)
 
 
+def _lens_of(block: Pixels) -> Lens:
+    """Return the lens of images that have one: their own, or what `complete_camera` has found."""
+    if block.lens is None:
+        raise MeasurementError("the lens of these images is not known", block.file)
+    return block.lens
+
+
 def _own_poses(block: Pixels, rows: np.ndarray) -> np.ndarray:
     """Return the board's poses (k, 4, 4) in the camera at some rows, by each image alone."""
-    assert block.lens is not None
-    own = np.array_split(rows, len(rows) // AT_ONCE + 1)
-    return np.concatenate([board_poses(block.lens, block.board, block.pixel[each]).poses for each in own])
+    own, lens = np.array_split(rows, len(rows) // AT_ONCE + 1), _lens_of(block)
+    return np.concatenate([board_poses(lens, block.board, block.pixel[each]).poses for each in own])
 
 
 def _without_gross_corners(block: Pixels, poses: np.ndarray) -> Pixels:
@@ -102,8 +109,7 @@ def _without_gross_corners(block: Pixels, poses: np.ndarray) -> Pixels:
 
     A gross corner moves the pose that the others are judged by: the worst go first, and poses (m, 4, 4) are found anew.
     """
-    lens, table, before = block.lens, corners(block.board), block.seen
-    assert lens is not None
+    lens, table, before = _lens_of(block), corners(block.board), block.seen
     off, stale = np.full(before.shape, np.nan), np.arange(len(block))
     for _ in range(ROUNDS):
         point = np.einsum("mij,kj->mki", poses[:, :3, :3], table) + poses[:, None, :3, 3]
@@ -177,9 +183,8 @@ def place_camera(block: Pixels, arm: np.ndarray) -> CameraPlacement:
     Raises:
         MeasurementError: where images and joints do not belong together.
     """
-    assert block.lens is not None
     rows = np.unique(np.linspace(0, len(block) - 1, ENOUGH).astype(int))
-    found = board_poses(block.lens, block.board, block.pixel[rows])
+    found = board_poses(_lens_of(block), block.board, block.pixel[rows])
     good = np.flatnonzero(np.isfinite(found.rms))
     if len(good) < FEWEST:
         raise MeasurementError(

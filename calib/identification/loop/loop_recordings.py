@@ -129,13 +129,12 @@ def _check_reference(motion: Motion) -> None:
             f"the reference of {motion.joint_names[joint]} (joint {joint + 1}) is not finite everywhere", motion.file
         )
     for j in np.flatnonzero(np.ptp(motion.q, axis=0) > 1e-3):
-        _compare(motion, int(j))
+        _compare(motion, motion.q_ref[:, j], int(j))
 
 
-def _compare(motion: Motion, joint: int) -> None:
-    """Refuse a reference that one joint does not follow; say where it looks like another unit."""
-    assert motion.q_ref is not None  # `_check_reference` asks first
-    q, asked = motion.q[:, joint], motion.q_ref[:, joint]
+def _compare(motion: Motion, asked: np.ndarray, joint: int) -> None:
+    """Refuse a reference `asked` (N,) that one joint does not follow; say where it looks like another unit."""
+    q = motion.q[:, joint]
     spread, size = np.std(q), np.std(asked)
     away = float(np.sqrt(np.mean((q - asked) ** 2)) / spread)
     if away < FAR:

@@ -163,18 +163,17 @@ def compare_unseen(
     found = compare(
         nominal, calibrated, [block], torques, words, not unseen.seen, seed, alone=alone, shares_frames=shares
     )
-    if expected is not None and isinstance(block, Positions):
-        found = replace(found, intervals=_intervals(expected, calibrated, found, unseen.own_frames))
+    sizes = found.errors[1].position
+    if expected is not None and isinstance(block, Positions) and sizes is not None:
+        sigma = expected.sigma_on(calibrated, block, torques[0], unseen.own_frames)
+        found = replace(found, intervals=_intervals(expected, block, sigma, sizes))
     if settled:
         return found
     return replace(found, settled=False, proves=False, frames="base and tool placement did not settle on these rows")
 
 
-def _intervals(expected: ErrorModel, cell: Installation, found: Comparison, placed_anew: bool) -> Intervals:
-    """Return what an error model expects on the rows of a comparison, and how many errors are within it."""
-    block, sizes = found.blocks[0], found.errors[1].position
-    assert isinstance(block, Positions) and sizes is not None
-    sigma = expected.sigma_on(cell, block, found.torques[0], placed_anew)
+def _intervals(expected: ErrorModel, block: Positions, sigma: np.ndarray, sizes: np.ndarray) -> Intervals:
+    """Return what an error model expects on rows, by its sigma there (m,) [m], beside the errors' sizes (m,) [m]."""
     beyond = np.atleast_2d(expected.beyond(block.q))
     names = tuple(name for name, out in zip(block.joint_names, np.asarray(beyond.any(axis=0)).tolist()) if out)
     return Intervals(sigma, expected.discrepancy.radius * sigma, sizes, np.asarray(beyond.any(axis=1)), names)

@@ -156,11 +156,10 @@ def choose(
     )  # fmt: skip
     candidates = _drawn(space, limits, settings) if joints is None else joints
     found = select_poses(None, m, search, q=candidates, space=space, existing=before, map=map, progress=progress)
-    assert found.q is not None
     comparable = float(found.history[0]) if method == "polish" else found.value
     notes += [] if view is None else [ASSUMED]
     driven = drivable(
-        chain, found.q, Exchange(space.jacobian, candidates, before, index), limits, settings.run, settings.seed,
+        chain, found.joints, Exchange(space.jacobian, candidates, before, index), limits, settings.run, settings.seed,
         lambda words: progress and progress(0, 1, words),
     )  # fmt: skip
     found, run = _driven(found, driven), driven.run
@@ -249,8 +248,7 @@ def _blind(
     """Return the index that would be reached if every pose were seen, by the same choice, and what would be known."""
     quick = replace(search, method="detmax", climbs=0)
     other = select_poses(None, m, quick, space=free, existing=past if len(past) else None)
-    assert other.q is not None
-    return other.value, foretold(seen, np.concatenate([free.jacobian(other.q), past]), typical, m)
+    return other.value, foretold(seen, np.concatenate([free.jacobian(other.joints), past]), typical, m)
 
 
 def targets(out: Path, plots: bool, chosen: Chosen | None = None) -> dict[str, Path]:
@@ -262,12 +260,11 @@ def targets(out: Path, plots: bool, chosen: Chosen | None = None) -> dict[str, P
 
 def write(chosen: Chosen, path: Path) -> Path:
     """Write the chosen poses under the joints' names [rad or m], and beside them what they will tell."""
-    assert chosen.selection.q is not None
     if chosen.prediction is not None:
         write_prediction(chosen.prediction, path)
     else:
         beside(path).unlink(missing_ok=True)  # an earlier selection's
-    return write_poses(path, chosen.selection.q, chosen.chain.joint_names, kinds=joint_kinds(chosen.chain))
+    return write_poses(path, chosen.selection.joints, chosen.chain.joint_names, kinds=joint_kinds(chosen.chain))
 
 
 def kept(chosen: Chosen) -> list[str]:

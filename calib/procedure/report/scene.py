@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.config import read_toml
-from calib.data.csv_table import read_table
+from calib.data.csv_table import Table, read_table
 from calib.data.poses.plans import read_poses
 from calib.dynamics.torque_rows import MOTOR, ROWS
 from calib.errors import CalibError, UsageError
@@ -275,15 +275,12 @@ def _rehearsed(path: Path, chain: Chain) -> Played:
 
 def _played(path: Path, folder: Path) -> Played:
     table = read_table(path)
-    q, v = (_block(table, letter) for letter in "qv")
-    assert q is not None
-    return Played(_name(path, folder), table.numbers("t"), q, v)
+    return Played(_name(path, folder), table.numbers("t"), _needed(table, "q", path), _block(table, "v"))
 
 
 def _torques(path: Path, folder: Path, chain: Chain | None) -> Torques:
     table = read_table(path)
-    measured, predicted = (_block(table, f"{what}_") for what in ("measured", "predicted"))
-    assert measured is not None and predicted is not None
+    measured, predicted = (_needed(table, f"{what}_", path) for what in ("measured", "predicted"))
     t = table.cells[table.index("t")]
     rows, units = _torque_rows(path.parent, chain, measured.shape[1])
     return Torques(
@@ -308,10 +305,18 @@ def _torque_rows(place: Path, chain: Chain | None, count: int) -> tuple[tuple[st
     return tuple(f"{name} torque" for name in names), ("N m or N",) * count
 
 
-def _block(table, letter: str) -> np.ndarray | None:
+def _block(table: Table, letter: str) -> np.ndarray | None:
     """Return columns letter1, letter2, … as (N, n); None without any."""
     names = [name for name in table.header if name.startswith(letter) and name[len(letter) :].isdigit()]
     return np.column_stack([table.numbers(name) for name in names]) if names else None
+
+
+def _needed(table: Table, letter: str, path: Path) -> np.ndarray:
+    """Return columns letter1, letter2, … as (N, n), which the file has to hold."""
+    found = _block(table, letter)
+    if found is None:
+        raise UsageError(f"{path} has no columns {letter}1, {letter}2, …; was it written by this toolkit?")
+    return found
 
 
 def _name(path: Path, folder: Path) -> str:

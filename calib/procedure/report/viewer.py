@@ -17,6 +17,7 @@ from calib import files
 from calib.errors import CalibError, UsageError
 from calib.procedure.report import scene as viewing
 from calib.procedure.report.scene import Measured, Played, Scene, Torques
+from calib.robot.chain import Chain
 from calib.robot.kinematics import joint_frames
 from calib.transforms import to_quaternion
 
@@ -101,7 +102,8 @@ def _send(recording: Any, scene: Scene) -> None:
     recording.log("about", rr.TextDocument(about(scene), media_type="text/markdown"), static=True)
     start = 0.0
     for name, q in scene.chosen:
-        start = _chosen(recording, scene, name, q, start)
+        if scene.chain is not None:
+            start = _chosen(recording, scene, scene.chain, name, q, start)
     for measured in scene.measured:
         start = _measured(recording, scene, measured, start)
     for played in scene.played:
@@ -175,11 +177,10 @@ def _measured(recording: Any, scene: Scene, measured: Measured, start: float) ->
     return start + EACH * len(measured.q) + GAP
 
 
-def _chosen(recording: Any, scene: Scene, name: str, q: np.ndarray, start: float) -> float:
+def _chosen(recording: Any, scene: Scene, chain: Chain, name: str, q: np.ndarray, start: float) -> float:
     """Log a pose plan as it grows: one more tool position each step, and the arm at the newest pose."""
     rr = _rerun()
-    assert scene.chain is not None
-    tips = viewing.skeleton(scene.chain, q)[:, -1]
+    tips = viewing.skeleton(chain, q)[:, -1]
     counts = np.arange(1, len(q) + 1)
     grown = np.concatenate([tips[:k] for k in counts])
     columns = rr.Points3D.columns(positions=grown, radii=np.full(len(grown), 0.008)).partition(counts)

@@ -56,13 +56,12 @@ def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], N
     said = any(words.startswith(BLIND) for words in chosen.unchecked)
     if instrument.measures == Pixels.kind and not chosen.by_images and not said:
         chosen = replace(chosen, unchecked=(*chosen.unchecked, f"{BLIND} ({HOW})"))
-    found = chosen.selection
-    assert found.q is not None
+    found, q = chosen.selection, chosen.selection.joints
     if found.interrupted:  # a session is resumed, not gone on with half a search
         raise KeyboardInterrupt
     gain = found.random_baseline / found.value if found.index == "cond" else found.value / found.random_baseline
     words = (
-        f"{len(found.q)} poses by {found.method}, {found.index} = {found.value:.4g}, {gain:.2f} times the best of 1000 "
+        f"{len(q)} poses by {found.method}, {found.index} = {found.value:.4g}, {gain:.2f} times the best of 1000 "
         f"random sets, {100 * found.efficiency:.1f} % of the convex bound ({selection.bound_words(found)})"
     )
     record = {"words": words, **selection.record(chosen), "seed": settings.seed}
@@ -74,7 +73,7 @@ def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], N
         save(predicted_map(outlook.points, outlook.spread), session.path(PREDICTED))
     unseen = _unseen(session, robot_file, chain, wanted.validation)
     kept = (*selection.kept(chosen), *(f"{words}: {number}" for words, number in selection.predicted_rows(chosen)))
-    return Plan(found.q, unseen, words, kept, record, chosen.run, chosen.prediction)
+    return Plan(q, unseen, words, kept, record, chosen.run, chosen.prediction)
 
 
 def _sigmas(position: float, orientation: float) -> tuple[float, float] | None:

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from calib import files
 from calib.errors import RobotError
-from calib.robot.chain import AXES, Chain, Element, random_joints
+from calib.robot.chain import AXES, Chain, Element, Joint, random_joints
 from calib.robot.formats.markup import edited, insert_child, set_attributes, text
 from calib.robot.formats.urdf import drive, ends
 from calib.robot.formats.urdf_tree import UNLIMITED, JointTag, UrdfTree
@@ -101,9 +101,9 @@ def write_new(chain: Chain) -> str:
         main = k in first
         if main and element.ratio != 1.0:
             raise RobotError(f"element '{element.name}': a URDF joint moves by q itself, not by {element.ratio:g} q")
-        child = _link_name(chain, k, main)
+        child = _link_name(chain, k, element.joint, main)
         lines += _link_lines(child, chain.inertias[element.joint] if main and chain.inertias is not None else None)
-        lines += _joint_lines(chain, element, main, parent, child, before)
+        lines += _joint_lines(chain, element, chain.joints[element.joint], main, parent, child, before)
         parent, before = child, np.eye(4)
     if parent != chain.tip:
         lines += [
@@ -289,15 +289,13 @@ def _numbers(values: np.ndarray) -> str:
     return " ".join("0" if abs(value) < 1e-15 else repr(value) for value in values.tolist())
 
 
-def _link_name(chain: Chain, k: int, main: bool) -> str:
-    """Return the name of the link behind moving element k: the chain's, where that is not taken by base or tip.
+def _link_name(chain: Chain, k: int, joint: int, main: bool) -> str:
+    """Return the name of the link behind element k, moved by `joint`: the chain's, if base and tip leave it.
 
     The tip's name may go to the last link where nothing follows it.
     """
-    element = chain.elements[k]
-    assert element.joint is not None
-    fallback = f"{chain.joint_names[element.joint]}_link" if main else f"{element.name}_link"
-    name = chain.links[element.joint] if main and chain.links else fallback
+    fallback = f"{chain.joint_names[joint]}_link" if main else f"{chain.elements[k].name}_link"
+    name = chain.links[joint] if main and chain.links else fallback
     last = k == len(chain.elements) - 1 and np.array_equal(chain.tail, np.eye(4))
     return fallback if name == chain.base or (name == chain.tip and not last) else name
 
@@ -311,10 +309,10 @@ def _placed(parent: str, child: str, origin: np.ndarray) -> list[str]:
     ]
 
 
-def _joint_lines(chain: Chain, element: Element, main: bool, parent: str, child: str, origin: np.ndarray) -> list[str]:
+def _joint_lines(
+    chain: Chain, element: Element, joint: Joint, main: bool, parent: str, child: str, origin: np.ndarray
+) -> list[str]:
     """Return one moving <joint>; a second element of a joint becomes a mimic joint."""
-    assert element.joint is not None
-    joint = chain.joints[element.joint]
     free = not np.isfinite([joint.lower, joint.upper]).any()
     kind = "prismatic" if element.axis[0] == "t" else "continuous" if free else "revolute"
     axis = element.sign * np.eye(3)[AXES.index(element.axis) % 3]
