@@ -89,7 +89,7 @@ def _ripple_slopes(wave: np.ndarray, by_x: np.ndarray, m: Joined, s: tuple[float
     return s[0] * by_x * gain, -2.0 * m.v / s[1] ** 2 * gain**2 * wave, 0.0
 
 
-def _banded(m: Joined, s: tuple[float, ...]) -> np.ndarray:
+def banded(m: Joined, s: tuple[float, ...]) -> np.ndarray:
     """Return the gain of ripple in one band and one direction: a hat over the frequency order · |v| / 2π [Hz].
 
     It fades over 0.1 rad beyond the positions it was learnt at, lower … upper: its phase does not carry further.
@@ -168,6 +168,6 @@ SHAPES: dict[str, Shape] = {
         lambda m, s: _ripple_slopes(np.cos(s[0] * m.x), -np.sin(s[0] * m.x), m, s),
         "N m", "N", ("order", "speed"),
     ),
-    "sine_band": Shape(lambda m, s: np.sin(s[0] * m.x) * _banded(m, s), None, "N m", "N", BANDED),
-    "cosine_band": Shape(lambda m, s: np.cos(s[0] * m.x) * _banded(m, s), None, "N m", "N", BANDED),
+    "sine_band": Shape(lambda m, s: np.sin(s[0] * m.x) * banded(m, s), None, "N m", "N", BANDED),
+    "cosine_band": Shape(lambda m, s: np.cos(s[0] * m.x) * banded(m, s), None, "N m", "N", BANDED),
 }  # fmt: skip
