@@ -82,6 +82,8 @@ def find_layout(table: Table, options: FileOptions, joints: Sequence[str]) -> La
     if twice:
         message = "is read twice, as two different columns: is one of them mapped to it by mistake? See [columns]"
         raise MeasurementError(message, table.file, column=twice[0])
+    if found.kind == "pose":
+        _check_one_source(table, options, found.positions[0], found.orientation)
     for name, theirs in options.columns.items():
         if theirs not in found.used:
             message = (
@@ -105,7 +107,6 @@ def _layout(table: Table, options: FileOptions, joints: Sequence[str]) -> Layout
     orientation = _find_orientation(table, options)
     if not orientation:
         raise MeasurementError("kind 'pose' needs qx qy qz qw, or r11 to r33; the header has neither", table.file)
-    _check_one_source(table, options, positions[0], orientation)
     if len(positions) > 1:
         message = "kind 'pose' allows one target per row, found numbered positions"
         raise MeasurementError(message, table.file, column=positions[1][0])
