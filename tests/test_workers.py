@@ -221,17 +221,19 @@ SCRIPT = """
 import sys
 from pathlib import Path
 from calib.workers import processes, workers
-from worker_tasks import until_told
+from worker_tasks import {task}
 if {guard}:
     processes.GRACE, processes.ATTEMPTS = 0.5, 1
     with workers(2) as crew:
-        for result in crew.{run}(until_told, [Path(sys.argv[1])] * 9):
+        for result in crew.{run}({task}, [Path(sys.argv[1])] * 9):
             print(result, flush=True)
 """
 
 
-def script(folder: Path, run: str = "map", guard: str = "__name__ == '__main__'") -> subprocess.Popen:
-    (folder / "script.py").write_text(SCRIPT.format(run=run, guard=guard))
+def script(
+    folder: Path, run: str = "map", guard: str = "__name__ == '__main__'", task: str = "until_told"
+) -> subprocess.Popen:
+    (folder / "script.py").write_text(SCRIPT.format(run=run, guard=guard, task=task))
     return subprocess.Popen(
         [sys.executable, str(folder / "script.py"), str(folder)], text=True, start_new_session=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
@@ -269,6 +271,18 @@ def test_after_ctrl_c_tasks_under_way_hand_back_what_they_have(tmp_path: Path, r
     assert out.count("so far") == 2 and "KeyboardInterrupt" in err and running.returncode != 0
     assert len(list(tmp_path.glob("*.pid"))) == 2
     assert_gone(pids)
+
+
+def test_a_second_signal_while_a_task_ends_shows_nothing_of_the_workers(tmp_path: Path) -> None:
+    """A terminal sends its own beside the parent's."""
+    running = script(tmp_path, task="slow_to_say")
+    for pid in pids_in(tmp_path):
+        os.kill(pid, signal.SIGINT)
+        time.sleep(0.3)
+        os.kill(pid, signal.SIGINT)
+    _, err = running.communicate(timeout=SECONDS)
+    assert "_serve" not in err and err.count("Traceback") - err.count("in a worker process:") == 1, err
+    assert running.returncode != 0
 
 
 def test_no_process_outlives_its_parent(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 import sys
 import warnings
 from functools import lru_cache
@@ -60,7 +61,12 @@ def main(arguments: list[str] | None = None) -> None:
     gc.set_threshold(*GARBAGE)
     if not os.environ.get("CALIB_DEBUG"):  # what numpy and others say to programmers helps nobody at a cell
         warnings.filterwarnings("ignore")
-    sys.exit(run(arguments))
+    try:
+        code = run(arguments)
+    except KeyboardInterrupt:  # one more, while the first was being seen to
+        code = 130
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a third would end as a signal what is over but for the exit
+    sys.exit(code)
 
 
 @lru_cache(maxsize=1)

@@ -112,13 +112,22 @@ def _lost(number: int, task: _Task, error: Died) -> TaskLost:
     )  # fmt: skip
 
 
-def run_call(call: bytes, hear: Callable[[], Any], dumps: Callable[[Any], bytes]) -> bytes:
-    """Run a pickled call where a worker is; return (its result, what it raised), pickled."""
+def run_call(
+    call: bytes, hear: Callable[[], Any], dumps: Callable[[Any], bytes], hush: Callable[[], Any] = lambda: None
+) -> bytes:
+    """Run a pickled call where a worker is; return (its result, what it raised), pickled.
+
+    Args:
+        hear: called before it, to hear of Ctrl-C.
+        dumps: what pickles.
+        hush: called as it raised, to hear of no other Ctrl-C: a terminal's comes beside the parent's own.
+    """
     try:
         hear()
         function, arguments = pickle.loads(call)
         return dumps((function(*arguments), None))
     except BaseException as error:
+        hush()
         where = f"in a worker process:\n{traceback.format_exc()}"
         try:
             error.add_note(where)

@@ -162,17 +162,18 @@ def _one_thread_to_inherit() -> Iterator[None]:
 def _serve(pipe: connection.Connection) -> None:
     """Run in a process: answer calls until the other end is closed. Only while a task runs, Ctrl-C is heard."""
     hear = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
+    hush = partial(signal.signal, signal.SIGINT, signal.SIG_IGN)
     Thread(target=_end_with_parent, daemon=True).start()
     sys.unraisablehook = _unheard
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    hush()
     signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
-    with suppress(EOFError, OSError):
+    with suppress(EOFError, OSError, KeyboardInterrupt):  # the last where one more came before `hush`
         pipe.send_bytes(b"ready")
         while True:
             try:
-                answer = run_call(pipe.recv_bytes(), hear, pickle.dumps)
+                answer = run_call(pipe.recv_bytes(), hear, pickle.dumps, hush)
             finally:
-                signal.signal(signal.SIGINT, signal.SIG_IGN)
+                hush()
             pipe.send_bytes(answer)
 
 

@@ -85,3 +85,19 @@ def until_told(folder: Path) -> str:
     except KeyboardInterrupt:
         return "so far"
     return "to the end"
+
+
+class SlowlySaid(KeyboardInterrupt):
+    """Takes a second to be pickled."""
+
+    def __reduce__(self) -> tuple:
+        time.sleep(1.0)
+        return KeyboardInterrupt, ()
+
+
+def slow_to_say(folder: Path) -> None:
+    (folder / f"{os.getpid()}.pid").touch()
+    try:
+        time.sleep(2 * SECONDS)
+    except KeyboardInterrupt:
+        raise SlowlySaid from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -37,6 +38,21 @@ def test_ctrl_c_says_what_the_same_command_will_do(monkeypatch, capsys, command,
     monkeypatch.setattr(cli, "_command", lambda: stop)
     assert cli.run([command, "folder"]) == 130
     assert words in capsys.readouterr().err
+
+
+def test_a_second_ctrl_c_ends_as_the_first_would(monkeypatch):
+    def stop(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "_command", lambda: stop)
+    monkeypatch.setattr(cli, "_complain", stop)  # as it comes while the first is told
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        with pytest.raises(SystemExit) as end:
+            cli.main(["identify"])
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert end.value.code == 130
 
 
 def test_names_in_brackets_reach_the_console():
