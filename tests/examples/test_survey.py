@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from scripts import run_here
 
 from calib.studies.conditions import read_study
@@ -20,6 +21,7 @@ def test_kept_rows_count():
     assert [one.name for one in read_study(["MCS-*"]).conditions if one.digest not in there] == []
 
 
+@pytest.mark.slow
 def test_tables_are_those_of_the_readme(capsys):
     """Every line of every table that the kept rows and recordings give stands in the README."""
     said = run_here(SURVEY / "tables.py", capsys=capsys)

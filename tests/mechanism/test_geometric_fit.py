@@ -33,6 +33,7 @@ def test_platform_poses_tell_the_geometry(name):
     assert after < 0.02 * before
 
 
+@pytest.mark.slow
 def test_redundant_encoders_alone_mend_what_they_contradict():
     """Without any pose: the encoders of the DualV agree to their noise, and its angle is better by several times."""
     nominal, _, q, x = planted("dualv")

@@ -25,7 +25,9 @@ def made(kind: str) -> Figure:
     return geometry_figures.error_map(RNG.normal(size=(40, 3)), RNG.uniform(0.0, 1e-3, 40))
 
 
-@pytest.mark.parametrize("kind", ["joints", "rotated", "map"])
+@pytest.mark.parametrize(
+    "kind", ["rotated", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("joints", "map"))]
+)
 def test_a_picture_is_what_matplotlib_draws(kind):
     figure = made(kind)
     with style.styled():
