@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from itertools import islice
 from pathlib import Path
 
@@ -36,19 +36,24 @@ from calib.workers.interrupts import finishing
 
 @pytest.fixture(scope="module")
 def crews(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Workers]]:
-    with (
-        pytest.MonkeyPatch.context() as patch,
-        dask_cluster.running(tmp_path_factory.mktemp("dask"), workers=2) as cluster,
-        workers() as here,
-        workers(2) as processes,
-        workers(cluster.address) as dask,
-    ):
+    with pytest.MonkeyPatch.context() as patch, ExitStack() as ends:
+
+        class Crews(dict[str, Workers]):
+            """Crews by where they work; a cluster takes seconds to start, and is started once it is asked for."""
+
+            def __missing__(self, where: str) -> Workers:
+                cluster = ends.enter_context(dask_cluster.running(tmp_path_factory.mktemp(where), workers=2))
+                self[where] = ends.enter_context(workers(cluster.address))
+                return self[where]
+
+        here, processes = ends.enter_context(workers()), ends.enter_context(workers(2))
         patch.setenv("OPENBLAS_NUM_THREADS", "2")  # of this process: its workers get one, see below
-        yield {"here": here, "processes": processes, "dask": dask}
+        yield Crews(here=here, processes=processes)
 
 
-EVERYWHERE = pytest.mark.parametrize("where", ["here", "processes", "dask"])
-IN_PARALLEL = pytest.mark.parametrize("where", ["processes", "dask"])
+DASK = pytest.param("dask", marks=pytest.mark.slow)
+EVERYWHERE = pytest.mark.parametrize("where", ["here", "processes", DASK])
+IN_PARALLEL = pytest.mark.parametrize("where", ["processes", DASK])
 
 
 @EVERYWHERE

@@ -195,6 +195,7 @@ def test_what_an_arm_does_not_repeat_is_told_from_what_a_corner_does_not():
     assert found.estimate.residual_std == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_bad_corners_and_images_are_named_and_do_little_harm():
     cell, block = study()
     block, start, candidates = started(cell, replace(block, lens=cell.lens))

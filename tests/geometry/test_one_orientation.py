@@ -62,6 +62,7 @@ def test_full_poses_of_one_orientation_are_placed_as_well_as_their_positions(kin
             assert rms(whole.cell, block) < most * max(rms(some.cell, points), 52e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hidden", [1.0])
 def test_task_files_beside_spread_poses_do_not_hide_the_model(hidden):
     """Leaving out the spread poses as a whole asks two surfaces of one orientation where its tool would be."""

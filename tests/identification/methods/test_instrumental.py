@@ -75,6 +75,7 @@ def error(estimate) -> float:
     return float(np.linalg.norm((estimate.values - truth()) / np.abs(truth()).max()))
 
 
+@pytest.mark.slow
 def test_instruments_are_right_where_least_squares_is_biased():
     """Over seeds: least squares is hundreds of spreads off, IV a few.
 

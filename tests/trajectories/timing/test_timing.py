@@ -63,7 +63,7 @@ def test_planned_torques_by_pinocchio_keep_the_limits_and_reach_them():
     np.testing.assert_allclose(np.diff(motion.q, axis=0) * 1000, (motion.v[1:] + motion.v[:-1]) / 2, atol=5e-3)
 
 
-@pytest.mark.parametrize("seed", [*range(4), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(4, 8))])
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 8))])
 def test_any_path_is_timed_with_no_limit_crossed_and_some_limit_active(seed):
     """Strong friction and accelerations limited, by turns; the sampling is other than that of the search."""
     from trajectories.timing.profile import dense
