@@ -26,7 +26,6 @@ from calib.procedure.dynamic_stage.inputs import gather as gather_logs
 from calib.procedure.kinematic_stage.inputs import gather
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.robot.calibrated import as_calibrated
-from calib.robot.chain import sampling_limits
 from calib.simulation.cells.truth import true_base
 from calib.simulation.cells.unmodelled import TorqueErrors
 from calib.simulation.cells.virtual_arm import MovingArm, moving_arm, record
@@ -145,7 +144,7 @@ def torques() -> None:
 
 def identified(arm: MovingArm, seeds: Sequence[int]) -> Identification:
     """Return the identification of a simulated arm from random motions of 20 s, on its true geometry."""
-    lower, upper = sampling_limits(arm.chain)
+    lower, upper = arm.chain.sampling_limits()
     speed = np.array([joint.velocity for joint in arm.chain.joints])
     logs = []
     for seed in seeds:

@@ -44,6 +44,12 @@ class Setpoints:
     def duration(self) -> float:
         return (len(self) - 1) / self.rate
 
+    def repeated(self, times: int) -> Setpoints:
+        """Return a closed motion `times` times over: periodic, both ends included, so N - 1 samples a period."""
+        if times < 1:
+            raise BadInput(f"a motion can be repeated once or more often, not {times} times")
+        return joined([self] * times)
+
 
 def joined(tracks: Sequence[Setpoints]) -> Setpoints:
     """Return tracks one after the other; each begins where the one before ends, at that very sample.
@@ -70,13 +76,6 @@ def joined(tracks: Sequence[Setpoints]) -> Setpoints:
     torques = [t.tau for t in tracks]
     tau = None if any(x is None for x in torques) else np.vstack([x[r] for x, r in zip(torques, rows) if x is not None])
     return Setpoints(first.rate, **parts, tau=tau)
-
-
-def repeated(track: Setpoints, times: int) -> Setpoints:
-    """Return a closed motion `times` times over: a periodic one with both ends included, so N - 1 samples a period."""
-    if times < 1:
-        raise BadInput(f"a motion can be repeated once or more often, not {times} times")
-    return joined([track] * times)
 
 
 def slowed(track: Setpoints, factor: float) -> Setpoints:

@@ -100,7 +100,7 @@ class PoseSelection:
 
     def __str__(self) -> str:
         lines = [f"{words:38} {number}" for words, number in selection.table(self.chosen)]
-        return "\n".join([*lines, *selection.kept(self.chosen), *(f"note: {note}" for note in self.chosen.notes)])
+        return "\n".join([*lines, *self.chosen.kept(), *(f"note: {note}" for note in self.chosen.notes)])
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -14,7 +14,6 @@ from calib.api.parallel import ParallelDynamics, ParallelGeometry
 from calib.arguments import checked
 from calib.errors import UsageError
 from calib.procedure.dynamic_stage import identify as arm_identify
-from calib.procedure.dynamic_stage import inputs as recorded
 from calib.procedure.kinematic_stage import fit as arm_fit
 from calib.procedure.kinematic_stage import inputs as measured
 
@@ -52,13 +51,12 @@ def validate(
     if isinstance(result, GeometryFit):
         both = measured.with_unseen(result.outcome.inputs, given, result.options, result.settings)
         return replace(result, outcome=arm_fit.assessed(result.outcome, both, result.options, result.settings))
-    more = recorded.with_unseen(result.outcome.inputs, given)
+    more = result.outcome.inputs.with_unseen(given)
     return replace(result, outcome=arm_identify.assessed(result.outcome, more))
 
 
 def _of_parallel(result: ParallelGeometry | ParallelDynamics, unseen: Sequence[Any]) -> Any:
-    from calib.procedure.parallel_stage import fit, identify
 
     if isinstance(result, ParallelGeometry):
-        return ParallelGeometry(fit.with_unseen(result.outcome, [Path(one) for one in unseen]))
-    return ParallelDynamics(identify.with_unseen(result.outcome, unseen))
+        return ParallelGeometry(result.outcome.with_unseen([Path(one) for one in unseen]))
+    return ParallelDynamics(result.outcome.with_unseen(unseen))

@@ -216,7 +216,7 @@ def run(
         progress(f"running {len(folders)} sessions")
         for outcome in run_sessions(folders, workers=workers, plots=plots, command=f"calib run --workers {workers}"):
             outcomes.append(outcome)
-            say(fleet.line(outcome))
+            say(outcome.line())
             progress(f"{len(outcomes)} of {len(folders)} sessions")
     places = [str(folder) for folder in folders]
     outcomes.sort(key=lambda one: places.index(one.folder))

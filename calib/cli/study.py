@@ -56,7 +56,7 @@ def study(
     else:
         blocks = [block for one in seen for block in (report.console_table(one), *report.failures(one))]
     say(*console.rendered(blocks))
-    say(*outcome.described(found), f"written to {folder}: {outcome.REPORT} shows it")
+    say(*found.described(), f"written to {folder}: {outcome.REPORT} shows it")
 
 
 @app.command()

@@ -83,7 +83,7 @@ def layout(cell: Installation) -> ParameterLayout:
     terms = cell.deflection.terms
     element_units = dict(zip(cell.chain.names, cell.chain.units))
     return ParameterLayout(
-        names=(*cell.chain.names, *frames, *cell.optics.names, *deflection.names(cell.deflection, cell.chain)),
+        names=(*cell.chain.names, *frames, *cell.optics.names, *cell.deflection.names(cell.chain)),
         units=(
             *cell.chain.units, *(units * (len(frames) // 6)), *cell.optics.units,
             *(_unit(element_units, term) for term in terms),

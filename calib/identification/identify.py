@@ -26,13 +26,11 @@ from calib.identification.friction.time_folds import estimate
 from calib.identification.methods.bias import LoopTest, compare_with_loop, require_loop, require_robot
 from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate
 from calib.identification.methods.registry import METHODS, method_named
-from calib.identification.prediction import Dynamics, Model, predict, transmitted
+from calib.identification.prediction import Dynamics, Model, predict
 from calib.identification.prior import FirstFit, Prior, find_prior, residual_inflation, scaled
 from calib.identification.rods import rods
 from calib.identification.rows import (
     ObservationRows,
-    by_recording,
-    extend,
     observe,
     observe_terms,
     pool,
@@ -41,7 +39,7 @@ from calib.identification.rows import (
 )
 from calib.identification.settings import IdentificationSettings, make_model, per_joint
 from calib.robot.calibrated import CalibratedChain, as_calibrated
-from calib.robot.chain import Chain, sampling_limits
+from calib.robot.chain import Chain
 
 Progress = Callable[[str], None]
 
@@ -161,7 +159,7 @@ def identify_model(
     say("observation matrix")
     rows = with_blocks([observe(model, base.kept, case, decimator) for case in cases], settings.folds)
     if model.torque_rows is POWER and len(cases) > 1:
-        rows = [by_recording(part, k, len(cases)) for k, part in enumerate(rows)]
+        rows = [part.by_recording(k, len(cases)) for k, part in enumerate(rows)]
     _require_enough(rows, base)
     say("first fit")
     whole, source = (shape, "sizes") if cad is None else (cad, "cad")
@@ -170,7 +168,7 @@ def identify_model(
     friction, loads = _richer_friction(model, base, rows, cases, decimator, first, prior, settings, progress)
     own = [None if k < model.inertial else model.columns[k - model.inertial] for k in base.kept]
     full = tuple(
-        extend(part, friction.terms, observe_terms(friction.terms, case, decimator, load, model.torque_rows))
+        part.extend(friction.terms, observe_terms(friction.terms, case, decimator, load, model.torque_rows))
         for part, case, load in zip(rows, cases, loads)
     )
     if prior is not None and friction.terms:
@@ -199,7 +197,7 @@ def identify_model(
 
 def chain_states(chain: Chain, model: RegressorModel, seed: int = 0) -> States:
     """Return random states of a chain's model within the chain's limits."""
-    lower, upper = sampling_limits(chain)
+    lower, upper = chain.sampling_limits()
     return bases.random_samples(model, seed=seed, lower=lower, upper=upper)
 
 
@@ -238,7 +236,7 @@ def _richer_friction(
         return FrictionSelection((), (), ()), nothing
     std, tau, values = first
     plain = Dynamics(model, base.to_standard(values))
-    loads = nothing if settings.friction in ("standard", "ripple") else [transmitted(plain, case) for case in cases]
+    loads = nothing if settings.friction in ("standard", "ripple") else [plain.transmitted(case) for case in cases]
     candidates = FrictionCandidates(
         cases, rows, loads, decimator, std, tau, np.array(per_joint(settings.v0, model.n, "v0")), model.prismatic,
         None if prior is None else prior.rows, settings.apart, model.torque_rows,

@@ -229,6 +229,10 @@ class IdentifyOptions:
         found = own_table(self.files, path) or self.every
         return replace(found, recording=_for_rows(found.recording, self.settings.torque_rows))
 
+    def file_settings(self, path: str) -> FileSettings:
+        """Return the settings of a recording that may have a cut behind its name."""
+        return self.for_file(parse_cut(path)[0])
+
 
 def _for_rows(recording: RecordingOptions, rows: TorqueRows) -> RecordingOptions:
     return replace(recording, rows=rows.name, motors=rows.driven, sensors=rows.sensed)
@@ -270,8 +274,3 @@ def _terms(tables: tuple[TermTable, ...], source: str) -> tuple[DriveTerm, ...]:
         except CalibError as error:
             raise UsageError(f"{source}: [[term]] number {number}: {error}") from error
     return tuple(result)
-
-
-def file_settings(options: IdentifyOptions, path: str) -> FileSettings:
-    """Return the settings of a recording that may have a cut behind its name."""
-    return options.for_file(parse_cut(path)[0])

@@ -33,6 +33,16 @@ class Dynamics(Generic[Model]):
     def __post_init__(self) -> None:
         object.__setattr__(self, "values", frozen(self.values))
 
+    def transmitted(self: Dynamics[IdentificationModel], case: Case) -> np.ndarray:
+        """Return the torques (N, n) the gears pass on to the bodies, by the model; friction may depend on them."""
+        model, motion = self.model, case.motion
+        result = np.empty(motion.q.shape)
+        for start in range(0, len(motion), BLOCK):
+            part = slice(start, start + BLOCK)
+            q, v, a = motion.q[part], motion.v[part], motion.a[part]
+            result[part] = model.transmitted(self.values, q, v, a, case.carried)
+        return result
+
 
 def predict(dynamics: Dynamics[RegressorModel], case: Case) -> np.ndarray:
     """Return the torques of all rows at the full rate (N, rows) [N m or N]: W(q, v, a) · values, without W."""
@@ -43,15 +53,4 @@ def predict(dynamics: Dynamics[RegressorModel], case: Case) -> np.ndarray:
         part = slice(start, start + BLOCK)
         q, v, a = motion.q[part], motion.v[part], motion.a[part]
         result[part] = model.torque(dynamics.values, q, v, a, case.carried, states[:, part])
-    return result
-
-
-def transmitted(dynamics: Dynamics, case: Case) -> np.ndarray:
-    """Return the torques (N, n) the gears pass on to the bodies, by the model: what load-dependent friction feels."""
-    model, motion = dynamics.model, case.motion
-    result = np.empty(motion.q.shape)
-    for start in range(0, len(motion), BLOCK):
-        part = slice(start, start + BLOCK)
-        q, v, a = motion.q[part], motion.v[part], motion.a[part]
-        result[part] = model.transmitted(dynamics.values, q, v, a, case.carried)
     return result

@@ -87,6 +87,14 @@ class Prior:
         inverse = scipy.linalg.solve_triangular(lower, np.diag(1.0 / unit), lower=True)
         return np.hstack([inverse, np.zeros((len(unit), 1))])
 
+    def resting(self, covariance: np.ndarray) -> np.ndarray:
+        """Return (b,) which parameters rest on the prior: the data lower their variance by less than `TOLD`.
+
+        Counted about the whole robot's share: its factor s is one number, and soon told.
+        """
+        b = len(self.own)
+        return np.diag(covariance)[:b] > (1.0 - TOLD) * self.own**2
+
 
 @dataclass(frozen=True, eq=False)
 class _Sizes:
@@ -200,15 +208,6 @@ def residual_inflation(all_rows: Sequence[ObservationRows], values: np.ndarray) 
         total += len(residual) * np.array(own)
         weight += len(residual) * seen
     return np.maximum(total / np.maximum(weight, 1.0), 1.0)
-
-
-def resting(prior: Prior, covariance: np.ndarray) -> np.ndarray:
-    """Return (b,) which parameters rest on the prior: the data lower their variance by less than `TOLD`.
-
-    Counted about the whole robot's share: its factor s is one number, and soon told.
-    """
-    b = len(prior.own)
-    return np.diag(covariance)[:b] > (1.0 - TOLD) * prior.own**2
 
 
 def _sizes(model: RegressorModel, data: Triangles, columns: np.ndarray, whole: np.ndarray, more: np.ndarray) -> _Sizes:

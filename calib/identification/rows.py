@@ -45,6 +45,28 @@ class ObservationRows:
     block: np.ndarray
     rate: float
 
+    def by_recording(self, own: int, count: int) -> ObservationRows:
+        """Return rows with a place per recording in place of their one row: recording `own` of `count` fills its own.
+
+        So that recordings are weighed apart, as joints are where a sample has a row for each.
+        """
+        place = np.arange(count) == own
+        return replace(
+            self, matrix=np.where(place[:, None], self.matrix, 0.0), target=np.where(place, self.target, 0.0),
+            present=self.present & place,
+        )  # fmt: skip
+
+    def extend(self, terms: Sequence[DriveTerm], columns: np.ndarray) -> ObservationRows:
+        """Return rows with more columns (M, rows, k) behind their own."""
+        if not terms:
+            return self
+        return replace(
+            self,
+            names=(*self.names, *(one.name for one in terms)),
+            units=(*self.units, *(one.unit for one in terms)),
+            matrix=np.concatenate([self.matrix, columns], axis=2),
+        )
+
 
 def observe(
     model: RegressorModel, columns: np.ndarray, case: Case, decimator: Decimator, load: np.ndarray | None = None
@@ -115,18 +137,6 @@ def segments(segment: np.ndarray) -> list[tuple[int, int]]:
     """Return (start, stop) of each run of equal numbers."""
     edges = np.concatenate([[0], np.flatnonzero(np.diff(segment)) + 1, [len(segment)]])
     return [(int(a), int(b)) for a, b in pairwise(edges)]
-
-
-def extend(rows: ObservationRows, terms: Sequence[DriveTerm], columns: np.ndarray) -> ObservationRows:
-    """Return rows with more columns (M, rows, k) behind their own."""
-    if not terms:
-        return rows
-    return replace(
-        rows,
-        names=(*rows.names, *(one.name for one in terms)),
-        units=(*rows.units, *(one.unit for one in terms)),
-        matrix=np.concatenate([rows.matrix, columns], axis=2),
-    )
 
 
 def with_blocks(all_rows: Sequence[ObservationRows], count: int) -> list[ObservationRows]:
@@ -223,18 +233,6 @@ def _power_block(
     losses = model.regressor(q, v, np.zeros_like(v), None, case.carried, states[:, part]).transpose(2, 1, 0)[columns, 0]
     stored = [k < model.inertial or model.columns[k - model.inertial].shape == "acceleration" for k in columns]
     return np.where(np.array(stored)[:, None], rising, losses)
-
-
-def by_recording(rows: ObservationRows, own: int, count: int) -> ObservationRows:
-    """Return rows with one place per recording in place of their single row: recording `own` of `count` fills its own.
-
-    So that recordings are weighed apart, as joints are where a sample has a row for each.
-    """
-    place = np.arange(count) == own
-    return replace(
-        rows, matrix=np.where(place[:, None], rows.matrix, 0.0), target=np.where(place, rows.target, 0.0),
-        present=rows.present & place,
-    )  # fmt: skip
 
 
 @runtime_checkable

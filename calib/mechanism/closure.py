@@ -61,6 +61,24 @@ class ClosedRobot:
     signs: np.ndarray
     fixed: bool
 
+    def locate(self, readings: np.ndarray, near: Posture | None = None) -> Posture:
+        """Return the postures at which the encoders of the actuated joints read so.
+
+        Args:
+            readings: (N, n) [rad or m]; a record, whose samples follow one another, is solved faster.
+            near: checked postures that are near, to start from: the new ones are not checked again; None: home.
+
+        Raises:
+            NoPosture: for samples out of reach, beyond a singularity, or in one.
+        """
+        readings = shaped(readings, (None, self.robot.n), f"readings of '{self.robot.name}'")
+        return _reached(self, readings, self.home.q[0, self.robot.actuated], _from_readings, near)
+
+    def place(self, coordinates: np.ndarray, near: Posture | None = None) -> Posture:
+        """Return the postures at platform coordinates (N, r) [m, rad], counted from home; arguments as of `locate`."""
+        coordinates = shaped(coordinates, (None, self.robot.r), f"platform coordinates of '{self.robot.name}'")
+        return _reached(self, coordinates, np.zeros(self.robot.r), _from_coordinates, near)
+
 
 _Aim = Callable[[ClosedRobot, Sequence[LegLinks], np.ndarray, np.ndarray, Posture, np.ndarray], np.ndarray]
 
@@ -110,26 +128,6 @@ def _why_singular(robot: ParallelRobot, home: Posture, leg: Leg) -> str:
             "ways (parallel axes behind a spherical end?)"
         )
     return "is singular at home (stretched or folded)"
-
-
-def locate(known: ClosedRobot, readings: np.ndarray, near: Posture | None = None) -> Posture:
-    """Return the postures at which the encoders of the actuated joints read so.
-
-    Args:
-        readings: (N, n) [rad or m]; a record, whose samples follow one another, is solved faster.
-        near: checked postures that are near, to start from: the new ones are not checked again; None: home.
-
-    Raises:
-        NoPosture: for samples out of reach, beyond a singularity, or in one.
-    """
-    readings = shaped(readings, (None, known.robot.n), f"readings of '{known.robot.name}'")
-    return _reached(known, readings, known.home.q[0, known.robot.actuated], _from_readings, near)
-
-
-def place(known: ClosedRobot, coordinates: np.ndarray, near: Posture | None = None) -> Posture:
-    """Return the postures at platform coordinates (N, r) [m, rad], counted from home; arguments as of `locate`."""
-    coordinates = shaped(coordinates, (None, known.robot.r), f"platform coordinates of '{known.robot.name}'")
-    return _reached(known, coordinates, np.zeros(known.robot.r), _from_coordinates, near)
 
 
 def coordinates_of(known: ClosedRobot, posture: Posture) -> np.ndarray:

@@ -22,7 +22,7 @@ import numpy as np
 from calib.errors import NotConverged, Unidentifiable
 from calib.estimation.base_columns import split_columns
 from calib.estimation.estimate import Estimate
-from calib.mechanism.closure import ClosedRobot, closed, coordinates_of, locate, place
+from calib.mechanism.closure import ClosedRobot, closed, coordinates_of
 from calib.mechanism.distribution import preload_directions
 from calib.mechanism.leg_links import LegLinks, Posture, leg_links, times
 from calib.mechanism.parallel_robot import Leg, ParallelRobot
@@ -148,12 +148,12 @@ def changed(robot: ParallelRobot, parameters: Sequence[LoopParameter], values: n
 
 def platform_errors(known: ClosedRobot, readings: np.ndarray, coordinates: np.ndarray) -> np.ndarray:
     """Return measured less computed platform coordinates (m, r) [m, rad] at encoder readings (m, n)."""
-    return coordinates - coordinates_of(known, locate(known, readings))
+    return coordinates - coordinates_of(known, known.locate(readings))
 
 
 def contradictions(known: ClosedRobot, readings: np.ndarray) -> np.ndarray:
     """Return what redundant encoder readings (m, n) contradict each other by, Nᵀ (q - q(x̂)) (m, n - r) [rad or m]."""
-    posture = locate(known, readings)
+    posture = known.locate(readings)
     across = preload_directions(known, loop_jacobians(known, posture)).transpose(0, 2, 1)
     return times(across, readings - posture.q[:, known.robot.actuated])
 
@@ -163,7 +163,7 @@ def _observed(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return residuals (m n or m (n - r),) and their observation Jacobian by the parameters: r ≈ W δg."""
     robot = known.robot
-    posture = place(known, coordinates) if coordinates is not None else locate(known, readings)
+    posture = known.place(coordinates) if coordinates is not None else known.locate(readings)
     links = leg_links(robot, posture)
     residual = readings - posture.q[:, robot.actuated]
     W = np.zeros((len(readings), robot.n, len(parameters)))

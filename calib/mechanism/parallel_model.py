@@ -26,7 +26,7 @@ from calib.dynamics.regressor_model import Loads, States
 from calib.dynamics.shapes import V0
 from calib.dynamics.torque_rows import MOTOR, POWER, Projection, TorqueRows, projected
 from calib.errors import CalibError, UsageError
-from calib.mechanism.closure import ClosedRobot, locate, place
+from calib.mechanism.closure import ClosedRobot
 from calib.mechanism.parallel_robot import COORDINATES, FORCES
 from calib.mechanism.platform_body import energy_columns, wrench_regressor
 from calib.mechanism.velocities import LoopMotion, loop_jacobians, of_platform, of_readings
@@ -118,7 +118,7 @@ class ParallelModel:
 
     def moved(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> LoopMotion:
         """Return the whole robot's motion from the encoders' q, v, a (N, n)."""
-        return of_readings(self.known, locate(self.known, q), np.asarray(v, dtype=float), np.asarray(a, dtype=float))
+        return of_readings(self.known, self.known.locate(q), np.asarray(v, dtype=float), np.asarray(a, dtype=float))
 
     def platform_regressor(self, motion: LoopMotion, carried: Collection[str] | None = None) -> np.ndarray:
         """Return W (N, r, p) on the platform's coordinates; its memory is ordered (p, r, N)."""
@@ -233,7 +233,7 @@ class ParallelModel:
     ) -> States:
         """Draw states: the platform uniform in its box, its twist and the derivative within ±3."""
         robot = self.known.robot
-        posture = place(self.known, rng.uniform(robot.lower, robot.upper, (count, robot.r)))
+        posture = self.known.place(rng.uniform(robot.lower, robot.upper, (count, robot.r)))
         motion = of_platform(self.known, posture, *rng.uniform(-RATE, RATE, (2, count, robot.r)))
         own = robot.actuated
         return States(posture.q[:, own], motion.v[:, own], motion.a[:, own])
@@ -322,4 +322,4 @@ def _renamed(one: DriveTerm, labels: Sequence[str]) -> str:
 
 def _to_platform(known: ClosedRobot, q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Return J_p^invᵀ (N, r, n), which takes the actuators' torques to the platform's coordinates."""
-    return loop_jacobians(known, locate(known, q)).readings.transpose(0, 2, 1)
+    return loop_jacobians(known, known.locate(q)).readings.transpose(0, 2, 1)

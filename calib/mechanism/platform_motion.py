@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.mechanism.closure import ClosedRobot, place
+from calib.mechanism.closure import ClosedRobot
 from calib.mechanism.distribution import distributed
 from calib.mechanism.leg_links import Posture
 from calib.mechanism.parallel_model import ParallelModel
@@ -24,7 +24,7 @@ def along(known: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray, near:
     Args:
         near: (N,) postures to start Newton from; None: from home.
     """
-    posture = place(known, x, near)
+    posture = known.place(x, near)
     return of_platform(known, posture, *_twist_of(known, x, v, a))
 
 
@@ -108,7 +108,7 @@ class PlatformRegressor:
         """Return the slopes of a value per sample; central differences, exact but for rounding by v and a."""
         known, (count, r) = self.model.known, x.shape
         within = self._reachable(x)
-        near, inside = place(known, within), within == x
+        near, inside = known.place(within), within == x
         still = loop_jacobians(known, near)
         result = np.empty((3, count, r))
         for order, step in enumerate((STEP, 1e-3, 1.0)):
@@ -117,7 +117,7 @@ class PlatformRegressor:
                 for shift in (step * np.eye(r)[j], -step * np.eye(r)[j]):
                     moved = [within, v, a]
                     moved[order] = moved[order] + shift
-                    posture = place(known, moved[0], near) if order == 0 else near
+                    posture = known.place(moved[0], near) if order == 0 else near
                     twist = _twist_of(known, *moved)
                     ends.append(of(of_platform(known, posture, *twist, None if order == 0 else still)))
                 result[order, :, j] = (ends[0] - ends[1]) / (2.0 * step)

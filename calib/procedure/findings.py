@@ -15,6 +15,13 @@ class Verdict:
     level: str
     reason: str
 
+    def held_by(self, found: Sequence[Finding]) -> Verdict:
+        """Return the verdict, no better than the findings allow; the one that holds it comes first in its reason."""
+        worst = max(found, key=lambda one: LEVELS.index(one.allows), default=None)
+        if worst is None or worst.allows == "pass" or LEVELS.index(worst.allows) < LEVELS.index(self.level):
+            return self
+        return Verdict(worst.allows, f"{worst.words}; {self.reason}")
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -50,11 +57,3 @@ def settled(found: Iterable[Finding], accepted: Collection[str]) -> tuple[Findin
     """Return findings, those among `accepted` marked as such, worst first."""
     marked = [replace(one, accepted=one.name in accepted) for one in found]
     return tuple(sorted(marked, key=lambda one: -LEVELS.index(one.level)))
-
-
-def held_by(verdict: Verdict, found: Sequence[Finding]) -> Verdict:
-    """Return the verdict, no better than the findings allow; the one that holds it comes first in its reason."""
-    worst = max(found, key=lambda one: LEVELS.index(one.allows), default=None)
-    if worst is None or worst.allows == "pass" or LEVELS.index(worst.allows) < LEVELS.index(verdict.level):
-        return verdict
-    return Verdict(worst.allows, f"{worst.words}; {verdict.reason}")

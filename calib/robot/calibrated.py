@@ -32,7 +32,7 @@ from calib.arrays import frozen, shaped
 from calib.errors import RobotError
 from calib.estimate_files import read_covariance, write_covariance
 from calib.robot import description
-from calib.robot.chain import Chain, element_index
+from calib.robot.chain import Chain
 from calib.robot.deflection import Deflection, Term
 from calib.robot.tables import check_keys, number, vector
 
@@ -111,6 +111,10 @@ class CalibratedChain:
     def moved(self) -> bool:
         """Whether calibration changed an element's value of a nominal arm that is known."""
         return self.nominal is not None and not np.array_equal(self.nominal.values, self.chain.values)
+
+    def without_corrections(self) -> CalibratedChain:
+        """Return the robot without its joint corrections, of which torques know nothing and which no URDF holds."""
+        return replace(self, corrections=None)
 
 
 def as_calibrated(robot: Chain | CalibratedChain) -> CalibratedChain:
@@ -192,17 +196,12 @@ def nominal_of(robot: CalibratedChain) -> Chain:
     return robot.nominal
 
 
-def without_corrections(robot: CalibratedChain) -> CalibratedChain:
-    """Return the robot without its joint corrections, of which torques know nothing and which no URDF holds."""
-    return replace(robot, corrections=None)
-
-
 def _covariance(path: Path, chain: Chain) -> np.ndarray | None:
     """Return the covariance (K, K) of the element values in a table by name; None where there is none."""
     if not path.is_file():
         return None
     names, values = read_covariance(path)
-    index = element_index(chain, names)
+    index = chain.element_index(names)
     result = np.zeros((len(chain.elements), len(chain.elements)))
     result[np.ix_(index, index)] = values
     return result

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from calib.arrays import shaped
-from calib.robot.chain import AXES, Chain, random_joints, stretched_length
+from calib.robot.chain import AXES, Chain, random_joints
 from calib.robot.kinematics import Sweep, sweep
 from calib.robot.obstacles import (
     SAMPLES,
@@ -35,7 +35,7 @@ TARGET = 0.02
 
 def usual_radius(chain: Chain) -> float:
     """Return the radius [m] of capsules that stand for the links of an arm where none is stated."""
-    return max(LEAST, round(SHARE * stretched_length(chain), 3))
+    return max(LEAST, round(SHARE * chain.stretched_length(), 3))
 
 
 @dataclass(frozen=True, eq=False)

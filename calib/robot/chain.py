@@ -177,18 +177,35 @@ class Chain:
         )
         return replace(self, elements=elements)
 
+    def element_index(self, names: Iterable[str]) -> np.ndarray:
+        """Return the indices of elements by name.
 
-def sampling_limits(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
-    """Return finite lower and upper joint limits (n,), ±π or ±1 m standing in where a joint has none."""
-    reach = np.array([np.pi if joint.kind == "revolute" else 1.0 for joint in chain.joints])
-    return np.where(np.isfinite(chain.lower), chain.lower, -reach), np.where(
-        np.isfinite(chain.upper), chain.upper, reach
-    )
+        Raises:
+            RobotError: for a name the chain does not have.
+        """
+        table = {name: k for k, name in enumerate(self.names)}
+        try:
+            return np.array([table[name] for name in names], dtype=int)
+        except KeyError as error:
+            raise RobotError(f"robot '{self.name}' has no element {error}; it has {', '.join(self.names)}") from None
+
+    def stretched_length(self) -> float:
+        """Return how long the stretched arm is at most [m]: the sum of its constant offsets."""
+        total = sum(abs(e.value) for e in self.elements if e.axis[0] == "t" and e.joint is None)
+        placed = sum(float(np.linalg.norm(e.placement[:3, 3])) for e in self.elements if e.placement is not None)
+        return max(total + placed + float(np.linalg.norm(self.tail[:3, 3])), 0.1)
+
+    def sampling_limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return finite lower and upper joint limits (n,), ±π or ±1 m standing in where a joint has none."""
+        reach = np.array([np.pi if joint.kind == "revolute" else 1.0 for joint in self.joints])
+        return np.where(np.isfinite(self.lower), self.lower, -reach), np.where(
+            np.isfinite(self.upper), self.upper, reach
+        )
 
 
 def random_joints(chain: Chain, count: int, seed: int | np.random.Generator = 0) -> np.ndarray:
     """Draw (count, n) joint values, uniform within the limits [rad or m]."""
-    lower, upper = sampling_limits(chain)
+    lower, upper = chain.sampling_limits()
     return np.random.default_rng(seed).uniform(lower, upper, (count, chain.n))
 
 
@@ -209,26 +226,6 @@ def element_length(chain: Chain, k: int) -> float:
         return element.value
     along = placement[:3, AXES.index(element.axis) % 3]
     return element.value + float(along @ placement[:3, 3])
-
-
-def element_index(chain: Chain, names: Iterable[str]) -> np.ndarray:
-    """Return the indices of elements by name.
-
-    Raises:
-        RobotError: for a name the chain does not have.
-    """
-    table = {name: k for k, name in enumerate(chain.names)}
-    try:
-        return np.array([table[name] for name in names], dtype=int)
-    except KeyError as error:
-        raise RobotError(f"robot '{chain.name}' has no element {error}; it has {', '.join(chain.names)}") from None
-
-
-def stretched_length(chain: Chain) -> float:
-    """Return how long the stretched arm is at most [m]: the sum of its constant offsets."""
-    total = sum(abs(e.value) for e in chain.elements if e.axis[0] == "t" and e.joint is None)
-    placed = sum(float(np.linalg.norm(e.placement[:3, 3])) for e in chain.elements if e.placement is not None)
-    return max(total + placed + float(np.linalg.norm(chain.tail[:3, 3])), 0.1)
 
 
 def joint_kinds(chain: Chain) -> list[str]:

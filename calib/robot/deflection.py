@@ -56,10 +56,9 @@ class Deflection:
     def with_coefficients(self, values: np.ndarray) -> Deflection:
         return replace(self, coefficients=np.asarray(values, dtype=float))
 
-
-def names(deflection: Deflection, chain: Chain) -> tuple[str, ...]:
-    """Return one readable name per term, e.g. ``theta3 per N·m``, ``theta3 sin 2 q4``."""
-    return tuple(_name(term, chain) for term in deflection.terms)
+    def names(self, chain: Chain) -> tuple[str, ...]:
+        """Return one readable name per term, e.g. ``theta3 per N·m``, ``theta3 sin 2 q4``."""
+        return tuple(_name(term, chain) for term in self.terms)
 
 
 def _name(term: Term, chain: Chain) -> str:

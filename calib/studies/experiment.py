@@ -32,7 +32,7 @@ from calib.identification.loop.loop_settings import LoopSettings
 from calib.identification.methods.method import IdentificationProblem
 from calib.identification.parameter_constraints import ConstraintSettings
 from calib.identification.rows import observe
-from calib.robot.chain import Chain, random_joints, sampling_limits
+from calib.robot.chain import Chain, random_joints
 from calib.robot.load import load
 from calib.simulation.cells import known_robots
 from calib.simulation.cells.cell import SimulatedInstrument, measure
@@ -103,7 +103,7 @@ def set_up(robot: str, duration: float) -> Setup:
     kept = _nominal_base(robot).kept
 
     def draw(number: int) -> Reference:
-        lower, upper = sampling_limits(chain)
+        lower, upper = chain.sampling_limits()
         middle, half = 0.5 * (lower + upper), 0.5 * REACH * (upper - lower)
         speed = SPEED * np.array([joint.velocity for joint in chain.joints])
         return random_fourier(

@@ -43,8 +43,8 @@ from calib.identification.rows import observe
 from calib.procedure.report.style import AFTER, INK, QUIET, WIDE, save, sheet, styled
 from calib.robot.chain import Chain
 from calib.simulation.cells import known_robots, lwr4plus
-from calib.simulation.loop.closed_loop import Plant, Sensing, inertia_diagonal, simulate
-from calib.simulation.loop.controllers import Controller, pd, with_feedforward
+from calib.simulation.loop.closed_loop import Plant, Sensing, simulate
+from calib.simulation.loop.controllers import Controller, pd
 from calib.simulation.loop.references import Reference, random_fourier
 from calib.simulation.loop.tracking import feed_forward, tracking_error
 from calib.transforms import pose
@@ -178,9 +178,9 @@ def _record(chain: Chain, reference: Reference, loaded: bool, seed: list[int]) -
 
 def controller(plant: Plant, reference: Reference) -> Controller:
     """Return PD gains for 8 Hz, damped by 0.8, on the mean inertia, with gravity and friction fed forward (chosen)."""
-    omega, inertia = 2 * np.pi * 8.0, inertia_diagonal(plant, reference.q[::500])
+    omega, inertia = 2 * np.pi * 8.0, plant.inertia_diagonal(reference.q[::500])
     slow = replace(reference, a=0.0 * reference.a)
-    return with_feedforward(pd(omega**2 * inertia, 2 * 0.8 * omega * inertia), feed_forward(plant, slow))
+    return pd(omega**2 * inertia, 2 * 0.8 * omega * inertia).with_feedforward(feed_forward(plant, slow))
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from calib.geometry.fit import GeometricFit, Settings, fit, fit_with_prior, para
 from calib.geometry.installation import Installation, see
 from calib.geometry.observation import prepare
 from calib.robot import mdh
-from calib.robot.chain import Chain, element_index, random_joints
+from calib.robot.chain import Chain, random_joints
 from calib.robot.kinematics import jacobian, jacobian_product
 from calib.simulation.cells import lwr4plus
 from calib.simulation.cells.cell import SimulatedInstrument, measure, true_poses
@@ -60,7 +60,7 @@ def study_chain(table: np.ndarray) -> Chain:
 
 def base_columns(chain: Chain) -> np.ndarray:
     """Return the positions of the paper's 32 base parameters."""
-    return element_index(chain, [name for name in chain.names if name not in DROPPED])
+    return chain.element_index([name for name in chain.names if name not in DROPPED])
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ from calib.identification.parameter_constraints import signs as signed
 from calib.identification.rows import observe
 from calib.simulation.cells import known_robots
 from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, simulate
-from calib.simulation.loop.controllers import Controller, pd, slower
+from calib.simulation.loop.controllers import Controller, pd
 from calib.simulation.loop.references import Reference, random_fourier, trapezoidal
 
 RATE, EVERY = 5000.0, 5
@@ -251,8 +251,8 @@ def controllers(study: Study, log: Log) -> dict[str, Controller]:
     return {
         "identified": found.controller,
         "kp +30 %, kd -30 %": pd(1.3 * right.kp, 0.7 * right.kd),
-        "bandwidth / 2": slower(right, 2.0),
-        "bandwidth / 3": slower(right, 3.0),
+        "bandwidth / 2": right.slower(2.0),
+        "bandwidth / 3": right.slower(3.0),
     }
 
 

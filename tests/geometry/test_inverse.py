@@ -11,7 +11,6 @@ from differences import check
 from calib.dynamics.gravity import gravity_torques
 from calib.geometry import inverse
 from calib.geometry.inverse import Goal
-from calib.robot.chain import sampling_limits
 from calib.robot.load import load
 from calib.simulation.cells.virtual_cells import lwr4plus_cell, perturbed_cell, rigid
 
@@ -29,7 +28,7 @@ def arm(robot: str, dof: int = 6) -> Goal:
 
 def joints(goal: Goal, count: int, seed: int, share: float = 0.8) -> np.ndarray:
     """Draw joints in the middle of the limits, clear of singularities."""
-    lower, upper = sampling_limits(goal.cell.chain)
+    lower, upper = goal.cell.chain.sampling_limits()
     middle, half = 0.5 * (lower + upper), 0.5 * share * (upper - lower)
     q = np.random.default_rng(seed).uniform(middle - half, middle + half, (4 * count, len(middle)))
     return q[inverse.conditions(goal, q) > 0.05][:count]

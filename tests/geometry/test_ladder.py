@@ -15,7 +15,7 @@ from calib.errors import UsageError
 from calib.geometry.first_guess import install
 from calib.geometry.installation import Installation, see
 from calib.geometry.model_choice.ladder import select_model
-from calib.robot.deflection import Deflection, Term, evaluate, names
+from calib.robot.deflection import Deflection, Term, evaluate
 
 SIGMA = 4e-5
 
@@ -101,9 +101,7 @@ def test_planted_compliance_is_found(seed, known):
     errors = [unseen(f.fit, truth, True) if known or f is plain else _unseen_sag(f.fit, truth) for f in (found, plain)]
     assert errors[0] < 2.5 * SIGMA < 5 * SIGMA < errors[1]
     if known:
-        fitted = dict(
-            zip(names(found.fit.cell.deflection, nominal), np.asarray(found.fit.cell.deflection.coefficients))
-        )
+        fitted = dict(zip(found.fit.cell.deflection.names(nominal), np.asarray(found.fit.cell.deflection.coefficients)))
         assert fitted["theta2 compliance"] == pytest.approx(4e-5, rel=0.1)
         assert fitted["theta4 compliance"] == pytest.approx(8e-5, rel=0.2)
 
@@ -129,7 +127,7 @@ def test_planted_harmonics_are_found(seed):
     found, plain = climbed(seed)
     assert "harmonics" in found.chosen
     assert unseen(found.fit, truth, False) < 0.5 * unseen(plain.fit, truth, False)
-    fitted = dict(zip(names(found.fit.cell.deflection, nominal), np.asarray(found.fit.cell.deflection.coefficients)))
+    fitted = dict(zip(found.fit.cell.deflection.names(nominal), np.asarray(found.fit.cell.deflection.coefficients)))
     joints = nominal.joint_names
     assert fitted[f"theta2 sin 2 {joints[1]}"] == pytest.approx(2e-4, rel=0.25)
     assert fitted[f"theta3 cos 5 {joints[2]}"] == pytest.approx(1.5e-4, rel=0.25)

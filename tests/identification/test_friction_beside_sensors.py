@@ -11,7 +11,6 @@ from calib.identification.identify import identify
 from calib.identification.identify_options import parse_options
 from calib.procedure.dynamic_stage.inputs import gather
 from calib.robot.calibrated import as_calibrated
-from calib.robot.chain import sampling_limits
 from calib.simulation.cells.truth import true_base
 from calib.simulation.cells.virtual_arm import moving_arm, record
 from calib.simulation.cells.virtual_cells import virtual_cell
@@ -22,7 +21,7 @@ from calib.simulation.loop.references import random_fourier
 def test_friction_with_memory_and_cables_of_a_simulated_arm() -> None:
     cell = virtual_cell("lwr4plus")
     arm = moving_arm(cell, "lwr4plus")  # 30 % of Fc has memory, cables pull, gears are warm: see its note
-    lower, upper = sampling_limits(arm.chain)
+    lower, upper = arm.chain.sampling_limits()
     speed = np.array([joint.velocity for joint in arm.chain.joints])
     motion = random_fourier(0.8 * lower, 0.8 * upper, 0.8 * speed, 10.0, 1000.0, seed=3)
     log = replace(record(arm, motion, 3), file="motion")

@@ -224,7 +224,7 @@ def test_every_key_of_the_loop_is_documented_and_read():
         {"loop": {"controller": "cascade", "position": 40, "velocity": [9.0, 5.0, 1.0], "reset": 0.1, "delay": 2}}
     ).settings.loop
     assert found is not None
-    made = loop_settings.stated_controller(found, 3)
+    made = found.stated_controller(3)
     np.testing.assert_allclose(made.kp, np.array([9.0, 5.0, 1.0]) * (40 + 10))
     np.testing.assert_allclose(made.ki, np.array([9.0, 5.0, 1.0]) * 400)
     assert made.delay == 2

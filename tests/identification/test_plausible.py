@@ -20,7 +20,7 @@ from calib.identification.identify import identify
 from calib.identification.possible.contradiction import Contradiction, contradiction
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.plausibility import findings, impossible
-from calib.procedure.findings import Finding, Verdict, held_by, settled
+from calib.procedure.findings import Finding, Verdict, settled
 
 NAMES = ("joint1", "joint2", "joint3")
 ARM = replace(planted.arm(), joints=tuple(replace(joint, effort=60.0) for joint in planted.arm().joints))
@@ -85,9 +85,9 @@ def test_one_joint_that_prefers_a_lag_is_no_clock() -> None:
 def test_a_finding_holds_the_verdict_until_it_is_accepted() -> None:
     odd = [Finding("masses", "fail", "wrong way"), Finding("lag", "pass", "late")]
     accepted = settled(odd, ("masses",))
-    held = held_by(Verdict("pass", "5 %"), odd)
+    held = Verdict("pass", "5 %").held_by(odd)
     assert held == Verdict("fail", "wrong way; 5 %")
-    assert held_by(Verdict("pass", "5 %"), accepted) == Verdict("pass", "5 %")
+    assert Verdict("pass", "5 %").held_by(accepted) == Verdict("pass", "5 %")
     assert [one.told for one in odd] == ['wrong way; if that is meant, accept = ["masses"] in the options', "late"]
     assert accepted[0].told == "wrong way (accepted by the options)"
 

@@ -7,7 +7,7 @@ import pytest
 
 from calib.errors import RobotError
 from calib.mechanism import library, parallel_files
-from calib.mechanism.closure import NoPosture, closed, coordinates_of, locate, place
+from calib.mechanism.closure import NoPosture, closed, coordinates_of
 from calib.mechanism.leg_links import leg_links
 from calib.mechanism.velocities import of_platform, of_readings
 
@@ -30,13 +30,13 @@ def test_encoders_and_platform_find_the_same_postures(name):
     known, rng = closed(parallel_files.read(library.path(name))), np.random.default_rng(0)
     robot = known.robot
     x = rng.uniform(robot.lower, robot.upper, (60, robot.r))
-    posture = place(known, x)
+    posture = known.place(x)
     assert max(np.abs(one.gap).max() for one in leg_links(robot, posture)) < 1e-12
-    back = locate(known, posture.q[:, robot.actuated])
+    back = known.locate(posture.q[:, robot.actuated])
     assert np.allclose(back.q, posture.q, atol=1e-10) and np.allclose(coordinates_of(known, back), x, atol=1e-10)
     slow = 0.5 * np.minimum(robot.upper, -robot.lower) * np.sin(np.linspace(0, 6, 400))[:, None]
-    record = place(known, slow)
-    assert np.allclose(record.q[::37], place(known, slow[::37]).q, atol=1e-9)
+    record = known.place(slow)
+    assert np.allclose(record.q[::37], known.place(slow[::37]).q, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -47,7 +47,7 @@ def test_velocities_and_accelerations_are_derivatives(name):
     rate = np.where(robot.selected < 3, rng.normal(size=robot.r), 0.0)  # roll-pitch-yaw is no integral of the twist
     rate[robot.selected == 5] = 0.5 if robot.r == 3 else 0.0
     steps = np.array([-h, 0.0, h])[:, None]
-    posture = place(known, x + rate * steps + 0.5 * rate[::-1] * (rate != 0) * steps**2)
+    posture = known.place(x + rate * steps + 0.5 * rate[::-1] * (rate != 0) * steps**2)
     found = of_platform(known, posture[1:2], rate[None], (rate[::-1] * (rate != 0))[None])
     assert np.allclose(found.v[0], (posture.q[2] - posture.q[0]) / (2 * h), atol=1e-6)
     assert np.allclose(found.a[0], (posture.q[2] - 2 * posture.q[1] + posture.q[0]) / h**2, atol=1e-5)
@@ -66,7 +66,7 @@ def test_files_are_read_back_exactly(name, tmp_path):
 def test_poses_out_of_reach_are_named():
     known = closed(parallel_files.read(library.path("dualv")))
     with pytest.raises(NoPosture, match=r"sample 2: .*leg\d stays .* mm from its attachment: out of reach") as told:
-        place(known, np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]))
+        known.place(np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]))
     assert told.value.samples == (1,)
 
 
@@ -75,7 +75,7 @@ def test_a_stretched_leg_is_a_singularity_of_type_1():
     known = closed(parallel_files.read(library.path("dualv")))
     pivot = 0.41 * np.array([np.cos(np.radians(15.52)), np.sin(np.radians(15.52))])
     with pytest.raises(NoPosture, match=r"leg[14] is (singular|stretched or folded).*type 1"):
-        place(known, np.array([[pivot[0] - 0.56 * (1 - 1e-11), pivot[1] - 0.11, 0.0]]))
+        known.place(np.array([[pivot[0] - 0.56 * (1 - 1e-11), pivot[1] - 0.11, 0.0]]))
 
 
 @pytest.mark.parametrize(
@@ -85,13 +85,13 @@ def test_a_five_bar_in_its_type_2_singularity_and_beyond_is_told(y, words):
     """Distal links in line, at y² = 0.3² - 0.28²: locked motors do not hold the tip."""
     known = closed(parallel_files.read(library.path("fivebar")))
     with pytest.raises(NoPosture, match=words):
-        place(known, np.array([[0.0, y - 0.5]]))
+        known.place(np.array([[0.0, y - 0.5]]))
 
 
 def test_a_stewart_platform_upside_down_is_beyond_a_type_2_singularity():
     known = closed(parallel_files.read(library.path("stewart")))
     with pytest.raises(NoPosture, match="type 2"):
-        place(known, np.array([[0.0, 0.0, -0.5, 0.0, 0.0, 0.0]]))
+        known.place(np.array([[0.0, 0.0, -0.5, 0.0, 0.0, 0.0]]))
 
 
 @pytest.mark.parametrize(

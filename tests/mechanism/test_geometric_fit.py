@@ -7,7 +7,7 @@ import pytest
 
 from calib.errors import Unidentifiable
 from calib.mechanism import library, parallel_files
-from calib.mechanism.closure import closed, coordinates_of, locate, place
+from calib.mechanism.closure import closed, coordinates_of
 from calib.mechanism.geometric_fit import changed, fit_loops, loop_parameters, platform_errors
 
 NOISE = 1e-5  # of the encoders [rad or m]
@@ -19,7 +19,7 @@ def planted(name: str, seed: int = 0, rows: int = 60):
     parameters = loop_parameters(nominal)
     true = closed(changed(nominal.robot, parameters, 1e-3 * rng.normal(size=len(parameters))))
     x = 0.9 * rng.uniform(nominal.robot.lower, nominal.robot.upper, (rows, nominal.robot.r))
-    q = place(true, x).q[:, nominal.robot.actuated]
+    q = true.place(x).q[:, nominal.robot.actuated]
     return nominal, true, q + NOISE * rng.normal(size=q.shape), x
 
 
@@ -40,7 +40,7 @@ def test_redundant_encoders_alone_mend_what_they_contradict():
     found = fit_loops(nominal, q)
     assert found.after < 1.5 * NOISE < 0.01 * found.before
     assert len(found.vague) > 20  # scale, place and more stay the nominal ones
-    angle = [np.std((x - coordinates_of(one, locate(one, q)))[:, 2]) for one in (nominal, found.known)]
+    angle = [np.std((x - coordinates_of(one, one.locate(q)))[:, 2]) for one in (nominal, found.known)]
     assert angle[1] < 0.4 * angle[0]
 
 

@@ -9,7 +9,7 @@ from closed_tree import ClosedTree
 from calib.dynamics import base as bases
 from calib.errors import UsageError
 from calib.mechanism import library, parallel_files
-from calib.mechanism.closure import ClosedRobot, closed, place
+from calib.mechanism.closure import ClosedRobot, closed
 from calib.mechanism.parallel_model import ParallelModel, make_parallel_model, rows_named
 from calib.mechanism.velocities import of_platform
 
@@ -45,7 +45,7 @@ def test_torques_are_those_of_pinocchios_constrained_dynamics(name):
     values = bodies(len(model.labels), rng)
     tree, own = ClosedTree(known, values), known.robot.actuated
     for _ in range(3):
-        posture = place(known, rng.uniform(known.robot.lower, known.robot.upper, (1, known.robot.r)))
+        posture = known.place(rng.uniform(known.robot.lower, known.robot.upper, (1, known.robot.r)))
         rate, tau = rng.normal(size=(1, known.robot.r)), np.zeros(posture.q.shape[1])
         tau[own] = 5.0 * rng.normal(size=known.robot.n)
         moving = of_platform(known, posture, rate, np.zeros_like(rate))
@@ -82,7 +82,7 @@ def test_power_is_the_change_of_energy(name):
     size[3:] = 0.0  # roll-pitch-yaw is no integral of the twist
     t = np.linspace(0.0, 1.0, 2001)[:, None]
     phase, omega = rng.uniform(0.0, 6.0, known.robot.r), rng.uniform(2.0, 5.0, known.robot.r)
-    posture = place(known, size * np.sin(omega * t + phase))
+    posture = known.place(size * np.sin(omega * t + phase))
     rate, change = size * omega * np.cos(omega * t + phase), -size * omega**2 * np.sin(omega * t + phase)
     motion, own = of_platform(known, posture, rate, change), known.robot.actuated
     values = np.concatenate([bodies(len(model.labels), rng).ravel(), rng.uniform(0.01, 0.1, len(model.terms))])

@@ -11,7 +11,7 @@ from without_figures import run
 import calib as api
 from calib.mechanism import library as parallel
 from calib.mechanism import parallel_files
-from calib.mechanism.closure import closed, place
+from calib.mechanism.closure import closed
 from calib.mechanism.geometric_fit import changed, loop_parameters
 from calib.mechanism.parallel_model import make_parallel_model
 from calib.mechanism.platform_motion import PlatformRegressor, along
@@ -54,7 +54,7 @@ def folder(tmp_path_factory):
     parameters = loop_parameters(known)
     true = closed(changed(known.robot, parameters, 1e-3 * rng.normal(size=len(parameters))))
     x = 0.9 * rng.uniform(known.robot.lower, known.robot.upper, (60, 3))
-    q = place(true, x).q[:, known.robot.actuated] + 1e-5 * rng.normal(size=(60, 4))
+    q = true.place(x).q[:, known.robot.actuated] + 1e-5 * rng.normal(size=(60, 4))
     motors = "motor1 [deg],motor2 [deg],motor3 [deg],motor4 [deg]"
     table = np.column_stack([np.degrees(q), 1e3 * x[:, :2], np.degrees(x[:, 2])])
     np.savetxt(path / "poses.csv", table, delimiter=",", header=motors + ",x [mm],y [mm],rz [deg]", comments="")

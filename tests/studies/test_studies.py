@@ -104,9 +104,8 @@ def test_a_trial_is_pure():
 def test_a_loop_that_cannot_be_recorded_is_a_row(monkeypatch: pytest.MonkeyPatch):
     """An unstable controller is counted, and ends nothing."""
     from calib.simulation.cells import known_robots
-    from calib.simulation.loop.controllers import scaled
 
-    stiff = scaled(known_robots.controller("rv2sq"), 100.0)
+    stiff = known_robots.controller("rv2sq").scaled(100.0)
     monkeypatch.setattr(known_robots, "controller", lambda name: replace(stiff, limit=np.full(6, np.inf)))
     make_experiment.cache_clear()
     row = run_trial(SHORT, "wls", 0)

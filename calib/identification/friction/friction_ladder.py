@@ -25,7 +25,7 @@ from calib.dynamics.torque_rows import MOTOR, TorqueRows
 from calib.errors import UsageError
 from calib.identification.cases import Case
 from calib.identification.friction.time_folds import CrossValidation
-from calib.identification.rows import ObservationRows, extend, observe_terms, triangulate
+from calib.identification.rows import ObservationRows, observe_terms, triangulate
 
 GAIN = 0.02  # a step has to lower a joint's rms error on unseen time by this share (our choice)
 WIDTHS = (0.0005, 0.002, 0.008, 0.03)  # of presliding, shares of a joint's travel (our choice)
@@ -239,7 +239,7 @@ def _cross_validation(
 ) -> tuple[CrossValidation, dict[str, list[int]]]:
     """Return the validation with all offered columns behind the base's, and where each step's stand."""
     rows = [
-        extend(part, every, observe_terms(every, case, candidates.decimator, load, candidates.torque_rows))
+        part.extend(every, observe_terms(every, case, candidates.decimator, load, candidates.torque_rows))
         for part, case, load in zip(candidates.rows, candidates.cases, candidates.loads)
     ]
     data = triangulate(rows)

@@ -8,7 +8,7 @@ import numpy as np
 
 from calib.errors import MeasurementError
 from calib.identification.cases import Case
-from calib.identification.prediction import Dynamics, transmitted
+from calib.identification.prediction import Dynamics
 from calib.identification.rows import term_columns
 
 LEAST = -0.01  # of the energy that a joint moves: noise and what other columns take over stay above (our choice)
@@ -29,7 +29,7 @@ def _dissipated(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
     taken, moved = np.zeros(n), np.zeros(n)
     for case in cases:
         v = case.motion.v
-        load = transmitted(dynamics, case) if any(one.form.loaded for one, _ in terms) else None
+        load = dynamics.transmitted(case) if any(one.form.loaded for one, _ in terms) else None
         moved += np.abs(v * case.target[:, -n:]).sum(axis=0)
         for one, value in terms:
             for row, values in term_columns(one, case, load):

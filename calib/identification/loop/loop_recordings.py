@@ -21,10 +21,10 @@ from calib.dynamics.bodies import Bodies
 from calib.errors import MeasurementError, NotConverged, UsageError
 from calib.identification.cases import Case
 from calib.identification.loop.controller import IdentifiedController, identify_controller
-from calib.identification.loop.loop_settings import LoopSettings, completed, per_joint, stated_controller
+from calib.identification.loop.loop_settings import LoopSettings
 from calib.identification.rows import segments
 from calib.simulation.loop.closed_loop import Plant
-from calib.simulation.loop.controllers import Controller, with_feedforward
+from calib.simulation.loop.controllers import Controller
 from calib.simulation.loop.references import Reference
 from calib.simulation.loop.tracking import feed_forward
 
@@ -97,7 +97,7 @@ def close_loops(
     if not stretches:
         raise MeasurementError("no stretch without gaps is long enough to be simulated", cases[0].motion.file)
     controller, identified, notes = _controller(loop, max((s[1:3] for s in stretches), key=lambda s: len(s[0].motion)))
-    design = per_joint(loop, "design", bodies.n) if loop.design else None
+    design = loop.per_joint("design", bodies.n) if loop.design else None
     pairs = []
     for _, part, reference, every in stretches:
         own = _fed_forward(controller, loop, cad, bodies, part.motion, reference, every)
@@ -202,7 +202,7 @@ def _controller(
     case, reference = longest
     n = case.motion.n
     if loop.controller != "identify":
-        return stated_controller(loop, n), None, ()
+        return loop.stated_controller(n), None, ()
     motion = case.motion
     band = min(loop.band, float(motion.cutoff.min()), 0.4 * motion.rate)
     found = identify_controller(
@@ -218,7 +218,7 @@ def _controller(
             found,
         )
     note = f"controller read from {case.name} up to {band:.3g} Hz, kp/kd and the torque's share it explains: {shown}"
-    return completed(loop, found.controller, n), found, (note,)
+    return loop.completed(found.controller, n), found, (note,)
 
 
 def _fed_forward(
@@ -232,8 +232,8 @@ def _fed_forward(
         if motion.tau_ff is None:
             raise MeasurementError("[loop] feedforward: the recording has no column tau_ff", motion.file)
         grid = np.arange(len(motion))
-        return with_feedforward(controller, CubicSpline(grid, motion.tau_ff)(np.arange(len(reference.t)) / every))
+        return controller.with_feedforward(CubicSpline(grid, motion.tau_ff)(np.arange(len(reference.t)) / every))
     if cad is None:
         raise UsageError("[loop] feedforward = 'cad': the robot's description holds no masses")
     inertial = frozen(np.concatenate([cad, np.zeros(10 * bodies.count - len(cad))]))
-    return with_feedforward(controller, feed_forward(Plant(bodies, (), inertial), reference))
+    return controller.with_feedforward(feed_forward(Plant(bodies, (), inertial), reference))

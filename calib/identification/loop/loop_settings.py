@@ -85,6 +85,43 @@ class LoopSettings:
     band: Positive = 20.0
     integral: Flag = False
 
+    def check_lengths(self, n: int) -> None:
+        """Refuse a list that has another length than the n joints.
+
+        Raises:
+            UsageError: with the key.
+        """
+        for key in (one.name for one in fields(self) if isinstance(getattr(self, one.name), tuple)):
+            if key != "positive" and getattr(self, key):
+                self.per_joint(key, n)
+
+    def completed(self, controller: Controller, n: int) -> Controller:
+        """Return the controller with what surrounds its gains: saturation, delay, filter."""
+        return Controller(
+            controller.kp, controller.kd, controller.ki, np.full(n, self.share), self.per_joint("limit", n),
+            self.per_joint("windup", n), delay=self.delay, cutoff=self.velocity_cutoff,
+        )  # fmt: skip
+
+    def per_joint(self, key: str, n: int) -> np.ndarray:
+        """Return (n,) values of a key that holds one or n."""
+        found = getattr(self, key)
+        if len(found) not in (1, n):
+            raise UsageError(f"[loop] {key}: {len(found)} values for {n} joints; give one, or one per joint")
+        return np.broadcast_to(np.array(found, dtype=float), (n,)).copy()
+
+    def stated_controller(self, n: int) -> Controller:
+        """Return the controller with the gains stated, for n joints.
+
+        Raises:
+            UsageError: where a list has another length than the joints.
+        """
+        if self.controller == "cascade":
+            first, second, third = (self.per_joint(key, n) for key in ("position", "velocity", "reset"))
+            made = cascade(first, second, third, share=self.share)
+        else:
+            made = pd(self.per_joint("kp", n), self.per_joint("kd", n), ki=self.per_joint("ki", n))
+        return self.completed(made, n)
+
 
 def check_loop(table: Any) -> Any:
     """Return the parsed table [loop] as it is, its gains held against its controller.
@@ -107,44 +144,3 @@ def check_loop(table: Any) -> Any:
     if kind == "identify" and table.get("share", 1.0) != 1.0:
         raise ValueError("share: a controller that is identified sees the whole velocity of the reference")
     return table
-
-
-def stated_controller(loop: LoopSettings, n: int) -> Controller:
-    """Return the controller with the gains stated, for n joints.
-
-    Raises:
-        UsageError: where a list has another length than the joints.
-    """
-    if loop.controller == "cascade":
-        first, second, third = (per_joint(loop, key, n) for key in ("position", "velocity", "reset"))
-        made = cascade(first, second, third, share=loop.share)
-    else:
-        made = pd(per_joint(loop, "kp", n), per_joint(loop, "kd", n), ki=per_joint(loop, "ki", n))
-    return completed(loop, made, n)
-
-
-def completed(loop: LoopSettings, controller: Controller, n: int) -> Controller:
-    """Return the controller with what surrounds its gains: saturation, delay, filter."""
-    return Controller(
-        controller.kp, controller.kd, controller.ki, np.full(n, loop.share), per_joint(loop, "limit", n),
-        per_joint(loop, "windup", n), delay=loop.delay, cutoff=loop.velocity_cutoff,
-    )  # fmt: skip
-
-
-def check_lengths(loop: LoopSettings, n: int) -> None:
-    """Refuse a list that has another length than the n joints.
-
-    Raises:
-        UsageError: with the key.
-    """
-    for key in (one.name for one in fields(loop) if isinstance(getattr(loop, one.name), tuple)):
-        if key != "positive" and getattr(loop, key):
-            per_joint(loop, key, n)
-
-
-def per_joint(loop: LoopSettings, key: str, n: int) -> np.ndarray:
-    """Return (n,) values of a key that holds one or n."""
-    found = getattr(loop, key)
-    if len(found) not in (1, n):
-        raise UsageError(f"[loop] {key}: {len(found)} values for {n} joints; give one, or one per joint")
-    return np.broadcast_to(np.array(found, dtype=float), (n,)).copy()

@@ -38,7 +38,7 @@ from calib.identification.loop.loop_recordings import periods_per_sample, take
 from calib.identification.prediction import Dynamics
 from calib.identification.rows import segments
 from calib.robot.chain import Chain
-from calib.simulation.loop.closed_loop import Plant, inertia_diagonal
+from calib.simulation.loop.closed_loop import Plant
 from calib.simulation.loop.controllers import Controller, pd
 from calib.simulation.loop.references import Reference
 from calib.simulation.loop.tracking import feed_forward, replayed_error
@@ -184,5 +184,5 @@ def _softer(one: DriveTerm, value: float, size: np.ndarray, reference: Reference
 
 
 def _default(robot: Plant, reference: Reference) -> Controller:
-    omega, inertia = 2.0 * np.pi * FREQUENCY, inertia_diagonal(robot, reference.q[::200])
+    omega, inertia = 2.0 * np.pi * FREQUENCY, robot.inertia_diagonal(reference.q[::200])
     return pd(omega**2 * inertia, 2.0 * DAMPING * omega * inertia)

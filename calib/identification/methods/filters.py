@@ -30,7 +30,7 @@ from calib.identification.methods.believed import BelievedRobot, believed_robot,
 from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 from calib.identification.rows import segments
-from calib.simulation.loop.closed_loop import Stepper, forward_dynamics, stepper
+from calib.simulation.loop.closed_loop import Stepper, forward_dynamics
 
 FASTER = 4.0  # times the positions' cut-off: rate of the filter, at least
 WIDE = 5.0  # standard deviations of least squares that the parameters are uncertain by at first
@@ -144,7 +144,7 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
     if part.stop - part.start <= 2 * thin:
         return before
     columns, p = before.robot.columns, len(before.mean)
-    made = stepper(before.robot.at(before.mean, case), columns)
+    made = before.robot.at(before.mean, case).stepper(columns)
     there = before.robot.carried(case)[columns]
     seen = np.maximum(motion.cutoffs.noise / np.sqrt(thin), 1e-9 * np.ptp(motion.q, axis=0).max())
     period = thin / motion.rate

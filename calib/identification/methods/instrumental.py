@@ -37,8 +37,7 @@ from calib.identification.loop.loop_recordings import Loop
 from calib.identification.loop.simulated_motion import low_passed, simulated_case, simulated_samples
 from calib.identification.parameter_constraints import Constraints, Held, hold, signs
 from calib.identification.rows import ObservationRows, observe
-from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, inertia_diagonal, simulate, with_parameters
-from calib.simulation.loop.controllers import scaled
+from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, simulate
 
 LIMIT = 10  # iterations; 3 to 6 are usual
 FOLLOWED = 1.25  # times the speed's noise, by which the simulated motion may be off the measured one (our choice)
@@ -341,7 +340,7 @@ def _regular(model: IdentificationModel, loop: Loop, inertia: np.ndarray | None)
 
 
 def _with_values(plant: Plant, values: np.ndarray) -> Plant:
-    return with_parameters(plant, np.concatenate([values, np.zeros(len(plant.parameters) - len(values))]))
+    return plant.with_parameters(np.concatenate([values, np.zeros(len(plant.parameters) - len(values))]))
 
 
 def _runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
@@ -350,7 +349,7 @@ def _runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
     for case, loop in cases:
         robot, controller = _loaded(plant, case), loop.controller
         if loop.design is not None:
-            controller = scaled(controller, inertia_diagonal(robot, loop.reference.q[::200]) / loop.design)
+            controller = controller.scaled(robot.inertia_diagonal(loop.reference.q[::200]) / loop.design)
         result.append(((case, loop), simulate(robot, controller, loop.reference, Sensing(every=loop.every))))
     return result
 
@@ -358,7 +357,7 @@ def _runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
 def _loaded(plant: Plant, case: Case) -> Plant:
     """Return the plant without the payloads that the case does not carry."""
     there = IdentificationModel(plant.bodies).carried_columns(case.carried)
-    return with_parameters(plant, plant.parameters * np.append(there, np.ones(len(plant.terms))))
+    return plant.with_parameters(plant.parameters * np.append(there, np.ones(len(plant.terms))))
 
 
 def _simulate_new(
@@ -371,7 +370,7 @@ def _simulate_new(
     retreats = 0
     while retreats < RETREATS:
         share, new = 0.5**retreats, task.plant(old, found)
-        tried = with_parameters(new, share * new.parameters + (1.0 - share) * old.parameters)
+        tried = new.with_parameters(share * new.parameters + (1.0 - share) * old.parameters)
         try:
             return task, found, tried, _runs(tried, task.cases), retreats
         except CalibError as error:

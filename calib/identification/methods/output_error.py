@@ -31,8 +31,7 @@ from calib.identification.methods.believed import BelievedRobot, believed_robot,
 from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 from calib.identification.rows import thinned
-from calib.simulation.loop.closed_loop import Sensing, inertia_diagonal, simulate, simulate_tangents
-from calib.simulation.loop.controllers import scaled
+from calib.simulation.loop.closed_loop import Sensing, simulate, simulate_tangents
 
 ROUNDS = 3  # of weighing joints by what the last estimate leaves
 LIMIT = 25  # simulations with tangents per round
@@ -108,7 +107,7 @@ class _Comparison:
         for case, loop in self.loops.pairs:
             plant, controller = self.robot.at(values, case), loop.controller
             if loop.design is not None:
-                controller = scaled(controller, inertia_diagonal(plant, loop.reference.q[::200]) / loop.design)
+                controller = controller.scaled(plant.inertia_diagonal(loop.reference.q[::200]) / loop.design)
             self.count[0] += 1
             simulate(plant, controller, loop.reference, Sensing(every=loop.every))
 
@@ -118,8 +117,8 @@ class _Comparison:
         for case, loop in self.loops.pairs:
             plant, controller, relative = self.robot.at(values, case), loop.controller, None
             if loop.design is not None:
-                diagonal = inertia_diagonal(plant, loop.reference.q[::200])
-                controller = scaled(controller, diagonal / loop.design)
+                diagonal = plant.inertia_diagonal(loop.reference.q[::200])
+                controller = controller.scaled(diagonal / loop.design)
                 relative = self._inertia_slopes(loop.reference.q[::200]) / diagonal[:, None]
             self.count[0] += 1
             run = simulate_tangents(plant, controller, loop.reference, self.robot.columns, loop.every, relative)
@@ -139,7 +138,7 @@ class _Comparison:
     def _inertia_slopes(self, q: np.ndarray) -> np.ndarray:
         """Return the slopes (n, p) of the mean diagonal of the inertia, which is linear in the parameters."""
         p = len(self.robot.columns)
-        return np.array([inertia_diagonal(self.robot.at(np.eye(p)[k]), q) for k in range(p)]).T
+        return np.array([self.robot.at(np.eye(p)[k]).inertia_diagonal(q) for k in range(p)]).T
 
     def whitened(self, values: np.ndarray, std: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return residuals (M n,) and slopes (M n, p) over (n,) std; of what cannot be simulated huge ones."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import UsageError
 from calib.identification.loop.loop_recordings import ClosedLoops, close_loops
-from calib.identification.loop.loop_settings import LoopSettings, per_joint
+from calib.identification.loop.loop_settings import LoopSettings
 from calib.identification.methods.instrumental import identify_instrumental
 from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate, attempted
@@ -54,7 +54,7 @@ class _Simulated(Method):
     ) -> MethodEstimate:  # fmt: skip
         found = identify_instrumental(
             model, problem.base, loops.pairs, problem.decimator, method=self.instruments or loop.instruments,
-            inertia=per_joint(loop, "inertia", model.n) if loop.inertia else None, positive=loop.positive,
+            inertia=loop.per_joint("inertia", model.n) if loop.inertia else None, positive=loop.positive,
             constraints=problem.constrained if self.takes_constraints else None,
         )  # fmt: skip
         return replace(

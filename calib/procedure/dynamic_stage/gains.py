@@ -15,7 +15,7 @@ from calib.errors import UsageError
 from calib.identification.cases import Case, make_case
 from calib.identification.gains import DriveGains, identify_gains, identify_relative_gains
 from calib.identification.identify import chain_states, common_decimator, find_base, first_fit
-from calib.identification.identify_options import FileSettings, GainPair, IdentifyOptions, file_settings
+from calib.identification.identify_options import FileSettings, GainPair, IdentifyOptions
 from calib.identification.rows import observe, pool, triangulate, with_blocks
 from calib.identification.settings import IdentificationSettings, make_model
 from calib.robot.chain import Chain
@@ -65,7 +65,7 @@ def find_gains(
 ) -> FoundGains:
     """Return how the currents of `motions` (path → motion) become torques."""
     currents = [path for path, motion in motions.items() if motion.kind == "current"]
-    stated = [path for path in currents if file_settings(options, path).gains is not None]
+    stated = [path for path in currents if options.file_settings(path).gains is not None]
     if options.gain_pair is not None:
         say("drive gains")
         return _from_pair(chain, options, options.gain_pair, motions)
@@ -118,7 +118,7 @@ def _relative(chain: Chain, options: IdentifyOptions, currents: Sequence[tuple[s
     """Return gains relative to the joint with the largest current: torques in its amperes."""
     if not currents:
         return FoundGains(options, None, None, "A", ("no drive gains are known: torques are currents [A]",))
-    cases = [make_case(path, motion, carried=file_settings(options, path).payload) for path, motion in currents]
+    cases = [make_case(path, motion, carried=options.file_settings(path).payload) for path, motion in currents]
     squares = sum(np.sum(np.asarray(case.target) ** 2, axis=0) for case in cases)
     reference = int(np.argmax(squares))
     found = _identify(chain, cases, options.settings, {}, reference)
@@ -181,7 +181,7 @@ def _case(
     where = str(beside) if Path(parse_cut(str(beside))[0]).exists() else name
     if not Path(parse_cut(where)[0]).exists():
         raise UsageError(f"{options.source}: gain_identification names {name}, which is neither given nor a file")
-    own = file_settings(options, where)
+    own = options.file_settings(where)
     motion = make_motion(read_recording(where, Joints(chain.joint_names), own.recording), own.filter)
     return make_case(name, motion, carried=carried)
 

@@ -18,11 +18,10 @@ from calib.data.signals.resampling import Resampled
 from calib.errors import UsageError, suggestion
 from calib.identification.cases import Case, case_names, make_case
 from calib.identification.gains import DriveGains
-from calib.identification.identify_options import FileSettings, IdentifyOptions, file_settings
-from calib.identification.loop.loop_settings import check_lengths
+from calib.identification.identify_options import FileSettings, IdentifyOptions
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.gains import FoundGains, find_gains
-from calib.robot.calibrated import CalibratedChain, without_corrections
+from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, joint_kinds
 from calib.robot.load import load_calibrated, resolve
 
@@ -70,6 +69,21 @@ class IdentificationInputs:
         """The arm that is identified."""
         return self.robot.chain
 
+    def with_unseen(self, validate: Sequence[str | Path | Recording]) -> IdentificationInputs:
+        """Return inputs with more recordings that were not learnt from.
+
+        Args:
+            validate: paths, each with a cut if wanted, or recordings in memory.
+        """
+        paths = [_path(each) for each in validate]
+        names = case_names([*(case.name for case in (*self.cases, *self.unseen)), *paths])[-len(paths) :]
+        cases, notes = [], []
+        for name, path, each in zip(names, paths, validate):
+            motion = read_motion(each, self.chain, self.options.file_settings(path), self.cases[0].motion)
+            cases.append(_read_case(path, name, motion, self.options, self.currents))
+            notes += [f"{name}: {note}" for note in motion.notes]
+        return replace(self, unseen=(*self.unseen, *cases), notes=(*self.notes, *notes))
+
 
 def gather(
     robot: str | Path | CalibratedChain,
@@ -105,13 +119,13 @@ def gather(
     source = Path(known.source or known.chain.name) if isinstance(robot, CalibratedChain) else resolve(robot)
     chain = known.chain
     if options.settings.loop is not None:
-        check_lengths(options.settings.loop, chain.n)
+        options.settings.loop.check_lengths(chain.n)
     names = case_names(paths)
     motions: list[Motion] = []
     for name, path, each in zip(names, paths, given):
         say(f"reading {name}")
         like = motions[0] if len(motions) >= len(recordings) else None
-        motion = read_motion(each, chain, file_settings(options, path), like)
+        motion = read_motion(each, chain, options.file_settings(path), like)
         motions.append(_referred(motion, path, chain, options) if len(motions) < len(recordings) else motion)
     notes = [f"{name}: {note}" for name, motion in zip(names, motions) for note in motion.notes]
     count = len(recordings)
@@ -119,26 +133,9 @@ def gather(
     options = found.options
     cases = [_read_case(path, name, motion, options, found) for name, path, motion in zip(names, paths, motions)]
     return IdentificationInputs(
-        without_corrections(known), source, tuple(cases[:count]), tuple(cases[count:]), options,
+        known.without_corrections(), source, tuple(cases[:count]), tuple(cases[count:]), options,
         (*notes, *found.notes), found,
     )  # fmt: skip
-
-
-def with_unseen(given: IdentificationInputs, validate: Sequence[str | Path | Recording]) -> IdentificationInputs:
-    """Return inputs with more recordings that were not learnt from.
-
-    Args:
-        given: robot, recordings and options.
-        validate: paths, each with a cut if wanted, or recordings in memory.
-    """
-    paths = [_path(each) for each in validate]
-    names = case_names([*(case.name for case in (*given.cases, *given.unseen)), *paths])[-len(paths) :]
-    cases, notes = [], []
-    for name, path, each in zip(names, paths, validate):
-        motion = read_motion(each, given.chain, file_settings(given.options, path), given.cases[0].motion)
-        cases.append(_read_case(path, name, motion, given.options, given.currents))
-        notes += [f"{name}: {note}" for note in motion.notes]
-    return replace(given, unseen=(*given.unseen, *cases), notes=(*given.notes, *notes))
 
 
 def _path(each: str | Path | Recording) -> str:
@@ -166,7 +163,7 @@ def _with_choices(options: IdentifyOptions, method: str | None, friction: str | 
 
 def _read_case(path: str, name: str, motion: Motion, options: IdentifyOptions, found: FoundGains) -> Case:
     """Return the case of one recording; payload and gains as the options, or the gain identification, say."""
-    own = file_settings(options, path)
+    own = options.file_settings(path)
     slow = (options.slow if options.slow is not None else 0.01) if options.cut_slow else None
     return make_case(
         name, motion, options.settings.torque_rows, gains=found.for_motion(motion, own), carried=own.payload, slow=slow
@@ -236,7 +233,7 @@ def _sharper(recording: Recording, motion: Motion, options: FilterOptions, sampl
 
 def _referred(motion: Motion, path: str, chain: Chain, options: IdentifyOptions) -> Motion:
     """Return the motion with the reference of a file of its own, where the options name one."""
-    own, loop = file_settings(options, path), options.settings.loop
+    own, loop = options.file_settings(path), options.settings.loop
     named = own.reference or (loop.reference if loop is not None and loop.reference != "recording" else "")
     if not named or loop is None:
         return motion

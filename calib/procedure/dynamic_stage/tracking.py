@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from calib.errors import CalibError
-from calib.identification.loop.loop_settings import stated_controller
 from calib.identification.loop.replay import CAD, FEEDBACK, FLOOR, IDENTIFIED, Replay, replay
 from calib.identification.prediction import Dynamics
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
@@ -52,7 +51,7 @@ def track(
     read = None if loop is None else controller
     try:
         if loop is not None and loop.controller != "identify":
-            read = stated_controller(loop, chain.n)
+            read = loop.stated_controller(chain.n)
         rate = None if read is None or loop is None else loop.rate
         replays = tuple(replay(chain, dynamics, case, predictions[case.name], read, rate) for case in chosen)
     except CalibError as error:

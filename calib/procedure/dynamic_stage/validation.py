@@ -32,7 +32,7 @@ from calib.procedure.dynamic_stage.verdict import (
     with_intervals,
     with_prior,
 )
-from calib.procedure.findings import Verdict, held_by, settled
+from calib.procedure.findings import Verdict, settled
 from calib.simulation.loop.controllers import Controller
 from calib.units import TORQUE
 
@@ -143,7 +143,7 @@ def assess(
     odd = settled(odd, inputs.options.accept)
     verdict = judge(fit, proofs, repeated, excitation, wrong, labels)
     verdict = with_intervals(verdict, {name: expected[name] for name in proofs if name in expected}, labels)
-    verdict = held_by(with_prior(verdict, findings.rests), odd)
+    verdict = with_prior(verdict, findings.rests).held_by(odd)
     say("tracking with the model fed forward")
     amperes = relative_warnings(inputs.unit)
     tracking = (

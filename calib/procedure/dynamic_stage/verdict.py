@@ -22,7 +22,6 @@ from calib.data.signals.motion import moving
 from calib.data.signals.persistency import ExcitationReport
 from calib.identification.cases import Case
 from calib.identification.identify import Identification
-from calib.identification.prior import resting
 from calib.identification.reweighted import standstill_shift
 from calib.identification.scores import Score
 from calib.identification.uncertainty.torque_errors import COVERED, TorqueIntervals
@@ -267,7 +266,7 @@ def resting_parameters(found: Identification[Any]) -> Resting:
     """Return the base parameters that the motion does not tell."""
     if found.prior is None:
         return Resting(of=found.base.b)
-    on = resting(found.prior, found.fitted.estimate.covariance)
+    on = found.prior.resting(found.fitted.estimate.covariance)
     names = tuple(name for name, rests in zip(found.base.names, on) if rests)
     return Resting(names, found.base.b, found.prior.source)
 

@@ -25,7 +25,7 @@ from calib.procedure.excitation.settings import ExcitationSettings
 from calib.procedure.kinematic_stage.inputs import load_rigid
 from calib.robot import description
 from calib.robot.calibrated import ROBOT, CalibratedChain
-from calib.robot.chain import Chain, sampling_limits
+from calib.robot.chain import Chain
 from trajectories.constraints import BoxLimit
 
 SMOOTH = 0.05  # [rad/s or m/s] of the Coulomb sign while searching; the figures reported have the model's own
@@ -246,7 +246,7 @@ def identifiable(
     if not locked:
         return IdentifiableColumns(None, None, names)
     known = None if prior is None else prior.information
-    kept = columns_at_rest(model.exact, locked, *sampling_limits(chain), known)
+    kept = columns_at_rest(model.exact, locked, *chain.sampling_limits(), known)
     sigmas = np.where(np.isin(np.arange(chain.n), list(locked)), np.inf, 1.0)
     still = ", ".join(chain.joint_names[j] for j in locked)
     gone = [name for k, name in enumerate(names) if k not in set(kept.tolist())]

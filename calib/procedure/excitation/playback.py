@@ -22,7 +22,7 @@ from trajectories.constraints import BoxLimit, MotionConstraint
 from trajectories.design.search import SearchResult
 from trajectories.design.verify import dense_motion
 from trajectories.places import Clearance
-from trajectories.setpoints import Setpoints, joined, repeated, slowed
+from trajectories.setpoints import Setpoints, joined, slowed
 
 ACCELERATION, JERK = 2.0, 20.0  # of an approach, per s and s² times the velocity limit, where nothing else is said
 LEISURE = 1.0  # [rad/s or m/s] an approach is no faster than this (our choice)
@@ -77,7 +77,7 @@ def play(family: Family, found: SearchResult, given: ExcitationInputs, settings:
     slow = _with_torque(slowed(joined([*ahead, once]), settings.slower), model) if settings.slower > 1 else None
     for name, track in (("approach", lead), ("rehearsal", slow)):
         notes = (*notes, *_torques(name, track, limits, chain))
-    return Playback(joined([*ahead, repeated(once, settings.repeat)]), lead, slow, settings.repeat, notes)
+    return Playback(joined([*ahead, once.repeated(settings.repeat)]), lead, slow, settings.repeat, notes)
 
 
 def _with_torque(track: Setpoints, dynamics: ExcitedModel) -> Setpoints:

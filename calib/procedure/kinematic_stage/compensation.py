@@ -34,7 +34,7 @@ from calib.geometry.parameters import layout
 from calib.geometry.uncertainty.spread import pose_sigmas
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.kinematic_stage.tables import read_covariance
-from calib.robot.chain import Chain, sampling_limits
+from calib.robot.chain import Chain
 from calib.robot.deflection import Deflection
 from calib.transforms import from_xyz_rpy, invert, pose, rotation_vector
 
@@ -267,7 +267,7 @@ def _wanted(goal: Goal, targets: Targets, start: Sequence[float] | None, seed: i
     if targets.q is not None:
         found = inverse.reach(goal, wanted, targets.q)
         return wanted, inverse.nearest(goal, wanted, np.clip(targets.q, goal.lower, goal.upper), found)
-    lower, upper = sampling_limits(goal.cell.chain)
+    lower, upper = goal.cell.chain.sampling_limits()
     middle = 0.5 * (lower + upper) if start is None else np.asarray(start, dtype=float)
     others = np.random.default_rng(seed).uniform(lower, upper, (STARTS, len(lower)))
     return wanted, _sought(goal, wanted, middle, others)

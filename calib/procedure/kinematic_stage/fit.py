@@ -35,10 +35,9 @@ from calib.procedure.kinematic_stage.remarks import Outlier, gross_rows, named_o
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.validation import Arms, Assessment, assess
 from calib.procedure.measuring.image_findings import image_notes
-from calib.procedure.measuring.selection_prediction import SelectionPrediction, check_robot, compared_with_fit
+from calib.procedure.measuring.selection_prediction import SelectionPrediction, compared_with_fit
 from calib.procedure.sigma_comparison import SigmaComparison
 from calib.robot.calibrated import CalibratedChain
-from calib.robot.chain import stretched_length
 
 Progress = Callable[[str], None]
 MOVED = 3.0  # nominal errors fall by this factor when each file gets a station of its own: it was moved (our choice)
@@ -125,7 +124,7 @@ def run(
     settings = Settings().combine(loss=wanted.loss or options.loss, loss_scale=options.loss_scale)
     asked, seed = wanted.model or options.model, wanted.seed
     if selection is not None:
-        check_robot(selection, inputs.chain.joint_names)
+        selection.check_robot(inputs.chain.joint_names)
     say("placing the instrument and the tool")
     start = install(inputs.chain, inputs.fit, inputs.known)
     torques = [gravity_of(inputs.chain, block) for block in inputs.fit]
@@ -140,7 +139,7 @@ def run(
         seed=seed,
         progress=lambda done, total, what: say(f"fitting: {what}"),
     )
-    found, long = climb(asked, settings=settings), stretched_length(inputs.chain)
+    found, long = climb(asked, settings=settings), inputs.chain.stretched_length()
     status = found.fit.solution.status
     if not status.good:
         odd = plausibility.findings(found.nominal.cell, found.fit, inputs.fit, torques, None, long)
@@ -202,7 +201,7 @@ def _found_of(
 
     `said` is what keeps rigid geometries from explaining the rows, `notes` are those of moved instruments etc.
     """
-    long = stretched_length(inputs.chain)
+    long = inputs.chain.stretched_length()
     left = _cross_validated(found)
     odd = plausibility.findings(found.nominal.cell, found.fit, inputs.fit, torques, left, long)
     return Findings(

@@ -95,6 +95,12 @@ class Chosen:
         """The names of figures that there are of it; none where the poses do not tell all parameters."""
         return () if self.prediction is None else FIGURES if self.outlook.others else FIGURES[:1]
 
+    def kept(self) -> list[str]:
+        """Return lines on what the poses were held against, on what they were not, and on the run."""
+        lines = [f"kept: {', '.join(self.checked)}"] if self.checked else []
+        lines += [f"NOT checked: {', '.join(self.unchecked)}"] if self.unchecked else []
+        return [*lines, *ways(self.run, self.driven)]
+
 
 def choose(
     robot: str | Path | CalibratedChain,
@@ -265,13 +271,6 @@ def write(chosen: Chosen, path: Path) -> Path:
     else:
         beside(path).unlink(missing_ok=True)  # an earlier selection's
     return write_poses(path, chosen.selection.joints, chosen.chain.joint_names, kinds=joint_kinds(chosen.chain))
-
-
-def kept(chosen: Chosen) -> list[str]:
-    """Return lines on what the poses were held against, on what they were not, and on the run."""
-    lines = [f"kept: {', '.join(chosen.checked)}"] if chosen.checked else []
-    lines += [f"NOT checked: {', '.join(chosen.unchecked)}"] if chosen.unchecked else []
-    return [*lines, *ways(chosen.run, chosen.driven)]
 
 
 def bound_words(found: Selection) -> str:

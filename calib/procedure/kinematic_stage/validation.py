@@ -21,7 +21,7 @@ from calib.geometry.installation import Installation
 from calib.geometry.observation import predict, prepare
 from calib.geometry.uncertainty.error_model import ErrorModel
 from calib.geometry.weighing import Settings
-from calib.procedure.findings import Verdict, held_by
+from calib.procedure.findings import Verdict
 from calib.procedure.kinematic_stage.comparison import (
     Comparison,
     compare,
@@ -117,7 +117,7 @@ def assess(
         outlier_share=findings.outlier_share, unexplained=findings.unexplained, tolerance=tolerance,
         nominal_cross_validated=findings.nominal_cross_validated, reach=findings.reach, blind=findings.blind,
     )  # fmt: skip
-    verdict = held_by(verdict, findings.odd)
+    verdict = verdict.held_by(findings.odd)
     if copies := _copies(inputs):
         verdict = replace(verdict, reason=f"not unseen: {', '.join(copies)}; {verdict.reason}")
     clause, loud = urdf_alone(fitted, validation)

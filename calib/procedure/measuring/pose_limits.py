@@ -34,7 +34,6 @@ from calib.procedure.measuring.constraints_file import (
     rising,
 )
 from calib.procedure.measuring.sight import SeenOnly, Sight, sight_of
-from calib.robot.chain import sampling_limits
 from calib.robot.formats.markup import text
 from calib.robot.obstacles import Obstacle, Wall
 from calib.robot.tables import placement
@@ -208,7 +207,7 @@ def _joint_margin(spans: Mapping[str, Any], where: str) -> float:
 
 
 def _joints(spans: Mapping[str, Any], cell: Installation, where: str, margin: float) -> tuple[np.ndarray, np.ndarray]:
-    lower, upper = (side.copy() for side in sampling_limits(cell.chain))
+    lower, upper = (side.copy() for side in cell.chain.sampling_limits())
     limited = np.isfinite(cell.chain.lower) & np.isfinite(cell.chain.upper)
     free = np.where(limited, margin * (upper - lower), 0.0)
     lower, upper = lower + free, upper - free

@@ -24,7 +24,7 @@ from scipy.sparse.csgraph import shortest_path
 from calib import files
 from calib.data.csv_table import read_table
 from calib.errors import UsageError
-from calib.robot.chain import Chain, stretched_length
+from calib.robot.chain import Chain
 from trajectories.tour import move_times, tour
 from trajectories.ways import Room, way
 
@@ -315,7 +315,7 @@ def _speeds(chain: Chain, share: float) -> tuple[np.ndarray, np.ndarray]:
 def _room(chain: Chain, limits: Any, velocity: np.ndarray) -> Room:
     """Return where ways may go: half the clearance is kept at places no further apart than it, for any point."""
     model, clearance = limits.collision, limits.clearance
-    reach = np.array([stretched_length(chain) if joint.kind == "revolute" else 1.0 for joint in chain.joints])
+    reach = np.array([chain.stretched_length() if joint.kind == "revolute" else 1.0 for joint in chain.joints])
 
     def clear(q: np.ndarray) -> np.ndarray:
         return np.ones(len(q), dtype=bool) if model is None else model.free(q, 0.5 * clearance)

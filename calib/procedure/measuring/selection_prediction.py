@@ -50,6 +50,12 @@ class SelectionPrediction:
     noise: Mapping[str, float]
     by_images: bool = False
 
+    def check_robot(self, joints: Sequence[str]) -> None:
+        """Refuse, before any work is done, the selection of another robot."""
+        if self.joints != tuple(joints):
+            ours, theirs = ", ".join(joints), ", ".join(self.joints)
+            raise UsageError(f"the selection is one of another robot: its joints are {theirs}, here they are {ours}")
+
 
 def beside(poses: Path) -> Path:
     """Return where the prediction of a CSV of chosen poses lies."""
@@ -86,13 +92,6 @@ def read(selection: Path) -> SelectionPrediction:
         return read_record(SelectionPrediction, json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError) as error:
         raise UsageError(f"{path} cannot be read ({error}); choose the poses again") from error
-
-
-def check_robot(prediction: SelectionPrediction, joints: Sequence[str]) -> None:
-    """Refuse, before any work is done, the selection of another robot."""
-    if prediction.joints != tuple(joints):
-        ours, theirs = ", ".join(joints), ", ".join(prediction.joints)
-        raise UsageError(f"the selection is one of another robot: its joints are {theirs}, here they are {ours}")
 
 
 def compared_with_fit(

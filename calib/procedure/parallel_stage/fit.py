@@ -123,6 +123,16 @@ class ParallelFit:
             )
         return lines
 
+    def with_unseen(self, validate: Sequence[Path]) -> ParallelFit:
+        """Return a fit judged anew on more unseen files beside those of before; nothing is fitted again."""
+        known = self.nominal.known
+        more = {f"{path.name}, unseen": read_rows(path, known.robot) for path in validate}
+        _check_alike(self.rows, more)
+        proofs = {name: errors for name, errors in self.unseen.items() if name.endswith("unseen")}
+        proofs |= {name: _errors(known, self.found.known, own) for name, own in more.items()}
+        verdict = _judge(known.robot, self.rows, self.own, proofs, self.settings.tolerance)
+        return replace(self, unseen=proofs, verdict=verdict, files=(*self.files, *validate))
+
 
 def fit_parallel(
     robot: FoundRobot,
@@ -167,17 +177,6 @@ def fit_parallel(
         proofs = _cross_validated(known, rows, held, settings.seed)
     verdict = _judge(known.robot, rows, own, proofs, settings.tolerance)
     return ParallelFit(robot, (*measured, *validate), rows, found, own, proofs, verdict, settings)
-
-
-def with_unseen(fitted: ParallelFit, validate: Sequence[Path]) -> ParallelFit:
-    """Return a fit judged anew on more unseen files beside those of before; nothing is fitted again."""
-    known = fitted.nominal.known
-    more = {f"{path.name}, unseen": read_rows(path, known.robot) for path in validate}
-    _check_alike(fitted.rows, more)
-    proofs = {name: errors for name, errors in fitted.unseen.items() if name.endswith("unseen")}
-    proofs |= {name: _errors(known, fitted.found.known, own) for name, own in more.items()}
-    verdict = _judge(known.robot, fitted.rows, fitted.own, proofs, fitted.settings.tolerance)
-    return replace(fitted, unseen=proofs, verdict=verdict, files=(*fitted.files, *validate))
 
 
 def read_rows(path: Path, robot: ParallelRobot) -> _Rows:

@@ -15,13 +15,13 @@ from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import MeasurementError, UsageError
 from calib.identification.cases import Case, case_names, make_case
 from calib.identification.identify import Identification, identify_model
-from calib.identification.identify_options import IdentifyOptions, file_settings
+from calib.identification.identify_options import IdentifyOptions
 from calib.identification.methods.method import Method
 from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.prediction import predict
 from calib.identification.scores import Score, score
 from calib.identification.settings import IdentificationSettings, per_joint
-from calib.mechanism.closure import NoPosture, locate
+from calib.mechanism.closure import NoPosture
 from calib.mechanism.parallel_model import PLATFORM, ParallelModel, make_parallel_model, rows_named
 from calib.mechanism.parallel_robot import ParallelRobot
 from calib.procedure.dynamic_stage.inputs import read_motion
@@ -72,6 +72,12 @@ class ParallelOutcome:
     validation: Mapping[str, Score]
     verdict: Verdict
     notes: tuple[str, ...]
+
+    def with_unseen(self, validate: Sequence[Recorded]) -> ParallelOutcome:
+        """Return an outcome judged anew on more unseen recordings; nothing is identified."""
+        known = (*self.cases, *self.unseen)
+        more = _cases(self.model, self.options, validate, known, lambda words: None)
+        return _assessed(self.robot, self.model, self.options, self.found, self.cases, (*self.unseen, *more))
 
 
 def joints_of(robot: ParallelRobot) -> Joints:
@@ -125,15 +131,6 @@ def identify_parallel(
     return _assessed(robot, model, options, found, learnt, unseen)
 
 
-def with_unseen(outcome: ParallelOutcome, validate: Sequence[Recorded]) -> ParallelOutcome:
-    """Return an outcome judged anew on more unseen recordings; nothing is identified."""
-    known = (*outcome.cases, *outcome.unseen)
-    more = _cases(outcome.model, outcome.options, validate, known, lambda words: None)
-    return _assessed(
-        outcome.robot, outcome.model, outcome.options, outcome.found, outcome.cases, (*outcome.unseen, *more)
-    )
-
-
 def _cases(
     model: ParallelModel, options: IdentifyOptions, given: Sequence[Recorded], before: Sequence[Case],
     say: Callable[[str], None],
@@ -144,7 +141,7 @@ def _cases(
     cases = []
     for name, path, each in zip(names, paths, given):
         say(f"reading {name}")
-        own = file_settings(options, path)
+        own = options.file_settings(path)
         motion = read_motion(each, joints_of(model.known.robot), own, before[0].motion if before else None)
         gains = None if own.gains is None else np.array(per_joint(own.gains, model.n, "gains"))
         if motion.kind == "current" and gains is None and motion.drive_gain is None:
@@ -260,7 +257,7 @@ def _contradictions(model: ParallelModel, cases: Sequence[Case]) -> list[str]:
     robot, notes = model.known.robot, []
     for case in cases if robot.redundant else ():
         q = case.motion.q[:: max(1, len(case.motion) // FEW)]
-        apart = float(np.sqrt(np.mean((q - locate(model.known, q).q[:, robot.actuated]) ** 2)))
+        apart = float(np.sqrt(np.mean((q - model.known.locate(q).q[:, robot.actuated]) ** 2)))
         if apart > APART:
             notes.append(
                 f"{case.name}: the {robot.n} encoders contradict each other by {1e3 * apart:.3g} mrad (or mm) rms: "

@@ -16,7 +16,7 @@ import numpy as np
 
 from calib.data.csv_table import read_table
 from calib.errors import MeasurementError, UsageError
-from calib.mechanism.closure import ClosedRobot, NoPosture, coordinates_of, locate, place
+from calib.mechanism.closure import ClosedRobot, NoPosture, coordinates_of
 from calib.mechanism.distribution import distributed
 from calib.mechanism.parallel_model import ParallelModel, make_parallel_model
 from calib.procedure.excitation.settings import DEFAULT_PLAN, PlanSettings
@@ -138,7 +138,7 @@ def plan_parallel(
     timings = tuple(time_optimal(path, bounds, law, rate=settings.rate) for path in own)
     torque = None if law is None else law.torque
     motion = joined([track(one.path, one.profile, settings.rate, torque) for one in timings])
-    return ParallelPlan(robot, timings, motion, coordinates_of(known, locate(known, motion.q)), notes)
+    return ParallelPlan(robot, timings, motion, coordinates_of(known, known.locate(motion.q)), notes)
 
 
 def _read_waypoints(path: Path, known: ClosedRobot) -> np.ndarray:
@@ -156,7 +156,7 @@ def _read_waypoints(path: Path, known: ClosedRobot) -> np.ndarray:
             f"({', '.join(known.robot.joint_names)}) are among its columns: {', '.join(table.header)}", path
         )  # fmt: skip
     try:
-        return coordinates_of(known, locate(known, read_rows(path, known.robot).readings))
+        return coordinates_of(known, known.locate(read_rows(path, known.robot).readings))
     except NoPosture as error:
         raise MeasurementError(f"waypoint out of reach: {error}", path) from error
 
@@ -208,7 +208,7 @@ def _of_actuators(known: ClosedRobot, path: JointPath) -> JointPath:
     spans = len(path.knots) - 1
     s = np.interp(np.linspace(0.0, spans, DENSE * spans + 1), np.arange(spans + 1), path.knots)
     try:
-        posture = place(known, path(s))
+        posture = known.place(path(s))
     except NoPosture as error:
         raise UsageError(f"the path leaves the workspace: {error}; move or add waypoints") from error
     dense = through(posture.q[:, known.robot.actuated], s)

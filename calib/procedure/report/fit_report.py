@@ -116,6 +116,17 @@ class Report:
     noise: Mapping[str, float | None]
     images: tuple[ImageCoverage, ...] = ()
 
+    def with_unseen(self, found: ValidationMetrics, sets: Sequence[RowErrors]) -> Report:
+        """Return a fit's report with rows it has not seen (`rows_of`), and verdict, reason and warnings that follow."""
+        metrics = replace(
+            self.metrics,
+            validation=found.validation,
+            verdict=found.verdict,
+            reason=found.reason,
+            warnings=found.warnings,
+        )
+        return replace(self, metrics=metrics, sets=(*self.sets, *sets))
+
 
 def fit_metrics(outcome: Outcome) -> FitMetrics:
     """Return the metrics of a fit as values."""
@@ -163,14 +174,6 @@ def rows_of(name: str, comparison: Comparison, unseen: bool) -> RowErrors:
         return rows
     expected = () if comparison.intervals is None else _plain(comparison.intervals.radius)
     return replace(rows, q=_plain(q), points=_plain(_points(comparison)), expected=expected)
-
-
-def with_unseen(report: Report, found: ValidationMetrics, sets: Sequence[RowErrors]) -> Report:
-    """Return a fit's report with rows it has not seen (`rows_of`), and verdict, reason and warnings that follow."""
-    metrics = replace(
-        report.metrics, validation=found.validation, verdict=found.verdict, reason=found.reason, warnings=found.warnings
-    )
-    return replace(report, metrics=metrics, sets=(*report.sets, *sets))
 
 
 def _points(comparison: Comparison) -> np.ndarray:

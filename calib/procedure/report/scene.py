@@ -56,6 +56,14 @@ class Measured:
     unseen: np.ndarray
     turned: np.ndarray
 
+    def arrow_scale(self, chain: Chain) -> float:
+        """Return the factor 1, 2 or 5 · 10^k that makes the larger arrows about a tenth of the arm long."""
+        span = float(np.ptp(skeleton(chain, self.q)[:, -1], axis=0).max()) or 1.0
+        large = float(np.quantile(np.linalg.norm(self.seen - self.nominal, axis=1), 0.9)) or 1e-3
+        wanted = 0.1 * span / large
+        steps = np.array([f * 10.0**k for k in range(7) for f in (1.0, 2.0, 5.0)])
+        return float(steps[np.argmin(np.abs(np.log(steps / wanted)))])
+
 
 @dataclass(frozen=True, eq=False)
 class Played:
@@ -336,12 +344,3 @@ def thinned(t: np.ndarray, rate: float = FRAMES) -> np.ndarray:
     """Return indices of samples at about `rate` [Hz], the last one included."""
     step = max(1, round(1.0 / (rate * float(np.median(np.diff(t)))))) if len(t) > 1 else 1
     return np.unique([*range(0, len(t), step), len(t) - 1])
-
-
-def arrow_scale(measured: Measured, chain: Chain) -> float:
-    """Return the factor 1, 2 or 5 · 10^k that makes the larger arrows about a tenth of the arm long."""
-    span = float(np.ptp(skeleton(chain, measured.q)[:, -1], axis=0).max()) or 1.0
-    large = float(np.quantile(np.linalg.norm(measured.seen - measured.nominal, axis=1), 0.9)) or 1e-3
-    wanted = 0.1 * span / large
-    steps = np.array([f * 10.0**k for k in range(7) for f in (1.0, 2.0, 5.0)])
-    return float(steps[np.argmin(np.abs(np.log(steps / wanted)))])

@@ -119,7 +119,7 @@ def about(scene: Scene) -> str:
     for measured in scene.measured:
         sizes = [1e3 * np.linalg.norm(measured.seen - p, axis=1) for p in (measured.nominal, measured.calibrated)]
         rms = [float(np.sqrt(np.mean(size**2))) for size in sizes]
-        scale = viewing.arrow_scale(measured, scene.chain) if scene.chain else 1.0
+        scale = measured.arrow_scale(scene.chain) if scene.chain else 1.0
         lines.append(
             f"{len(measured.q)} measured poses ({int(measured.unseen.sum())} of them unseen): {rms[0]:.3f} mm rms "
             f"nominal (orange), {rms[1]:.3f} mm calibrated (green). **Arrows are {scale:g} times as long as the "
@@ -145,7 +145,7 @@ def _measured(recording: Any, scene: Scene, measured: Measured, start: float) ->
     rr = _rerun()
     if not len(measured.q) or scene.chain is None:
         return start
-    scale = viewing.arrow_scale(measured, scene.chain)
+    scale = measured.arrow_scale(scene.chain)
     index = _poses("pose", len(measured.q), start)
     recording.log("world/seen", rr.Points3D(measured.seen, radii=0.006, colors=SEEN), static=True)
     for name, points, colour in (("nominal", measured.nominal, BEFORE), ("calibrated", measured.calibrated, AFTER)):

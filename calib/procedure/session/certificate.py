@@ -76,7 +76,7 @@ def _whole_report(session: Session) -> fit_report.Report:
     fit = fit_report.read(session.fit.report)
     content = json.loads(place.rows.read_text()) if place.rows.exists() and found.validation else []
     whole = replace(found, warnings=(*fit.metrics.warnings, *found.warnings))
-    return fit_report.with_unseen(fit, whole, read_record(tuple[RowErrors, ...], content))
+    return fit.with_unseen(whole, read_record(tuple[RowErrors, ...], content))
 
 
 def _arrival_notes(session: Session, place: str, unseen: str) -> list[str]:

@@ -16,7 +16,7 @@ import numpy as np
 from calib import files
 from calib.data.recordings.recording_files import read_recording
 from calib.dynamics.torque_rows import torque_rows
-from calib.identification.identify_options import FileSettings, IdentifyOptions, file_settings, read_options
+from calib.identification.identify_options import FileSettings, IdentifyOptions, read_options
 from calib.identification.settings import Payload
 from calib.procedure.dynamic_stage import identify as identifying
 from calib.procedure.dynamic_stage import inputs
@@ -134,7 +134,7 @@ def _check_recording(session: Session, path: Path, name: str) -> tuple[list[floa
         MeasurementError: for what cannot be right: units, order of joints, another motion, reversed torques.
     """
     chain, options = _calibrated(session), options_of(session)
-    own = file_settings(options, str(path))
+    own = options.file_settings(str(path))
     recording = read_recording(str(path), inputs.joints_of(chain), own.recording)
     rate = 1.0 / max(float(np.median(np.diff(recording.t))), 1e-9)  # as identification takes it
     sensors = ", and sensors behind the gears" if recording.tau_link is not None else ""

@@ -55,7 +55,14 @@ class FleetRow:
     asks: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        return "\n".join([line(self), *(self.asks or remarks([self]))])
+        return "\n".join([self.line(), *(self.asks or remarks([self]))])
+
+    def line(self) -> str:
+        """Return one session's end in a line."""
+        errors = self.nominal is not None and f"{self.nominal:.3g} → {self.calibrated:.3g} mm"
+        torque = self.torque is not None and f"torque {self.torque:.3g} %"
+        words = [word for word in (self.state, self.verdict, errors, torque, f"{self.seconds:.1f} s") if word]
+        return f"{self.folder}: {', '.join(words)}"
 
 
 def folders_of(given: Sequence[Path]) -> list[Path]:
@@ -125,14 +132,6 @@ def _go_on(folder: Path, say: Callable[[str], None], command: str, plots: bool) 
         sets = (unseen.validation or unseen.fit).values()
         torque = max((one.raw.relative_error_percent.total or 0.0 for one in sets), default=None)
     return FleetRow(str(folder), DONE, verdict, "", *errors, torque, code=1 if verdict == "fail" else 0)
-
-
-def line(one: FleetRow) -> str:
-    """Return one session's end in a line."""
-    errors = one.nominal is not None and f"{one.nominal:.3g} → {one.calibrated:.3g} mm"
-    torque = one.torque is not None and f"torque {one.torque:.3g} %"
-    words = [word for word in (one.state, one.verdict, errors, torque, f"{one.seconds:.1f} s") if word]
-    return f"{one.folder}: {', '.join(words)}"
 
 
 def table(outcomes: Sequence[FleetRow]) -> RenderableType:

@@ -123,20 +123,25 @@ class Session:
         """The folder of the export, relative to the session's."""
         return EXPORT[self.dynamic]
 
+    def write_state(self, state: StateFile) -> None:
+        """Record `state`, whole or not at all."""
+        running = {"running": state.running} if state.running else {}
+        steps = {name: asdict(record) for name, record in state.steps.items()}
+        files.write_json(self.path("state.json"), {"schema": SCHEMA, "steps": steps, **running})
 
-def verdicts(session: Session) -> dict[str, tuple[str, str]]:
-    """Return verdict and reason of each stage."""
-    geometry = session.validation.metrics()
-    found = {"geometry": (geometry.verdict, geometry.reason)}
-    if session.dynamic:
-        dynamics = session.identification.unseen.verdict()
-        found["dynamics"] = (dynamics.verdict, dynamics.reason)
-    return found
+    def verdicts(self) -> dict[str, tuple[str, str]]:
+        """Return verdict and reason of each stage."""
+        geometry = self.validation.metrics()
+        found = {"geometry": (geometry.verdict, geometry.reason)}
+        if self.dynamic:
+            dynamics = self.identification.unseen.verdict()
+            found["dynamics"] = (dynamics.verdict, dynamics.reason)
+        return found
 
 
 def verdict_of(session: Session) -> str:
     """Return the worse of the stages' verdicts."""
-    return max((verdict for verdict, _ in verdicts(session).values()), key=VERDICTS.index)
+    return max((verdict for verdict, _ in session.verdicts().values()), key=VERDICTS.index)
 
 
 def create(
@@ -231,13 +236,6 @@ def read_state(session: Session) -> StateFile:
         return parse(StateFile, state, "what it records", SessionError)
     except SessionError as error:
         raise SessionError(f"{path} is damaged ({error}); {advice}") from None
-
-
-def write_state(session: Session, state: StateFile) -> None:
-    """Record `state`, whole or not at all."""
-    running = {"running": state.running} if state.running else {}
-    steps = {name: asdict(record) for name, record in state.steps.items()}
-    files.write_json(session.path("state.json"), {"schema": SCHEMA, "steps": steps, **running})
 
 
 @contextmanager

@@ -31,7 +31,7 @@ from calib.procedure.measuring.selection_prediction import read as read_predicti
 from calib.procedure.measuring.selection_prediction import write as write_prediction
 from calib.procedure.report import certificate, fit_report
 from calib.procedure.session import arrival
-from calib.procedure.session.folder import POSES, POSES_CHECKED, SELECTION, SUMMARY, UNSEEN, WAYS, Session, verdicts
+from calib.procedure.session.folder import POSES, POSES_CHECKED, SELECTION, SUMMARY, UNSEEN, WAYS, Session
 from calib.robot.chain import Chain
 from calib.units import JOINT
 
@@ -242,7 +242,7 @@ def validate(session: Session, say: Say) -> list[str]:
     fit, out = session.fit, session.validation
     before, report = fit.metrics(), fit_report.read(fit.report)
     if not session.settings.poses.validation and not unseen:
-        fit_report.write(fit_report.with_unseen(report, out.take_over(before), []), out.report)
+        fit_report.write(report.with_unseen(out.take_over(before), []), out.report)
         return ["no validation asked for: judged by cross-validation only"]
     plan = _planned(session, chain, "validation")
     like = _gathered(session).fit if any(path.is_dir() for path in unseen) else ()
@@ -257,7 +257,7 @@ def validate(session: Session, say: Say) -> list[str]:
     )  # fmt: skip
     rows = [fit_report.rows_of(name, each, each.proves) for name, each in found.validation.items()]
     written = out.write(found, given, [asdict(each) for each in rows])
-    fit_report.write(fit_report.with_unseen(report, written, rows), out.report)
+    fit_report.write(report.with_unseen(written, rows), out.report)
     fresh = [words for words in found.warnings if words not in before.warnings]
     return [*notes, f"verdict {found.verdict.level}: {found.verdict.reason}", *fresh]
 
@@ -268,7 +268,7 @@ def export(session: Session, say: Say) -> list[str]:
 
     out = session.path(session.export)
     lines = _exported(session, out, say)
-    return [*mark(out, verdicts(session)), *lines]
+    return [*mark(out, session.verdicts()), *lines]
 
 
 def _exported(session: Session, out: Path, say: Say) -> list[str]:

@@ -72,7 +72,7 @@ def plan(session: Session, robot_file: Any, chain: Chain, say: Callable[[str], N
 
         save(predicted_map(outlook.points, outlook.spread), session.path(PREDICTED))
     unseen = _unseen(session, robot_file, chain, wanted.validation)
-    kept = (*selection.kept(chosen), *(f"{words}: {number}" for words, number in selection.predicted_rows(chosen)))
+    kept = (*chosen.kept(), *(f"{words}: {number}" for words, number in selection.predicted_rows(chosen)))
     return Plan(q, unseen, words, kept, record, chosen.run, chosen.prediction)
 
 

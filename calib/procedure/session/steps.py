@@ -28,7 +28,6 @@ from calib.procedure.session.folder import (
     StateFile,
     StepRecord,
     read_state,
-    write_state,
 )
 from calib.procedure.session.step_list import STEPS, SessionStep
 
@@ -180,13 +179,13 @@ def run_next(session: Session, say: Say, progress: Say, command: str = "calib ne
 def _run(session: Session, step: SessionStep, say: Say, progress: Say, command: str) -> None:
     number = _steps_of(session).index(step) + 1
     recorded = read_state(session).without(step.name)
-    write_state(session, replace(recorded, running=step.name))
+    session.write_state(replace(recorded, running=step.name))
     inputs, started = _inputs(session, step), time.perf_counter()
     progress(step.purpose)
     try:
         notes = step.make(session, progress)
     except BaseException:
-        write_state(session, recorded)
+        session.write_state(recorded)
         raise
     produced = sorted({path for name in step.outputs for path in session.folder.glob(name) if path.is_file()})
     made = StepRecord(
@@ -199,7 +198,7 @@ def _run(session: Session, step: SessionStep, say: Say, progress: Say, command: 
         toolkit=certificate.versions(),
         notes=tuple(notes),
     )
-    write_state(session, StateFile({**recorded.steps, step.name: made}))
+    session.write_state(StateFile({**recorded.steps, step.name: made}))
     say(f"{number} {step.name}: {notes[0] if notes else 'done'}")
     for note in notes[1:]:
         say(f"    {note}")
@@ -208,7 +207,7 @@ def _run(session: Session, step: SessionStep, say: Say, progress: Say, command: 
 def forget(session: Session, step: SessionStep) -> None:
     """Let a step and all behind it be made again."""
     own = _steps_of(session)
-    write_state(session, read_state(session).without(*(later.name for later in own[own.index(step) :])))
+    session.write_state(read_state(session).without(*(later.name for later in own[own.index(step) :])))
 
 
 def _move_export(session: Session) -> None:
@@ -228,4 +227,4 @@ def _move_export(session: Session) -> None:
         name: replace(entry, inputs=renamed(entry.inputs), outputs=renamed(entry.outputs))
         for name, entry in recorded.steps.items()
     }
-    write_state(session, StateFile(made, recorded.running))
+    session.write_state(StateFile(made, recorded.running))

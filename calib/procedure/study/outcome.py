@@ -46,6 +46,14 @@ class StudyOutcome:
     notes: tuple[str, ...]
     folder: Path
 
+    def described(self) -> list[str]:
+        """Return what a command says of itself at its end."""
+        done = self.progress
+        lines = [f"note: {note}" for note in self.notes]
+        if done.wanted:
+            lines.append(f"{done} in {span(done.seconds)}")
+        return lines
+
 
 def run_study(
     named: Sequence[str | Path],
@@ -126,15 +134,6 @@ def _check_folder(out: Path, named: Sequence[str | Path]) -> None:
     foreign = [name for name in (SUMMARY, REPORT) if (out / name).exists()]
     if foreign and not any((out / name).exists() for name in (JOURNAL, WHOLE)):
         raise UsageError(f"{out} holds {', '.join(foreign)} which no study left there; choose another (--out)")
-
-
-def described(outcome: StudyOutcome) -> list[str]:
-    """Return what a command says of itself at its end."""
-    done = outcome.progress
-    lines = [f"note: {note}" for note in outcome.notes]
-    if done.wanted:
-        lines.append(f"{done} in {span(done.seconds)}")
-    return lines
 
 
 def method_lines() -> list[str]:

@@ -24,7 +24,7 @@ from calib.errors import CannotSimulate
 from calib.geometry.images.optics import BoardShape, Optics, shaped_points
 from calib.geometry.installation import Installation
 from calib.geometry.inverse import Goal, reach, seen_at
-from calib.robot.chain import Chain, random_joints, sampling_limits
+from calib.robot.chain import Chain, random_joints
 from calib.robot.deflection import Deflection
 from calib.robot.kinematics import forward
 from calib.simulation.cells.cell import Cell, true_poses
@@ -150,7 +150,7 @@ def views(
         CannotSimulate: where hardly any are found.
     """
     sought, rng, arm = sought or Views(), np.random.default_rng(seed), found.cell.nominal
-    lower, upper = sampling_limits(arm)
+    lower, upper = arm.sampling_limits()
     goal = Goal(replace(found.cell.truth, chain=arm, deflection=Deflection()), 6, lower, upper)
     result = np.zeros((0, arm.n))
     for _ in range(TRIES):

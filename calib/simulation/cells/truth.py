@@ -17,11 +17,11 @@ from calib.estimate_files import StoredEstimate
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation, see
-from calib.robot.chain import Chain, random_joints, sampling_limits
+from calib.robot.chain import Chain, random_joints
 from calib.robot.deflection import evaluate
 from calib.simulation.cells.cell import Cell, true_poses
 from calib.simulation.cells.unmodelled import WARM_TIME
-from calib.simulation.cells.virtual_arm import MovingArm, link_torque, true_torque
+from calib.simulation.cells.virtual_arm import MovingArm
 from calib.simulation.loop.references import random_fourier
 from calib.transforms import to_quaternion
 
@@ -84,11 +84,11 @@ def torque_errors(
         chain: the calibrated arm, whose limits the motion keeps.
         seed: of the motion.
     """
-    lower, upper = sampling_limits(chain)
+    lower, upper = chain.sampling_limits()
     speed = np.array([joint.velocity if np.isfinite(joint.velocity) else 2.0 for joint in chain.joints])
     motion = random_fourier(0.8 * lower, 0.8 * upper, 0.8 * speed, SECONDS, RATE, seed=seed)
     states = (motion.q, motion.v, motion.a)
-    motor, link = true_torque(arm, *states), link_torque(arm, *states)
+    motor, link = arm.true_torque(*states), arm.link_torque(*states)
     true = model.torque_rows.target(motor, link, motion.q, motion.v)
     load = model.transmitted(values, *states, ())
     predicted = np.einsum("kij,j->ki", model.regressor(*states, load, ()), values)
@@ -132,7 +132,7 @@ def true_base(
     names = tuple(name for name in model.names if name in known)
     terms = tuple(one for one in model.terms if one.name in names)
     bare = [replace(model, bodies=bodies_of(chain), terms=terms) for chain in (cell.nominal, arm.chain)]
-    lower, upper = sampling_limits(arm.chain)
+    lower, upper = arm.chain.sampling_limits()
     samples = bases.random_samples(bare[0], seed=seed, lower=lower, upper=upper)
     base = bases.regroup(bases.find(bare[0], samples), bare[1], samples)
     plain = (base.standard[k] for k in base.kept)  # what is regrouped on one geometry need not be on another

@@ -150,10 +150,9 @@ class TorqueErrors:
         ]
         return _named(parts)
 
-
-def cable_torques(errors: TorqueErrors, q: np.ndarray, effort: np.ndarray) -> np.ndarray:
-    """Return the torques (N, n) of the cables at joint values q (N, n); `effort` (n,) are the limits [N m or N]."""
-    return errors.cable * effort * np.tanh(q / CABLE)
+    def cable_torques(self, q: np.ndarray, effort: np.ndarray) -> np.ndarray:
+        """Return the torques (N, n) of the cables at joint values q (N, n); `effort` (n,) are the limits [N m or N]."""
+        return self.cable * effort * np.tanh(q / CABLE)
 
 
 def gear_torques(

@@ -23,9 +23,9 @@ from calib.robot import library
 from calib.robot.chain import Chain, random_joints
 from calib.simulation.cells import known_robots
 from calib.simulation.cells.cell import Cell
-from calib.simulation.cells.unmodelled import TorqueErrors, cable_torques, gear_torques
-from calib.simulation.loop.closed_loop import Plant, Sensing, inertia_diagonal, simulate
-from calib.simulation.loop.controllers import Controller, pd, with_feedforward
+from calib.simulation.cells.unmodelled import TorqueErrors, gear_torques
+from calib.simulation.loop.closed_loop import Plant, Sensing, simulate
+from calib.simulation.loop.controllers import Controller, pd
 from calib.simulation.loop.references import Reference
 from calib.simulation.loop.tracking import feed_forward
 
@@ -60,6 +60,17 @@ class MovingArm:
     note: str
     unmodelled: TorqueErrors
 
+    def true_torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        """Return the torques (N, n) of a warm arm's motors without noise [N m or N], along a finely sampled motion."""
+        return _modelled(self, q, v, a) + _unmodelled(self, q, v, a, np.full(len(q), np.inf))
+
+    def link_torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        """Return the torques behind the gears (N, n) without noise [N m or N]."""
+        whole = IdentificationModel(self.plant.bodies, self.plant.terms)
+        shared = np.isin(whole.names, self.link.names)
+        model = np.einsum("kij,j->ki", self.link.regressor(q, v, a), self.plant.parameters[shared])
+        return model + self.unmodelled.cable_torques(q, self.effort)
+
 
 def moving_arm(cell: Cell, robot: str, seed: int = 0, unmodelled: TorqueErrors | None = None) -> MovingArm:
     """Return the true arm of a cell as it moves.
@@ -88,7 +99,7 @@ def moving_arm(cell: Cell, robot: str, seed: int = 0, unmodelled: TorqueErrors |
     plant = Plant(bodies_of(chain), tuple(terms), np.concatenate([standard_parameters(chain), values.ravel()]))
     share = np.array([KNOWN if name[:1] == "F" else 1.0 for name in known_robots.SIDED])
     told = np.concatenate([standard_parameters(nominal), (values * share).ravel()])
-    inertia = inertia_diagonal(plant, random_joints(chain, 200, 0))
+    inertia = plant.inertia_diagonal(random_joints(chain, 200, 0))
     omega = 2 * np.pi * BANDWIDTH
     note = (
         f"masses off their nominal by {2 * MASS:.0%}, centres by {1e3 * SHIFT:g} mm (1 sigma); {source}; torque noise "
@@ -133,12 +144,12 @@ def record(
     """
     rng = np.random.default_rng(seed)
     slow = replace(reference, a=0.0 * reference.a)
-    controller = with_feedforward(arm.gains, feed_forward(arm.believed, slow))
+    controller = arm.gains.with_feedforward(feed_forward(arm.believed, slow))
     sensing = Sensing(SIGMA_Q, push=arm.unmodelled.push * arm.effort, push_band=PUSH_BAND)
     beyond = _unmodelled(arm, reference.q, reference.v, reference.a, running + reference.t)
     run = simulate(arm.plant, controller, reference, sensing, rng, push=-beyond)
     noise = [sigma * arm.effort * rng.normal(size=run.q.shape) for sigma in (SIGMA_LINK, SIGMA_MOTOR)]
-    sensed = _held(link_torque(arm, run.q, run.v, run.a)) + noise[0]
+    sensed = _held(arm.link_torque(run.q, run.v, run.a)) + noise[0]
     motor = _held(run.torque) + noise[1]
     return Recording(run.t, run.measured, motor, "torque", arm.chain.joint_names, tau_link=sensed)
 
@@ -152,19 +163,6 @@ def _held(torque: np.ndarray) -> np.ndarray:
     result = torque.copy()
     result[1:] = 0.5 * (torque[1:] + torque[:-1])
     return result
-
-
-def true_torque(arm: MovingArm, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-    """Return the torques (N, n) of a warm arm's motors without noise [N m or N], along a finely sampled motion."""
-    return _modelled(arm, q, v, a) + _unmodelled(arm, q, v, a, np.full(len(q), np.inf))
-
-
-def link_torque(arm: MovingArm, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-    """Return the torques behind the gears (N, n) without noise [N m or N]."""
-    whole = IdentificationModel(arm.plant.bodies, arm.plant.terms)
-    shared = np.isin(whole.names, arm.link.names)
-    model = np.einsum("kij,j->ki", arm.link.regressor(q, v, a), arm.plant.parameters[shared])
-    return model + cable_torques(arm.unmodelled, q, arm.effort)
 
 
 def _modelled(arm: MovingArm, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
@@ -183,7 +181,7 @@ def _unmodelled(arm: MovingArm, q: np.ndarray, v: np.ndarray, a: np.ndarray, t: 
     friction = viscous * v + coulomb * np.sign(v)
     drive = _modelled(arm, q, v, a) if arm.unmodelled.ripple else np.zeros_like(q)
     beyond = gear_torques(arm.unmodelled, q, drive, coulomb, friction, t)
-    return beyond + cable_torques(arm.unmodelled, q, arm.effort)
+    return beyond + arm.unmodelled.cable_torques(q, arm.effort)
 
 
 def _drives(robot: str, chain: Chain, effort: np.ndarray) -> tuple[np.ndarray, str]:
@@ -200,7 +198,7 @@ def _drives(robot: str, chain: Chain, effort: np.ndarray) -> tuple[np.ndarray, s
     speed = np.array([joint.velocity if np.isfinite(joint.velocity) else 2.0 for joint in chain.joints])
     bare = Plant(bodies_of(chain), (), standard_parameters(chain))
     rows = {
-        "Ia": 0.5 * inertia_diagonal(bare, random_joints(chain, 200, 0)),
+        "Ia": 0.5 * bare.inertia_diagonal(random_joints(chain, 200, 0)),
         "Fvm": 0.05 * effort / speed,
         "Fcm": 0.05 * effort,
     }

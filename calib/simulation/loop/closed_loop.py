@@ -69,6 +69,26 @@ class Plant:
         """Number of parameters that are the bodies'; they come first."""
         return 10 * self.bodies.count
 
+    def stepper(self, columns: np.ndarray) -> Stepper:
+        """Return a plant made ready to be advanced, with slopes by the parameters `columns` (c,)."""
+        find = np.full(len(self.parameters), -1)
+        find[np.asarray(columns, dtype=int)] = 2 * self.bodies.n + np.arange(len(columns))
+        return Stepper(_packed(self), (*_layout_of(self), find))
+
+    def with_parameters(self, parameters: np.ndarray) -> Plant:
+        """Return the plant with other parameters."""
+        return replace(self, parameters=parameters)
+
+    def inertia_diagonal(self, q: np.ndarray) -> np.ndarray:
+        """Return the mean diagonal (n,) of the inertia, motors' included, over configurations (N, n)."""
+        from calib.dynamics import rigid_body
+        from calib.dynamics.drives import added_inertia
+
+        bodies = self.inertial
+        inertia = rigid_body.mass_matrix(self.bodies, self.parameters[:bodies], np.asarray(q, dtype=float))
+        added = added_inertia(self.terms, self.parameters[bodies:], self.bodies.n)
+        return np.einsum("kii->i", inertia) / len(inertia) + np.diag(added)
+
 
 @dataclass(frozen=True, eq=False)
 class Sensing:
@@ -340,29 +360,6 @@ class Stepper:
         if status != loop_kernels.FINE:
             raise _failure(status, 0.0, "")
         return q, v, gain, slopes.reshape(2 * n, -1)
-
-
-def stepper(plant: Plant, columns: np.ndarray) -> Stepper:
-    """Return a plant made ready to be advanced, with slopes by the parameters `columns` (c,)."""
-    find = np.full(len(plant.parameters), -1)
-    find[np.asarray(columns, dtype=int)] = 2 * plant.bodies.n + np.arange(len(columns))
-    return Stepper(_packed(plant), (*_layout_of(plant), find))
-
-
-def with_parameters(plant: Plant, parameters: np.ndarray) -> Plant:
-    """Return the plant with other parameters."""
-    return replace(plant, parameters=parameters)
-
-
-def inertia_diagonal(plant: Plant, q: np.ndarray) -> np.ndarray:
-    """Return the mean diagonal (n,) of the inertia, motors' included, over configurations (N, n)."""
-    from calib.dynamics import rigid_body
-    from calib.dynamics.drives import added_inertia
-
-    bodies = plant.inertial
-    inertia = rigid_body.mass_matrix(plant.bodies, plant.parameters[:bodies], np.asarray(q, dtype=float))
-    added = added_inertia(plant.terms, plant.parameters[bodies:], plant.bodies.n)
-    return np.einsum("kii->i", inertia) / len(inertia) + np.diag(added)
 
 
 def _draw(rng: np.random.Generator, sigma: np.ndarray, count: int) -> np.ndarray:

@@ -67,6 +67,18 @@ class Controller:
         ahead = np.zeros_like(reference.q) if self.ahead is None else self.ahead
         return np.array([reference.q, reference.v, shaped(ahead, reference.q.shape, "torque ahead"), reference.a])
 
+    def scaled(self, factor: np.ndarray | float) -> Controller:
+        """Return the controller with all gains times `factor`, (n,) or one: the same bandwidth on another inertia."""
+        return replace(self, kp=self.kp * factor, kd=self.kd * factor, ki=self.ki * factor)
+
+    def slower(self, factor: float) -> Controller:
+        """Return the controller with its bandwidth divided by `factor`: kp by factor², kd by factor, ki by factor³."""
+        return replace(self, kp=self.kp / factor**2, kd=self.kd / factor, ki=self.ki / factor**3)
+
+    def with_feedforward(self, ahead: np.ndarray) -> Controller:
+        """Return the controller with a torque (N, n) added open loop."""
+        return replace(self, ahead=frozen(ahead))
+
 
 def pd(kp: np.ndarray, kd: np.ndarray, limit: np.ndarray | float = np.inf, ki: np.ndarray | float = 0.0) -> Controller:
     """Return a PD (or PID) controller."""
@@ -106,18 +118,3 @@ def computed_torque(
     """
     kp, kd = np.full(n, frequency**2), np.full(n, 2 * damping * frequency)
     return Controller(kp, kd, np.zeros(n), np.ones(n), np.asarray(limit), np.asarray(np.inf), model=frozen(model))
-
-
-def with_feedforward(controller: Controller, ahead: np.ndarray) -> Controller:
-    """Return the controller with a torque (N, n) added open loop."""
-    return replace(controller, ahead=frozen(ahead))
-
-
-def scaled(controller: Controller, factor: np.ndarray | float) -> Controller:
-    """Return the controller with all gains times `factor`, (n,) or one: the same bandwidth on another inertia."""
-    return replace(controller, kp=controller.kp * factor, kd=controller.kd * factor, ki=controller.ki * factor)
-
-
-def slower(controller: Controller, factor: float) -> Controller:
-    """Return the controller with its bandwidth divided by `factor`: kp by factor², kd by factor, ki by factor³."""
-    return replace(controller, kp=controller.kp / factor**2, kd=controller.kd / factor, ki=controller.ki / factor**3)

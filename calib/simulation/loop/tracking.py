@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.dynamics.idim import IdentificationModel
 from calib.simulation.loop.closed_loop import Plant, Sensing, sample_ticks, simulate
-from calib.simulation.loop.controllers import Controller, with_feedforward
+from calib.simulation.loop.controllers import Controller
 from calib.simulation.loop.references import Reference
 
 BLOCK = 4096  # instants at a time
@@ -28,7 +28,7 @@ def replayed_error(
     robot: Plant, controller: Controller, reference: Reference, ahead: np.ndarray | None, push: np.ndarray
 ) -> np.ndarray:
     """Return the rms of q - q_r (n,) [rad or m] under torques (N, n) ahead and (N, n) that push, without noise."""
-    own = controller if ahead is None else with_feedforward(controller, ahead)
+    own = controller if ahead is None else controller.with_feedforward(ahead)
     run = simulate(robot, own, reference, push=push)
     return np.sqrt(np.mean((run.q - reference.q) ** 2, axis=0))
 
@@ -47,7 +47,7 @@ def tracking_error(
         robot: what moves; on a real arm the best model there is stands for it.
         believed: whose torques are fed forward; None: feedback alone.
     """
-    ahead = controller if believed is None else with_feedforward(controller, feed_forward(believed, reference))
+    ahead = controller if believed is None else controller.with_feedforward(feed_forward(believed, reference))
     run = simulate(robot, ahead, reference, sensing, seed)
     tick = sample_ticks(len(reference.t), 1 if sensing is None else sensing.every)
     return np.sqrt(np.mean((run.q - reference.at(tick)[0]) ** 2, axis=0))

@@ -119,7 +119,7 @@ def test_where_the_simulation_does_not_follow_the_motion_drowned_signs_are_those
 
     Measured: 3 % off in place of 24, and 2.9 % with the right one.
     """
-    case, slow = log(1e-3, 1, 0.02), Loop(controllers.slower(PD, 5.0), motion(), EVERY)
+    case, slow = log(1e-3, 1, 0.02), Loop(PD.slower(5.0), motion(), EVERY)
 
     def wrong(loop=None) -> float:
         values = found(case, loop, v0=0.02, limit=20).fit.estimate.values
@@ -163,7 +163,7 @@ def test_a_bound_that_binds_leaves_no_spread_of_its_parameter_and_less_of_the_ot
     assert held.constrained is not None and "sits on its bound" in held.constrained.lines()[0]
 
 
-@pytest.mark.parametrize("wrong", [controllers.slower(PD, 3.0), controllers.pd(1.4 * PD.kp, 0.7 * PD.kd)])
+@pytest.mark.parametrize("wrong", [PD.slower(3.0), controllers.pd(1.4 * PD.kp, 0.7 * PD.kd)])
 def test_a_wrong_controller_down_to_a_third_of_the_bandwidth_still_serves(wrong):
     result = found(log(1e-3, 4), Loop(wrong, motion(), EVERY))
     assert error(result.fit.estimate) < 0.05 < error(result.ordinary.estimate)
@@ -178,11 +178,10 @@ def test_the_loop_ends_in_few_rounds_wherever_it_starts():
 
 def test_gains_stated_for_another_inertia_follow_the_estimate():
     """Half the gains, stated for half the inertia, are the robot's own once the estimate is."""
-    from calib.simulation.loop.closed_loop import inertia_diagonal
 
     case, plant = log(1e-3, 6), arm()[0]
-    design = 0.5 * inertia_diagonal(plant, motion().q[::200])
-    scaled = found(case, Loop(controllers.scaled(PD, 0.5), motion(), EVERY, design))
+    design = 0.5 * plant.inertia_diagonal(motion().q[::200])
+    scaled = found(case, Loop(PD.scaled(0.5), motion(), EVERY, design))
     assert np.all(scaled.distance < 1.05 * found(case).distance + 0.05)
 
 

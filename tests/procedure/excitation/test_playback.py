@@ -12,7 +12,7 @@ from trajectories.approach import straight_approach
 from trajectories.errors import BadInput
 from trajectories.messages import joint_trajectory, to_json, to_yaml
 from trajectories.recall import average, find_periods
-from trajectories.setpoints import Setpoints, joined, repeated, slowed
+from trajectories.setpoints import Setpoints, joined, slowed
 
 RATE, PERIOD = 500.0, 1000
 V, A, J = (np.full(3, x) for x in (1.5, 4.0, 40.0))
@@ -51,7 +51,7 @@ def test_bad_approaches_are_named(change, message):
 
 def test_motions_join_only_where_they_meet():
     start = straight_approach(np.ones(3), LOOP.q[0], V, A, J, RATE)
-    whole = repeated(LOOP, 3)
+    whole = LOOP.repeated(3)
     assert len(whole) == 3 * PERIOD + 1
     with pytest.raises(BadInput, match=r"begins .* away .*\(speed of joint 3\)"):
         joined([start, whole])

@@ -88,7 +88,7 @@ def test_a_fit_shows_every_pose_as_both_arms_see_it(fitted, tmp_path):
     errors = ("/errors/nominal", "/errors/calibrated", "/errors/unseen", "/turns/calibrated")
     for name in (*errors, *axes, "/world/pose", "/world/robot/lines"):
         assert found[name] == 60, name
-    scale = viewing.arrow_scale(measured, scene.chain)
+    scale = measured.arrow_scale(scene.chain)
     assert {f"/world/errors_times_{scale:g}/{arm}" for arm in ("nominal", "calibrated")} <= still
     assert f"{scale:g} times as long as the errors" in viewer.about(scene)
 

@@ -15,7 +15,7 @@ from sessions import go_on
 from without_figures import run
 
 from calib.procedure.session import steps
-from calib.procedure.session.folder import Session, locked, open_session, verdicts
+from calib.procedure.session.folder import Session, locked, open_session
 
 OLDER = Path(__file__).parent / "older"
 EXPECTED = OLDER / "expected"
@@ -41,7 +41,7 @@ def test_an_older_session_stands_where_it_stood_and_goes_on(cell: Path) -> None:
     assert set(_standing(cell).values()) == {steps.DONE}
     assert (cell / "8-dynamics/metrics.json").read_bytes() == before
     assert "0.038 mm" in (cell / "certificate.html").read_text().replace("\N{NO-BREAK SPACE}", " ")
-    assert {half: level for half, (level, _) in verdicts(session).items()} == {"geometry": "pass", "dynamics": "pass"}
+    assert {half: level for half, (level, _) in session.verdicts().items()} == {"geometry": "pass", "dynamics": "pass"}
     written = (EXPECTED, cell / "9-export")
     joints = [re.findall(r"(?m)^ *<origin.*", (place / "robot.urdf").read_text()) for place in written]
     assert len(joints[0]) == 3 and joints[0] == joints[1]

@@ -21,7 +21,6 @@ from calib.simulation.loop.closed_loop import (
     Sensing,
     SimulatedRun,
     forward_dynamics,
-    inertia_diagonal,
     simulate,
     simulate_many,
 )
@@ -122,10 +121,10 @@ def test_what_is_recorded_obeys_the_model_to_rounding():
 def test_friction_holds_without_chatter_where_explicit_steps_are_too_long():
     plant, controller = known_robots.plant("tx40"), known_robots.controller("tx40")
     known = known_robots.truth("tx40")["drives"]
-    stiffness = known["Fc"][5] / known["v0"] / inertia_diagonal(plant, np.zeros((1, 6)))[5]
+    stiffness = known["Fc"][5] / known["v0"] / plant.inertia_diagonal(np.zeros((1, 6)))[5]
     assert stiffness / 1000.0 > 2.785  # a 1 kHz RK4 step is unstable there
     reference = still(np.array([0.2, 0.5, 0.5, 0.3, 0.5, 0.1]), 1.0, 1000.0)
-    calm = controllers.slower(controller, 4.0)
+    calm = controller.slower(4.0)
     run = simulate(plant, calm, reference, start=(reference.q[0], np.full(6, 0.3)))
     late = slice(len(run.t) // 2, None)
     assert np.abs(run.a[late]).max() < 1e-2
@@ -137,7 +136,7 @@ def test_the_robot_follows_and_feed_forward_pays():
     plain = simulate(plant, controller, reference)
     regressor = known_robots.model(plant).regressor(reference.q, reference.v, reference.a)
     ahead = np.einsum("kij,j->ki", regressor, plant.parameters)
-    better = simulate(plant, controllers.with_feedforward(controller, ahead), reference)
+    better = simulate(plant, controller.with_feedforward(ahead), reference)
     errors = [np.sqrt(np.mean((run.q - reference.q) ** 2, axis=0)) for run in (plain, better)]
     assert errors[0].max() < 5e-3
     assert np.all(errors[1] < 0.2 * errors[0])
@@ -189,7 +188,7 @@ def test_what_cannot_be_simulated_is_refused():
     with pytest.raises(CalibError, match="not positive definite"):
         simulate(replace(plant, parameters=-plant.parameters), controller, reference)
     with pytest.raises(NotConverged, match="diverged"):
-        simulate(plant, controllers.scaled(controller, 300.0), reference)
+        simulate(plant, controller.scaled(300.0), reference)
     stiff = replace(plant, terms=drives.standard(["Ia Fv Fc"] * 6, 1e-5))
     with pytest.raises(CalibError, match="too stiff"):
         simulate(stiff, controller, reference)

@@ -87,7 +87,7 @@ def test_gains_may_follow_the_parameters():
     def at(step: float):
         x = plant.parameters.copy()
         x[9] += step
-        own = controllers.scaled(controller, 1.0 + step * relative[:, 0])
+        own = controller.scaled(1.0 + step * relative[:, 0])
         return simulate(replace(plant, parameters=x), own, reference).q
 
     expected = (at(1e-5) - at(-1e-5)) / 2e-5
@@ -109,7 +109,7 @@ def short() -> references.Reference:
 def test_a_loop_that_diverges_says_so():
     plant, controller, reference = known_robots.plant("tx40"), known_robots.controller("tx40"), short()
     with pytest.raises(NotConverged, match="diverged"):
-        simulate_tangents(plant, controllers.scaled(controller, 300.0), reference, np.array([5]))
+        simulate_tangents(plant, controller.scaled(300.0), reference, np.array([5]))
 
 
 @pytest.mark.slow  # as above
