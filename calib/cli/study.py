@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.shared import Base, Plots, Robot, Seed, Tip, reporting, say
+from calib.cli.shared import Base, Plots, Robot, Seed, Tip, exit_failed, reporting, say
 
 app = typer.Typer()
 SHOWN = 3  # conditions whose tables are printed in full
@@ -76,7 +76,10 @@ def compare(
     tip: Tip = None,
     seed: Seed = 0,
 ) -> None:
-    """Rank identification methods on recordings of your robot. What counts is how well they predict other motion."""
+    """Rank identification methods on recordings of your robot. What counts is how well they predict other motion.
+
+    The one to take is judged as calib identify judges it; where its verdict is fail, none is to take: exit code 1.
+    """
     from calib import files
     from calib.identification.identify_options import read_options
     from calib.procedure.dynamic_stage import inputs
@@ -95,11 +98,12 @@ def compare(
         found = compare_methods(
             given, chosen, friction, progress, lambda one: say_now(method_table.line(one))
         )  # fmt: skip
-    say(*console.rendered(method_table.blocks(found)), *(f"note: {line}" for line in caveats(given, found)))
+    say(*console.section(method_table.section(found, caveats(given, found))))
     if out is not None:
         say(f"written to {write_table(found, out)}")
     if all(one.failure for one in found):
         raise typer.Exit(3)
+    exit_failed(next(one.verdict.level for one in found if one.verdict is not None))
 
 
 def _names(text: str | None) -> list[str] | None:

@@ -91,8 +91,18 @@ class IdentificationOutcome:
 
 def run(inputs: IdentificationInputs, progress: Progress | None = None) -> IdentificationOutcome:
     """Identify, predict every recording, and judge."""
-    say, settings = progress or (lambda words: None), inputs.options.settings
-    found = identify(inputs.robot, inputs.cases, settings, progress)
+    return judged(inputs, identify(inputs.robot, inputs.cases, inputs.options.settings, progress), progress)
+
+
+def judged(
+    inputs: IdentificationInputs, found: Identification, progress: Progress | None = None
+) -> IdentificationOutcome:
+    """Predict every recording by what was identified from the inputs, and judge.
+
+    Raises:
+        MeasurementError: where friction would drive most joints.
+    """
+    say = progress or (lambda words: None)
     wrong = driven(found.dynamics, inputs.cases)  # refused before hours go into the geometry's share
     carried, geometries = _carry(inputs, found, say)
     excitation = {case.name: report_excitation(case.motion) for case in inputs.cases}
@@ -104,7 +114,7 @@ def run(inputs: IdentificationInputs, progress: Progress | None = None) -> Ident
         contradiction(found, inputs.chain) if inputs.unit == TORQUE else None,
     )  # fmt: skip
     result = assess(inputs, found.dynamics, findings, wrong, progress=say)
-    return IdentificationOutcome(inputs, found, findings, result, carried, geometries, settings.seed)
+    return IdentificationOutcome(inputs, found, findings, result, carried, geometries, found.settings.seed)
 
 
 def assessed(outcome: IdentificationOutcome, inputs: IdentificationInputs) -> IdentificationOutcome:

@@ -5,8 +5,10 @@ All estimate the same columns (base parameters and standard friction, unless ano
 identification band, over all unseen recordings together; their standard errors, and those of differences between
 methods, come from a jackknife over blocks of time (Künsch 1989), since residuals are not white. Methods within `APART`
 standard errors of the best, or within `SLACK` of its error, are as good; of these one is taken that is fast: at most
-`QUICK` seconds, or `ALIKE` times the time of the fastest, the first in rank. None is taken where the best predicts no
-better than no model does (100 %), or where all recordings repeat the training motion; one that does is left out.
+`QUICK` seconds, or `ALIKE` times the time of the fastest, the first in rank. Of that one stands beneath the table
+what `calib identify` says of it: the same verdict, from the same findings. None is taken where that verdict is fail,
+where the best predicts no better than no model does (100 %), or where all recordings repeat the training motion; one
+that does is left out.
 """
 
 from __future__ import annotations
@@ -26,9 +28,11 @@ from calib.identification.methods.method import Method
 from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.prediction import predict
 from calib.identification.settings import IdentificationSettings
+from calib.procedure.dynamic_stage.identify import judged
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.validation import overlaps, repeated_motion
 from calib.procedure.dynamic_stage.verdict import motion_warnings
+from calib.procedure.findings import Verdict
 
 BLOCKS = 10  # of time in each recording
 APART, SLACK, ALIKE, QUICK = 2.0, 0.05, 2.0, 1.0  # our choices; the last in seconds
@@ -53,6 +57,7 @@ class ComparedMethod:
         parameters: number of them.
         seconds: of the method alone.
         iterations, simulations: of the method.
+        verdict, warnings: what `calib identify` says of it; None and empty but for the one that the rule comes to.
     """
 
     name: str
@@ -71,6 +76,8 @@ class ComparedMethod:
     seconds: float = np.nan
     iterations: int = 0
     simulations: int = 0
+    verdict: Verdict | None = None
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +118,7 @@ def compare_methods(
     if inputs.options.settings.loop is None and all(method.needs_controller for method in chosen.values()):
         raise UsageError(f"{', '.join(chosen)}: {LOOP}")
     done: list[tuple[ComparedMethod, _Sums]] = []
+    models: dict[str, Identification] = {}
     failed: list[ComparedMethod] = []
     alike = ~np.isin(np.arange(inputs.cases[0].target.shape[1]), inputs.currents.own)
     for name, method in chosen.items():
@@ -120,7 +128,8 @@ def compare_methods(
         say(name)
         try:
             found = identify(inputs.robot, inputs.cases, _settings(inputs, method, friction), partial(_said, say, name))
-            done.append(_judged(found, inputs, alike))
+            done.append(_errors(found, inputs, alike))
+            models[name] = found
             each(done[-1][0])
         except CalibError as error:
             failed.append(ComparedMethod(name, " ".join(str(error).split())))
@@ -128,23 +137,31 @@ def compare_methods(
         except Exception as error:  # of one method: the others' results are not lost by it
             failed.append(ComparedMethod(name, f"an error that nobody foresaw: {type(error).__name__}: {error}"))
             each(failed[-1])
-    return [*_ranked(done, alike, bool(proofs)), *failed]
+    ranked = _ranked(done, alike)
+    return [
+        *(_held(one, inputs, models[one.name], bool(proofs), say) if one.chosen else one for one in ranked),
+        *failed,
+    ]
 
 
 def caveats(inputs: IdentificationInputs, found: Sequence[ComparedMethod]) -> list[str]:
     """Return what a user should know of a ranking, and why none is to be taken where none is."""
     repeated = repeated_motion(inputs.cases, inputs.unseen)
-    told = motion_warnings({}, repeated, {})
+    told = [*inputs.currents.notes, *motion_warnings({}, repeated, {})]
+    told += [line for one in found for line in one.warnings]
     if len(repeated) == len(inputs.unseen):
         told.append("none to take: give motion that is no repeat with --validate")
     elif repeated:
         told.append(f"left out of the ranking: {', '.join(repeated)}")
+    judged_one = next((one for one in found if one.verdict is not None and one.verdict.level == "fail"), None)
     if found and found[0].unseen >= USELESS:
         told.append(
             f"none to take: the best is off by {found[0].unseen:.3g} % on unseen motion, no model by {USELESS:g} %: "
             "learn from more motion"
         )
-    return told
+    elif judged_one is not None:
+        told.append(f"none to take: calib identify fails the model of {judged_one.name}, for the reason below")
+    return list(dict.fromkeys(told))
 
 
 def _said(say: Callable[[str], None], name: str, words: str) -> None:
@@ -161,7 +178,25 @@ def _settings(inputs: IdentificationInputs, method: Method, friction: str) -> Id
     return settings if method.needs_controller else replace(settings, loop=None)
 
 
-def _judged(
+def _held(
+    one: ComparedMethod, inputs: IdentificationInputs, found: Identification, proven: bool, say: Callable[[str], None]
+) -> ComparedMethod:
+    """Return the method that the rule comes to with the verdict on its model, to be taken where nothing speaks against.
+
+    Args:
+        proven: whether the recordings are motion that it has not seen.
+    """
+    warnings: tuple[str, ...] = ()
+    try:
+        outcome = judged(inputs, found, partial(_said, say, one.name))
+        verdict, warnings = outcome.verdict, outcome.warnings
+    except CalibError as error:
+        verdict = Verdict("fail", " ".join(str(error).split()))
+    taken = proven and one.unseen < USELESS and verdict.level != "fail"
+    return replace(one, chosen=taken, verdict=verdict, warnings=warnings)
+
+
+def _errors(
     found: Identification, inputs: IdentificationInputs, alike: np.ndarray
 ) -> tuple[ComparedMethod, _Sums]:  # fmt: skip
     """Return a method's errors; nothing of other methods yet."""
@@ -209,7 +244,8 @@ def _jackknife(each: np.ndarray) -> float:
     return float(np.sqrt((len(each) - 1) / len(each) * np.sum((each - each.mean()) ** 2)))
 
 
-def _ranked(done: Sequence[tuple[ComparedMethod, _Sums]], alike: np.ndarray, proven: bool) -> list[ComparedMethod]:
+def _ranked(done: Sequence[tuple[ComparedMethod, _Sums]], alike: np.ndarray) -> list[ComparedMethod]:
+    """Return the methods by rank; chosen is the first fast one among the good, whatever its verdict will be."""
     if not done:
         return []
     order = sorted(done, key=lambda pair: pair[0].unseen)
@@ -221,8 +257,7 @@ def _ranked(done: Sequence[tuple[ComparedMethod, _Sums]], alike: np.ndarray, pro
         good = behind <= max(APART * sigma, SLACK * best.unseen)
         result.append(replace(one, rank=rank, behind=behind, behind_sigma=sigma, good=bool(good)))
     least = min(one.seconds for one in result if one.good)
-    fast = (one for one in result if one.good and one.seconds <= max(QUICK, ALIKE * least))
-    taken = next(fast) if proven and best.unseen < USELESS else None
+    taken = next(one for one in result if one.good and one.seconds <= max(QUICK, ALIKE * least))
     return [replace(one, chosen=one is taken) for one in result]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from calib.procedure.report.page import Block, Table, Text
+from calib.procedure.report.page import Block, Section, Table, Text
 from calib.procedure.study.method_comparison import APART, SLACK, ComparedMethod
 
 HEADER = (
@@ -19,7 +19,16 @@ def line(one: ComparedMethod) -> str:
     return f"{one.name}: {words}"
 
 
-def blocks(found: Sequence[ComparedMethod]) -> Iterator[Block]:
+def section(found: Sequence[ComparedMethod], notes: Sequence[str]) -> Section:
+    """Return the table, what a user should know, and the verdict on the model of the method that the rule comes to."""
+    own = next((one for one in found if one.verdict is not None), None)
+    shown = (*_blocks(found), Text("", notes, "note"))
+    if own is None or own.verdict is None:
+        return Section("Methods", shown)
+    return Section("Methods", shown, own.verdict.level, f"{own.name}: {own.verdict.reason}")
+
+
+def _blocks(found: Sequence[ComparedMethod]) -> Iterator[Block]:
     """Yield the ranked table, and why methods are not in it."""
     good = [one for one in found if not one.failure]
     rows = [

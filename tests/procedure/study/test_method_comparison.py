@@ -106,3 +106,28 @@ def test_the_command_writes_what_it_shows(robot: Path, tmp_path: Path, capsys: p
     assert "did you mean 'wls'" in capsys.readouterr().err
     assert run([*words, "--methods", "iv"]) == 2
     assert "[loop]" in capsys.readouterr().err
+
+
+def test_what_identify_fails_is_not_to_be_taken(robot: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """One joint's torque is doubled in the unseen file: better than no model, and yet none of this robot."""
+    train, other = recorded(tmp_path)
+    content = dict(np.load(other))
+    np.savez(other, **(content | {"tau": content["tau"] * [1.0, 2.0, 1.0]}))
+    words = [str(robot), str(train), "--validate", str(other)]
+    assert run(["compare", *words, "--methods", "wls,ols"]) == 1
+    shown = capsys.readouterr().out
+    assert "take │" not in shown and "none to take" in shown
+    compared = shown[shown.index("verdict: fail") :].splitlines()[0].partition(": ")[2].partition(": ")[2]
+    name, _, reason = compared.partition(": ")
+    out = ["--method", name, "--friction", "standard", "--no-plots", "--out", str(tmp_path / "out")]
+    assert run(["identify", *words, *out]) == 1
+    assert f"verdict: fail: {reason}" in capsys.readouterr().out
+
+
+def test_the_one_to_take_has_the_verdict_of_an_identification(robot: Path, tmp_path: Path):
+    train, other = recorded(tmp_path)
+    given = gather(robot, [train], [other])
+    found = compare_methods(given, ["wls", "ols"])
+    (taken,) = (one for one in found if one.verdict is not None)
+    assert taken.chosen and taken.verdict is not None and taken.verdict.level == "pass"
+    assert set(taken.warnings) <= set(caveats(given, found))
