@@ -24,6 +24,7 @@ from calib.identification.friction.friction_ladder import FrictionCandidates, Fr
 from calib.identification.friction.ripple import Ripple, find_all
 from calib.identification.friction.time_folds import estimate
 from calib.identification.methods.bias import LoopTest, compare_with_loop, require_loop, require_robot
+from calib.identification.methods.loop_agreement import LoopDisagreement, disagreement
 from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate
 from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.prediction import Dynamics, Model, predict
@@ -60,6 +61,7 @@ class Identification(Generic[Model]):
         prior: what was known of the base parameters beforehand, where it was used.
         ripples: gear ripple found above the identification band, by joint; not part of the estimate's covariance.
         bias: what the simulated closed loop says of least squares, where a loop is stated.
+        unlike: how recorded torques refute an estimate that takes the loop for granted; None where they do not.
     """
 
     dynamics: Dynamics[Model]
@@ -73,6 +75,7 @@ class Identification(Generic[Model]):
     prior: Prior | None = None
     ripples: tuple[Ripple, ...] = ()
     bias: LoopTest = field(default_factory=LoopTest)
+    unlike: LoopDisagreement | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -192,7 +195,10 @@ def identify_model(
     say("essential parameters")
     gone = _essential(found, settings)
     condition = condition_numbers(problem.pooled.factors.reshape(-1, len(values) + 1)[:, : base.b])
-    return Identification(dynamics, base, found, gone, friction, settings, full, condition, prior, ripples, bias)
+    unlike = disagreement(problem, found, bias)
+    return Identification(
+        dynamics, base, found, gone, friction, settings, full, condition, prior, ripples, bias, unlike
+    )
 
 
 def chain_states(chain: Chain, model: RegressorModel, seed: int = 0) -> States:

@@ -17,6 +17,7 @@ whether least squares is biased. Gains are what the joints feel, torque per posi
     limit = [130.0, 60.0]            # saturation [N m]
     windup = 0.1                     # largest integral of the error [rad s]
     velocity_cutoff = 200.0          # low-pass of the measured velocity [Hz]
+    reference_velocity = "derivative"  # of q_ref at the instant; or "difference": over the period before it
     feedforward = "none"             # none; cad: the robot's own inertias; recording: column tau_ff
     reference = "recording"          # the column q_ref (q_des, q_cmd, …); or a file, see below
     design = [1.2, 1.5]              # inertias for which the gains are stated [kg m²], if they follow the estimate
@@ -25,6 +26,12 @@ whether least squares is biased. Gains are what the joints feel, torque per posi
     positive = ["Ia1", "Fv1"]        # base parameters that must not be negative
     band = 20.0                      # identify: up to which frequency [Hz] the gains are read
     integral = false                 # identify: look for ki too
+
+In the simulated controller the measured velocity is a backward difference, (q_k - q_k-1) · rate, and so half a period
+late, then low-passed at velocity_cutoff; the reference's is q_ref's derivative at instant k (of a cubic spline through
+the logged samples), on time. A controller that takes the backward difference of q_ref as well needs
+``reference_velocity = "difference"``: else methods that rest on the loop (cloe, clie) find kd / (2 rate) too much
+inertia. The position error is q_ref,k - q_k, the torque is held over the period after `delay` more of them.
 
 A reference of its own is a table (CSV) or an archive (npz) with stamps and q_ref or q, no torques; its clock is the
 recording's: both count from their first sample. ``[files."run.csv"] reference = "run_ref.csv"`` states one per
@@ -45,6 +52,7 @@ from calib.errors import UsageError
 from calib.simulation.loop.controllers import Controller, cascade, pd
 
 CONTROLLERS = ("pd", "cascade", "identify")
+SPEEDS = ("derivative", "difference")
 AHEAD = ("none", "cad", "recording")
 INSTRUMENTS = ("iv", "didim")
 NEEDED = {"pd": ("kp", "kd"), "cascade": ("position", "velocity"), "identify": ()}
@@ -76,6 +84,7 @@ class LoopSettings:
     limit: Bounds = (np.inf,)
     windup: Bounds = (np.inf,)
     velocity_cutoff: Positive | None = None
+    reference_velocity: Annotated[str, OneOf(SPEEDS)] = "derivative"
     feedforward: Annotated[str, OneOf(AHEAD)] = "none"
     reference: Name = "recording"
     design: Gains = ()

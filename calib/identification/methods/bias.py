@@ -16,6 +16,7 @@ from calib.identification.settings import IdentificationSettings
 FOLLOWS = 10.0  # [%] of a joint's motion by which the simulated robot may miss the recorded one (our choice)
 BLUR = 3.0  # widths of the smoothed sign that the noise of the velocity may have (our choice)
 SMALL = 3.0  # standard deviations of a shift that does not matter, however surely it is there (our choice)
+NEGLIGIBLE = 1.0  # standard deviations of a shift that is not worth a word (our choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +39,7 @@ class LoopTest:
             return [f"the test of least squares by simulation of the closed loop failed: {self.failure}"]
         if self.found is None:
             return []
-        told = [*_weakness(self.found), *_distance(self.found)]
+        told = [*_weakness(self.found), *(_distance(self.found) or _gains(self.found))]
         return told + (_blurred(self) if taken else _words(self.found))
 
 
@@ -118,11 +119,24 @@ def _distance(found: Instrumental) -> list[str]:
     ]
 
 
+def _gains(found: Instrumental) -> list[str]:
+    """Say whose gains are not those of the recording: all that the simulated robot did was to follow."""
+    if not len(found.off):
+        return []
+    named = ", ".join(f"{found.stray[j]:.2g} times at joint {j + 1}" for j in found.off)
+    return [
+        f"the recorded robot strays further from its reference than the simulated one, or less ({named}): are kp and "
+        "kd of [loop] that many times the controller's? iv and didim bear it, cloe and clie do not"
+    ]
+
+
 def _words(found: Instrumental) -> list[str]:
-    """Say what the test means."""
-    if not found.verdict.biased() or not found.valid:
+    """Say what the test means; nothing of a loop that explains less than the model does, or of a bias too small."""
+    if not found.verdict.biased() or not found.valid or not found.explains:
         return []
     shift = found.shift
+    if shift.max() < NEGLIGIBLE:
+        return []
     worst = np.argsort(-shift)[:5]
     named = ", ".join(f"{found.names[k]} by {shift[k]:.2g} sigma" for k in worst)
     p = f"p = {found.verdict.p:.2g}" if found.verdict.p > 0.0 else "p < 1e-300"

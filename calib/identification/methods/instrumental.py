@@ -41,6 +41,8 @@ from calib.simulation.loop.closed_loop import Plant, Sensing, SimulatedRun, simu
 
 LIMIT = 10  # iterations; 3 to 6 are usual
 FOLLOWED = 1.25  # times the speed's noise, by which the simulated motion may be off the measured one (our choice)
+GAINS_OFF = 1.25  # times as far from its reference as simulated: from here on gains are not those stated (our choice)
+UNLIKE = 2.0  # times the model's own error, that the torque simulated is off by where the loop is another (our choice)
 RETREATS = 6  # halvings of a step to parameters that cannot be simulated
 
 
@@ -95,6 +97,8 @@ class Instrumental:
         std, inflation: of the rows, (rows,), and of all together.
         distance: (n,) 100 ‖q - q_s‖ / ‖q - mean q‖ [%] of filtered measured and simulated positions: large where the
             controller is not the robot's.
+        stray: (n,) how many times as far from its reference the recorded robot is as the simulated one: the factor
+            that stated gains are off by. NaN where noise hides it.
         constrained: what constraints made of the estimate, where there are any; `fit` has its values and covariance.
         problem: triangles of [Z W y], one group per torque row.
         estimator: what each round made of them.
@@ -110,6 +114,7 @@ class Instrumental:
     std: np.ndarray
     inflation: float
     distance: np.ndarray
+    stray: np.ndarray
     constrained: Held | None
     problem: Instruments
     estimator: _RoundEstimator
@@ -122,10 +127,35 @@ class Instrumental:
     @property
     def direct(self) -> np.ndarray:
         """(n,) 100 ‖y - Z x‖ / ‖y‖ [%]: the torque of the simulated robot against the recorded, joint by joint."""
-        p = len(self.names)
-        values = np.concatenate([self.fit.estimate.values, np.zeros(p)])
-        rest, size = (self.problem.data.residual_squares(x) for x in (values, np.zeros(2 * p)))
+        return self.simulated_error(self.fit.estimate.values)
+
+    def simulated_error(self, values: np.ndarray) -> np.ndarray:
+        """Return (n,) 100 ‖y - Z x‖ / ‖y‖ [%] of any values (p,), free of the noise of measured positions."""
+        return self._error(np.concatenate([values, np.zeros(len(self.names))]))
+
+    @property
+    def own(self) -> np.ndarray:
+        """(n,) 100 ‖y - W x‖ / ‖y‖ [%]: the same of the measured motion."""
+        return self._error(np.concatenate([np.zeros(len(self.names)), self.fit.estimate.values]))
+
+    def _error(self, values: np.ndarray) -> np.ndarray:
+        rest, size = (self.problem.data.residual_squares(x) for x in (values, np.zeros(2 * len(self.names))))
         return 100.0 * np.sqrt(rest / np.where(size > 0.0, size, np.inf))
+
+    @property
+    def off(self) -> np.ndarray:
+        """Joints, from 0, of which the loop's gains are off: the recorded robot strays another way than simulated."""
+        estimate, simulated = self.fit.estimate, self.problem.data.factors[:, :, : len(self.names)]
+        sizes = np.maximum(np.sum((simulated @ estimate.values) ** 2, axis=1), 1e-300)
+        # the torques' share that is unsure makes e_s = q_ref - q_s unsure, too
+        unsure = np.sqrt(np.einsum("gij,jk,gik->g", simulated, estimate.covariance, simulated) / sizes)
+        away = np.abs(np.log(np.maximum(np.nan_to_num(self.stray, nan=1.0), 1e-3)))
+        return np.flatnonzero(away > np.log(GAINS_OFF) + 5.0 * unsure)
+
+    @property
+    def explains(self) -> bool:
+        """Whether the simulated loop explains the recording as well as the model does its measured motion."""
+        return not len(self.off) and bool(np.all(self.direct < UNLIKE * self.own))
 
     @property
     def shift(self) -> np.ndarray:
@@ -323,7 +353,7 @@ def _result(
     strength = instrumental_variables.strength(problem, std)
     return Instrumental(
         fit, ordinary, frozen(task.kept, int), plant, tuple(rounds), strength, verdict, frozen(std), found.tau,
-        _distance(runs), bound, problem, task.estimator,
+        _distance(runs), _stray(runs), bound, problem, task.estimator,
     )  # fmt: skip
 
 
@@ -453,6 +483,23 @@ def _distance(runs: Runs) -> np.ndarray:
         away += np.sum((motion.q - low_passed(run.q, motion)[simulated_samples(case, run.t, loop)]) ** 2, axis=0)
         size += np.sum((motion.q - motion.q.mean(axis=0)) ** 2, axis=0)
     return frozen(100.0 * np.sqrt(away / size))
+
+
+def _stray(runs: Runs) -> np.ndarray:
+    """Return (n,) the slope of q_ref - q against q_ref - q_s, which noise of q leaves as it is; see `Instrumental`."""
+    pairs = []
+    for (case, loop), run in runs:
+        motion, used = case.motion, simulated_samples(case, run.t, loop)
+        asked = loop.reference.at(np.arange(len(run.t)) * loop.every)[0]
+        asked, moved = (low_passed(x, motion)[used] for x in (asked, run.q))
+        pairs.append((asked - motion.q, asked - moved))
+    found, expected = (np.concatenate(x) for x in zip(*pairs))
+    size = np.maximum(np.sum(expected**2, axis=0), 1e-300)
+    slope = np.sum(found * expected, axis=0) / size
+    rest = found - slope * expected
+    rows = [inflation(rest[:, j]) for j in range(rest.shape[1])]
+    sigma = np.sqrt(np.array(rows) * np.mean(rest**2, axis=0) / size)
+    return frozen(np.where(5.0 * sigma < np.abs(slope) * np.log(GAINS_OFF), slope, np.nan))
 
 
 ROUNDS = {

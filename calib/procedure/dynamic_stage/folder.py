@@ -120,7 +120,7 @@ class IdentificationFolder:
         errors = stated and found and TorqueErrorModel(found.columns, found.covariance, stated)
         return ModelFindings(
             metrics.findings.rests, metrics.findings.notes, known and known.controller(), errors,
-            metrics.findings.contradiction,
+            metrics.findings.contradiction, metrics.findings.unlike,
         )  # fmt: skip
 
 

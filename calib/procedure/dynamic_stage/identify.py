@@ -111,7 +111,7 @@ def judged(
     findings = ModelFindings(
         resting_parameters(found), model_warnings(inputs.cases, found, excitation),
         None if loops is None else loops.controller, learn_torque_errors(found, inputs.cases, carried.covariance),
-        contradiction(found, inputs.chain) if inputs.unit == TORQUE else None,
+        contradiction(found, inputs.chain) if inputs.unit == TORQUE else None, found.unlike,
     )  # fmt: skip
     result = assess(inputs, found.dynamics, findings, wrong, progress=say)
     return IdentificationOutcome(inputs, found, findings, result, carried, geometries, found.settings.seed)

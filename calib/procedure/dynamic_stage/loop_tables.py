@@ -17,8 +17,12 @@ INSTRUMENTAL = "instrumental.csv"
 HEADER = ("name", "unit", "instrumental", "sigma", "least_squares", "shift_sigma", "explained_percent")
 
 
-def loop_table(bias: LoopTest) -> dict[str, Any] | None:
-    """Return what ``metrics.json`` holds under ``loop``; None where no loop was stated."""
+def loop_table(bias: LoopTest, beside: bool = False) -> dict[str, Any] | None:
+    """Return what ``metrics.json`` holds under ``loop``; None where no loop was stated.
+
+    Args:
+        beside: whether the estimate is another method's.
+    """
     found, loops = bias.found, bias.loops
     notes = {"notes": list(loops.notes)} if loops is not None and loops.notes else {}
     if found is None:
@@ -29,6 +33,7 @@ def loop_table(bias: LoopTest) -> dict[str, Any] | None:
         "controller": controller_table(loops.controller),
         "controller_explains_percent": None if identified is None else _floats(identified.explained),
         "instruments": found.estimator.name,
+        "beside": beside,
         "rounds": len(found.rounds),
         "retreats": sum(one.retreats for one in found.rounds),
         "durbin_wu_hausman": {
@@ -44,7 +49,9 @@ def loop_table(bias: LoopTest) -> dict[str, Any] | None:
         "least_partial_r2": float(found.strength.partial_r2.min()),
         "distance_percent": _floats(found.distance),
         "simulated_torque_error_percent": _floats(found.direct),
+        "strays_times": _floats(found.stray),
         "valid": found.valid,
+        "explains": found.explains,
     }
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from calib.identification.cases import Case
 from calib.identification.gains import DriveGains
+from calib.identification.methods.loop_agreement import LoopDisagreement
 from calib.identification.methods.registry import METHODS
 from calib.identification.parameter_constraints import Held
 from calib.identification.possible.contradiction import Contradiction
@@ -67,6 +68,7 @@ class StoredFindings:
     controller: _StoredController | None = None
     errors: TorqueDiscrepancy | None = None
     contradiction: Contradiction | None = None
+    unlike: LoopDisagreement | None = None
 
 
 def switched_off(names: Sequence[str], base: int, sigma: np.ndarray) -> tuple[str, ...]:
@@ -126,7 +128,7 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
             for one in found.ripples
         ],
         "elimination": _elimination_table(outcome),
-        "loop": loop_table(found.bias),
+        "loop": loop_table(found.bias, found.fitted.instrumental is None),
         "constraints": _constraint_table(found.fitted.held),
         "tracking": tracking_table(outcome.tracking),
         "filters": {case.name: _filter_table(case.motion) for case in (*outcome.inputs.cases, *outcome.inputs.unseen)},
@@ -139,6 +141,7 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
                 _StoredController.of(outcome.findings.controller),
                 outcome.findings.errors and outcome.findings.errors.discrepancy,
                 outcome.findings.contradiction,
+                outcome.findings.unlike,
             )
         ),
         "warnings": list(outcome.warnings),

@@ -153,6 +153,8 @@ class LoopMetrics:
 
     failure: str = ""
     notes: tuple[str, ...] = ()
+    instruments: str = ""
+    beside: bool = False
     rounds: int = 0
     durbin_wu_hausman: _DurbinWuHausman | None = None
     largest_shift_sigma: float = 0.0
@@ -162,6 +164,7 @@ class LoopMetrics:
     distance_percent: Numbers = ()
     simulated_torque_error_percent: Numbers = ()
     valid: bool = True
+    explains: bool = True
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,8 @@ jump     a position that leaves the slope of the rows around it: marginal
 bodies   an estimate that is `NO_ROBOT` times as far from every possible robot as 95 % of right ones are: marginal;
          beyond `NEVER` times: fail. Honest recordings at hand are up to 3.6 times as far (LWR4+; Panda 1.5, TIAGo 2.3).
          Not said where that robot leaves less than `NOTICED` % of the torque more: precise data find 0.1 % of a gain
+loop     an estimate that takes the loop for granted (cloe, clie) and that recorded torques refute, see
+         `calib.identification.methods.loop_agreement`: marginal; where it leaves `LOST` % of a torque: fail
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ import numpy as np
 
 from calib.identification.checks.recording_sizes import Lag, RecordingSizes
 from calib.identification.checks.whole_robot import ClockRatio, Rearranged
+from calib.identification.methods.loop_agreement import LoopDisagreement
 from calib.identification.possible.contradiction import Contradiction
 from calib.procedure.findings import Finding
 
@@ -35,6 +38,7 @@ FAR, OFF = 3.0, 2.2
 SLIGHT, WRONG = 0.05, 1.5
 HELPS = 0.3
 INERT = 2.0
+LOST = 30.0
 EXCHANGED, TURNED, UNTOLD = 0.98, 0.7, 0.3
 NO_ROBOT, NEVER, NOTICED = 5.0, 10.0, 2.0
 
@@ -63,6 +67,30 @@ def impossible(found: Contradiction | None) -> list[Finding]:
             "which way does gravity point? If all are right, the model lacks a kind of friction, or a load",
         )
     ]  # fmt: skip
+
+
+def another_loop(found: LoopDisagreement | None) -> list[Finding]:
+    """Return what it means that recorded torques refute an estimate that takes the loop for granted."""
+    if found is None:
+        return []
+
+    def shown(numbers: Sequence[float]) -> str:
+        return " ".join(f"{x:.3g}" for x in numbers)
+
+    times, mean = np.array(found.factor), float(np.median(found.factor))
+    words = (
+        f"{found.method} and {found.beside} disagree, {found.parameter} by {found.sigmas:.0f} sigma, and "
+        f"{found.method} leaves {shown(found.left)} % of the torques where {found.beside} leaves "
+        f"{shown(found.beside_left)} %: the [loop] is not the one of the recording, and the sigmas of {found.method} "
+        f"do not hold; take {found.beside}, or see to [loop]"
+    )
+    if np.ptp(times) < 0.1 * abs(mean) and abs(mean - 1.0) > 0.1:
+        words += f": all torques are {mean:.2g} times those of {found.beside}, are kp and kd off by that factor?"
+    elif np.any(np.abs(times - 1.0) > 0.1):
+        words += f": by joint, torques are {shown(found.factor)} times those of {found.beside}, kp, kd?"
+    else:
+        words += ": gains, rate, delay, how velocities are formed (reference_velocity)?"
+    return [Finding("loop", "fail" if max(found.left) > LOST else "marginal", words)]
 
 
 def _masses(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:

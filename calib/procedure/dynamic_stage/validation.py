@@ -16,6 +16,7 @@ from calib.data.signals.persistency import ExcitationReport, repeats, report_exc
 from calib.identification.cases import Case
 from calib.identification.checks.recording_sizes import compare_sizes
 from calib.identification.friction.passivity import driven
+from calib.identification.methods.loop_agreement import LoopDisagreement
 from calib.identification.possible.contradiction import Contradiction
 from calib.identification.prediction import Dynamics, predict
 from calib.identification.scores import Score, score
@@ -49,6 +50,7 @@ class ModelFindings:
         controller: that was stated or identified; None without any.
         errors: what errors its torques are expected to have; None where too little was recorded to say.
         contradiction: how far it is from every possible robot; None where nobody knows.
+        unlike: how recorded torques refute an estimate that takes the loop for granted; None where they do not.
     """
 
     rests: Resting
@@ -56,6 +58,7 @@ class ModelFindings:
     controller: Controller | None = None
     errors: TorqueErrorModel | None = None
     contradiction: Contradiction | None = None
+    unlike: LoopDisagreement | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +143,7 @@ def assess(
     labels = settings.torque_rows.numbered(inputs.chain.n)
     sizes = [compare_sizes(case, inputs.chain, settings.gravity, inputs.unit == TORQUE) for case in inputs.cases]
     odd = plausibility.findings(sizes, inputs.chain.joint_names) + plausibility.impossible(findings.contradiction)
+    odd += plausibility.another_loop(findings.unlike)
     odd = settled(odd, inputs.options.accept)
     verdict = judge(fit, proofs, repeated, excitation, wrong, labels)
     verdict = with_intervals(verdict, {name: expected[name] for name in proofs if name in expected}, labels)

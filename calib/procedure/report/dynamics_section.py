@@ -317,8 +317,9 @@ def _loop_sentences(loop: LoopMetrics) -> list[str]:
     lines, test = list(loop.notes), loop.durbin_wu_hausman
     if test is None:
         return lines
+    whose = f"the test of least squares by {loop.instruments}, not this estimate: " if loop.beside else ""
     lines.append(
-        f"closed loop simulated, {loop.rounds} rounds; simulated against recorded motion "
+        f"{whose}closed loop simulated, {loop.rounds} rounds; simulated against recorded motion "
         f"{_joints(loop.distance_percent)} % apart, torque {_joints(loop.simulated_torque_error_percent)} %"
     )
     strength = "weak" if loop.instruments_weak else "strong"
@@ -330,6 +331,8 @@ def _loop_sentences(loop: LoopMetrics) -> list[str]:
     if test.least_squares_biased:
         little = loop.largest_shift_sigma < SMALL
         said = "least squares is biased, surely but by little" if little else "least squares is biased"
+    if not loop.explains:
+        said = "of a loop that explains less than the model does: it says nothing"
     if not loop.valid:
         said += ", but these instruments are not to be trusted"
     p = f"p = {test.p:.2g}" if test.p > 0.0 else "p < 1e-300"

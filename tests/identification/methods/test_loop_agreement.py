@@ -1,0 +1,69 @@
+"""Claims of what takes a loop for granted: a loop stated wrongly is named, by recorded torques; a right one never."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+from small_arm import LOOP, problem
+
+from calib.identification.methods.bias import LoopTest, compare_with_loop
+from calib.identification.methods.loop_agreement import LoopDisagreement, disagreement
+from calib.identification.methods.registry import METHODS
+from calib.procedure.dynamic_stage.plausibility import another_loop
+from calib.records import read_record
+
+
+def judged(name: str, *noise: float, seed: int = 0, **loop) -> tuple[LoopDisagreement | None, LoopTest]:
+    """Return what is said of an estimate of the small arm with a loop changed, and the test beside it."""
+    one = replace(problem(seed, *noise), loop=replace(LOOP, **loop))
+    found = METHODS[name].estimate(one)
+    assert found.found
+    test = compare_with_loop(one, found)
+    return disagreement(one, found, test), test
+
+
+def times(factor: float) -> dict:
+    return {"kp": tuple(factor * np.array(LOOP.kp)), "kd": tuple(factor * np.array(LOOP.kd))}
+
+
+def test_gains_that_are_off_are_named_with_their_factor():
+    """Of cloe every parameter is off by it; what instruments say of least squares there is not said."""
+    found, test = judged("cloe", 1e-5, 0.05, **times(2.0))
+    assert found is not None and found.beside == "iv" and found.sigmas > 100.0
+    np.testing.assert_allclose(found.factor, 2.0, rtol=0.02)
+    (finding,) = another_loop(found)
+    assert finding.level == "fail" and "all torques are 2 times those of iv, are kp and kd off" in finding.words
+    told = test.lines(taken=False)
+    assert any("2 times at joint 1, 2 times at joint 2" in line for line in told)
+    assert not any("biased" in line for line in told)
+    assert read_record(LoopDisagreement, asdict(found)) == found
+
+
+def test_a_velocity_formed_otherwise_is_named():
+    """Half a period of it is inertia: the residuals of positions hold nothing of it."""
+    found, test = judged("cloe", 1e-5, 0.02, reference_velocity="difference")
+    assert found is not None and test.found is not None and not len(test.found.off)
+    (finding,) = another_loop(found)
+    assert finding.level == "marginal" and "reference_velocity" in finding.words
+    np.testing.assert_allclose(found.factor, 1.0, atol=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["cloe", "clie"])
+@pytest.mark.parametrize("noise", [(0.0, 0.05), (2e-5, 0.02), (5e-4, 0.1), (2e-3, 0.05)])
+def test_of_a_loop_that_is_right_nothing_is_said(name: str, noise: tuple[float, float]):
+    for seed in range(3):
+        found, test = judged(name, *noise, seed=seed)
+        assert found is None
+        assert not any("strays" in line for line in test.lines(taken=False))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["iv", "didim"])
+def test_estimates_that_bear_another_loop_come_with_a_note(name: str):
+    found, test = judged(name, 1e-5, 0.05, **times(0.5))
+    assert found is None and any("strays" in line for line in test.lines(taken=True))
+    assert test.found is not None
+    np.testing.assert_allclose(test.found.stray, 0.5, rtol=0.05)
