@@ -89,9 +89,10 @@ class DynamicsModel:
         return metric_tables.metrics(self.outcome)
 
     def to_dataframe(self) -> Any:
-        """Return the base parameters as a pandas DataFrame: name, unit, value, sigma."""
-        found = self.estimate
-        rows = zip(found.names, found.units, found.values.tolist(), found.sigma.tolist())
+        """Return the base parameters as a pandas DataFrame: name, unit, value, sigma; NaN where a constraint holds."""
+        found, held = self.estimate, metric_tables.on_bounds(self.outcome.found)
+        sigma = np.where(np.isin(self.outcome.found.names, held), np.nan, found.sigma)
+        rows = zip(found.names, found.units, found.values.tolist(), sigma.tolist())
         return data_frame(rows, ["name", "unit", "value", "sigma"])
 
     def renderables(self) -> Iterator[Any]:

@@ -16,20 +16,24 @@ from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import Triangles, combine, condition_numbers, retriangulate
 
 
-def tls(data: Triangles, noise: np.ndarray, std: np.ndarray | None = None) -> LinearFit:
+def tls(
+    data: Triangles, noise: np.ndarray, std: np.ndarray | None = None, inflation: np.ndarray | None = None
+) -> LinearFit:
     """Estimate x of (W - ΔW) x = y - Δy with the smallest Σ (ΔW_kc / noise_c)² + (Δy_k / noise_y)².
 
     With exact columns first, [W y] = Q [R11 R12; 0 R22]; the right singular vector of R22 / noise to the smallest
     singular value gives the noisy components of [x; -1], back substitution the exact ones (Golub, Hoffman & Stewart
     1987; Van Huffel & Vandewalle 1991, section 3.6). The noise level is σ² = s_min² / (r - p). Covariance (Fuller 1987,
     theorem 2.3.2, normal noise): V = M⁻¹ σ_vv + r M⁻¹ (Σ_uu σ_vv - Σ_uv Σ_uvᵀ) M⁻¹ with M = WᵀW - r Σ_uu,
-    Σ_uv = -Σ_uu x and σ_vv = σ² (noise_y² + Σ noise_c² x_c²).
+    Σ_uv = -Σ_uu x and σ_vv = σ² (noise_y² + Σ noise_c² x_c²). With rows that tell less than they are, the share of V
+    that M's rows W_g bear is taken by what each of them is worth: V + σ_vv M⁻¹ (Σ_g (τ_g - 1) W_gᵀ W_g) M⁻¹.
 
     Args:
         data: triangles of W and y.
         noise: (p + 1,) standard deviation of the noise in each column and in y, in their units, up to one common
             factor; zero for exact ones.
         std: (g,) factor by which the noise of each group of rows exceeds `noise`; None: alike.
+        inflation: (g,) >= 1, τ, see `linear`; None: every row counts.
 
     Raises:
         Unidentifiable: where the noise, not the data, decides on the solution.
@@ -46,8 +50,13 @@ def tls(data: Triangles, noise: np.ndarray, std: np.ndarray | None = None) -> Li
     variance = singular**2 / (count - p) if count > p else np.nan
     if not np.isfinite(variance):
         raise Unidentifiable(f"{count} rows for {p} parameters leave nothing to judge them by", data.names)
-    covariance = _covariance(factor[:p, :p], noise, values, variance, count, data.names)
-    estimate = Estimate(data.names, data.units, values, covariance, float(np.sqrt(variance)), count - p)
+    more, independent = np.zeros((0, p)), count
+    if inflation is not None:
+        scale = np.sqrt(inflation - 1.0) / (1.0 if std is None else std)
+        more = (data.factors[:, :, :p] * np.broadcast_to(scale, (data.groups,))[:, None, None]).reshape(-1, p)
+        independent = int(np.sum(data.rows / inflation))
+    covariance = _covariance(factor[:p, :p], noise, values, variance, count, data.names, more)
+    estimate = Estimate(data.names, data.units, values, covariance, float(np.sqrt(variance)), max(independent - p, 1))
     group_std = np.sqrt(data.residual_squares(values) / np.maximum(data.rows * (1.0 - p / count), 1e-300))
     return LinearFit(estimate, group_std, *condition_numbers(factor[:p, :p]))
 
@@ -82,9 +91,10 @@ def _null_direction(
 
 
 def _covariance(
-    upper: np.ndarray, noise: np.ndarray, values: np.ndarray, variance: float, rows: int, names: tuple[str, ...]
-) -> np.ndarray:
-    """Return V (p, p) of `tls`, computed on columns of unit norm."""
+    upper: np.ndarray, noise: np.ndarray, values: np.ndarray, variance: float, rows: int, names: tuple[str, ...],
+    more: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """Return V (p, p) of `tls`, computed on columns of unit norm; `more` (k, p): rows √(τ - 1) W."""
     norms = np.linalg.norm(upper, axis=0)
     scaled, own, x = upper / norms, variance * (noise[:-1] / norms) ** 2, values * norms
     gram = scaled.T @ scaled - rows * np.diag(own)
@@ -94,4 +104,5 @@ def _covariance(
     inverse = np.linalg.inv(gram)
     total = variance * noise[-1] ** 2 + own @ x**2
     middle = np.diag(own) * total - np.outer(own * x, own * x)
-    return (inverse * total + rows * inverse @ middle @ inverse) / np.outer(norms, norms)
+    extra = (more / norms) @ inverse
+    return (inverse * total + rows * inverse @ middle @ inverse + total * extra.T @ extra) / np.outer(norms, norms)

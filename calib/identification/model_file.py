@@ -3,7 +3,8 @@
 ``estimate.csv`` has one row per parameter that was estimated, ``covariance.csv`` their covariance (a header, then one
 row per parameter, each beginning with its name): base parameters in the order of the model's columns, then richer
 friction. ZZ1R stands for the combination that ``dynamics.json`` spells out under ``base``. A richer term that the
-evidence switched off has no sigma, and is named under ``switched_off`` in ``metrics.json``.
+evidence switched off has no sigma, and is named under ``switched_off`` in ``metrics.json``; nor has a parameter that a
+constraint holds: its zeros in ``covariance.csv`` are the constraint's, and what the other parameters' sigmas rest on.
 
 ``unit`` in ``dynamics.json`` and ``metrics.json`` is "N m", or "A of joint 2" where currents had no gains: export,
 plan and excite refuse such a model. Gains that were identified stand in ``drive_gains.csv`` (joint, gain [N m per A],

@@ -140,3 +140,18 @@ def test_a_y_that_no_column_needs_dependent_exact_columns_and_wrong_noise_are_re
     twice = np.column_stack([matrix[:, 0], matrix[:, 0], matrix[:, 1]])
     with pytest.raises(Unidentifiable, match="exact columns"):
         tls(collect(twice, target), np.array([0.0, 0.0, 1.0, 1.0]))
+
+
+def test_rows_alike_in_time_widen_the_covariance_until_it_covers():
+    """Every error stands for four rows: with each of them counted as news, the intervals are half as wide."""
+    away = {1.0: [], 4.0: []}
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        clean = np.repeat(rng.normal(size=(100, 3)), 4, axis=0) @ np.array([[1.0, 0.3, 0], [0, 1.0, 0.5], [0, 0, 1.0]])
+        error = np.repeat(rng.normal(size=(100, 4)), 4, axis=0) * NOISE
+        spoilt = np.column_stack([clean, clean @ TRUTH]) + error
+        for tau, each in away.items():
+            found = tls(collect(spoilt[:, :3], spoilt[:, 3]), NOISE, inflation=np.array([tau])).estimate
+            each.append((found.values - TRUTH) / found.sigma)
+    assert np.std(away[1.0]) > 1.6
+    assert 0.8 < np.std(away[4.0]) < 1.25

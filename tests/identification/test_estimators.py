@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,13 @@ import planted_motion as planted
 import pytest
 from without_figures import run
 
+from calib.estimate_files import read_estimate
 from calib.estimation.triangles import collect
+from calib.identification.identify import identify as fit
 from calib.identification.methods.least_squares import scaled_tls
 from calib.identification.methods.registry import LISTING, METHODS
+from calib.procedure.dynamic_stage.inputs import gather
+from calib.procedure.dynamic_stage.verdict import model_warnings
 
 
 def identify(robot: Path, log: Path, method: str, out: Path, code: int = 0) -> dict[str, tuple[float, float]]:
@@ -79,6 +84,39 @@ def test_total_least_squares_is_right_where_columns_are_as_noisy_as_it_says():
     mean = {name: np.abs(np.mean(each, axis=0)) * np.sqrt(40) for name, each in errors.items()}
     assert mean["tls"].max() < 3.5 and mean["ls"].max() > 10.0
     assert 0.7 < np.std(errors["tls"]) < 1.3
+
+
+def test_what_a_joint_lacks_widens_the_sigmas_of_all_least_squares(robot: Path, tmp_path: Path):
+    """A slow wave in one joint's torque: irls and tls promise no more than weighted least squares of the same rows."""
+    log = planted.series(0)
+    drift = np.convolve(np.random.default_rng(0).normal(size=len(log["t"])), np.hanning(300), "same")
+    wave = 0.3 * np.outer(drift, [0.0, 0.0, 1.0])
+    path = planted.write(tmp_path, "wave.npz", 0, tau=log["tau"] + wave)
+    inputs = gather(robot, [path], friction="standard")
+    found = {
+        method: fit(inputs.robot, inputs.cases, replace(inputs.options.settings, method=method))
+        for method in ("hopfield", "irls", "tls")
+    }
+    assert found["hopfield"].fitted.inflation[2] > 3.0
+    sigma = {method: one.fitted.estimate.sigma for method, one in found.items()}
+    assert all(np.median(sigma[method] / sigma["hopfield"]) > 0.9 for method in ("irls", "tls"))
+    assert any("sigmas hold for motion like this" in line for line in model_warnings(inputs.cases, found["tls"], {}))
+
+
+def test_a_parameter_on_its_bound_has_no_sigma(robot: Path, tmp_path: Path):
+    """Certainty would be the bound's, not the data's: the cell is empty, the others have theirs, readers get NaN."""
+    options, out = tmp_path / "o.toml", tmp_path / "out"
+    options.write_text("[constraints]\nbounds = { Fv1 = [4.0, inf] }\n")
+    log = planted.write(tmp_path, "train.npz", 0)
+    more = ("--method", "pc-wls", "--friction", "standard", "--options", options, "--out", out)
+    run("identify", robot, log, *more)
+    rows = {row["name"]: row for row in csv.DictReader((out / "estimate.csv").open())}
+    assert float(rows["Fv1"]["value"]) == pytest.approx(4.0, rel=1e-5)
+    assert rows["Fv1"]["sigma"] == rows["Fv1"]["rsd"] == rows["Fv1"]["sigma_torque"] == ""
+    assert "on its bound" in rows["Fv1"]["expression"]
+    assert all(float(row["sigma"]) > 0.0 for name, row in rows.items() if name != "Fv1")
+    stored = read_estimate(out)
+    assert np.isnan(stored.sigma).tolist() == [name == "Fv1" for name in stored.names]
 
 
 def test_every_method_says_what_it_assumes():

@@ -98,3 +98,15 @@ def test_the_command_reports_it(robot, tmp_path, capsys):
     assert set(said["rms"]) == {"feedback", "cad", "model", "floor"} and len(said["rms"]["model"]) == 3
     assert np.all(np.array(said["rms"]["model"]) < 0.5 * np.array(said["rms"]["cad"]))
     assert "divides the tracking error by" in capsys.readouterr().out
+
+
+def test_no_ratio_is_told_of_a_model_that_is_no_possible_robot():
+    from calib.procedure.dynamic_stage.metrics import ReplayController, ReplayMetrics
+    from calib.procedure.report.dynamics_section import tracking_blocks
+
+    def said(*added: float) -> str:
+        replay = ReplayMetrics({"feedback": (1e-3, 1e-3)}, 13.4, True, ReplayController(), added)
+        return " ".join(tracking_blocks({"log": replay})[1].lines)
+
+    assert "divides the tracking error by 13.4" in said(0.0, 0.0)
+    assert "13.4" not in said(0.0, 1.4) and "no possible robot" in said(0.0, 1.4)

@@ -60,7 +60,7 @@ class _LeastSquares(Method):
         return MethodEstimate(self.name, EstimateStatus.FOUND, fit, problem.pooled, std, tau, self.weighted, known)
 
 
-def scaled_tls(pooled: Triangles, std: np.ndarray, exact: np.ndarray) -> LinearFit:
+def scaled_tls(pooled: Triangles, std: np.ndarray, exact: np.ndarray, inflation: np.ndarray | None = None) -> LinearFit:
     """Return the scaled TLS fit: columns that move have noise of `COLUMN_NOISE` of their size, y that of its residuals.
 
     The common level is the smallest singular value's; the ratio of the noises, which no single recording tells, is our
@@ -70,12 +70,13 @@ def scaled_tls(pooled: Triangles, std: np.ndarray, exact: np.ndarray) -> LinearF
         pooled: triangles, one group per torque row.
         std: (rows,) of the residuals.
         exact: (p,) bool, columns without noise: ones (offsets) and signs.
+        inflation: (rows,) of the residuals; None: every row counts.
     """
     p = pooled.parameters
     stacked = np.sum((pooled.factors / std[:, None, None]) ** 2, axis=(0, 1))
     size = np.sqrt(stacked / max(float(pooled.rows.sum()), 1.0))
     noise = np.append(np.where(exact, 0.0, COLUMN_NOISE * size[:p]), 1.0)
-    return tls(pooled, noise, std)
+    return tls(pooled, noise, std, inflation)
 
 
 def weighed(problem: IdentificationProblem) -> tuple[np.ndarray, np.ndarray]:
@@ -183,7 +184,8 @@ def _irls(problem: IdentificationProblem, std: np.ndarray, tau: np.ndarray) -> L
 def _reweighted(
     problem: IdentificationProblem, tau: np.ndarray, solve: Callable[[np.ndarray], np.ndarray] | None = None
 ) -> SampleFit:
-    return irls(samples_of(problem), inflation=float(np.median(tau)), solve=solve)
+    """Return IRLS over whole samples; one is worth what its most correlated row is, as S mixes the rows."""
+    return irls(samples_of(problem), inflation=float(np.max(tau)), solve=solve)
 
 
 def samples_of(problem: IdentificationProblem) -> Samples:
@@ -211,7 +213,7 @@ TLS = _LeastSquares(
     "tls",
     f"columns of W are noisy too: each by {COLUMN_NOISE:.0%} of its rms where a joint's torque is noisy by its "
     "residuals, all up to one factor that the data tell, independently from row to row; offsets and signs are exact",
-    lambda problem, std, tau: scaled_tls(problem.pooled, std, problem.exact),
+    lambda problem, std, tau: scaled_tls(problem.pooled, std, problem.exact, tau),
 )
 _CONSISTENT = "; parameters satisfy [constraints]"
 PC_OLS = _ConstrainedLeastSquares("pc-ols", OLS.assumes + _CONSISTENT, OLS)

@@ -30,6 +30,7 @@ from calib.procedure.dynamic_stage.metric_tables import (
     finite,
     gain_table,
     metrics,
+    on_bounds,
     report,
     switched_off,
 )
@@ -224,15 +225,17 @@ def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:
     """Return name, expression, unit, value, σ, RSD [%] and the essential value of each parameter, then σ's two parts.
 
     σ is the total; the geometry's part is left out where the geometry is taken as exact. Terms that the evidence
-    switched off have no σ: nobody measured them.
+    switched off, and parameters that a constraint holds, have no σ: nobody measured them.
     """
     found = outcome.found
     estimate = found.fitted.estimate
     words = [line.split(" = ", 1)[1] for line in expressions(found.base)]
-    off = switched_off(found.names, found.base.b, estimate.sigma)
+    held = on_bounds(found)
+    off = (*switched_off(found.names, found.base.b, estimate.sigma), *held)
     words += [
         f"{one.shape}, switched off: not measured" if one.name in off else one.shape for one in found.friction.terms
     ]
+    words = [f"{own}, on its bound: no sigma" if name in held else own for name, own in zip(found.names, words)]
     carried = outcome.carried
     sigmas = estimate.sigma if carried is None else carried.sigma
     parts = [None] * len(sigmas) if carried is None or carried.geometry is None else carried.sigma_geometry.tolist()

@@ -10,6 +10,7 @@ import numpy as np
 
 from calib.identification.cases import Case
 from calib.identification.gains import DriveGains
+from calib.identification.identify import Identification
 from calib.identification.methods.loop_agreement import LoopDisagreement
 from calib.identification.methods.registry import METHODS
 from calib.identification.parameter_constraints import Held
@@ -77,6 +78,17 @@ def switched_off(names: Sequence[str], base: int, sigma: np.ndarray) -> tuple[st
     Their rows of ``covariance.csv`` hold that floor, so that the model's other σ are those without the terms.
     """
     return tuple(name for name, own in zip(names[base:], sigma[base:]) if own < OFF)
+
+
+def on_bounds(found: Identification) -> tuple[str, ...]:
+    """Return parameters that a constraint holds where they are: the data do not tell them, and have no σ of them.
+
+    The covariance takes the constraint as an equality: its zeros there are what the other parameters' σ rest on.
+    """
+    if found.fitted.held is None:
+        return ()
+    free = found.fitted.held.free.estimate.sigma
+    return tuple(name for name, own, data in zip(found.names, found.fitted.estimate.sigma, free) if own <= 1e-9 * data)
 
 
 def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:

@@ -41,6 +41,7 @@ BEND = 1e-4  # rms of link minus motor position that shows elasticity [rad or m]
 HOLDS = 0.93  # least share of errors on unseen motion within the 95 % intervals, beyond chance
 JOINT_HOLDS = 0.90  # the same for a single joint, whose errors may leave them twice as often as stated
 SURELY = 2.0  # sigmas below zero from which on a drive's inertia or friction is called negative
+ALIKE = 3.0  # neighbouring rows that count as one from which on what is left is no noise, but something unmodelled
 SLOW_SHARE = 0.1  # share of samples near standstill from which on Coulomb friction is drawn down
 
 
@@ -231,6 +232,7 @@ def model_warnings(
     """Return what a user should know of the model and the motion it was identified from, whatever is unseen."""
     told = parameter_warnings(found)
     told += found.bias.lines(found.fitted.instrumental is not None)
+    told += _unmodelled(found)
     told += _elastic(cases)
     told += _slow_bias(cases, found)
     return tuple(told)
@@ -295,6 +297,19 @@ def _rests(found: Identification[Any]) -> list[str]:
     source = "the robot's own inertias" if found.prior.source == "cad" else "nothing but the order of their sizes"
     how = f"drawn to {source} ({len(names)} of {found.base.b})"
     return [f"not identifiable from this motion, {how}: {', '.join(names)}"]
+
+
+def _unmodelled(found: Identification) -> list[str]:
+    """Say where sigmas hold for this motion alone: the model lacks something there."""
+    alike = np.nan_to_num(found.fitted.inflation)
+    rows = found.settings.torque_rows.numbered(found.dynamics.model.n)
+    joints = [f"{rows[k]} ({alike[k]:.0f} rows count as one)" for k in np.flatnonzero(alike >= ALIKE)]
+    if not joints:
+        return []
+    return [
+        f"what is left of joint {', '.join(joints)} is no noise but something that the model lacks: sigmas hold for "
+        "motion like this one, estimates from other motion may differ by more"
+    ]
 
 
 def _elastic(cases: Sequence[Case]) -> list[str]:

@@ -366,18 +366,20 @@ def tracking_blocks(replays: Mapping[str, ReplayMetrics], failure: str = "") -> 
         rows += [(SHORT.get(key, key), *(_number(x and 1e3 * x) for x in rms)) for key, rms in one.rms.items()]
     joints = [str(j + 1) for j in range(len(first.inertia_added))]
     lines = []
+    gain = f": feeding the model forward divides the tracking error by {first.feedback_over_model:.3g}"
     if any(first.inertia_added):
         shown = " ".join(f"{x:.2g}" for x in first.inertia_added if x is not None)
         lines.append(
             f"the identified model is no possible robot: it is simulated with motor inertia added, {shown} kg m² (kg); "
             "compare the rows, do not trust their size"
         )
+        gain = ""
     default = f"a PD of {FREQUENCY:g} Hz, damping {DAMPING:g} (our default)"
     control = "the controller of [loop]" if first.controller.stated else default
     motion = "motion the fit has not seen" if first.unseen else "the motion of the fit itself, which flatters"
     lines.append(
         f"the simulated robot is the identified model, disturbed by the torque it left unexplained; {control}; "
-        f"{motion}: feeding the model forward divides the tracking error by {first.feedback_over_model:.3g}"
+        f"{motion}{gain}"
     )
     title = "Tracking, simulated: rms of q - reference [mrad or mm]"
     return [Table(title, ("fed forward", *joints), rows, numbers=range(1, 1 + len(joints))), Text("", lines)]
