@@ -67,7 +67,7 @@ def disagreement(problem: IdentificationProblem, found: MethodEstimate, test: Lo
     if away[worst] < SIGMAS or not np.any(left > limit * beside):
         return None
     return LoopDisagreement(
-        found.method, name, other.names[worst], float(away[worst]), *(tuple(map(float, x)) for x in (left, beside)),
+        found.method, name, other.names[worst], float(away[worst]), tuple(left.tolist()), tuple(beside.tolist()),
         _factors(problem, own.values, other.values),
     )  # fmt: skip
 
