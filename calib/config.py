@@ -81,7 +81,7 @@ def parse(kind: type[T], found: Any, place: str, error: type[CalibError] = Usage
     try:
         return _adapter(kind).validate_python(found)
     except ValidationError as wrong:
-        raise error(_complaint(wrong.errors(include_url=False), kind, place)) from None
+        raise error(_complaint(wrong.errors(include_url=False), kind, place, found)) from None
 
 
 def strict(kind: type[T]) -> type[T]:
@@ -183,7 +183,17 @@ def _no_key(key: str, keys: Collection[str]) -> str:
     return f"there is no key '{key}'{suggestion(key, keys)}; {there}"
 
 
-def _complaint(errors: list[Any], kind: type, place: str) -> str:
+def _written(table: Any, loc: Sequence[Any], found: Any) -> Any:
+    """Return what a file holds at a place, where that is a text that `found`, a number in SI, was made of."""
+    for part in loc:
+        try:
+            table = table[part]
+        except (KeyError, IndexError, TypeError):
+            return found
+    return table if isinstance(table, str) else found
+
+
+def _complaint(errors: list[Any], kind: type, place: str, whole: Any) -> str:
     """Return the first of pydantic's errors in our form; a key that is not known explains one that is missing."""
     first = next((one for one in errors if one["type"] == UNKNOWN), errors[0])
     loc = tuple(part for part in first["loc"] if not (isinstance(part, str) and part.startswith(TAG)))
@@ -207,7 +217,7 @@ def _complaint(errors: list[Any], kind: type, place: str) -> str:
         near = suggestion(found, context["allowed"]) if isinstance(found, str) else ""
         words = f"one of {', '.join(context['allowed'])}{near}"
     elif name == "expected":
-        words = first["msg"]
+        words, found = first["msg"], _written(whole, loc, found)
     else:
         words = {"tuple_type": f"a list of tables, [[{loc[-1]}]]", "too_short": "at least one number"}.get(
             name, _PLAIN.get(name.split("_")[0], "a table")

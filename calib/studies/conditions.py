@@ -27,6 +27,9 @@ TOML; SI units. Every combination of robot, noise, decimation, cutoff and mismat
     sigma_q = "1e-4 deg"             # of every encoder, in the loop
     sigma_tau = 0.05                 # of the logged torque [N m]
 
+In its folder summary.csv holds, of every figure of a method on a condition, the median over runs and, as ``_lower`` and
+``_upper``, the quartiles: each the nearest of the runs' own values, not interpolated between two.
+
 The same data set serves all methods. The 15 conditions of Leboutet et al. (2021), MCS-TX40-1-1 to MCS-RV2SQ-1-5, and
 others come with the toolkit: ``calib study --list``.
 """

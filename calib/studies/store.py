@@ -2,7 +2,8 @@
 
 rows.csv       rows since the last command ended, one line each, flushed to the disk as trials end: a killed process
                loses at most the line it was writing, and that line is taken off when the store is opened again
-rows.parquet   all rows before; made of both when a command ends, where pyarrow is there (extra ``study``)
+rows.parquet   all rows before; made of both when a command ends, where pyarrow is there (extra ``study``): rows.csv is
+               left with its header alone
 study.lock     held while a command works on the folder
 
 A row's key is (digest of the condition, method, seed): rows of conditions that a study file no longer states stay, and
@@ -23,8 +24,8 @@ from pathlib import Path
 from typing import IO, Any
 
 from calib import files
-from calib.errors import CalibError, UsageError
-from calib.studies.trial import COLUMNS, TrialRow
+from calib.errors import CalibError, UsageError, suggestion
+from calib.studies.trial import COLUMNS, STATUSES, TrialRow
 
 JOURNAL, WHOLE, LOCK = "rows.csv", "rows.parquet", "study.lock"
 FORMAT = 1  # of the store: first cell of every header
@@ -165,12 +166,26 @@ def _read_journal(path: Path) -> tuple[list[TrialRow], int, int]:
     rows = []
     for number, cells in enumerate(csv.reader(lines[1:]), 2):
         try:
-            rows.append(TrialRow(*(_value(kind, cell) for kind, cell in zip(_TYPES, cells[1:], strict=True))))
+            rows.append(_row(cells[1:]))
         except ValueError as error:
             raise UsageError(
                 f"{path}: line {number} is damaged ({error}); delete that line, and its trial is run again"
             ) from error
     return rows, good, int(good < len(data))
+
+
+def _row(cells: Sequence[str]) -> TrialRow:
+    """Return the row of a line's cells.
+
+    Raises:
+        ValueError: for a line that is short, a number that is none, a status that no trial ends with.
+    """
+    if len(cells) != len(COLUMNS):
+        raise ValueError(f"{len(cells)} cells, not {len(COLUMNS)}")
+    row = TrialRow(*(_value(kind, cell) for kind, cell in zip(_TYPES, cells)))
+    if row.status not in STATUSES:
+        raise ValueError(f"status '{row.status}'{suggestion(row.status, STATUSES)}")
+    return row
 
 
 def _check_columns(path: Path, found: Sequence[str]) -> None:
@@ -227,4 +242,8 @@ def _read_whole(path: Path) -> list[TrialRow]:
         raise UsageError(f"{path} is damaged: {error}; delete it, and its trials are run again") from error
     store = (table.schema.metadata or {}).get(b"store", b"").decode()
     _check_columns(path, [store, *table.column_names])
-    return [TrialRow(**row) for row in table.to_pylist()]
+    rows = [TrialRow(**row) for row in table.to_pylist()]
+    if wrong := {row.status for row in rows} - set(STATUSES):
+        raise UsageError(f"{path} is damaged: no trial ends with the status '{min(wrong)}'; delete it, and its trials "
+                         "are run again")  # fmt: skip
+    return rows

@@ -20,6 +20,7 @@ from calib.studies.experiment import Experiment, make_experiment, set_up
 
 FOUND = EstimateStatus.FOUND.value
 NOT_RECORDED, FAILED = "not recorded", "failed"  # beside `EstimateStatus`: the true robot, or the method, raised
+STATUSES = (*(one.value for one in EstimateStatus), NOT_RECORDED, FAILED)
 WIDE = 1.959963984540054  # standard deviations that hold 95 %
 NAN = float("nan")
 _CHANGED = " method "

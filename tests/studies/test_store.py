@@ -83,6 +83,21 @@ def test_a_store_of_another_version_is_refused_as_it_is(tmp_path: Path):
     assert path.read_text() == old
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [(",found,", ",foundd,", "status 'foundd'.*did you mean 'found'"), (",1e-06,", ",", "cells, not")],
+)
+def test_a_line_that_is_short_or_ends_as_no_trial_does_is_damaged(tmp_path: Path, old: str, new: str, words: str):
+    with opened(tmp_path) as store:
+        store.append(rows(3))
+    path = tmp_path / JOURNAL
+    lines = path.read_text().splitlines(keepends=True)
+    assert old in lines[2]
+    path.write_text("".join([*lines[:2], lines[2].replace(old, new), *lines[3:]]))
+    with pytest.raises(UsageError, match=f"line 3 is damaged .*{words}"), opened(tmp_path):
+        pass
+
+
 def test_a_damaged_line_is_named(tmp_path: Path):
     with opened(tmp_path) as store:
         store.append(rows(2))

@@ -75,6 +75,7 @@ def test_what_a_condition_is_called_is_no_part_of_what_it_is():
         ('"1e-4 deg"', "30.0", "at most 0.1"),
         ('"rv2sq"', '"rv2"', "did you mean 'rv2sq'"),
         ("duration", "cutoff = 70\nduration", "expected less than 70 Hz, half the rate of the rv2sq's log"),
+        ('"1e-4 deg"', '"-1e-4 deg"', "sigma_q: expected 0 or more, found '-1e-4 deg'"),
         ("[[noise]]", '[[noise]]\nname = "1"\nsigma_q = 0\nsigma_tau = 0\n[[noise]]', "two conditions 'small-1'"),
     ],
 )

@@ -2,7 +2,8 @@
 
 rows.parquet, rows.csv   every trial (`calib.studies.store`): more may be added by anyone, at any time. While a command
                          runs its rows go to rows.csv, which is emptied into rows.parquet at the end
-summary.csv              one line per condition and method: medians and quartiles of every figure
+summary.csv              one line per condition and method: of every figure its median and, as lower and upper, its
+                         quartiles, the nearest of the runs' own values
 report.html              tables, box plots, the decision rule; one file
 """
 
@@ -38,6 +39,7 @@ class StudyOutcome:
         progress: of this command.
         notes: what a user should know.
         folder: where all of it is.
+        rows: which file holds how many rows, in words; "" where nothing was run.
     """
 
     study: Study
@@ -52,7 +54,7 @@ class StudyOutcome:
         lines = [f"note: {note}" for note in self.notes]
         if done.wanted:
             lines.append(f"{done} in {span(done.seconds)}")
-        return lines
+        return [*lines, self.rows] if self.rows else lines
 
 
 def run_study(
@@ -84,7 +86,7 @@ def run_study(
     study = read_study(named, methods, runs)
     _check_folder(out, named)
     notes: list[str] = []
-    progress = Progress(0)
+    progress, settled = Progress(0), ""
     if report_only:
         kept = read_rows(out)  # takes no lock: a study that runs there may be looked at
     else:
@@ -95,8 +97,9 @@ def run_study(
             with workers(where) as crew:
                 progress = run(study, store, crew, lambda found: say(str(found)))
             say("writing")
-            store.settle()
+            place = store.settle()
             kept = list(store.rows.values())
+            settled = f"{place.name} holds {len(kept)} rows"
     digests = {condition.digest for condition in study.conditions}
     own = [row for row in kept if row.digest in digests]
     others, changed = len(kept) - len(own), Counter(row.method for row in own if not row.current)
@@ -123,7 +126,7 @@ def run_study(
     files.write_table(out / SUMMARY, header, lines)
     page = report.make_page(study, conditions, own, notes, plots)
     files.write(out / REPORT, page)
-    return StudyOutcome(study, conditions, progress, tuple(notes), out)
+    return StudyOutcome(study, conditions, progress, tuple(notes), out, settled)
 
 
 def _check_folder(out: Path, named: Sequence[str | Path]) -> None:
