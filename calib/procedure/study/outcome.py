@@ -47,6 +47,7 @@ class StudyOutcome:
     progress: Progress
     notes: tuple[str, ...]
     folder: Path
+    rows: str = ""
 
     def described(self) -> list[str]:
         """Return what a command says of itself at its end."""
