@@ -58,11 +58,11 @@ LISTING: tuple[MethodEntry, ...] = (
     MethodEntry(WLS, "least squares, each joint by its residuals", "Gautier & Poignet 2001"),
     MethodEntry(
         IRLS, "least squares, weighted across joints, odd samples gated out", "Han, Wu, Liu & Xiong 2020",
-        ("gate of 3 sigma",),
+        ("gate of 3 sigma",), version=2,
     ),
     MethodEntry(
         TLS, "total least squares with scaled columns", "Golub & Van Loan 1980; Van Huffel & Vandewalle 1991",
-        ("ratio of the columns' noise to the torques'",),
+        ("ratio of the columns' noise to the torques'",), version=2,
     ),
     MethodEntry(
         ML, "maximum likelihood: positions noisy too, noise levels estimated",
@@ -100,7 +100,7 @@ LISTING: tuple[MethodEntry, ...] = (
     ),
     MethodEntry(PC_OLS, "ols" + _CONSTRAINED, _SOUSA),
     MethodEntry(PC_WLS, "wls" + _CONSTRAINED, _SOUSA),
-    MethodEntry(PC_IRLS, "irls" + _CONSTRAINED, _SOUSA, ("gate of 3 sigma",)),
+    MethodEntry(PC_IRLS, "irls" + _CONSTRAINED, _SOUSA, ("gate of 3 sigma",), version=2),
     MethodEntry(PC_IV, "iv" + _CONSTRAINED, "Janot & Wensing 2021", ("tolerance 2.5 %", "10 rounds")),
     MethodEntry(PC_DIDIM, "didim" + _CONSTRAINED, "Leboutet et al. 2021", ("tolerance 2.5 %", "10 rounds")),
 )  # fmt: skip
