@@ -12,6 +12,7 @@ from rich.console import Console
 from study_rows import ROW
 
 from calib.errors import UsageError
+from calib.identification.methods.registry import VERSIONS
 from calib.procedure.report.console import rendered
 from calib.procedure.study.report import console_table
 from calib.studies.conditions import Condition, read_study, shipped
@@ -145,8 +146,11 @@ def test_of_methods_as_good_as_each_other_the_cheap_one_is_taken(tmp_path: Path)
 def test_what_is_there_stays_in_sight_of_a_study_that_asks_for_less(tmp_path: Path):
     """A method that was added alone, or taken out of the file, leaves the others' rows in the summary."""
     study = read_study([written(tmp_path)], ["tls"])
+    row = replace(ROW, digest=study.conditions[0].digest)
     found = [
-        replace(ROW, digest=study.conditions[0].digest, method=name, seed=k) for name in ("tls", "wls") for k in (0, 1)
+        replace(row, method=name, seed=k, version=f"0.1.0 method {VERSIONS[name]}")
+        for name in ("tls", "wls")
+        for k in (0, 1)
     ]
     (one,) = summarise(study, found)
     assert {method.method for method in one.methods} == {"tls", "wls"}
