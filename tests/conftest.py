@@ -15,11 +15,13 @@ import pytest
 from hypothesis import HealthCheck, settings
 from recordings import DATA
 
+from calib.cli import GARBAGE
+
 # a shell's job in the background inherits that Ctrl-C is ignored; tests send it to themselves and to their processes
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # as the command line does: thousands of tests and what they import are no garbage, and walked over at every collection
-gc.set_threshold(20_000, 10, 10)
+gc.set_threshold(*GARBAGE)
 
 # the same inputs in every run; `pytest --hypothesis-profile=search` looks for new ones
 settings.register_profile(

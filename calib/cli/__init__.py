@@ -65,7 +65,8 @@ def main(arguments: list[str] | None = None) -> None:
         code = run(arguments)
     except KeyboardInterrupt:  # one more, while the first was being seen to
         code = 130
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a third would end as a signal what is over but for the exit
+    if arguments is None:  # the process is this command's: a third would end as a signal what is over but for the exit
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
     sys.exit(code)
 
 
