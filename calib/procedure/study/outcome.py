@@ -109,7 +109,8 @@ def run_study(
         notes.append(f"{others} rows are of conditions that are not of this study: kept, and not counted")
     if changed:
         named_rows = ", ".join(f"{count} of {name}" for name, count in changed.items())
-        notes.append(f"rows of methods that have changed since they ran do not count, and are run again: {named_rows}")
+        words = "rows of methods that have changed since they ran do not count until they are run again"
+        notes.append(f"{words}: {named_rows}")
     if not progress.lost and not own:
         told = f"{len(kept)} rows, none of them of this study's conditions" if kept else "no rows"
         told = f"{len(kept)} rows; {notes[-1]}" if changed else told
