@@ -1,0 +1,31 @@
+"""How much of the time encoder noise, fed back, drives a condition's robot to its torque limits.
+
+    python examples/survey/torque_limits.py [MCS-RV2SQ-1-3 …]
+
+A method that simulates the loop without noise never meets those limits: where they act, it believes a stiffer loop than
+the one that moved. Prints the share of control periods at the limit, joint by joint [%], with the noise and without.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+
+from calib.simulation.cells import known_robots
+from calib.simulation.loop.closed_loop import Sensing, simulate
+from calib.studies.conditions import read_study
+from calib.studies.experiment import set_up
+
+
+def main() -> None:
+    for condition in read_study(sys.argv[1:] or ["MCS-RV2SQ-1-3"]).conditions:
+        setup, controller = set_up(condition.robot, condition.duration), known_robots.controller(condition.robot)
+        for words, sigma in (("with encoder noise", condition.sigma_q), ("without", 0.0)):
+            run = simulate(setup.plant, controller, setup.reference, Sensing(sigma), np.random.default_rng(0))
+            share = 100.0 * np.mean(np.abs(run.torque) >= 0.999 * np.asarray(controller.limit), axis=0)
+            print(f"{condition.name}, {words}: {np.round(share, 1)}")
+
+
+if __name__ == "__main__":
+    main()
