@@ -34,6 +34,8 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
 
     [filter]                         # default: from the data
     cutoff = 20.0                    # f_q of the positions' filter [Hz], or one per joint
+    velocity_cutoff = 50.0           # f_v, of the positions that velocities come from [Hz], or one per joint; default:
+                                     # f_q where that is stated, else as far above it as the encoders are quiet
     order = 4
     band = 10.0                      # f_p, the identification band [Hz]
     dynamics = 2.0                   # f_dyn, where it is known [Hz]

@@ -57,6 +57,13 @@ class Cutoffs:
     effort_power: np.ndarray
     reasons: tuple[str, ...]
 
+    def acceleration_noise(self, cutoff: float | np.ndarray, rate: float) -> np.ndarray:
+        """Return (n,) what white position noise makes of the accelerations at a cut-off f_q [Hz], one or (n,).
+
+        σ_a = σ_q (2π)² sqrt(2 f_q⁵ / (5 f_s)), with `rate` f_s [Hz].
+        """
+        return self.noise * (2 * np.pi) ** 2 * np.sqrt(2 * cutoff**5 / (5 * rate))
+
 
 def propose_cutoffs(sampled: Resampled, dynamics: float | None = None) -> Cutoffs:
     """Return the cut-offs that `sampled` asks for.

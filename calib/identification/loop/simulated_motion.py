@@ -21,8 +21,8 @@ def simulated_case(case: Case, run: SimulatedRun, loop: Loop) -> Case:
     what tells W from Z is noise.
     """
     index, motion = simulated_samples(case, run.t, loop), case.motion
-    q = low_passed(run.q, motion)
-    v, a = slope(q, motion.rate), curvature(q, motion.rate)
+    q, less = (low_passed(run.q, motion, at) for at in (motion.cutoff, motion.velocity_cutoff))
+    v, a = slope(less, motion.rate), curvature(q, motion.rate)
     return replace(case, motion=replace(motion, q=q[index], v=v[index], a=a[index]))
 
 
@@ -40,10 +40,14 @@ def simulated_samples(case: Case, t: np.ndarray, loop: Loop) -> np.ndarray:
     return index
 
 
-def low_passed(q: np.ndarray, motion: Motion) -> np.ndarray:
-    """Return simulated positions (N, n), or their slopes (N, n, ...), through the low-pass of the recorded ones."""
-    result = np.empty_like(q)
-    for cutoff in np.unique(motion.cutoff):
-        own = motion.cutoff == cutoff
-        result[:, own] = low_pass(q[:, own], motion.rate, float(cutoff))
+def low_passed(q: np.ndarray, motion: Motion, cutoff: np.ndarray | None = None) -> np.ndarray:
+    """Return simulated positions (N, n), or their slopes (N, n, ...), through the low-pass of the recorded ones.
+
+    Args:
+        cutoff: (n,) of another of its filters [Hz].
+    """
+    result, cutoffs = np.empty_like(q), motion.cutoff if cutoff is None else cutoff
+    for f in np.unique(cutoffs):
+        own = cutoffs == f
+        result[:, own] = low_pass(q[:, own], motion.rate, float(f))
     return result

@@ -136,14 +136,15 @@ def noise_of_states(motion: Motion, decimator: Decimator) -> np.ndarray:
     From the impulse response of low-pass, differences and decimation; the noise's level is that of the log's spectrum.
     """
     result = np.empty((motion.n, 3, 3))
-    for cutoff in np.unique(motion.cutoff):
+    both = np.stack([motion.cutoff, motion.velocity_cutoff], axis=1)
+    for cutoff, faster in np.unique(both, axis=0):
         reach = int(np.ceil(6.0 * motion.rate / cutoff)) + decimator.reach + 16
         impulse = np.zeros(2 * reach + 1)
         impulse[reach] = 1.0
-        q = low_pass(impulse, motion.rate, float(cutoff))
-        states = np.stack([q, slope(q, motion.rate), curvature(q, motion.rate)])
+        q, less = (low_pass(impulse, motion.rate, float(f)) for f in (cutoff, faster))
+        states = np.stack([q, slope(less, motion.rate), curvature(q, motion.rate)])
         response = np.array([np.convolve(one, decimator.taps) for one in np.nan_to_num(states)])
-        result[motion.cutoff == cutoff] = response @ response.T
+        result[np.all(both == (cutoff, faster), axis=1)] = response @ response.T
     return result * (motion.cutoffs.noise**2)[:, None, None]
 
 

@@ -198,10 +198,14 @@ def read_motion(
     if own.filter.band is not None or motion.decimator.factor <= max(widest, 1.0):
         return motion
     band = SHARE * motion.rate / (2 * max(1, int(widest)))
-    cutoff = tuple(float(f) for f in motion.cutoff)
-    wider = make_motion(recording, replace(own.filter, band=min(band, 0.45 * motion.rate), cutoff=cutoff), sampled)
+    same = replace(own.filter, cutoff=_joints(motion.cutoff), velocity_cutoff=_joints(motion.velocity_cutoff))
+    wider = make_motion(recording, replace(same, band=min(band, 0.45 * motion.rate)), sampled)
     note = f"f_p = {wider.band:.3g} Hz instead: a short recording must not lose its ends to the decimation's window"
     return replace(wider, notes=(*motion.notes, note))
+
+
+def _joints(values: np.ndarray) -> tuple[float, ...]:
+    return tuple(float(one) for one in values)
 
 
 def joints_of(chain: Chain) -> Joints:
@@ -215,18 +219,18 @@ def joints_of(chain: Chain) -> Joints:
 def _sharper(recording: Recording, motion: Motion, options: FilterOptions, sampled: Resampled) -> Motion:
     """Return the motion with a higher f_q, where the encoders are quiet enough: f_q ≥ 5 f_dyn is a least value.
 
-    White noise of the positions, σ_q, makes σ_a = σ_q (2π)² sqrt(2 f_q⁵ / (5 f_s)) in the accelerations; f_q is
-    doubled where that stays below `QUIET` of every moving joint's rms acceleration (our choice).
+    f_q is doubled where noise stays below `QUIET` of every moving joint's rms acceleration (our choice).
     """
     size = np.sqrt(np.mean(motion.a**2, axis=0))
     moves = np.ptp(motion.q, axis=0) > 1e-3
     cutoff = float(motion.cutoff.max())
     f = 2.0 * cutoff
-    noise = motion.cutoffs.noise * (2 * np.pi) ** 2 * np.sqrt(2 * f**5 / (5 * motion.rate))
+    noise = motion.cutoffs.acceleration_noise(f, motion.rate)
     if f > 0.4 * motion.rate or not moves.any() or not (noise < QUIET * size)[moves].all():
         return motion
     borders = 2.0 / cutoff if options.borders is None else options.borders  # no samples that the wider band would add
-    sharper = make_motion(recording, replace(options, cutoff=f, borders=borders), sampled)
+    same = replace(options, velocity_cutoff=_joints(motion.velocity_cutoff), borders=borders)
+    sharper = make_motion(recording, replace(same, cutoff=f), sampled)
     note = f"f_q = {f:.3g} Hz instead: the positions are quiet enough"
     return replace(sharper, notes=(*motion.notes, note), cutoffs=motion.cutoffs)
 

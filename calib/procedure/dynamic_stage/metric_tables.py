@@ -216,6 +216,7 @@ def _filter_table(motion: Any) -> dict[str, Any]:
     return {
         "rate": float(motion.rate),
         "cutoff": [float(x) for x in motion.cutoff],
+        "velocity_cutoff": [float(x) for x in motion.velocity_cutoff],
         "band": float(motion.band),
         "decimation": int(motion.decimator.factor),
     }

@@ -249,3 +249,41 @@ def test_the_spectrum_is_welchs():
     g, theirs = welch(x, 200.0, "hann", 400, axis=0, detrend="linear")
     np.testing.assert_allclose(f, g)
     np.testing.assert_allclose(power[:-1], theirs[:-1], rtol=1e-9, atol=1e-15)  # but for the Nyquist line, never used
+
+
+def test_velocities_of_quiet_encoders_keep_the_corner_that_friction_makes():
+    """A joint reverses against Coulomb friction: the filter that suits accelerations alone makes Ia 1 % too large."""
+    ia, fv, fc, rate, fine = 0.8, 1.0, 2.0, 1000.0, 10
+    step, gain, damping = 1.0 / (rate * fine), (2 * np.pi * 4) ** 2 * ia, 1.6 * 2 * np.pi * 4 * ia
+    t = np.arange(int(20 * rate * fine)) * step
+    lines = np.array([[0.2, 0.9, 0.0], [0.5, 0.5, 1.0]])
+    angle = 2 * np.pi * lines[:, :1] * t + lines[:, 2:]
+    asked, speed = lines[:, 1] @ np.sin(angle), (2 * np.pi * lines[:, 0] * lines[:, 1]) @ np.cos(angle)
+    q, v, rows = asked[0], speed[0], []
+    for k in range(len(t)):
+        tau = gain * (asked[k] - q) + damping * (speed[k] - v)
+        rows.append((q, tau))
+        then = v + step * (tau - fv * v - fc * np.sign(v)) / ia
+        v = 0.0 if v * then < 0 and abs(tau) < fc else then
+        q += step * v
+    log = np.array(rows[::fine]) + np.random.default_rng(0).normal(size=(len(t) // fine, 2)) * (1e-5, 0.02)
+    recording = Recording(t[::fine], log[:, :1], log[:, 1:], "torque", ("a",))
+    off = []
+    for options in (FilterOptions(), FilterOptions(cutoff=10.0)):
+        motion = make_motion(recording, options)
+        W = decimate(np.column_stack([motion.a, motion.v, np.sign(motion.v)]), motion.decimator, motion.segment)
+        found = np.linalg.lstsq(W, decimate(motion.effort[:, 0], motion.decimator, motion.segment), rcond=None)[0]
+        off.append(np.abs(found / (ia, fv, fc) - 1.0))
+        assert motion.cutoff[0] == 10.0
+    assert off[0].max() < 0.004 < 0.008 < off[1][0]
+
+
+def test_velocities_of_noisy_encoders_are_filtered_as_positions_are():
+    t = even()
+    quiet, noisy = (make_motion(recorded(t, t, noise=noise)) for noise in (1e-6, 3e-2))
+    assert (quiet.velocity_cutoff > 2.0 * quiet.cutoff).all()
+    np.testing.assert_array_equal(noisy.velocity_cutoff, noisy.cutoff)
+    stated = make_motion(recorded(t, t), FilterOptions(cutoff=30.0, velocity_cutoff=(50.0, 60.0)))
+    np.testing.assert_array_equal(stated.velocity_cutoff, (50.0, 60.0))
+    with pytest.raises(MeasurementError, match="cut-off of 260 Hz"):
+        make_motion(recorded(t, t), FilterOptions(velocity_cutoff=260.0))
