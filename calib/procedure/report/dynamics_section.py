@@ -184,7 +184,7 @@ def _key_figures(unseen: UnseenReport, tolerance: float = 0.0) -> list[KeyFigure
     return [
         KeyFigure("torque unexplained", "", percent(raw.total), spread, basis, allowed),
         KeyFigure("the same in the motion's band", "", percent(band.total), "", basis),
-        KeyFigure(f"its worst row, {row}", "", percent(worst), "", basis),
+        KeyFigure(f"in that band, the worst row: {row}", "", percent(worst), "", basis),
     ]
 
 
@@ -229,16 +229,19 @@ def _interval_blocks(
 ) -> list[Block]:  # fmt: skip
     """Return how many errors are within the 95 % interval that the model states, per row of unseen recordings."""
     cells: list[Sequence[str]] = []
+    strong = set()
     for name, one in unseen.items():
         if (found := one.interval95) is None:
             continue
-        cells.append((name, f"{found.coverage_percent:.1f} %", *(f"{x:.0f} %" for x in found.joints_percent)))
-        cells.append(("  median half width", "", *(f"{x:.3g} {unit}" for x, unit in zip(found.median, units))))
-        cells.append(("  of the time extrapolated", f"{found.extrapolated_percent:.0f} %", *[""] * len(rows)))
+        cells.append((name,))
+        strong.add(len(cells))
+        cells.append(("all", f"{found.coverage_percent:.1f} %", "", f"{found.extrapolated_percent:.0f} %"))
+        for row, inside, half, unit in zip(rows, found.joints_percent, found.median, units):
+            cells.append((row, f"{inside:.0f} %", f"± {half:.3g} {unit}", ""))
     if not cells:
         return []
-    header = ("errors within the 95 % interval", "all", *rows)
-    return [Table("Intervals stated", header, cells, numbers=range(1, 2 + len(rows)))]
+    header = ("torque", "errors within the 95 % interval", "median interval", "of the time extrapolated")
+    return [Table("Intervals stated", header, cells, strong=frozenset(strong), numbers=range(1, 4))]
 
 
 def _friction_table(metrics: ModelMetrics) -> Table:

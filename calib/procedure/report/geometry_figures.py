@@ -105,7 +105,7 @@ def residuals_by_joint(
     slides = prismatic or [False] * n
     low, high = _decades(factor * np.concatenate([before, after]))
     with styled():
-        figure, axes = sheet(rows, columns, WIDE, 0.75 + 1.45 * rows, across=0.15, between=0.55, top=0.42)
+        figure, axes = sheet(rows, columns, WIDE, 0.75 + 1.45 * rows, across=0.25, between=0.55, top=0.42)
         for plot in axes[n:]:
             plot.set_axis_off()
         for j, plot in enumerate(axes[:n]):
@@ -114,6 +114,7 @@ def residuals_by_joint(
                 plot.plot(x, factor * sizes, ".", color=colour, markersize=3.2, markeredgewidth=0.0)
             plot.set_xlabel(f"{joint_names[j]} [{'m' if slides[j] else 'deg'}]", fontsize=7.5)
             log_axis(plot.yaxis, low, high, 4)
+            plot.locator_params(axis="x", nbins=5)
             plot.tick_params(labelsize=7)
             plot.grid(axis="y")
             if j % columns:
@@ -153,12 +154,14 @@ def error_map(
     """
     top = 1e3 * float(np.max(sizes, initial=1e-9))
     both = [sizes] if expected is None or not len(expected) else [sizes, expected]
+    every = 1e3 * np.concatenate([*both, [1e-9]])
+    limit = min(float(every.max()), 1.5 * float(np.percentile(every, 99)))  # few far off do not hide the rest
     with styled():
         figure, axes = sheet(len(both), 2, WIDE, 3.1 * len(both), across=0.6, right=0.75, between=0.7)
         for plot, (k, i, j) in zip(axes, ((k, 0, j) for k in range(len(both)) for j in (1, 2))):
             order = np.argsort(both[k])
             drawn = plot.scatter(
-                points[order, i], points[order, j], c=1e3 * both[k][order], cmap=HEAT, vmin=0.0, vmax=top, s=16,
+                points[order, i], points[order, j], c=1e3 * both[k][order], cmap=HEAT, vmin=0.0, vmax=limit, s=16,
                 edgecolors=QUIET, linewidths=0.25,
             )  # fmt: skip
             plot.plot(0.0, 0.0, marker="+", color=INK, markersize=9)
@@ -168,7 +171,7 @@ def error_map(
             plot.set(xlabel=f"{names[i]} [m]", ylabel=f"{names[j]} [m]")
             plot.grid(True)
             if j == 2:
-                colour_scale(figure, plot, drawn, "[mm]")
+                colour_scale(figure, plot, drawn, "[mm]", extend="max" if limit < every.max() else "neither")
         axes[0].set_title(f"from above: {words.format(f'{top:.3g} mm')}")
         axes[1].set_title("from the side")
         if len(both) > 1:

@@ -117,7 +117,7 @@ def colour_scale(figure: Figure, axes: Axes, drawn: Any, title: str = "", **opti
     scale = figure.add_axes((place.x1 + 0.1 / width, place.y0, 0.1 / width, place.height))
     figure.colorbar(drawn, cax=scale, **options)
     scale.tick_params(labelsize=7)
-    scale.set_title(title, fontsize=7.5, fontweight="normal")
+    scale.set_title(title, fontsize=7.5, fontweight="normal", pad=16.0 if options.get("extend") == "max" else None)
 
 
 def log_axis(axis: XAxis | YAxis, low: float, high: float, most: int = 7) -> None:
