@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from calib.procedure.report.style import (
     AFTER,
@@ -49,7 +50,8 @@ def error_histogram(
     one, two = factor * np.asarray(before), factor * np.asarray(after)
     top = max(one.max(), two.max(), 1e-9) * 1.02
     apart = np.median(two) < np.median(one) / 6.0  # then equal bins would show one bar of the smaller errors
-    least = max(min(one.min(), two.min()), 1e-4 * top) * 0.9
+    seen = factor * noise if noise else top
+    least = max(min(one.min(), two.min(), seen), 1e-4 * top) * 0.9
     edges = np.geomspace(least, top, 31) if apart else np.linspace(0.0, top, 31)
     rms = [float(np.sqrt(np.mean(sizes**2))) for sizes in (one, two)]
     with styled():
@@ -67,13 +69,15 @@ def error_histogram(
                 textcoords="offset points", color=colour, va="top", ha="right" if right else "left", fontsize=7.5,
             )  # fmt: skip
         if noise:
-            axes.axvline(factor * noise, color=INK, linewidth=0.9, linestyle=":")
+            axes.axvline(seen, color=INK, linewidth=0.9, linestyle=":")
+            left = apart and np.log(seen / edges[0]) > 0.25 * np.log(edges[-1] / edges[0])
             axes.annotate(
-                "instrument", (factor * noise, 0.89), xycoords=("data", "axes fraction"), xytext=(3, 0),
-                textcoords="offset points", color=INK, va="top", fontsize=6.5,
+                "instrument", (seen, 0.89), xycoords=("data", "axes fraction"), xytext=(-3 if left else 3, 0),
+                textcoords="offset points", color=INK, va="top", ha="right" if left else "left", fontsize=6.5,
             )  # fmt: skip
         if apart:
             log_axis(axes.xaxis, edges[0], edges[-1])
+        axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
         axes.set(xlabel=f"{nature} error [{unit}]", ylabel="poses", ylim=(0.0, 1.2 * highest))
         if not apart:
             axes.set_xlim(edges[0], edges[-1])
