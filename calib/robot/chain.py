@@ -22,7 +22,10 @@ HEAVIEST = 100.0  # [m/s²] (our choice)
 
 @dataclass(frozen=True)
 class Joint:
-    """One actuated joint: its name, kind and limits (SI; infinite where none are given)."""
+    """One actuated joint: its name, kind and limits (SI; infinite where none are given).
+
+    `unstated` names limits of 0 or below as they were written (``velocity 0``): taken as not stated, and told.
+    """
 
     name: str
     kind: str = "revolute"
@@ -30,6 +33,7 @@ class Joint:
     upper: float = np.inf
     velocity: float = np.inf
     effort: float = np.inf
+    unstated: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
         if self.kind not in ("revolute", "prismatic"):
@@ -39,6 +43,9 @@ class Joint:
         for what in ("velocity", "effort"):
             if not getattr(self, what) >= 0.0:
                 raise RobotError(f"joint '{self.name}': {what} {getattr(self, what):g} is no limit: expected 0 or more")
+            if getattr(self, what) == 0.0:
+                object.__setattr__(self, "unstated", (*self.unstated, f"{what} 0"))
+                object.__setattr__(self, what, np.inf)
 
     @property
     def unit(self) -> str:
@@ -95,6 +102,7 @@ class Chain:
         gravity: (3,) in the base frame [m/s²].
         links: names of the n links behind the joints (URDF), for messages and export.
         floor: height of what the arm stands on, in the base frame [m]: nothing of it goes below where nobody says more.
+        remarks: what its description says that looks wrong, by the reader.
     """
 
     name: str
@@ -107,6 +115,7 @@ class Chain:
     gravity: np.ndarray = field(default_factory=lambda: np.array(GRAVITY))
     links: tuple[str, ...] = ()
     floor: float = 0.0
+    remarks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "tail", frozen(self.tail))

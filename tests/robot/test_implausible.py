@@ -10,6 +10,7 @@ import pytest
 from calib.errors import RobotError
 from calib.robot.chain import Joint
 from calib.robot.load import load
+from calib.robot.plausible import impossible_bodies, remarks
 
 
 @pytest.mark.parametrize("change", [{"velocity": -1.0}, {"effort": -5.0}, {"velocity": np.nan}])
@@ -30,3 +31,44 @@ def test_limits_below_zero_are_none(change):
 def test_what_is_not_finite_is_refused(change, said):
     with pytest.raises(RobotError, match=said):
         replace(load("ur5"), **change)
+
+
+def _links(**change: float):
+    """Return the LWR4+ with the fourth body's parameters changed: their names' values, or times what is given."""
+    chain = load("lwr4plus")
+    bodies = np.array(chain.inertias)
+    names = ("XX", "XY", "XZ", "YY", "YZ", "ZZ", "MX", "MY", "MZ", "M")
+    for name, value in change.items():
+        bodies[3, names.index(name)] = value
+    return replace(chain, inertias=bodies)
+
+
+@pytest.mark.parametrize("name", ["lwr4plus", "tx40", "rv2sq"])
+def test_bodies_of_sound_robots_are_possible(name):
+    assert remarks(load(name)) == ()
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        ({"M": 0.0}, "no mass"),
+        ({"M": -2.0}, "negative mass"),
+        ({"M": 2000.0}, "kg in all"),
+        ({"MX": 100.0}, "centre of mass beyond the arm"),
+        ({"XX": 1e4}, "radius of gyration"),
+        ({"ZZ": -0.1}, "negative moment"),
+        ({"XX": 0.3}, "no body has"),
+    ],
+)
+def test_impossible_bodies_are_named(change, said):
+    (found,) = impossible_bodies(_links(**change))
+    assert said in found
+
+
+def test_limits_of_zero_are_told_as_not_stated():
+    chain = load("ur5")
+    joints = (Joint("a", velocity=0.0), *chain.joints[1:])
+    assert joints[0].velocity == np.inf
+    assert remarks(replace(chain, joints=joints)) == (
+        "a: velocity 0 in the robot's description is no limit; taken as not stated",
+    )

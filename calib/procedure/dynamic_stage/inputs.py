@@ -24,6 +24,7 @@ from calib.procedure.dynamic_stage.gains import FoundGains, find_gains
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, joint_kinds
 from calib.robot.load import load_calibrated, resolve
+from calib.robot.plausible import remarks
 
 LOST = 0.05  # of a recording may fall to the windows of the parallel decimation (our choice)
 QUIET = 0.02  # noise of the accelerations that is no matter, of their rms (our choice)
@@ -127,7 +128,7 @@ def gather(
         like = motions[0] if len(motions) >= len(recordings) else None
         motion = read_motion(each, chain, options.file_settings(path), like)
         motions.append(_referred(motion, path, chain, options) if len(motions) < len(recordings) else motion)
-    notes = [f"{name}: {note}" for name, motion in zip(names, motions) for note in motion.notes]
+    notes = [*remarks(chain), *(f"{name}: {note}" for name, motion in zip(names, motions) for note in motion.notes)]
     count = len(recordings)
     found = find_gains(chain, options, dict(zip(paths, motions)), paths[:count], say)
     options = found.options

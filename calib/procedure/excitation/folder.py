@@ -242,9 +242,11 @@ def plan_metrics(planned: Planned) -> dict[str, Any]:
 
 def plan_lines(planned: Planned) -> list[str]:
     """Return what a person wants to read at the end."""
+    crossed = "none" if np.isfinite(planned.limits.velocity).all() else "none that is known"
     words = [
         f"{planned.track.duration:.3f} s at {planned.track.rate:g} Hz; some limit is within {ACTIVE:.0%} of being "
-        f"reached for {_active_share(planned):.1%} of the time, none is crossed at {_verified(planned)} instants",
+        f"reached for {_active_share(planned):.1%} of the time, {crossed} is crossed at "
+        f"{_verified(planned)} instants",
         "smallest margins:",
     ]
     for name, one in _margins(planned).items():

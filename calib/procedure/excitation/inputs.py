@@ -20,7 +20,7 @@ from calib.identification.identify_options import FileSettings
 from calib.identification.model_file import from_table, read_covariance, read_table, refuse_currents
 from calib.procedure.dynamic_stage.inputs import read_motion
 from calib.procedure.excitation import coefficients
-from calib.procedure.excitation.limits import MotionLimits, read_motion_limits
+from calib.procedure.excitation.limits import MotionLimits, check_bodies, read_motion_limits
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.procedure.kinematic_stage.inputs import load_rigid
 from calib.robot import description
@@ -124,7 +124,7 @@ def read_inputs(
         UsageError, MeasurementError: for a file that is none, or belongs to another robot.
     """
     chain, source = load_rigid(robot, None, base, tip)
-    known = read_motion_limits(limits, chain, source)
+    known = read_motion_limits(limits, chain, source, predicted=None if model is None else True)
     dynamics = read_model(chain, model, settings.drives, known)
     locked = _read_locked(settings.lock, chain, known.positions)
     prior = read_prior(settings.existing, dynamics, chain)
@@ -139,6 +139,7 @@ def read_model(chain: Chain, folder: Path | None, sets: str, limits: MotionLimit
     terms = drives.standard([sets] * chain.n, V0, linear)
     values, notes = None, []
     if chain.inertias is not None:
+        check_bodies(chain, limits.torque)
         known = {"velocity": 0, "sign": 1}
         own = [
             0.0 if limits.friction is None or one.shape not in known

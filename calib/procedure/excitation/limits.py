@@ -44,6 +44,7 @@ from calib.procedure.measuring.constraints_file import DEFAULTS, ConstraintsFile
 from calib.procedure.measuring.pose_limits import Limits, limits_of
 from calib.robot.chain import Chain
 from calib.robot.kinematics import joint_frames, joint_jacobian, sweep
+from calib.robot.plausible import impossible_bodies
 from poses.space import PoseConstraint
 from trajectories.basis import SampledMotion
 from trajectories.constraints import BoxLimit, MotionConstraint, box_limits
@@ -123,7 +124,11 @@ class MotionLimits:
 
 
 def read_motion_limits(
-    path: Path | None, chain: Chain, source: Path | None = None, given_way: bool = False
+    path: Path | None,
+    chain: Chain,
+    source: Path | None = None,
+    given_way: bool = False,
+    predicted: bool | None = None,
 ) -> MotionLimits:
     """Read the limits of a motion; where nothing else is stated it keeps what poses keep (`limits_of`).
 
@@ -132,9 +137,11 @@ def read_motion_limits(
         source: the robot's file, for its collision shapes.
         given_way: the motion goes where its user says: what is not stated is not kept, since capsules and a floor that
             we think of should not forbid a way that somebody knows.
+        predicted: torques are, so that their limits count; default where the chain's masses are known.
 
     Raises:
-        UsageError: for an unknown key or a value that a key cannot have.
+        UsageError: for an unknown key or a value that a key cannot have, and for limits of 0 or below in the robot's
+            description in whose place nothing is stated.
     """
     stated = LimitsFile() if path is None else parse(LimitsFile, read_toml(path), str(path))
     where, own = str(path or "limits"), stated.torque
@@ -148,6 +155,10 @@ def read_motion_limits(
     jerk = _per_joint(stated.jerk, f"{where}: jerk", chain)
     amounts = {key: value for key, value in own.items() if key not in MARGINS}
     torque = _per_joint(amounts, f"{where}: torque", chain, efforts, ("torque", "force"))
+    needed = {"velocity": velocity}
+    if chain.inertias is not None if predicted is None else predicted:
+        needed["effort"] = torque
+    unlimited = _unlimited(chain, needed, source)
     margin = number(own["margin"], f"{where}: torque.margin") if "margin" in own else None
     if margin is not None and not 0.0 <= margin < 1.0:
         raise UsageError(f"{where}: torque.margin: expected a share of the limit, from 0 to below 1, found {margin:g}")
@@ -162,11 +173,49 @@ def read_motion_limits(
     constraints += _places(stated, found, points)
     if found.collision is not None:
         constraints.append(_clearance(found))
-    notes = (*found.notes, *([f"kept: {', '.join(found.checked)}"] if found.checked else []))
+    notes = (*found.notes, *unlimited, *([f"kept: {', '.join(found.checked)}"] if found.checked else []))
     notes += (f"NOT checked: {', '.join(found.unchecked)}",) if found.unchecked else ()
     if found.collision is None:
-        notes = (*found.notes, _unchecked(path))
+        notes = (*found.notes, *unlimited, _unchecked(path))
     return MotionLimits(tuple(constraints), torque, margin, deviations, friction, stated.frequency.resonance, notes)
+
+
+def check_bodies(chain: Chain, torque: np.ndarray) -> None:
+    """Refuse to keep torque limits (n,) by bodies that cannot exist.
+
+    Raises:
+        UsageError: naming them.
+    """
+    if np.isfinite(torque).any() and (wrong := impossible_bodies(chain)):
+        raise UsageError(
+            f"robot '{chain.name}': {'; '.join(wrong)}: torques predicted from such bodies keep no limit; correct the "
+            "masses in the robot's file, take its <inertial> tags out, or name an identified model (--model)"
+        )
+
+
+def _unlimited(chain: Chain, bounds: Mapping[str, np.ndarray], source: Path | None) -> list[str]:
+    """Return in words which joints have no limit of speed (of torque), where nothing was written for one.
+
+    Raises:
+        UsageError: where something was written that is none, and no limits file says better.
+    """
+    notes = []
+    for what, table, units in (
+        ("velocity", "velocity", ("90 deg/s", "0.5 m/s")),
+        ("effort", "torque", ("100 Nm", "100 N")),
+    ):
+        none = np.isinf(bounds.get(what, np.zeros(chain.n)))
+        for joint in (joint for joint, free in zip(chain.joints, none) if free):
+            wrong = next((one for one in joint.unstated if one.startswith(what)), None)
+            if wrong is not None:
+                unit = units[joint.kind != "revolute"]
+                advice = f'correct it there, or state it in a limits file: [{table}] {joint.name} = "{unit}"'
+                place = f"{source or chain.name}, joint '{joint.name}'"
+                raise UsageError(f"{place}: {wrong} is no limit, and no motion is designed without one; {advice}")
+        if none.any():
+            names = ", ".join(name for name, free in zip(chain.joint_names, none) if free)
+            notes.append(f"no {table} limit is known of {names}: NOT limited; state it in a limits file ([{table}])")
+    return notes
 
 
 def _unchecked(path: Path | None) -> str:

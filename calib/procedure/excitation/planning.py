@@ -20,7 +20,7 @@ from calib.errors import RobotError, UsageError
 from calib.identification.model_file import read_dynamics, refuse_currents
 from calib.identification.prediction import Dynamics
 from calib.identification.uncertainty.torque_uncertainty import Uncertainty, read_uncertainty
-from calib.procedure.excitation.limits import MotionLimits, read_motion_limits
+from calib.procedure.excitation.limits import MotionLimits, check_bodies, read_motion_limits
 from calib.procedure.excitation.playback import approach_to, check_slower
 from calib.procedure.excitation.settings import DEFAULT_PLAN, PlanSettings
 from calib.procedure.excitation.waypoints import read_waypoints
@@ -130,7 +130,7 @@ def plan(
     if settings.payloads and model is None:
         raise UsageError(f"payloads {', '.join(settings.payloads)}: they are identified ones: name the model")
     chain, source = load_rigid(robot, waypoints, base, tip)
-    known = read_motion_limits(limits, chain, source, given_way=True)
+    known = read_motion_limits(limits, chain, source, given_way=True, predicted=None if model is None else True)
     law, notes, uncertain = _law(chain, model, settings.payloads, drives, known)
     lower, upper, bounds = _bounds(chain, known, law)
     arm = chain if model is None else read_dynamics(model)[0]
@@ -231,6 +231,7 @@ def _law(
             stated = {"Fv": known.friction[0], "Fc": known.friction[1]}
         if chain.inertias is None:
             return None, ("the robot's masses are not known: torques are not limited",), None
+        check_bodies(chain, known.torque)
         values = np.column_stack([stated.get(key, np.zeros(chain.n)) for key in DRIVES])
     except RobotError as error:
         raise UsageError(str(error)) from error

@@ -29,6 +29,7 @@ from calib.robot.formats.markup import text
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.kinematics import forward
 from calib.robot.load import load, resolve
+from calib.robot.plausible import remarks
 
 
 @dataclass(frozen=True)
@@ -120,7 +121,7 @@ def gather(
         fit.append(kept)
         if aside is not None:
             unseen[_free_name(unseen, block.file)] = Unseen(aside, held_out=True)
-    given = with_unseen(Inputs(chain, source, tuple(fit), unseen, (), earlier), validate, options, settings)
+    given = with_unseen(Inputs(chain, source, tuple(fit), unseen, remarks(chain), earlier), validate, options, settings)
     if earlier is None or earlier.corrections is None:
         return given
     name, count = source if isinstance(robot, CalibratedChain) else robot, len(earlier.deflection.terms)

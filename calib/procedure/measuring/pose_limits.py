@@ -36,6 +36,7 @@ from calib.procedure.measuring.constraints_file import (
 from calib.procedure.measuring.sight import SeenOnly, Sight, sight_of
 from calib.robot.formats.markup import text
 from calib.robot.obstacles import Obstacle, Wall
+from calib.robot.plausible import remarks
 from calib.robot.tables import placement
 from calib.transforms import invert
 from poses import constraints
@@ -173,6 +174,7 @@ def limits_of(
         kept = (*kept, *(words.get(part.name, part.name) for part in sight.targets[0]))
     clearance = (stated.collision or CollisionTable()).margin
     pairs = None if model is None or not model.pairs else model
+    notes = (*notes, *remarks(cell.chain))
     return Limits(lower, upper, found, notes, pairs, clearance, sight, kept, _unchecked(stated, absent, seen))
 
 

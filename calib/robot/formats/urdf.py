@@ -111,6 +111,7 @@ def build(tree: UrdfTree, base: str, tip: str) -> Chain:
         tail=pending,
         inertias=_inertias(tree, path),
         links=tuple(joint.child for joint in actuated),
+        remarks=tree.remarks,
     )
 
 

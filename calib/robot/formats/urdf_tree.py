@@ -19,6 +19,7 @@ from calib.transforms import from_xyz_rpy
 MOVING = ("revolute", "continuous", "prismatic")
 KINDS = (*MOVING, "fixed", "floating", "planar")
 UNLIMITED = 1e9
+TURN = 2 * np.pi + 1e-3  # [rad]
 XACRO = "expand it first: xacro file.xacro > robot.urdf"
 
 
@@ -46,6 +47,7 @@ class JointTag:
     upper: float
     velocity: float
     effort: float
+    unstated: tuple[str, ...]
     node: Node
 
     @property
@@ -59,7 +61,7 @@ class JointTag:
     def as_joint(self) -> Joint:
         """Return what the chain keeps of it."""
         kind = "prismatic" if self.kind == "prismatic" else "revolute"
-        return Joint(self.name, kind, self.lower, self.upper, self.velocity, self.effort)
+        return Joint(self.name, kind, self.lower, self.upper, self.velocity, self.effort, self.unstated)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +74,7 @@ class UrdfTree:
         joints: by name, in the order of the file.
         above: link name to the joint that carries it.
         below: link name to the joints it carries.
+        remarks: what looks wrong in it.
     """
 
     name: str
@@ -80,6 +83,7 @@ class UrdfTree:
     joints: dict[str, JointTag]
     above: dict[str, JointTag]
     below: dict[str, list[JointTag]]
+    remarks: tuple[str, ...] = ()
 
     @property
     def roots(self) -> list[str]:
@@ -135,7 +139,8 @@ def read(source: str, where: str) -> UrdfTree:
     """Read the text of a URDF; `where` names it in messages.
 
     Raises:
-        RobotError: with the line, for broken XML, xacro, unknown kinds, missing parts, loops and second parents.
+        RobotError: with the line, for broken XML, xacro, unknown kinds, missing parts, loops, second parents, and
+            several angles beyond a full turn.
     """
     root = parse(source, where)
     if root.tag != "robot":
@@ -159,9 +164,27 @@ def read(source: str, where: str) -> UrdfTree:
             raise RobotError(f"{place}: link '{joint.child}' has two parents, joints {both}; a URDF is a tree")
         above[joint.child] = joint
         below[joint.parent].append(joint)
-    tree = UrdfTree(root.attributes.get("name", "robot"), where, bodies, joints, above, below)
+    name, remarks = root.attributes.get("name", "robot"), _large_angles(joints, where)
+    tree = UrdfTree(name, where, bodies, joints, above, below, remarks)
     _check_loops(tree)
     return tree
+
+
+def _large_angles(joints: dict[str, JointTag], where: str) -> tuple[str, ...]:
+    """Return in words a joint whose origin is turned by more than a full turn; several of them are degrees.
+
+    Raises:
+        RobotError: for several joints.
+    """
+    found = []
+    for joint in joints.values():
+        node = joint.node.first("origin")
+        if node is not None and (np.abs(_floats(node, "rpy", "0 0 0", where)) > TURN).any():
+            found.append(f"joint '{joint.name}' (line {node.line}): rpy=\"{node.attributes['rpy']}\"")
+    if len(found) > 1:
+        shown = ", ".join(found[:3]) + (f" and {len(found) - 3} more" if len(found) > 3 else "")
+        raise RobotError(f"{where}: {shown}: beyond a full turn: degrees? A URDF's angles are radians; convert them")
+    return tuple(f"{one} is beyond a full turn: degrees? A URDF's angles are radians" for one in found)
 
 
 def transform_body(body: np.ndarray, pose: np.ndarray) -> np.ndarray:
@@ -204,7 +227,7 @@ def _joint(node: Node, links: Iterable[str], where: str) -> JointTag:
     if kind not in KINDS:
         raise RobotError(f"{place}: type '{kind}' is none of {', '.join(KINDS)}{suggestion(kind, KINDS)}")
     ends = [_end(node, role, links, place) for role in ("parent", "child")]
-    lower, upper, velocity, effort = _limits(node, kind, place)
+    lower, upper, velocity, effort, unstated = _limits(node, kind, place)
     return JointTag(
         name=name,
         kind=kind,
@@ -217,6 +240,7 @@ def _joint(node: Node, links: Iterable[str], where: str) -> JointTag:
         upper=upper,
         velocity=velocity,
         effort=effort,
+        unstated=unstated,
         node=node,
     )
 
@@ -260,23 +284,26 @@ def _mimic(node: Node, place: str) -> Mimic | None:
     return Mimic(leader, _float(found, "multiplier", 1.0, place), _float(found, "offset", 0.0, place))
 
 
-def _limits(node: Node, kind: str, place: str) -> tuple[float, float, float, float]:
-    """Return lower, upper, velocity, effort; infinite where not given or beyond 1e9, the last two also where 0.
+def _limits(node: Node, kind: str, place: str) -> tuple[float, float, float, float, tuple[str, ...]]:
+    """Return lower, upper, velocity, effort, and which of the last two are 0 or below as they are written.
 
-    URDF demands velocity and effort, so 0 is what people write who do not know them, and 1e9 is what we write.
+    Infinite where not given or beyond 1e9, the last two also where 0 or below: URDF demands velocity and effort, so 0
+    is what people write who do not know them, and 1e9 is what we write.
     """
     found = node.first("limit")
     lower, upper, velocity, effort = -np.inf, np.inf, np.inf, np.inf
+    unstated: list[str] = []
     if found is not None:
         if kind in ("revolute", "prismatic") and ("lower" in found.attributes or "upper" in found.attributes):
             lower, upper = _float(found, "lower", 0.0, place), _float(found, "upper", 0.0, place)
             if not lower < upper:
                 found_limits = f"lower limit {lower:g} is not below the upper {upper:g}"
                 raise RobotError(f"{place}: {found_limits}; correct them, or make the joint fixed or continuous")
-        velocity, effort = _float(found, "velocity", 0.0, place), _float(found, "effort", 0.0, place)
+        velocity, effort = _float(found, "velocity", np.inf, place), _float(found, "effort", np.inf, place)
+        unstated = [f"{what} {size:g}" for what, size in (("velocity", velocity), ("effort", effort)) if size <= 0]
     lower, upper = lower if lower > -UNLIMITED else -np.inf, upper if upper < UNLIMITED else np.inf
     velocity, effort = (size if 0 < size < UNLIMITED else np.inf for size in (velocity, effort))
-    return lower, upper, velocity, effort
+    return lower, upper, velocity, effort, tuple(unstated)
 
 
 def _body(node: Node, where: str) -> np.ndarray | None:

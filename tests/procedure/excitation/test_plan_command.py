@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +17,14 @@ from without_figures import run
 from calib import files
 from calib.dynamics import drives
 from calib.dynamics.bodies import STANDARD
+from calib.errors import CalibError
 from calib.procedure.excitation import folder as motion_folder
 from calib.procedure.excitation import planning
+from calib.procedure.excitation.folder import plan_lines
 from calib.procedure.excitation.settings import PlanSettings
 from calib.procedure.excitation.waypoints import read_waypoints
 from calib.robot import description
+from calib.robot.calibrated import CalibratedChain
 from calib.robot.kinematics import forward
 from calib.simulation.cells.known_robots import truth
 from calib.transforms import to_quaternion
@@ -251,3 +256,31 @@ def test_waypoints_that_leave_a_joint_out_plan_no_shorter_arm(room, capsys):
     assert run("plan", "arm.urdf", "--waypoints", "short.csv", "--out", "p") == 2
     said = capsys.readouterr().err
     assert f"column '{CHAIN.joint_names[-1]}' is missing" in said and "--tip" in said and not Path("p").exists()
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"M": -2.0}, "body behind A4: a negative mass"),
+        ({"velocity": 0.0}, "joint 'A4': velocity 0 is no limit"),
+        ({"effort": 0.0}, "joint 'A4': effort 0 is no limit"),
+    ],
+)
+def test_a_robot_that_cannot_be_is_not_planned_with(room, capsys, change, message):
+    joints, bodies = list(CHAIN.joints), np.array(CHAIN.inertias)
+    joints[3] = replace(joints[3], name="A4", **{key: value for key, value in change.items() if key != "M"})
+    bodies[3, 9] = change.get("M", bodies[3, 9])
+    wrong = replace(CHAIN, joints=tuple(joints), inertias=bodies)
+    limits = Path("limits.toml")
+    limits.write_text("")
+    with pytest.raises(CalibError, match=re.escape(message)):
+        planning.plan(CalibratedChain(wrong), Path("way.csv"), limits=limits)
+    if "velocity" in change:
+        limits.write_text('[velocity]\nA4 = "90 deg/s"\n')
+        assert planning.plan(CalibratedChain(wrong), Path("way.csv"), limits=limits).limits.velocity[3] == np.pi / 2
+        told = planning.plan(CalibratedChain(replace(wrong, joints=CHAIN.joints)), Path("way.csv"))
+        assert not any("NOT limited" in note for note in told.notes)
+        free = replace(joints[3], unstated=())
+        told = planning.plan(CalibratedChain(replace(wrong, joints=(*joints[:3], free, *joints[4:]))), Path("way.csv"))
+        assert any("no velocity limit is known of A4" in note for note in told.notes)
+        assert "none that is known is crossed" in plan_lines(told)[0]

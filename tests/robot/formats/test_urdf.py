@@ -285,6 +285,14 @@ def test_missing_and_placeholder_limits_are_infinite():
     a, b = urdf.parse(source).joints
     assert (a.lower, a.upper, a.velocity, a.effort) == (-np.inf, np.inf, np.inf, np.inf)
     assert (b.lower, b.upper, b.velocity, b.effort) == (-1.0, 0.0, np.inf, 3.0)
+    assert (a.unstated, b.unstated) == (("velocity 0", "effort 0"), ())
+
+
+def test_angles_beyond_a_full_turn_are_told_and_several_of_them_refused():
+    one, two = (joint(name, "revolute", *ends, Z, "0 0 0.1", "90 0 0") for name, *ends in ("abc", "dcd"))
+    assert "joint 'd' (line 5): rpy=\"90 0 0\" is beyond" in urdf.parse(robot(two, links="c d")).remarks[0]
+    with pytest.raises(RobotError, match=r"joint 'a' .*joint 'd' .*degrees"):
+        urdf.parse(robot(one, two, links="b c d"))
 
 
 BODIES = ("base", "one", "box", "lid", "tip")
