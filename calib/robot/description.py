@@ -120,7 +120,7 @@ def _from_elements(table: Mapping[str, Any], where: str) -> Chain:
     for index, entry in enumerate(_tables(table, "joint", where)):
         place = f"{where}, [[joint]] number {index + 1}"
         check_keys(entry, _JOINT, place)
-        limits = {key: number(entry[key], f"{place}, {key}") for key in _LIMITS if key in entry}
+        limits: dict[str, Any] = {key: number(entry[key], f"{place}, {key}") for key in _LIMITS if key in entry}
         joints.append(Joint(word(entry, "name", place), word(entry, "kind", place, "revolute"), **limits))
         inertias.append(vector(entry["inertia"], 10, f"{place}, inertia") if "inertia" in entry else None)
         links.append(word(entry, "link", place) if "link" in entry else None)
