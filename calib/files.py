@@ -11,8 +11,11 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import lru_cache
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,9 +25,50 @@ from calib.records import shielded
 if TYPE_CHECKING:  # the commands' help is written without loading it
     import numpy as np
 
+LARGEST = 1 << 26  # bytes of a table that an earlier run may have left (our choice)
+_staged: ContextVar[list[tuple[str, Path]] | None] = ContextVar("staged", default=None)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A result that is one file, and how one of an earlier run is told from a person's own.
+
+    Attributes:
+        what: in words.
+        suffixes: that it may have.
+        ours: tells whether an earlier run left a file, and nobody has added to it since.
+    """
+
+    what: str
+    suffixes: tuple[str, ...]
+    ours: Callable[[Path], bool]
+
+
+@contextmanager
+def together() -> Iterator[None]:
+    """Let all files that are written inside appear at the end, or, where one cannot be written, none of them."""
+    if _staged.get() is not None:  # part of a larger whole
+        yield
+        return
+    staged: list[tuple[str, Path]] = []
+    token = _staged.set(staged)
+    try:
+        yield
+        while staged:
+            temporary, path = staged[0]
+            try:
+                os.replace(temporary, path)
+            except OSError as error:
+                raise CalibError(f"cannot write {path}: {error.strerror or error}") from error
+            del staged[0]
+    finally:
+        _staged.reset(token)
+        for temporary, _ in staged:
+            os.unlink(temporary)
+
 
 def write(path: str | Path, content: str | bytes) -> Path:
-    """Write `content` to `path` by way of a temporary file in the same folder and a rename.
+    """Write `content` to `path` by way of a temporary file in the same folder and a rename (see `together`).
 
     A killed process or a full disk leaves the old file as it was.
 
@@ -44,7 +88,10 @@ def write(path: str | Path, content: str | bytes) -> Path:
             file.flush()
             os.fsync(file.fileno())
         os.chmod(temporary, 0o666 & ~_umask())
-        os.replace(temporary, path)
+        if (staged := _staged.get()) is not None:
+            staged.append((temporary, path))
+        else:
+            os.replace(temporary, path)
     except OSError as error:
         if temporary and os.path.exists(temporary):
             os.unlink(temporary)
@@ -92,24 +139,88 @@ def check_target(out: Path, inputs: Iterable[str | Path | None], suffixes: Seque
     Raises:
         UsageError: with the file concerned.
     """
-    if suffixes and out.suffix not in suffixes:
-        raise UsageError(f"{out}: give a file with the suffix {' or '.join(suffixes)}")
     if _reached(out) and out.is_dir():
         raise UsageError(f"{out} is a folder; give a file to write to")
     check_writable(out.absolute().parent)
     check_not_input([out], inputs)
+    if suffixes and out.suffix not in suffixes:
+        raise UsageError(f"{out}: give a file with the suffix {' or '.join(suffixes)}")
 
 
-def check_targets(targets: Sequence[Path], inputs: Sequence[str | Path | None]) -> None:
+def check_results(
+    targets: Sequence[tuple[Path, Kind]], inputs: Sequence[str | Path | None] = (), overwrite: bool = False
+) -> None:
     """Refuse, before any work is done, files that cannot be written or are read (`check_target`), or are one file.
+
+    Args:
+        targets: to be written; what stands there is replaced where an earlier run left it, or with `overwrite`.
+        inputs: what is read.
 
     Raises:
         UsageError: with the file concerned.
     """
-    for number, target in enumerate(targets):
-        check_target(target, inputs)
-        if any(same_file(target, other) for other in targets[:number]):
+    for number, (target, kind) in enumerate(targets):
+        check_target(target, inputs, kind.suffixes)
+        if any(same_file(target, other) for other, _ in targets[:number]):
             raise UsageError(f"{target} is to be written twice; give each file a name of its own")
+        if not overwrite and target.exists() and target.stat().st_size and not _left_by_us(target, kind):
+            raise UsageError(
+                f"{target} holds {_begins(target)}: no {kind.what} as an earlier run left it; nothing was changed. "
+                "Write elsewhere, or say --overwrite (in Python overwrite=True)"
+            )
+
+
+def _left_by_us(path: Path, kind: Kind) -> bool:
+    try:
+        return path.is_file() and path.stat().st_size <= LARGEST and kind.ours(path)
+    except Exception:  # what cannot be read as that kind, for whatever reason, is not of it
+        return False
+
+
+def _begins(path: Path) -> str:
+    """Say what a file begins with."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(200)
+    except OSError as error:
+        return f"what cannot be read ({error.strerror})"
+    size = f"{path.stat().st_size} bytes"
+    line = head.lstrip().partition(b"\n")[0]
+    return f"{size} that begin with '{line.decode()[:80].strip()}'" if line.isascii() and b"\0" not in head else size
+
+
+def marked(what: str, suffix: str, mark: bytes) -> Kind:
+    """Return the kind of files that carry `mark` among their first letters."""
+
+    def ours(path: Path) -> bool:
+        with path.open("rb") as file:
+            return mark in file.read(1 << 14)
+
+    return Kind(what, (suffix,), ours)
+
+
+def table(what: str, fits: Callable[[list[str], list[list[str]]], bool]) -> Kind:
+    """Return the kind of CSV tables (`write_table`) whose header and rows `fits`."""
+    return Kind(what, (".csv",), partial(_fits, fits))
+
+
+def _fits(fits: Callable[[list[str], list[list[str]]], bool], path: Path) -> bool:
+    """Tell whether a table is as `write_table` writes it, to the letter, and `fits`."""
+    text = path.read_text(encoding="utf-8")
+    header, *rows = csv.reader(io.StringIO(text, newline=""))
+    again = _headed(header)
+    csv.writer(again, lineterminator="\n").writerows([_again(cell) for cell in row] for row in rows)
+    return again.getvalue() == text and all(len(row) == len(header) for row in rows) and fits(header, rows)
+
+
+def _again(cell: str) -> str:
+    try:
+        return f"{float(cell):.12g}"
+    except ValueError:
+        return cell
+
+
+PICTURE = marked("figure", ".png", b"armature-calib")
 
 
 def check_writable(folder: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from calib import estimate_files, files
-from calib.errors import RobotError, UsageError
+from calib.errors import CalibError, RobotError, UsageError
 from calib.folders import METRICS, check_target, write_staged
 
 
@@ -80,3 +80,16 @@ def test_a_covariance_comes_back_by_names_of_any_kind(tmp_path: Path) -> None:
     path.write_text(path.read_text().replace("ü,", "u,", 1))
     with pytest.raises(RobotError, match="do not name the same parameters"):
         estimate_files.read_covariance(tmp_path)
+
+
+def test_files_written_together_appear_together(tmp_path: Path) -> None:
+    with pytest.raises(CalibError, match="nothing was changed"), files.together():
+        files.write(tmp_path / "a.csv", "1")
+        (tmp_path / "file").touch()
+        files.write(tmp_path / "file" / "b.csv", "2")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+    with files.together():
+        files.write(tmp_path / "a.csv", "1")
+        assert not (tmp_path / "a.csv").exists()
+        files.write(tmp_path / "b.csv", "2")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.csv", "b.csv", "file"]

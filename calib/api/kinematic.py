@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calib import files
 from calib.api.given import listed, optional, saved
 from calib.api.rendering import as_text, data_frame
 from calib.arguments import checked
@@ -22,7 +23,7 @@ from calib.procedure.findings import Verdict
 from calib.procedure.kinematic_stage import compensation, compensation_file, fit, folder, inputs, selection
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSettings, SelectionSettings
 from calib.procedure.measuring import selection_prediction
-from calib.procedure.measuring.run import write_run
+from calib.procedure.measuring.run import run_kind, write_run
 from calib.procedure.parallel_stage.robots import FoundRobot, recognised, refuse_links, refuse_parallel
 from calib.procedure.report.fit_report import fit_metrics
 from calib.robot.calibrated import CalibratedChain
@@ -52,22 +53,26 @@ class PoseSelection:
         return np.asarray(self.chosen.selection.q)
 
     @checked
-    def save(self, path: str | Path, *, plots: bool = True) -> Path:
+    def save(self, path: str | Path, *, plots: bool = True, overwrite: bool = False) -> Path:
         """Write the poses as CSV under the joints' names [rad or m], and beside it what they will tell.
 
-        That is ``…_prediction.json``, which a fit's ``selection`` takes, and the figures of `plot`.
+        That is ``…_prediction.json``, which a fit's ``selection`` takes, and the figures of `plot`. Files that no
+        earlier selection left, or that hold measurements since, are refused unless `overwrite`.
         """
         from calib.procedure.report.style import save
 
         path = Path(path)
+        selection.check_targets(path, self.chosen.chain, plots, chosen=self.chosen, overwrite=overwrite)
         beside = selection.targets(path, plots)
-        for name, figure in self.plot().items() if plots else ():
-            save(figure, beside[name])
-        return selection.write(self.chosen, path)
+        with files.together():
+            for name, figure in self.plot().items() if plots else ():
+                save(figure, beside[name])
+            return selection.write(self.chosen, path)
 
     @checked
-    def save_run(self, path: str | Path) -> Path:
+    def save_run(self, path: str | Path, *, overwrite: bool = False) -> Path:
         """Write the run through the poses, in their order, as CSV: t [s], pose (0 for a via-point), joints."""
+        files.check_results([(Path(path), run_kind(self.chosen.chain.joint_names))], overwrite=overwrite)
         return write_run(Path(path), self.chosen.run, self.chosen.chain)
 
     def plot(self) -> dict[str, Figure]:
@@ -216,8 +221,12 @@ class JointCommands:
         return self.commands.nominal
 
     @checked
-    def save(self, path: str | Path, *, partial: bool = False) -> Path:
-        """Write the commands as CSV; `partial` writes what is reached, even where some targets are not."""
+    def save(self, path: str | Path, *, partial: bool = False, overwrite: bool = False) -> Path:
+        """Write the commands as CSV; `partial` writes what is reached, even where some targets are not.
+
+        A file that holds anything but an earlier run's commands is refused unless `overwrite`.
+        """
+        files.check_results([(Path(path), compensation_file.COMMANDS)], overwrite=overwrite)
         return compensation_file.write(self.commands, self.fitted, self.targets, Path(path), partial)
 
     def __repr__(self) -> str:

@@ -41,7 +41,7 @@ app = typer.Typer(
     epilog=EXIT_CODES,
 )
 
-_FLAGS = ("--debug", "--help", "--line", "--plots", "--no-plots", "--refit-frames", "--no-refit-frames")
+_FLAGS = ("--debug", "--help", "--line", "--plots", "--no-plots", "--refit-frames", "--no-refit-frames", "--overwrite")
 _USAGE: Any = typer.BadParameter.__mro__[2]  # ClickException, of the click that this typer uses (or brings)
 
 for _group in (geometry, camera, dynamics, study, motion, session):

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from calib.cli.shared import Base, Plots, Robot, Seed, Tip, exit_failed, numbers, progress, say, say_written
+from calib.cli.shared import Base, Overwrite, Plots, Robot, Seed, Tip, exit_failed, numbers, progress, say, say_written
 
 app = typer.Typer()
 
@@ -126,6 +126,7 @@ def select(
     tip: Tip = None,
     seed: Seed = 0,
     plots: Plots = True,
+    overwrite: Overwrite = False,
 ) -> None:
     """Choose the poses at which the geometry of ROBOT shows best.
 
@@ -133,15 +134,18 @@ def select(
     how well the tool will be known over the workspace, and OUT_outlook.png what fewer and more poses would tell.
     """
     from calib.api.kinematic import select_poses
-    from calib.files import check_targets
+    from calib.data.poses.fit_options import FitOptions
+    from calib.files import together
+    from calib.procedure.kinematic_stage.inputs import load_robot
+    from calib.procedure.kinematic_stage.selection import check_targets
     from calib.procedure.kinematic_stage.selection import targets as targets_of
     from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
     from calib.procedure.measuring.constraints_file import beside
     from calib.procedure.measuring.run import RunSettings
 
     named = beside(constraints).values() if constraints else ()
-    planned = [out, *([run] if run else []), *targets_of(out, plots).values()]
-    check_targets(planned, [robot, existing, constraints, *named])
+    chain, _ = load_robot(robot, existing, FitOptions(), base, tip)
+    check_targets(out, chain, plots, [robot, existing, constraints, *named], run=run, overwrite=overwrite)
     targets = tuple(tuple(numbers(text, 3, "--tool")) for text in tool or [])
     sigmas = None if sigma is None else numbers(sigma, 2, "--sigma")
     stated = None if sigmas is None else (sigmas[0], sigmas[1])
@@ -155,9 +159,11 @@ def select(
             progress=show,
         )  # fmt: skip
         show("writing")
-        chosen.save(out, plots=plots)
+        with together():
+            chosen.save(out, plots=plots, overwrite=overwrite)
+            if run:
+                chosen.save_run(run, overwrite=overwrite)
     if run:
-        chosen.save_run(run)
         say(f"the run: {run}; calib view {run} --robot {robot}")
     say(str(chosen))
     if told := targets_of(out, plots, chosen.chosen):
@@ -180,6 +186,7 @@ def export(
     for_corrections: Annotated[
         bool, typer.Option("--for-corrections", help="the URDF that joint_corrections.csv belongs to, worse without it")
     ] = False,
+    overwrite: Overwrite = False,
     prior: Annotated[
         str, typer.Option(help="with --into: what draws masses that the torques do not tell, entropic or euclidean")
     ] = "entropic",
@@ -191,6 +198,7 @@ def export(
     import warnings
 
     from calib.errors import UsageError
+    from calib.files import together
     from calib.procedure.export import delivery, geometry
     from calib.procedure.parallel_stage.robots import refuse_parallel
 
@@ -210,24 +218,23 @@ def export(
             "nothing to write: give --urdf SOURCE.urdf --out FILE.urdf, --ur-kinematics, --offsets or --into"
         )
     found = geometry.read(folder)
-    geometry.check_targets(folder, urdf, [path for path in (out, ur_kinematics, offsets) if path])
+    geometry.check_targets(folder, urdf, out, ur_kinematics, offsets, overwrite)
     verdicts = delivery.verdicts(folder)
     judged = delivery.remark(verdicts)
+    with together():
+        read = geometry.export_urdf(found, urdf, out, for_corrections, judged) if urdf and out else ""
+        if ur_kinematics:
+            geometry.export_ur_kinematics(found, ur_kinematics, judged)
+        if offsets:
+            geometry.export_offsets(found, offsets)
     if urdf and out:
-        read = geometry.export_urdf(found, urdf, out, for_corrections)
-        if judged:
-            delivery.mark_file(out, judged)
         say(f"{out}: joint origins of {urdf} calibrated, all else kept; base link and flange stay where the source has "
             f"them; {read}")  # fmt: skip
     if ur_kinematics:
-        geometry.export_ur_kinematics(found, ur_kinematics)
-        if judged:
-            delivery.mark_file(ur_kinematics, judged)
         say(f"{ur_kinematics}: for kinematics_params_file of ur_description")
         if note := geometry.flange_note(found):
             say(f"note: {note}")
     if offsets:
-        geometry.export_offsets(found, offsets)
         say(f"{offsets}: offset of each joint, the rest of the geometry left out; --model offsets fits the best ones")
     if found.corrections is not None:
         note = f"note: the corrections in {folder}/joint_corrections.csv are in none of these files"
@@ -262,21 +269,23 @@ def compensate(
     partial: Annotated[
         bool, typer.Option("--partial", help="write what is reached, even where some targets are not")
     ] = False,
+    overwrite: Overwrite = False,
     seed: Seed = 0,
 ) -> None:
     """Turn targets into joint commands that put the real tool there."""
     from calib.api import kinematic
-    from calib.files import check_target
+    from calib.files import check_results
     from calib.procedure.export.geometry import results
+    from calib.procedure.kinematic_stage.compensation_file import COMMANDS
 
     may = numbers(tolerance, 2, "--tolerance")
     fitted = kinematic.read_fitted(folder)
-    check_target(out, [targets, *results(fitted.folder)])
+    check_results([(out, COMMANDS)], [targets, *results(fitted.folder)], overwrite)
     with progress() as show:
         found = kinematic.compensate(
             fitted, targets, frame=frame, tool=tool, dof=dof, tolerance=(1e-3 * may[0], 1e-3 * may[1]), seed=seed,
             start=numbers(start, fitted.nominal.chain.n, "--start") if start else None, progress=show,
         )  # fmt: skip
-    found.save(out, partial=partial)
+    found.save(out, partial=partial, overwrite=overwrite)
     say(str(found))
     say(f"{int(found.commands.reached.sum())} of {len(found.q)} commands written to {out}")

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.shared import Base, Plots, Robot, Seed, Tip, numbers, progress, say_written
+from calib.cli.shared import Base, Overwrite, Plots, Robot, Seed, Tip, numbers, progress, say_written
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, DEFAULT_PLAN, ExcitationSettings, PlanSettings
 
 app = typer.Typer()
@@ -90,11 +90,12 @@ def recall(
     log: Annotated[str, typer.Argument(help="a recording of it; log.npz@0:90 cuts")],
     out: Annotated[Path, typer.Option(help="the averaged period: .npz with its variance, or .csv")],
     skip: Annotated[int, typer.Option(help="whole periods to leave out at the beginning")] = 0,
+    overwrite: Overwrite = False,
 ) -> None:
     """Find a designed motion in a log, and average its periods. What comes out is a recording for calib identify."""
     from calib.procedure.excitation import recall as excitation_recall
 
-    excitation_recall.check_target(out, folder, log)
+    excitation_recall.check_target(out, folder, log, overwrite)
     found = excitation_recall.find(folder, log, skip)
     excitation_recall.write(found, out)
     say_written(excitation_recall.lines(found), out)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calib.cli.shared import Base, Plots, Seed, Tip, exit_failed, make_console, reporting, say
+from calib.cli.shared import Base, Overwrite, Plots, Seed, Tip, exit_failed, make_console, reporting, say
 
 if TYPE_CHECKING:
     from calib.procedure.session.questions import Answers
@@ -248,10 +248,11 @@ def view(
         bool | None, typer.Option("--spawn/--no-spawn", help="open Rerun's window; by default where nothing is saved")
     ] = None,
     robot: Annotated[str | None, typer.Option(help="the arm to draw, where the folder does not say")] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Show robot, errors, poses, motions or torques in Rerun."""
     from calib.errors import UsageError, command_line
-    from calib.files import check_target
+    from calib.files import check_results
     from calib.procedure.parallel_stage.robots import refuse_parallel
     from calib.procedure.report import viewer
 
@@ -260,7 +261,8 @@ def view(
         raise UsageError("nothing to do: give --save FILE.rrd, or leave --no-spawn out")
     if save:
         inside = folder.iterdir() if folder.is_dir() else ()
-        check_target(save, [folder, robot, *(path for path in inside if path.suffix != ".rrd")])
+        read = [folder, robot, *(path for path in inside if path.suffix != ".rrd")]
+        check_results([(save, viewer.RECORDING)], read, overwrite)
     scene = viewer.write(folder, save, robot) if save else None
     if save:
         size = f"{1e-6 * save.stat().st_size:.1f} MB"

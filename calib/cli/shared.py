@@ -20,6 +20,9 @@ Robot = Annotated[str, typer.Argument(help="a .urdf, an MDH .toml, a library nam
 Base = Annotated[str | None, typer.Option(help="URDF: the link the arm starts at")]
 Tip = Annotated[str | None, typer.Option(help="URDF: the link the arm ends at")]
 Plots = Annotated[bool, typer.Option("--plots/--no-plots", help="draw figures, or leave them out")]
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="replace files, whatever they hold; without: those of an earlier run")
+]
 Seed = Annotated[int, typer.Option(min=0, help="reproduces everything random")]
 
 

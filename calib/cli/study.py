@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.shared import Base, Plots, Robot, Seed, Tip, exit_failed, reporting, say
+from calib.cli.shared import Base, Overwrite, Plots, Robot, Seed, Tip, exit_failed, reporting, say
 
 app = typer.Typer()
 SHOWN = 3  # conditions whose tables are printed in full
@@ -72,6 +72,7 @@ def compare(
         Path | None, typer.Option(help="TOML, as of calib identify; with [loop], all methods run")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="CSV to write the table to")] = None,
+    overwrite: Overwrite = False,
     base: Base = None,
     tip: Tip = None,
     seed: Seed = 0,
@@ -85,10 +86,10 @@ def compare(
     from calib.procedure.dynamic_stage import inputs
     from calib.procedure.report import console
     from calib.procedure.study import method_table
-    from calib.procedure.study.method_comparison import caveats, compare_methods, write_table
+    from calib.procedure.study.method_comparison import COMPARISON, caveats, compare_methods, write_table
 
     if out is not None:
-        files.check_target(out, [robot, *recordings, *(validate or []), options], (".csv",))
+        files.check_results([(out, COMPARISON)], [robot, *recordings, *(validate or []), options], overwrite)
     chosen = _names(methods)
     with reporting() as (say_now, progress):
         given = inputs.gather(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,6 +22,8 @@ from calib.data.poses.plausible import Limits
 from calib.data.poses.pose_files import read_joints
 from calib.errors import MeasurementError
 
+DIGITS = 9  # of one number or more in a row that was computed: values typed by a person have fewer (our choice)
+_DIGIT = re.compile(r"\d")
 NEAR = 0.02  # read-back and commanded joints of one pose differ by less [rad or m]; our choice
 
 
@@ -40,6 +43,17 @@ def write_poses(
             values[:, j] = np.rad2deg(values[:, j])
             header[j] = f"{header[j]} [deg]"
     return files.write_numbers(path, header, values)
+
+
+def poses_kind(joint_names: Sequence[str]) -> files.Kind:
+    """Return the kind of files that `write_poses` writes in rad of one arm: joints and nothing that was measured."""
+
+    def fits(header: list[str], rows: list[list[str]]) -> bool:
+        n = len(joint_names)
+        planned = all(any(len(_DIGIT.findall(cell)) >= DIGITS for cell in row[:n]) for row in rows)
+        return header[:n] == list(joint_names) and planned and not any(cell for row in rows for cell in row[n:])
+
+    return files.table("list of planned poses", fits)
 
 
 def read_poses(

@@ -126,7 +126,7 @@ class ErrorModel:
         jacobian = _placed_anew(jacobian, np.arange(frames))[frames:]
         values, vectors = np.linalg.eigh(self.covariance[np.ix_(stays, stays)])
         root = vectors * np.sqrt(np.clip(values, 0.0, None))
-        spread = (root.T @ jacobian.reshape(len(root), -1)).reshape(-1, 3, len(block))
+        spread = (root.T @ jacobian.reshape(len(root), 3 * len(block))).reshape(len(root), 3, len(block))
         return self._sigma(np.sum(spread**2, axis=(0, 1)), block.q)
 
     def _sigma(self, own: np.ndarray, q: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +16,17 @@ from calib.robot import calibrated
 from calib.robot.calibrated import CalibratedChain, nominal_of
 from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import ur, urdf, urdf_write
-from calib.robot.formats.markup import text
+from calib.robot.formats.markup import text, with_comment
 from calib.robot.formats.readback import link_poses, tip_poses
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.kinematics import forward, joint_frames
 from calib.transforms import invert
 
+UR_KINEMATICS = files.Kind("UR kinematics", (".yaml", ".yml"), lambda path: b" calib_" in path.read_bytes())
+OFFSETS_HEADER = ("joint", "unit", "offset", "sigma")
+OFFSETS = files.table("list of joint offsets", lambda header, _: tuple(header) == OFFSETS_HEADER)
+_ORIGIN, _COMPUTED = re.compile(r"<origin\b[^>]*>"), re.compile(r"\.\d{9}")
+_JUDGED = re.compile(r"<!-- verdict .*? -->", re.S)
 SAME = 1e-9  # poses read back by Pinocchio have to agree to this [m, and as a rotation matrix]
 
 
@@ -60,12 +65,38 @@ def without_corrections(folder: Path) -> str:
     )
 
 
-def check_targets(folder: Path, source: Path | None, targets: Sequence[Path]) -> None:
-    """Refuse, before any work is done, files that cannot be written, are read or are a result, or are one file."""
-    for target in targets:
+def check_targets(
+    folder: Path,
+    source: Path | None,
+    out: Path | None = None,
+    ur_kinematics: Path | None = None,
+    offsets: Path | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Refuse, before any work is done, files that cannot be written, are read, not an earlier export's, or one file.
+
+    Args:
+        folder: of the fit; source: the URDF to edit.
+        out, ur_kinematics, offsets: to be written.
+        overwrite: replace whatever stands there.
+    """
+    calibrated_urdf = files.Kind("calibrated form of that URDF", (".urdf",), lambda path: _is_calibrated(path, source))
+    asked = [(out, calibrated_urdf), (ur_kinematics, UR_KINEMATICS), (offsets, OFFSETS)]
+    targets = [(target, kind) for target, kind in asked if target is not None]
+    for target, _ in targets:
         if source is not None and files.same_file(source, target):
             raise UsageError(f"{target} is the source URDF, which stays as it is; give another name to write to")
-    files.check_targets(targets, [source, *results(folder)])
+    files.check_results(targets, [source, *results(folder)], overwrite)
+
+
+def _is_calibrated(path: Path, source: Path | None) -> bool:
+    """Tell whether `export_urdf` made a file of a source: it differs in origins alone, and those were computed."""
+    if source is None:
+        return False
+    theirs, ours = (_JUDGED.sub("", text(one)[0]) for one in (source, path))
+    new = set(_ORIGIN.findall(ours)) - set(_ORIGIN.findall(theirs))
+    rest = [_ORIGIN.sub("", one).split() for one in (theirs, ours)]
+    return any(map(_COMPUTED.search, new)) and rest[0] == rest[1]
 
 
 def results(folder: Path) -> list[Path]:
@@ -73,7 +104,13 @@ def results(folder: Path) -> list[Path]:
     return [folder / name for name in files_of(folder, (*OURS, *identification.OURS))]
 
 
-def export_urdf(robot: CalibratedChain, source: Path, out: Path, for_corrections: bool = False) -> str:
+def export_urdf(
+    robot: CalibratedChain,
+    source: Path,
+    out: Path,
+    for_corrections: bool = False,
+    remark: str = "",
+) -> str:
     """Put the calibrated geometry into the XML of `source`, have others read it back, and write it to `out`.
 
     Only the origins of the arm's joints change. The base link stays where the nominal robot has its base, and the fixed
@@ -84,6 +121,7 @@ def export_urdf(robot: CalibratedChain, source: Path, out: Path, for_corrections
         source: a URDF of the nominal robot.
         out: the file to write.
         for_corrections: take the geometry that the joint corrections belong to, which is worse without them.
+        remark: to stand at its head.
 
     Returns:
         Who has read it back.
@@ -92,7 +130,8 @@ def export_urdf(robot: CalibratedChain, source: Path, out: Path, for_corrections
     content, encoding = text(source)
     edited = urdf_write.edit(content, nominal_of(robot), chain, str(source))
     read = check_readback(edited, str(source), chain)
-    files.write(out, edited.encode(encoding))
+    data = edited.encode(encoding)
+    files.write(out, with_comment(data, remark) if remark else data)
     return read
 
 
@@ -135,10 +174,10 @@ def export_offsets(robot: CalibratedChain, out: Path) -> Path:
         element, before = robot.chain.elements[k], nominal.elements[k]
         known = float(sigma[k]) if sigma[k] > 0.0 else None
         rows.append((joint.name, joint.unit, (element.value - before.value) / element.ratio, known))
-    return files.write_table(out, ("joint", "unit", "offset", "sigma"), rows)
+    return files.write_table(out, OFFSETS_HEADER, rows)
 
 
-def export_ur_kinematics(robot: CalibratedChain, out: Path) -> Path:
+def export_ur_kinematics(robot: CalibratedChain, out: Path, remark: str = "") -> Path:
     """Write the kinematics YAML of ur_description (see `calib.robot.formats.ur.kinematics`).
 
     ur_description puts its tool0 where wrist_3 is: fixed joints of the robot's file behind it (a flange, a tool) are
@@ -151,7 +190,7 @@ def export_ur_kinematics(robot: CalibratedChain, out: Path) -> Path:
         content = ur.kinematics(nominal_of(robot), robot.chain)
     except RobotError as error:
         raise UsageError(f"'{robot.chain.name}' has not the axes of a UR arm: {error}") from error
-    return files.write(out, content)
+    return files.write(out, f"# {remark}\n{content}" if remark else content)
 
 
 def flange_note(robot: CalibratedChain) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,13 @@ SHOWN = 20  # targets that a message lists
 COLUMNS = (
     "left [mm]", "left [mrad]", "before [mm]", "before [mrad]", "sigma [mm]", "sigma [mrad]", "unseen_rms [mm]",
 )  # fmt: skip
+
+
+def _header(names: Sequence[str]) -> list[str]:
+    return ["row", *names, "status", *COLUMNS, "reason"]
+
+
+COMMANDS = files.table("list of joint commands", lambda header, _: header == _header(header[1 : -len(COLUMNS) - 2]))
 
 
 def write(commands: Commands, fitted: Fitted, targets: Targets, out: Path, partial: bool = False) -> Path:
@@ -32,7 +40,6 @@ def write(commands: Commands, fitted: Fitted, targets: Targets, out: Path, parti
         raise UsageError("\n".join([head, *shown]) + advice)
     names = targets.columns or fitted.cell.chain.joint_names
     factors = np.array(targets.factors or [1.0] * len(names))
-    header = ("row", *names, "status", *COLUMNS, "reason")
     unseen = None if fitted.unseen is None else 1e3 * fitted.unseen
     rows = []
     for k, good in enumerate(commands.reached):
@@ -40,7 +47,7 @@ def write(commands: Commands, fitted: Fitted, targets: Targets, out: Path, parti
         numbers = np.concatenate([commands.left[k], commands.before[k], commands.sigma[k]])
         cells = [None if np.isnan(value) else 1e3 * float(value) for value in numbers]
         rows.append((k + 1, *q, "reached" if good else "not reached", *cells, unseen, commands.reason[k]))
-    return files.write_table(out, header, rows)
+    return files.write_table(out, _header(names), rows)
 
 
 def lines(commands: Commands, targets: Targets, fitted: Fitted) -> list[str]:

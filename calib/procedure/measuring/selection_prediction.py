@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +60,11 @@ class SelectionPrediction:
 def beside(poses: Path) -> Path:
     """Return where the prediction of a CSV of chosen poses lies."""
     return poses.parent / (poses.stem + SUFFIX)
+
+
+def left_by_select(path: Path) -> bool:
+    """Tell whether a file is a prediction as `write` leaves it."""
+    return set(json.loads(path.read_text(encoding="utf-8"))) == {field.name for field in fields(SelectionPrediction)}
 
 
 def write(prediction: SelectionPrediction, poses: Path) -> Path:

@@ -32,6 +32,7 @@ from matplotlib.text import Text
 from matplotlib.ticker import FixedFormatter, FixedLocator, MaxNLocator, NullLocator
 from matplotlib.transforms import IdentityTransform
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from calib import files
 from calib.procedure.report.page import Picture
@@ -315,7 +316,9 @@ def png(figure: Figure, dpi: float = DPI) -> bytes:
     palette[palette > 251] = 255  # the paper is white; the search for a palette misses it by a digit
     image.putpalette(palette.tolist())
     buffer = io.BytesIO()
-    image.save(buffer, "png", dpi=(dpi, dpi))
+    told = PngInfo()
+    told.add_text("Software", "armature-calib")  # by which `calib.files.PICTURE` knows it
+    image.save(buffer, "png", dpi=(dpi, dpi), pnginfo=told)
     return buffer.getvalue()
 
 

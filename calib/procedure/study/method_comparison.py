@@ -261,13 +261,16 @@ def _ranked(done: Sequence[tuple[ComparedMethod, _Sums]], alike: np.ndarray) -> 
     return [replace(one, chosen=one is taken) for one in result]
 
 
+HEADER = [
+    "rank", "method", "unseen_percent", "sigma", "raw_percent", "training_percent", "worst_joint",
+    "worst_joint_percent", "behind", "behind_sigma", "as_good", "take", "parameters", "seconds", "iterations",
+    "simulations", "failure",
+]  # fmt: skip
+COMPARISON = files.table("comparison of methods", lambda header, _: header == HEADER)
+
+
 def write_table(found: Sequence[ComparedMethod], path: Path) -> Path:
     """Write the comparison as CSV."""
-    header = [
-        "rank", "method", "unseen_percent", "sigma", "raw_percent", "training_percent", "worst_joint",
-        "worst_joint_percent", "behind", "behind_sigma", "as_good", "take", "parameters", "seconds", "iterations",
-        "simulations", "failure",
-    ]  # fmt: skip
     lines = [
         (
             one.rank or "", one.name, *_cells(one.unseen, one.sigma, one.raw, one.training), one.worst[0] or "",
@@ -277,7 +280,7 @@ def write_table(found: Sequence[ComparedMethod], path: Path) -> Path:
         )
         for one in found
     ]  # fmt: skip
-    return files.write_table(path, header, lines)
+    return files.write_table(path, HEADER, lines)
 
 
 def _cells(*values: float) -> list[object]:

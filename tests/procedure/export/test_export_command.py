@@ -39,6 +39,11 @@ def test_the_source_keeps_everything_but_its_joint_origins(cell, calib, fitted):
     assert re.sub(r"<origin [^>]*>", "", before) == re.sub(r"<origin [^>]*>", "", after)
     q = np.random.default_rng(1).uniform(-2, 2, (30, 6))
     assert np.abs(forward(urdf.read("new.urdf"), q) - forward(load(fitted), q)).max() < 1e-9
+    kept = after.replace("</robot>", "<!-- mine --></robot>")
+    for content, expected in ((after, 0), (kept, 2), (before, 2)):  # its own file again; edited since; a copy
+        Path("new.urdf").write_text(content)
+        assert calib("export", fitted, "--urdf", "source.urdf", "--out", "new.urdf")[0] == expected
+    assert Path("new.urdf").read_text() == before
 
 
 def test_pinocchio_reads_the_exported_urdf_as_the_calibrated_arm(cell, calib, fitted):
@@ -173,11 +178,11 @@ def test_a_marginal_result_is_exported_with_what_made_it_marginal(cell, calib, f
     assert code == 0 and out.startswith(said) and "do not use" not in out
     assert Path("x/README.txt").read_text().startswith(said)
     assert f"<!-- {said}" in Path("x/robot.urdf").read_text()
-    code, out, _ = calib("export", "odd", "--urdf", "source.urdf", "--out", "one.urdf", "--ur-kinematics", "k.txt")
+    code, out, _ = calib("export", "odd", "--urdf", "source.urdf", "--out", "one.urdf", "--ur-kinematics", "k.yaml")
     assert code == 0 and said in out and f"<!-- {said}" in Path("one.urdf").read_text()
-    for name in ("k.txt", "x/ur_kinematics.yaml"):
+    for name in ("k.yaml", "x/ur_kinematics.yaml"):
         assert Path(name).read_text().startswith(f"# {said}")
-    assert yaml.safe_load(Path("k.txt").read_text())["kinematics"]
+    assert yaml.safe_load(Path("k.yaml").read_text())["kinematics"]
     with pytest.warns(UserWarning, match=said):
         assert export("odd", "x")[0].startswith(said)
     assert calib("export", fitted, "--into", "x")[0] == 0

@@ -314,3 +314,9 @@ def test_turned_orientations_fail_on_unseen_rows(cell, calib):
 def _directions(count: int) -> np.ndarray:
     axes = np.random.default_rng(5).standard_normal((count, 3))
     return axes / np.linalg.norm(axes, axis=1)[:, None]
+
+
+def test_a_placement_alone_is_validated_with_frames_of_its_own(cell, calib):
+    file, other = cell.write("a.csv", cell.measure(60)), cell.write("b.csv", cell.measure(40, 1))
+    code, out, err = calib("fit", "ur5", file, "--model", "frames", "--validate", other, "--refit-frames", "--out", "o")
+    assert (code, "b.csv" in out) == (0, True), err

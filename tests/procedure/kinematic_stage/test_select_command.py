@@ -159,3 +159,38 @@ def test_nothing_is_written_onto_what_is_read(cell, calib, out, words):
     code, _, err = calib("select", "ur5", "-m", 8, "--candidates", 100, *given, "--out", out)
     assert (code, words in err) == (2, True), err
     assert kept == {name: Path(name).read_bytes() for name in kept}
+
+
+def _poses(path: str, names: tuple[str, ...], more: str = "") -> bytes:
+    head, row = ",".join(names), ",".join(["0.123456789012"] * len(names))
+    Path(path).write_text(f"{head}{',x,y,z' if more else ''}\n{row}{more}\n")
+    return Path(path).read_bytes()
+
+
+def test_a_file_that_an_earlier_run_did_not_leave_is_kept(cell, calib) -> None:
+    names = load("ur5").joint_names
+    kept = {
+        "measured.csv": _poses("measured.csv", names, ",0.1,0.2,0.3"),
+        "taught.csv": ",".join(names).encode() + b"\n0.1,0.2,0.3,0.4,0.5,0.6\n",
+        "other.csv": b"a,b\n1,2\n",
+    }
+    for name, content in kept.items():
+        Path(name).write_bytes(content)
+        code, _, err = calib("select", "ur5", "-m", "8", "--candidates", "100", "--no-plots", "--out", name)
+        assert (code, name in err and "--overwrite" in err) == (2, True), err
+    assert {name: Path(name).read_bytes() for name in kept} == kept
+    assert not list(Path().glob("*_prediction.json"))
+    code, _, err = calib("select", "ur5", "-m", "8", "--candidates", "100", "--no-plots", "--out", "plot_mine.png")
+    assert (code, "suffix .csv" in err) == (2, True)
+
+
+def test_a_command_replaces_its_own_files(cell, calib) -> None:
+    given = ("select", "ur5", "--candidates", "100", "--out", "p.csv", "--run", "run.csv")
+    for more in (("-m", "8"), ("-m", "9")):
+        code, _, err = calib(*given, *more)
+        assert code == 0, err
+    assert len(Path("p.csv").read_text().splitlines()) == 10
+    _poses("empty.csv", load("ur5").joint_names, ",,,")  # columns to fill in, nothing filled in yet
+    for name, more in (("empty.csv", ()), ("run.csv", ("--overwrite",))):
+        code, _, err = calib("select", "ur5", "-m", "8", "--candidates", "100", "--no-plots", "--out", name, *more)
+        assert code == 0, err
