@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -12,6 +13,7 @@ from calib.estimation.triangles import Triangles
 from calib.identification.rows import pool
 
 ITERATIONS = 12
+ALIKE = 10.0  # largest ratio of the prior deviations of a group's parameters of one unit (our choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +87,12 @@ class CrossValidation:
             others = ~np.isin(blocks, run)
             whole = squares[others].sum(axis=0) + known
             rows = int(np.sum(samples[others].sum(axis=0) / self.inflation))
-            found.append(_drawn(whole, rows, self.group[columns])[0])
+            found.append(_drawn(whole, rows, self.group[columns], self._kinds[columns])[0])
         return found
+
+    @cached_property
+    def _kinds(self) -> np.ndarray:
+        return _kinds(self.group, self.data.units)
 
     @cached_property
     def _squares(self) -> np.ndarray:
@@ -118,12 +124,26 @@ def estimate(
         scale = np.where(size > 0.0, size, 1.0)
         found = np.linalg.lstsq(stacked[:, :-1] / scale, stacked[:, -1], rcond=1e-10)[0]
         return found / scale, np.full(len(group), np.inf)
-    return _drawn(stacked.T @ stacked, int(np.sum(data.rows / inflation)), group)
+    return _drawn(stacked.T @ stacked, int(np.sum(data.rows / inflation)), group, _kinds(group, data.units))
 
 
-def _drawn(square: np.ndarray, rows: int, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return values and prior standard deviations (p,) from [W y]ᵀ[W y] (p + 1, p + 1) of so many rows."""
+def _kinds(group: np.ndarray, units: Sequence[str]) -> np.ndarray:
+    """Return (p,) a number for columns of one group and one unit; -1 for those of no group."""
+    found, unit = np.unique(units, return_inverse=True)
+    return np.where(group < 0, -1, group * len(found) + unit)
+
+
+def _drawn(square: np.ndarray, rows: int, group: np.ndarray, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return values and prior standard deviations (p,) from [W y]ᵀ[W y] (p + 1, p + 1) of so many rows.
+
+    A group's ridge is in units of what each column explains, so that one is enough for different units; but parameters
+    of one kind are about equally large. What the motion hardly shows (Stribeck's torque of a joint that never slows
+    down) has a prior deviation of `ALIKE` times that of the best shown at most, not one without end.
+    """
     size = np.sqrt(np.diag(square)[:-1])
+    seen = np.zeros(kinds.max(initial=-1) + 2)  # the last for -1
+    np.maximum.at(seen, kinds, size)
+    size = np.where(group < 0, size, np.maximum(size, seen[kinds] / ALIKE))
     scale = np.where(size > 0.0, size, 1.0) / np.sqrt(max(rows, 1))
     scaled = square[:-1, :-1] / (scale[:, None] * scale)
     scaled[np.diag_indices(len(group))] += np.where(group < 0, 1e-9 * rows, 0.0)  # free, without data: stays at zero
