@@ -24,7 +24,7 @@ class MotionSamples:
     Attributes:
         index: (N,) which of the motion's.
         q, v, a: (N, n).
-        effort: torques of the whole motion, smoothed.
+        effort: torques of the whole motion, smoothed; velocity: of the whole motion.
         bodies: of the robot.
     """
 
@@ -33,6 +33,7 @@ class MotionSamples:
     v: np.ndarray
     a: np.ndarray
     effort: np.ndarray
+    velocity: np.ndarray
     bodies: Bodies
 
     @property
@@ -70,7 +71,7 @@ def take_samples(case: Case, bodies: Bodies, count: int) -> MotionSamples | None
     index = inner[:: max(1, len(inner) // count)]
     effort = _smoothed(np.asarray(case.target), max(1, round(SMOOTH * motion.rate)))
     q, v, a = (np.ascontiguousarray(x[index]) for x in (motion.q, motion.v, motion.a))
-    return MotionSamples(index, q, v, a, effort, bodies)
+    return MotionSamples(index, q, v, a, effort, motion.v, bodies)
 
 
 def drive_columns(v: np.ndarray, a: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Can recordings be of this robot? Its own masses, its limits, and the clock of the torques against that of positions.
 
 Numbers only; what they mean for a verdict is said in `calib.procedure.dynamic_stage.plausibility`. Everything is looked
-at on a few samples with standard friction: sizes and signs, no model. All thresholds are our choice; on the real
+at on a few samples: sizes, signs and clocks, no model. All thresholds are our choice; on the real
 recordings at hand (Panda, KR300, LWR4+, TX40, TIAGo, 22 of a UR10e) none is reached.
 """
 
@@ -14,32 +14,15 @@ import numpy as np
 
 from calib.dynamics.bodies import Bodies, bodies_of
 from calib.identification.cases import Case
-from calib.identification.checks.motion_samples import MotionSamples, basis, left_share, take_samples
+from calib.identification.checks.motion_samples import take_samples
 from calib.identification.checks.recorded_motion import share_of_nominal
+from calib.identification.checks.torque_lag import Lag, lag_of
 from calib.identification.checks.whole_robot import ClockRatio, Rearranged, clock_ratio, rearranged
 from calib.identification.rows import segments
 from calib.robot.chain import Chain
 
 ROWS, FEW = 1500, 500  # samples on which a lag is looked for, and all else
-LAGS = 0.25  # largest lag that is tried [s], in steps of
-STEP = 0.005
-FALLS, ALIKE, LEAST = 0.2, 0.01, 0.015
-"""A joint prefers a lag where its residual falls by this share; joints agree within this [s] or a quarter of it, on no
-less than this [s]."""
 TRAVEL = 0.05  # a joint that travels less says nothing of its velocity's size [rad or m]
-
-
-@dataclass(frozen=True)
-class Lag:
-    """By how much torques come later than the positions of their row [s], and what that explains.
-
-    Attributes:
-        before, after: rms share of the joints' torques that bodies and standard friction leave: as recorded, shifted.
-    """
-
-    seconds: float
-    before: float
-    after: float
 
 
 @dataclass(frozen=True)
@@ -86,7 +69,7 @@ def compare_sizes(
         speed = _speed_ratio(motion.t, motion.q, v, motion.segment)
     bodies = _under(chain, gravity)
     many, few = (take_samples(case, bodies, count) for count in (ROWS, FEW))
-    lag = None if many is None else _lag_of(many, motion.rate)
+    lag = None if many is None else lag_of(many, motion.rate)
     clock = clock_ratio(few, chain) if newtons and few is not None else None
     other = rearranged(few, chain) if known and few is not None else None
     return RecordingSizes(case.name, masses, speed, lag, clock, other, motion.jumps)
@@ -108,36 +91,6 @@ def _speed_ratio(t: np.ndarray, q: np.ndarray, v: np.ndarray, segment: np.ndarra
     power = np.maximum((own**2).sum(axis=0), 1e-300)
     alike = (own * seen).sum(axis=0) > 0.9 * np.sqrt(power * (seen**2).sum(axis=0))
     return np.where(alike & (np.ptp(q, axis=0) > TRAVEL), (own * seen).sum(axis=0) / power, np.nan)
-
-
-def _lag_of(samples: MotionSamples, rate: float) -> Lag | None:
-    """Return the lag of the torques on which most joints agree; None where they do not.
-
-    One joint alone may prefer a lag, since its friction is of another form than assumed; a clock is everybody's.
-
-    Args:
-        samples: of the recording.
-        rate: of its motion [Hz].
-    """
-    n = samples.q.shape[1]
-    shifts = np.arange(-LAGS, LAGS + STEP / 2, STEP)
-    places, times = samples.index + shifts[:, None] * rate, np.arange(len(samples.effort))
-    columns = np.concatenate([samples.inertial, samples.drives], axis=2)
-    left = np.array(
-        [left_share(basis(columns[:, j]), np.interp(places, times, samples.effort[:, j])) for j in range(n)]
-    )  # (n, shifts)
-    now = left[:, len(shifts) // 2]
-    better = left.min(axis=1) < (1.0 - FALLS) ** 2 * now
-    if not better.any():
-        return None
-    own = shifts[left.argmin(axis=1)]
-    common = float(np.median(own[better]))
-    agree = better & (np.abs(own - common) <= np.maximum(ALIKE, 0.25 * abs(common)))
-    if 2 * agree.sum() < n or abs(common) < LEAST:
-        return None
-    common = float(own[agree].mean())
-    shifted = left[:, int(np.argmin(np.abs(shifts - common)))]
-    return Lag(common, float(np.sqrt(now.mean())), float(np.sqrt(shifted.mean())))
 
 
 def _under(chain: Chain, gravity: Sequence[float] | None) -> Bodies:

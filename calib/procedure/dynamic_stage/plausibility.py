@@ -6,8 +6,8 @@ fails, or holds the verdict at marginal, until the options' ``accept`` says that
 masses   torques that pull against the robot's own masses, or `FAR` times as much as these ask for, or a share of it:
          fail; beyond `OFF`, or `FAR` at single joints: marginal
 speed    measured velocities that are not the slope of the positions, by `SLIGHT`: marginal; by `WRONG` times: fail
-lag      torques that come later than the positions of their row, at most joints alike (``[recording] lag = …`` takes
-         them earlier): a note; where that explains `HELPS` of what is left: marginal
+lag      torques that come later than the positions of their row, surely and by 15 ms (``[recording] lag = …`` takes
+         them earlier), or those of one joint alone: marginal; where that leaves all errors 1/`HALVES` or less: fail
 clock    inertias that are `INERT` times too large or small beside the masses that gravity tells, for the lengths of the
          robot: marginal; beyond `FAR`: fail. Not said where measured velocities say so already
 order    two joints with which exchanged the robot's own masses leave less than `EXCHANGED` of the torques, and of no
@@ -28,7 +28,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from calib.identification.checks.recording_sizes import Lag, RecordingSizes
+from calib.identification.checks.recording_sizes import RecordingSizes
+from calib.identification.checks.torque_lag import Lag
 from calib.identification.checks.whole_robot import ClockRatio, Rearranged
 from calib.identification.methods.loop_agreement import LoopDisagreement
 from calib.identification.possible.contradiction import Contradiction
@@ -36,7 +37,7 @@ from calib.procedure.findings import Finding
 
 FAR, OFF = 3.0, 2.2
 SLIGHT, WRONG = 0.05, 1.5
-HELPS = 0.3
+HALVES = 2.0
 INERT = 2.0
 LOST = 30.0
 EXCHANGED, TURNED, UNTOLD = 0.98, 0.7, 0.3
@@ -49,7 +50,7 @@ def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Fin
     for each in sizes:
         speed = list(_speed(each, joints))
         found += [*_masses(each, joints), *speed, *([] if speed else _clock(each.name, each.clock))]
-        found += [*_lag(each.name, each.lag), *_other(each.name, each.other, joints)]
+        found += [*_lag(each.name, each.lag, joints), *_other(each.name, each.other, joints)]
         found += [Finding("jump", "marginal", f"{each.name}: {words}") for words in each.jumps]
     return found
 
@@ -137,16 +138,29 @@ def _speed(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
     yield Finding("speed", "fail" if far else "marginal", f"{words} Accelerations and inertias rest on the stamps")
 
 
-def _lag(name: str, lag: Lag | None) -> Iterator[Finding]:
+def _lag(name: str, lag: Lag | None, joints: Sequence[str]) -> Iterator[Finding]:
     if lag is None:
         return
-    way = "later" if lag.seconds > 0 else "earlier"
-    yield Finding(
-        "lag", "marginal" if lag.after < (1.0 - HELPS) * lag.before else "pass",
-        f"{name}: the torques come some {1e3 * abs(lag.seconds):.0f} ms {way} than the positions: [recording] lag = "
-        f"{lag.seconds:.3f} in the options takes them back; with standard friction {100 * lag.after:.1f} % of the "
-        f"joints' torques then stay unexplained, {100 * lag.before:.1f} % as recorded",
-    )  # fmt: skip
+    if lag.told:
+        size = f"{1e3 * abs(lag.seconds):.0f} ± {1e3 * lag.sigma:.0f} ms {_way(lag.seconds)}"
+        yield Finding(
+            "lag", "fail" if lag.factor > HALVES else "marginal",
+            f"{name}: the torques come {size} than the positions: [recording] lag = {lag.seconds:.3f} in the options "
+            f"takes them back; a model of bodies and friction then leaves {100 * lag.after:.1f} % of the joints' "
+            f"torques, {100 * lag.before:.1f} % as recorded",
+        )  # fmt: skip
+    if (j := lag.joint) is not None:
+        apart = float(lag.own[j] - lag.seconds)
+        yield Finding(
+            "lag", "marginal",
+            f"{name}: the torques of {joints[j]} alone come some {1e3 * abs(apart):.0f} ms {_way(apart)} than those of "
+            f"the other joints, which leaves {lag.gains[j]:.2g} times as much of them unexplained: have its drive and "
+            "its encoder one clock?",
+        )  # fmt: skip
+
+
+def _way(seconds: float) -> str:
+    return "later" if seconds > 0 else "earlier"
 
 
 def _clock(name: str, found: ClockRatio | None) -> Iterator[Finding]:

@@ -1,0 +1,169 @@
+"""By how much do torques come later than the positions of their row? A clock is everybody's; a joint may be late alone.
+
+One model of all joints is fitted at every lag that is tried: bodies shared by the joints, drives of each, and least
+squares weighed by what is left of each joint. Bodies of each joint's own bend after a late torque: they find 148 ms
+where torques are 100 ms late. Friction turns over later than its speed does, as long as joints bend before they slide,
+and would pass for a lag of 20 ms (the Panda's wrist); so sign(v) may come `FREE` earlier and later, at each joint, and
+friction tells nothing of the lag: masses and inertias do. The least of the residual is found by a parabola; its sigma
+takes each joint's vote for one draw. All of this and its thresholds are our choice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.identification.checks.motion_samples import MotionSamples, basis
+from calib.identification.checks.recorded_motion import CREEP
+
+LAGS = 0.25  # largest lag that is tried [s], in steps of
+STEP = 0.005
+FREE = 0.03  # by which friction may turn over early or late by itself [s]
+SWEEPS = 30  # over the joints' own lags
+LEAST, SURE = 0.015, 3.0  # least lag that is told [s], and in sigmas
+HELPS = 1.05  # and what is left without it over what is left with it: of another robot any lag may be the best
+ALONE, OTHERS = 0.15, 3.0  # share by which a lag of its own helps a joint, and times as much as any other joint's
+ROUNDS = 4  # of weighing joints by what is left of them
+UNSURE = 0.005  # sigma that a friction of another form brings [s]: real recordings as they are show lags of 4 ms rms
+LONG = 2.0  # time with samples below which a motion tells no lag: bodies then stand for it [s]
+
+
+@dataclass(frozen=True)
+class Lag:
+    """By how much torques come later than the positions of their row [s], and what that explains.
+
+    Attributes:
+        sigma: of `seconds` [s].
+        before, after: rms share of the joints' torques that bodies and friction leave: as recorded, shifted.
+        factor: what is left as recorded over what is left shifted, joints weighed by what is left of them.
+        own: (n,) lags of the joints, each for itself [s].
+        gains: (n,) what is left of a joint at the common lag over what is left at its own, the others at theirs.
+    """
+
+    seconds: float
+    sigma: float
+    before: float
+    after: float
+    factor: float
+    own: np.ndarray
+    gains: np.ndarray
+
+    @property
+    def told(self) -> bool:
+        """Whether all torques come late, surely, and by enough."""
+        least = max(LEAST, SURE * self.sigma)
+        return least < abs(self.seconds) < LAGS - STEP and self.factor > HELPS
+
+    @property
+    def joint(self) -> int | None:
+        """The one joint, from 0, that has a lag of its own as no other has; None without."""
+        j, more = int(self.gains.argmax()), np.sort(self.gains) - 1.0
+        apart = abs(self.own[j] - self.seconds) > LEAST
+        return j if apart and more[-1] > max(ALONE, OTHERS * (more[-2] if len(more) > 1 else np.inf)) else None
+
+
+def lag_of(samples: MotionSamples, rate: float) -> Lag | None:
+    """Return the lag of the torques; None where the motion is too short to tell.
+
+    Args:
+        samples: of the recording.
+        rate: of its motion [Hz].
+    """
+    m, n = samples.q.shape
+    if m * float(np.median(np.diff(samples.index))) < LONG * rate:
+        return None
+    shifts = np.arange(-LAGS, LAGS + STEP / 2, STEP)
+    recorded = np.full(n, len(shifts) // 2)
+    places, times = samples.index + shifts[:, None] * rate, np.arange(len(samples.effort))
+    torque = np.stack([np.interp(places, times, own) for own in samples.effort.T])
+    columns = np.concatenate([samples.inertial, samples.drives, *_turning(samples, rate)], axis=2).transpose(1, 0, 2)
+    fit = _Fit(columns, torque, 1.0 / np.maximum(torque[:, recorded[0]].std(axis=1), 1e-12))
+    for _ in range(ROUNDS):
+        left = fit.left(np.full(n, fit.common.argmin()))
+        fit = _Fit(columns, torque, fit.weight / np.maximum(left.std(axis=1), 1e-12))
+    at = int(fit.common.argmin())
+    common, alone = np.full(n, at), fit.own(np.full(n, at))
+    spread = torque[:, recorded[0]].std(axis=1)
+
+    def share(places: np.ndarray) -> float:
+        return float(np.sqrt(np.mean((fit.left(places).std(axis=1) / fit.weight / np.maximum(spread, 1e-12)) ** 2)))
+
+    return Lag(
+        seconds=float(shifts[at] + STEP * _least(fit.common, at)),
+        sigma=float(np.hypot(fit.sigma(at), UNSURE)),
+        before=share(recorded),
+        after=share(common),
+        factor=float(np.sqrt(fit.common[recorded[0]] / max(fit.common[at], 1e-300))),
+        own=shifts[alone],
+        gains=np.array([fit.gain(alone, j, at) for j in range(n)]),
+    )
+
+
+class _Fit:
+    """Least squares of the joints' torques at any lags: projections at every lag, so that sums of them are cheap."""
+
+    def __init__(self, columns: np.ndarray, torque: np.ndarray, weight: np.ndarray) -> None:
+        """Project torques (n, shifts, m), weighed (n,), on columns (n, m, p) of all joints."""
+        n, m, p = columns.shape
+        self.weight, self.torque = weight, torque * weight[:, None, None]
+        self.basis = basis((columns * weight[:, None, None]).reshape(n * m, p)).reshape(n, m, -1)
+        self.parts = np.matmul(self.torque, self.basis)  # (n, shifts, k)
+        self.power = (self.torque**2).sum(axis=2)
+        self.common = self.power.sum(axis=0) - (self.parts.sum(axis=0) ** 2).sum(axis=1)
+        """(shifts,) what is left where all joints have one lag."""
+
+    def left(self, places: np.ndarray) -> np.ndarray:
+        """Return (n, m) what is left of the weighed torques at the joints' lags (n,)."""
+        rows = np.arange(len(places))
+        return self.torque[rows, places] - self.basis @ self.parts[rows, places].sum(axis=0)
+
+    def along(self, places: np.ndarray, joint: int) -> np.ndarray:
+        """Return (shifts,) what is left in all where one joint's lag varies and the others keep theirs (n,)."""
+        others = np.flatnonzero(np.arange(len(places)) != joint)
+        fixed = self.parts[others, places[others]].sum(axis=0)
+        explained = ((fixed + self.parts[joint]) ** 2).sum(axis=1)
+        return np.asarray(self.power[others, places[others]].sum() + self.power[joint] - explained)
+
+    def own(self, places: np.ndarray) -> np.ndarray:
+        """Return (n,) the lags of least squares of the joints, each for itself, from the given ones on."""
+        places = places.copy()
+        for _ in range(SWEEPS):
+            before = places.copy()
+            for joint in range(len(places)):
+                places[joint] = self.along(places, joint).argmin()
+            if (places == before).all():
+                break
+        return places
+
+    def gain(self, places: np.ndarray, joint: int, common: int) -> float:
+        """Return what is left with a joint at the common lag over what is left at its own (n,), by its own torque."""
+        along, own = self.along(places, joint), float((self.left(places)[joint] ** 2).sum())
+        return float(np.sqrt(1.0 + max(along[common] - along[places[joint]], 0.0) / max(own, 1e-300)))
+
+    def sigma(self, at: int) -> float:
+        """Return the sigma of the common lag at place `at` [s]: each joint's vote is one draw."""
+        inner = int(np.clip(at, 1, self.torque.shape[1] - 2))
+        slope = (self.torque[:, inner + 1] - self.torque[:, inner - 1]) / (2.0 * STEP)
+        slope = slope - self.basis @ np.einsum("jm,jmk->k", slope, self.basis)
+        votes, power = (self.left(np.full(len(slope), inner)) * slope).sum(axis=1), float((slope**2).sum())
+        few = len(votes) / max(len(votes) - 1, 1)
+        return float(np.sqrt(few * ((votes - votes.mean()) ** 2).sum()) / max(power, 1e-300))
+
+
+def _turning(samples: MotionSamples, rate: float) -> list[np.ndarray]:
+    """Return columns (m, n, n) of friction that turns over early, and late."""
+    n, times = samples.q.shape[1], np.arange(len(samples.velocity))
+    found = []
+    for early in (-FREE, FREE):
+        v = np.stack([np.interp(samples.index + early * rate, times, own) for own in samples.velocity.T], axis=1)
+        found.append(np.tanh(v / CREEP)[:, :, None] * np.eye(n))
+    return found
+
+
+def _least(left: np.ndarray, at: int) -> float:
+    """Return where the parabola about the least place has its least, in places from it."""
+    if not 0 < at < len(left) - 1:
+        return 0.0
+    bend = left[at - 1] - 2.0 * left[at] + left[at + 1]
+    return 0.5 * float(left[at - 1] - left[at + 1]) / float(bend) if bend > 0.0 else 0.0
