@@ -23,7 +23,12 @@ left                position [mm] and orientation [mrad] that the calibrated mod
 before              the same for the nominal joints: what goes wrong without compensation
 sigma               of the tool's position [mm] and orientation [mrad] (root of the sum over the axes), from the fit's
                     covariance
-unseen_rms [mm]     rms error of the calibrated arm on poses that its fit has not seen: what to expect of a real arm
+unseen_rms [mm]     rms error of the calibrated arm on poses that its fit has not seen
+expected [mm]       standard deviation of the real tool's position error at this target, all axes together, with all
+                    that the model leaves and the instrument's noise, as the fit found it on rows left out: what to
+                    expect of a real arm there; empty where the fit does not say
+interval95 [mm]     radius within which 95 % of such errors are to be
+extrapolated        1 where a joint stands outside the range that was measured for the fit, else 0
 reason              why not, or what is odd
 ==================  ===================================================================================================
 """

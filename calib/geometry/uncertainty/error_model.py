@@ -137,7 +137,12 @@ class ErrorModel:
 
     def beyond(self, q: np.ndarray) -> np.ndarray:
         """Return which joints (m, n) stand outside the range that was learnt from: there a prediction extrapolates."""
-        return (q < self.learnt.min(axis=0)) | (q > self.learnt.max(axis=0))
+        return outside(q, self.learnt)
+
+
+def outside(q: np.ndarray, learnt: np.ndarray) -> np.ndarray:
+    """Return which joints (m, n) of poses q (m, n) stand outside the range of those learnt from (k, n) [rad or m]."""
+    return np.asarray((q < learnt.min(axis=0)) | (q > learnt.max(axis=0)))
 
 
 def _distances(q: np.ndarray, learnt: np.ndarray, levers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

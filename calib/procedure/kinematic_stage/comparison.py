@@ -20,6 +20,10 @@ from calib.procedure.kinematic_stage.metrics import RepeatedPoses
 from calib.procedure.measuring.image_findings import reprojection
 from calib.robot.chain import Chain
 
+# of unseen rows: the standard deviation that the fit expects of the calibrated arm's position error there, all axes
+# together; the radius within which 95 % of such errors are to be; 1 where a joint is outside the range learnt from
+INTERVAL = ("sigma [mm]", "interval95 [mm]", "extrapolated")
+
 
 @dataclass(frozen=True, eq=False)
 class Intervals:
@@ -177,6 +181,14 @@ def _intervals(expected: ErrorModel, block: Positions, sigma: np.ndarray, sizes:
     beyond = np.atleast_2d(expected.beyond(block.q))
     names = tuple(name for name, out in zip(block.joint_names, np.asarray(beyond.any(axis=0)).tolist()) if out)
     return Intervals(sigma, expected.discrepancy.radius * sigma, sizes, np.asarray(beyond.any(axis=1)), names)
+
+
+def interval_cells(found: Comparison, count: int) -> list[tuple[float | None, float | None, int | None]]:
+    """Return the cells of `INTERVAL` for each of `count` rows; empty where the fit states no errors."""
+    if found.intervals is None:
+        return [(None, None, None)] * count
+    each = found.intervals
+    return list(zip((1e3 * each.sigma).tolist(), (1e3 * each.radius).tolist(), each.beyond.astype(int).tolist()))
 
 
 def gravity_of(chain: Chain, block: PoseMeasurements) -> np.ndarray | None:

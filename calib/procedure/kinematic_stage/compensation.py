@@ -31,6 +31,7 @@ from calib.geometry import installation_file, inverse
 from calib.geometry.installation import Installation, see
 from calib.geometry.inverse import Goal
 from calib.geometry.parameters import layout
+from calib.geometry.uncertainty.error_model import Discrepancy, ErrorModel, outside
 from calib.geometry.uncertainty.spread import pose_sigmas
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.kinematic_stage.tables import read_covariance
@@ -56,6 +57,8 @@ class Fitted:
         free, covariance: of the fit's parameters, see `read_covariance`.
         unseen: rms error of the calibrated arm on poses that were not fitted [m]; None where there were none.
         fitted: rms error on the fitted poses [m].
+        learnt: (k, n) poses that were fitted [rad or m], and `discrepancy`: what makes errors at others likely; None
+            where the fit does not say.
     """
 
     folder: Path
@@ -65,6 +68,8 @@ class Fitted:
     covariance: np.ndarray
     unseen: float | None
     fitted: float | None
+    learnt: np.ndarray | None = None
+    discrepancy: Discrepancy | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +83,10 @@ class Commands:
         reason: (m,) why not; "" where reached.
         left, before: (m, 2) position [m] and orientation [rad] left at ``q``, and at ``nominal``; NaN for an
             orientation that does not count.
-        sigma: (m, 2) of position [m] and orientation [rad] at ``q``.
+        sigma: (m, 2) of position [m] and orientation [rad] at ``q``, from the parameters' covariance.
+        expected: (m, 2) standard deviation of the real tool's position error at ``q`` [m], all that the model leaves
+            included, and the radius within which 95 % of such errors are to be; None where the fit does not say.
+        beyond: (m, n) joints outside the range that was measured for the fit; none where that is not known.
         dof: 6, 5 or 3.
         notes: which frames were meant, and what is odd.
     """
@@ -90,6 +98,8 @@ class Commands:
     left: np.ndarray
     before: np.ndarray
     sigma: np.ndarray
+    expected: np.ndarray | None
+    beyond: np.ndarray
     dof: int
     notes: tuple[str, ...]
 
@@ -110,7 +120,9 @@ def read(folder: str | Path) -> Fitted:
     own = fit.metrics()
     judged = proof.metrics() if proof.judged.is_file() else own
     rms = [1e-3 * one.calibrated.main.rms for one in (own.fit, *judged.validation.values()) if one.calibrated.main]
-    return Fitted(fit.path, cell, nominal, free, covariance, max(rms[1:], default=None), rms[0] if rms else None)
+    unseen, fitted = max(rms[1:], default=None), rms[0] if rms else None
+    learnt, known = fit.learnt_joints(cell.chain.joints), None if own.findings is None else own.findings.discrepancy
+    return Fitted(fit.path, cell, nominal, free, covariance, unseen, fitted, learnt, known)
 
 
 def placements(fitted: Fitted, frame: str = "base", tool: str = "flange") -> tuple[Installation, Installation]:
@@ -225,12 +237,14 @@ def compensate(
     singular = inverse.conditions(after, q0) < SINGULAR
     reason = tuple("" if good else _why(one.chain, *row) for good, *row in zip(reached, q0, q, left, singular))
     say("sigmas")
-    sigma = _predicted_sigmas(fitted, q, frame, tool, after)
+    sigma, expected = _predicted_sigmas(fitted, q, frame, tool, after)
+    beyond = np.zeros(q.shape, bool) if fitted.learnt is None else outside(q, fitted.learnt)
+    reason = tuple(why or _extrapolates(one.chain, row) for why, row in zip(reason, np.atleast_2d(beyond)))
     missed = _sizes(inverse.differences(after, np.clip(q0, lower, upper), wanted))
     if count == 3:
         sigma[:, 1] = np.nan
     words = (_frame_words(fitted, frame), _tool_words(tool), *notes, *_turn_words(fitted, count))
-    return Commands(q, q0, reached, reason, left, missed, sigma, count, words)
+    return Commands(q, q0, reached, reason, left, missed, sigma, expected, beyond, count, words)
 
 
 def _dof(targets: Targets, chain: Chain, asked: int | None) -> tuple[int, tuple[str, ...]]:
@@ -310,8 +324,19 @@ def _why(chain: Chain, nominal: np.ndarray, q: np.ndarray, left: np.ndarray, sin
     return f"out of reach: {rest} left at the nearest pose found"
 
 
-def _predicted_sigmas(fitted: Fitted, q: np.ndarray, frame: str, tool: str, goal: Goal) -> np.ndarray:
-    """Return sigmas (m, 2) of the tool; where the fit did not place the tool, it counts as known."""
+def _extrapolates(chain: Chain, beyond: np.ndarray) -> str:
+    """Say which joints (n,) of a command stand outside the range that was measured."""
+    names = ", ".join(name for name, out in zip(chain.joint_names, beyond) if out)
+    return f"extrapolated: {names} outside the range that was measured" if names else ""
+
+
+def _predicted_sigmas(
+    fitted: Fitted, q: np.ndarray, frame: str, tool: str, goal: Goal
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return the tool's sigmas (m, 2) by the parameters, and what to expect of it (m, 2), see `Commands`.
+
+    Where the fit did not place the tool, it counts as known.
+    """
     cell, free, covariance = fitted.cell, fitted.free, fitted.covariance
     number = cell.tool_names.index(tool) if tool in cell.tool_names else 0
     if tool not in cell.tool_names:
@@ -319,7 +344,13 @@ def _predicted_sigmas(fitted: Fitted, q: np.ndarray, frame: str, tool: str, goal
         free, covariance = free[keep], covariance[np.ix_(keep, keep)]
         cell = replace(cell, tools=np.repeat(goal.cell.tools, len(cell.tools), axis=0))
     torque = None if goal.torques is None else goal.torques(q)
-    return pose_sigmas(cell, q, free, covariance, torque, -1 if frame == "base" else _station(fitted, frame), number)
+    station = -1 if frame == "base" else _station(fitted, frame)
+    own = pose_sigmas(cell, q, free, covariance, torque, station, number)
+    if fitted.learnt is None or fitted.discrepancy is None:
+        return own, None
+    errors = ErrorModel(cell, free, covariance, fitted.learnt, fitted.discrepancy)
+    sigma = errors.position_sigma(q, torque, station, number)
+    return own, np.column_stack([sigma, fitted.discrepancy.radius * sigma])
 
 
 def _frame_words(fitted: Fitted, frame: str) -> str:

@@ -15,6 +15,7 @@ from calib.procedure.kinematic_stage.compensation import Commands, Fitted
 SHOWN = 20  # targets that a message lists
 COLUMNS = (
     "left [mm]", "left [mrad]", "before [mm]", "before [mrad]", "sigma [mm]", "sigma [mrad]", "unseen_rms [mm]",
+    "expected [mm]", "interval95 [mm]", "extrapolated",
 )  # fmt: skip
 
 
@@ -46,7 +47,10 @@ def write(commands: Commands, fitted: Fitted, targets: Targets, out: Path, parti
         q = (commands.q[k] / factors).tolist() if good else [None] * len(names)
         numbers = np.concatenate([commands.left[k], commands.before[k], commands.sigma[k]])
         cells = [None if np.isnan(value) else 1e3 * float(value) for value in numbers]
-        rows.append((k + 1, *q, "reached" if good else "not reached", *cells, unseen, commands.reason[k]))
+        there = (None, None) if commands.expected is None else (1e3 * commands.expected[k]).tolist()
+        known = None if fitted.learnt is None else int(commands.beyond[k].any())
+        status = "reached" if good else "not reached"
+        rows.append((k + 1, *q, status, *cells, unseen, *there, known, commands.reason[k]))
     return files.write_table(out, _header(names), rows)
 
 
@@ -63,13 +67,39 @@ def lines(commands: Commands, targets: Targets, fitted: Fitted) -> list[str]:
         f"by the calibrated model, rms over {int(good.sum())} targets: {before} without compensation, "
         f"{left} with it; sigma of the model {sigma}"
     ]
-    if fitted.unseen is not None:
-        result.append(f"what to expect of the real arm: {1e3 * fitted.unseen:.3g} mm rms, as on poses not fitted")
-    else:
-        known = "" if fitted.fitted is None else f" ({1e3 * fitted.fitted:.3g} mm rms on the fitted ones)"
-        result.append(f"the fit had no unseen poses{known}: nothing says what to expect of the real arm")
+    result += [_expectation(commands, fitted), *_extrapolation(commands, fitted)]
     most = np.abs(commands.q - commands.nominal)[good].max(initial=0.0)
     return [*result, f"joints move by {1e3 * most:.3g} mrad (mm) at most"]
+
+
+def _expectation(commands: Commands, fitted: Fitted) -> str:
+    """Say what to expect of the real arm at these targets, by the error model where there is one."""
+    good = commands.reached
+    apart = "" if fitted.unseen is None else f"; {1e3 * fitted.unseen:.3g} mm rms were found on poses not fitted"
+    if commands.expected is not None:
+        rms = np.sqrt(np.mean(commands.expected[good, 0] ** 2))
+        within = commands.expected[good, 1].max()
+        return (
+            f"what to expect of the real arm at these targets: {1e3 * rms:.3g} mm rms, at the worst one 95 % within "
+            f"{1e3 * within:.3g} mm{apart}"
+        )
+    if fitted.unseen is not None and not commands.beyond[good].any():
+        return f"what to expect of the real arm: {1e3 * fitted.unseen:.3g} mm rms, as on poses not fitted"
+    known = "" if fitted.fitted is None else f" ({1e3 * fitted.fitted:.3g} mm rms on the fitted ones)"
+    why = f"the fit had no unseen poses{known}" if fitted.unseen is None else "targets outside the range measured"
+    return f"{why}: nothing says what to expect of the real arm{apart}"
+
+
+def _extrapolation(commands: Commands, fitted: Fitted) -> list[str]:
+    """Say how many targets extrapolate, and which joints."""
+    out = commands.beyond & commands.reached[:, None]
+    if not out.any():
+        return []
+    names = ", ".join(name for name, one in zip(fitted.cell.chain.joint_names, out.any(axis=0)) if one)
+    return [
+        f"EXTRAPOLATED: {int(out.any(axis=1).sum())} of {int(commands.reached.sum())} targets have joints outside the "
+        f"range that was measured ({names}): no measurement proves the arm there; measure poses like them"
+    ]
 
 
 def _pair(values: np.ndarray) -> str:

@@ -5,6 +5,7 @@ A fit's folder is written whole, beside its place, then moved there. Nothing els
 
 from __future__ import annotations
 
+import csv
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -26,9 +27,10 @@ from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import Findings, FitMetrics, ValidationMetrics
 from calib.procedure.kinematic_stage.tables import HEADER, estimate_table, read_covariance, write_residuals
 from calib.procedure.kinematic_stage.validation import Arms, Assessment, nominal_arm, write_errors
-from calib.records import read_record
+from calib.records import read_record, shielded
 from calib.robot import calibrated
 from calib.robot.calibrated import CorrectedChain
+from calib.robot.chain import Joint
 from calib.robot.formats import urdf_write
 
 T = TypeVar("T")
@@ -125,6 +127,15 @@ class FitFolder:
             return None
         free, covariance = read_covariance(self.path, cell)
         return ErrorModel(cell, free, covariance, np.concatenate([block.q for block in inputs.fit]), known)
+
+    def learnt_joints(self, joints: Sequence[Joint]) -> np.ndarray | None:
+        """Read the joint values (m, n) [rad or m] of the fitted rows; None where the residuals are not there."""
+        if not self.residuals.is_file():
+            return None
+        names = [shielded(f"{joint.name} [{joint.unit}]") for joint in joints]
+        with self.residuals.open(encoding="utf-8", newline="") as file:
+            rows = [[float(row[name]) for name in names] for row in csv.DictReader(file) if row["set"] == "fit"]
+        return np.array(rows).reshape(-1, len(names)) if rows else None
 
 
 @dataclass(frozen=True)

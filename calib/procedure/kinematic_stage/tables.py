@@ -20,7 +20,7 @@ from calib.geometry.installation import Installation
 from calib.geometry.observation import observe, prepare
 from calib.geometry.parameters import layout, parameter_values
 from calib.geometry.result import GeometricFit
-from calib.procedure.kinematic_stage.comparison import Comparison
+from calib.procedure.kinematic_stage.comparison import INTERVAL, Comparison, interval_cells
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.units import ERRORS
 
@@ -128,7 +128,12 @@ COMPONENTS = {
 
 
 def write_residuals(outcome: Outcome, path: Path) -> Path:
-    """Write measured minus predicted of every row, fitted (with its robust weight) and unseen."""
+    """Write measured minus predicted of every row, fitted (with its robust weight) and unseen.
+
+    Unseen rows have the columns of `INTERVAL` as well, as ``errors.csv`` of a session: ``sigma``, the standard
+    deviation that the fit expects of the calibrated arm's position error there, ``interval95`` within which 95 % of
+    such errors are to be, ``extrapolated`` 1 where a joint stands outside the range that was learnt from.
+    """
     named = {(each.file, each.row) for each in outcome.outliers}
     weights = _weights(outcome)
     rows: list[list[object]] = []
@@ -141,7 +146,7 @@ def write_residuals(outcome: Outcome, path: Path) -> Path:
     joints = outcome.inputs.chain.joints
     header = ["set", "file", "row", "station", "tool", *(f"{joint.name} [{joint.unit}]" for joint in joints)]
     header += [name for names in COMPONENTS.values() for name in names]
-    return files.write_table(path, [*header, "size [mm]", "nominal size [mm]", "weight", "outlier"], rows)
+    return files.write_table(path, [*header, "size [mm]", "nominal size [mm]", "weight", "outlier", *INTERVAL], rows)
 
 
 def _weights(outcome: Outcome) -> dict[tuple[str, int, str], float]:
@@ -160,7 +165,7 @@ def _key(measured: PoseMeasurements, i: int) -> tuple[str, int, str]:
 
 def _residual_rows(label: str, comparison: Comparison, named: set, weights: dict) -> list[list[object]]:
     nominal, cell = comparison.cells
-    result = []
+    result, stated = [], iter(interval_cells(comparison, sum(map(len, comparison.blocks))))
     pairs = zip(
         prepare(nominal, comparison.blocks, comparison.torques), prepare(cell, comparison.blocks, comparison.torques)
     )
@@ -182,6 +187,7 @@ def _residual_rows(label: str, comparison: Comparison, named: set, weights: dict
             row: list[object] = [label, key[0], key[1], station, key[2], *map(float, measured.q[i])]
             row += [_number(value) for values in columns.values() for value in values[:, i]]
             row += [_number(sizes[i]), _number(first[i]), weights.get(key), int(key[:2] in named and label == "fit")]
+            row += next(stated)
             result.append(row)
     return result
 

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,10 +23,12 @@ from calib.geometry.uncertainty.error_model import ErrorModel
 from calib.geometry.weighing import Settings
 from calib.procedure.findings import Verdict
 from calib.procedure.kinematic_stage.comparison import (
+    INTERVAL,
     Comparison,
     compare,
     compare_unseen,
     gravity_of,
+    interval_cells,
 )
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import Findings
@@ -35,7 +37,6 @@ from calib.robot.chain import Chain
 from calib.transforms import invert
 
 ELSEWHERE = 20.0  # nominal errors this many times the fit's: the instrument must have stood elsewhere (our choice)
-INTERVAL = ("sigma [mm]", "interval95 [mm]", "extrapolated")
 GROSS = 8.0  # our choice
 PLACES = tuple(
     f"{name} [{unit}]"
@@ -235,9 +236,7 @@ def write_errors(path: Path, chain: Chain, validation: Mapping[str, Comparison])
     """Write the errors of both arms at every unseen row; where positions were measured, with where and whither.
 
     Then ``x y z`` is where the target was seen, ``to_nominal`` and ``to_calibrated`` lead from there to where each arm
-    puts it, all in the calibrated arm's base. ``sigma`` is the standard deviation that the fit expects of the
-    calibrated arm's error there, ``interval95`` within which 95 % of such errors are to be, ``extrapolated`` 1 where a
-    joint stands outside the range that was learnt from.
+    puts it, all in the calibrated arm's base. Behind them `INTERVAL`, as in ``residuals.csv``.
     """
     rows: list[list[object]] = []
     for name, each in validation.items():
@@ -246,21 +245,13 @@ def write_errors(path: Path, chain: Chain, validation: Mapping[str, Comparison])
         sizes = [found.main for found in each.errors]
         if len(sizes[0]) == len(q):
             places = np.concatenate([_places(each, number) for number in range(len(each.blocks))])
+            stated = interval_cells(each, len(q))
             rows += [
                 [name, number, *map(float, joints), 1e3 * float(a), 1e3 * float(b), *map(_cell, place), *interval]
-                for number, joints, a, b, place, interval in zip(
-                    numbers, q, *sizes, places, _interval_cells(each, len(q))
-                )
+                for number, joints, a, b, place, interval in zip(numbers, q, *sizes, places, stated)
             ]
     joints = [f"{joint.name} [{joint.unit}]" for joint in chain.joints]
     files.write_table(path, ["file", "row", *joints, "nominal [mm]", "calibrated [mm]", *PLACES, *INTERVAL], rows)
-
-
-def _interval_cells(found: Comparison, count: int) -> Iterable[Sequence[float | int | None]]:
-    if found.intervals is None:
-        return [(None, None, None)] * count
-    each = found.intervals
-    return zip((1e3 * each.sigma).tolist(), (1e3 * each.radius).tolist(), each.beyond.astype(int).tolist())
 
 
 def _places(found: Comparison, number: int) -> np.ndarray:

@@ -112,6 +112,24 @@ def test_poses_in_the_instruments_frame_are_met_by_the_true_tool(cell, fitted, h
     assert np.sqrt(np.mean(before[:, 0] ** 2)) > 10 * position
     assert before[:, 1].max() < 1e-6
     assert 0.2 * position < np.sqrt(np.mean(before[:, 2] ** 2)) < 2 * position
+    expected, radius = (numbers(rows, [name])[:, 0] * 1e-3 for name in ("expected [mm]", "interval95 [mm]"))
+    assert position < np.sqrt(np.mean(expected**2)) and 0.7 < np.sqrt(np.mean(expected**2)) / unseen < 1.3
+    sizes = np.linalg.norm(true_poses(cell, numbers(rows, Q))[:, :3, 3] - wanted[:, :3, 3], axis=1)
+    assert np.mean(sizes <= radius) > 0.9
+    assert f"what to expect of the real arm at these targets: {1e3 * np.sqrt(np.mean(expected**2)):.3g} mm rms" in out
+
+
+def test_targets_outside_the_measured_range_are_named_and_expected_to_be_worse(cell, fitted, here, calib):
+    q = np.array([[0.5, -1.2, 1.3, 0.4, 0.9, 0.2], [3.0, -1.2, 1.3, 0.4, 0.9, 3.1]])
+    write(here / "t.csv", Q, q)
+    code, out, err = calib("compensate", fitted, "t.csv", "--out", "commands.csv")
+    assert code == 0, err
+    near, far = commands()
+    names = cell.nominal.joint_names
+    assert (near["extrapolated"], near["reason"], far["extrapolated"]) == ("0", "", "1")
+    assert far["reason"] == f"extrapolated: {names[0]}, {names[5]} outside the range that was measured"
+    assert f"EXTRAPOLATED: 1 of 2 targets have joints outside the range that was measured ({names[0]}, " in out
+    assert float(far["expected [mm]"]) > 1.2 * float(near["expected [mm]"])
 
 
 def test_joint_targets_are_the_nominal_robots_poses(cell, fitted, here, calib):

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from calib.geometry import installation_file
@@ -108,6 +109,12 @@ def test_holdout_keeps_the_last_share_of_the_permutation(cell, calib):
     rows = read_rows(Path("done/residuals.csv"))
     held = sorted(int(row["row"]) - 1 for row in rows if row["set"] == "held out")
     assert held == sorted(np.random.default_rng(3).permutation(60)[45:].tolist())
+    stated = [[row[name] for name in ("sigma [mm]", "interval95 [mm]", "extrapolated")] for row in rows]
+    assert all(each == ["", "", ""] for row, each in zip(rows, stated) if row["set"] == "fit")
+    unseen = [(float(row["size [mm]"]), *map(float, each)) for row, each in zip(rows, stated) if row["set"] != "fit"]
+    within = 100 * np.mean([size <= radius for size, _, radius, _ in unseen])
+    assert within == pytest.approx(metrics["validation"]["day1.csv"]["interval95"]["coverage_percent"])
+    assert {out for *_, out in unseen} <= {0.0, 1.0} and all(0 < sigma < radius for _, sigma, radius, _ in unseen)
 
 
 def test_a_pose_file_from_another_station_needs_refitted_frames(cell, calib):
