@@ -19,6 +19,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from calib.config_types import TAG, UNKNOWN, Hidden, shown
 from calib.errors import CalibError, UsageError, suggestion
+from calib.files import check_regular
 
 T = TypeVar("T")
 LARGEST = 8_000_000  # bytes of a file, and levels of tables in tables (our choices)
@@ -35,6 +36,7 @@ def read_toml(path: str | Path, error: type[CalibError] = UsageError) -> dict[st
             of more than 64 bits.
     """
     try:
+        check_regular(path, streams=True)
         with open(path, "rb") as file:
             data = file.read(LARGEST + 1)
         if len(data) > LARGEST:

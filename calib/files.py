@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import hashlib
 import io
 import json
@@ -10,6 +11,7 @@ import math
 import os
 import re
 import shutil
+import stat
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -274,6 +276,22 @@ def check_not_input(targets: Iterable[Path], inputs: Iterable[str | Path | None]
 def same_file(one: Path, other: Path) -> bool:
     """Say whether two paths lead to one place, on file systems that do not tell cases apart, too."""
     return one.resolve() == other.resolve() or (one.exists() and other.exists() and one.samefile(other))
+
+
+def check_regular(path: str | Path, streams: bool = False) -> None:
+    """Refuse to read a pipe or a device, which nobody may ever fill, and which can be read once at most.
+
+    Args:
+        path: of a file, or a folder.
+        streams: allow what a shell hands over (``<(command)``, ``/dev/stdin``): for what is read once.
+
+    Raises:
+        OSError: with the reason.
+    """
+    mode = os.stat(path).st_mode
+    handed = streams and str(path).startswith(("/dev/fd/", "/dev/stdin", "/proc/self/fd/"))
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode) or handed or str(path) == os.devnull):
+        raise OSError(errno.EINVAL, "is a pipe or a device, not a file: write what it gives to a file first", str(path))
 
 
 def fingerprint(path: Path) -> str:

@@ -21,6 +21,7 @@ import numpy as np
 
 from calib.arrays import frozen
 from calib.errors import MeasurementError, suggestion
+from calib.files import check_regular
 from calib.records import plain_text
 from calib.units import ANGLES, LENGTHS, plain_number
 
@@ -152,6 +153,7 @@ def row_width(path: str | Path) -> int:
 def _open(path: str | Path, headed: bool) -> tuple[IO[str], str, list[str]]:
     """Open a file and return it behind its header line, with the separator and the header's cells."""
     try:
+        check_regular(path)
         file = open(path, encoding="utf-8-sig", newline="")  # noqa: SIM115 (the caller reads on, and closes it)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise MeasurementError(f"cannot be read: {getattr(error, 'strerror', None) or error}", path) from error

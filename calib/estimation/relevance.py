@@ -6,7 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-from scipy.linalg.lapack import dtrtri  # type: ignore[attr-defined]
+from scipy.linalg.lapack import dpotrf, dtrtri  # type: ignore[attr-defined]
+
+from calib.errors import Unidentifiable
 
 EXACT = 1e-7  # ‖y - W x‖ relative to ‖y‖ below which a fit counts as perfect: WᵀW knows no better
 SETTLED = 0.02  # share of the parameters' sigmas that a search among many may leave open (our choice)
@@ -178,11 +180,22 @@ def relevance(
 def _posterior(
     square: np.ndarray, cross: np.ndarray, penalty: np.ndarray, beta: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and variances of x from WᵀW and Wᵀy; a diagonal raised by 1e-12 keeps it regular to rounding."""
-    system = square.copy()
-    diagonal = system.flat[:: len(penalty) + 1]
-    system.flat[:: len(penalty) + 1] = np.maximum((diagonal + penalty / beta) * (1.0 + 1e-12), 1e-280)
-    factor = scipy.linalg.cholesky(system.T, lower=True, overwrite_a=True, check_finite=False)
+    """Return mean and variances of x from WᵀW and Wᵀy.
+
+    A diagonal raised by 1e-12, or by as much more as it takes, keeps it regular to rounding: rows that repeat each
+    other leave columns that no two poses tell apart.
+    """
+    for raised in 10.0 ** np.arange(-12.0, 1.0, 2.0):
+        system = square.copy()
+        diagonal = system.flat[:: len(penalty) + 1]
+        system.flat[:: len(penalty) + 1] = np.maximum((diagonal + penalty / beta) * (1.0 + raised), 1e-280)
+        factor, failed = dpotrf(system.T, lower=1, overwrite_a=1)
+        if not failed:
+            break
+    else:
+        raise Unidentifiable(
+            "the measurements cannot tell the model's terms apart; are rows repeated? Measure more poses"
+        )
     solution = scipy.linalg.cho_solve((factor, True), cross, check_finite=False)
     inverse, _ = dtrtri(factor, lower=1, overwrite_c=1)  # of the triangle: the variances need no more
     return solution, np.einsum("ij,ij->j", inverse, inverse) / beta

@@ -12,6 +12,7 @@ from calib.data.recordings.csv_logs import read_log
 from calib.data.recordings.recording import Joints, Recording, earlier, parse_cut
 from calib.data.recordings.recording_options import RecordingOptions, check_units
 from calib.errors import MeasurementError
+from calib.files import check_regular
 
 Reader = Callable[[Path, Joints | None, RecordingOptions, Ends], Recording]
 
@@ -51,9 +52,11 @@ def _check_names(recording: Recording, joints: Joints) -> None:
 
 def _reader(path: Path) -> Reader:
     """Return the reader that the first bytes of the file, or a folder, ask for."""
-    if path.is_dir() or path.suffix in (".bag", ".mcap", ".db3"):
-        return read_bag
     try:
+        if path.exists():
+            check_regular(path)
+        if path.is_dir() or path.suffix in (".bag", ".mcap", ".db3"):
+            return read_bag
         with open(path, "rb") as file:
             head = file.read(1 << 16)
     except OSError as error:

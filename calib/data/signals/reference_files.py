@@ -18,6 +18,7 @@ from calib.data.recordings.recording import Joints
 from calib.data.recordings.recording_options import SYNONYMS, RecordingOptions, joint_order, scale
 from calib.data.signals.motion import Motion
 from calib.errors import MeasurementError
+from calib.files import check_regular
 
 
 def with_reference(motion: Motion, path: Path, joints: Joints, options: RecordingOptions) -> Motion:
@@ -45,6 +46,7 @@ def with_reference(motion: Motion, path: Path, joints: Joints, options: Recordin
 
 def _is_archive(path: Path) -> bool:
     try:
+        check_regular(path)
         with open(path, "rb") as file:
             return file.read(2) == b"PK"
     except OSError as error:

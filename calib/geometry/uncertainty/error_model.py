@@ -145,6 +145,16 @@ def outside(q: np.ndarray, learnt: np.ndarray) -> np.ndarray:
     return np.asarray((q < learnt.min(axis=0)) | (q > learnt.max(axis=0)))
 
 
+def _root_of_inverse(precision: np.ndarray) -> np.ndarray:
+    """Return R (p, p) with R Rᵀ the inverse of a precision of unit diagonal; of rows that are copies, too."""
+    try:
+        factor = np.linalg.cholesky(precision + 1e-12 * np.eye(len(precision)))
+    except np.linalg.LinAlgError:  # by rounding; Cholesky is five times as fast
+        values, vectors = np.linalg.eigh(precision)
+        return vectors / np.sqrt(np.maximum(values, 1e-12 * values[-1]))
+    return scipy.linalg.solve_triangular(factor, np.eye(len(precision)), lower=True).T
+
+
 def _distances(q: np.ndarray, learnt: np.ndarray, levers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the squared distances (m,) [m²] of poses from the nearest learnt one, and from single joints' values.
 
@@ -298,8 +308,7 @@ class _Rows:
             alive = np.flatnonzero(found.ridge > 0.0)
             precision = square[np.ix_(alive, alive)] / found.noise**2 + np.diag(found.ridge[alive] ** -2.0)
             scale = 1.0 / np.sqrt(np.diag(precision))
-            factor = np.linalg.cholesky(precision * np.outer(scale, scale) + 1e-12 * np.eye(len(scale)))
-            root = scale[:, None] * scipy.linalg.solve_triangular(factor, np.eye(len(scale)), lower=True).T
+            root = scale[:, None] * _root_of_inverse(precision * np.outer(scale, scale))
             learnt = np.concatenate([np.delete(b.q, rows, axis=0) for b, rows in zip(self.measured, inside)])
             stays = {b.station for b, rows in zip(self.measured, inside) if len(rows) < len(b)}
             for number, rows in enumerate(inside):

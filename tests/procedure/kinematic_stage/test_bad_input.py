@@ -235,3 +235,16 @@ def test_a_number_that_is_not_finite_is_never_written(tmp_path):
     with pytest.raises(CalibError, match=r"fit\.rms\[1\] is not a finite number"):
         files.write_json(tmp_path / "a.json", {"fit": {"rms": [1.0, float("nan")]}})
     assert not list(tmp_path.iterdir())
+
+
+def test_poses_copied_ten_times_are_twenty_poses(cell, calib):
+    code, out, err = calib("fit", "ur5", cell.write("a.csv", 10 * cell.measure(20)), "--no-plots", "--out", "o")
+    assert (code, "180 rows" in out, "verdict: pass" in out) == (0, True, False), err
+
+
+@pytest.mark.parametrize("given", [("fit", "ur5", "pipe"), ("fit", "ur5", "a.csv", "--options", "pipe")])
+def test_a_pipe_that_nobody_fills_is_refused(cell, calib, given):
+    os.mkfifo("pipe")
+    cell.write("a.csv", cell.measure(10))
+    code, _, err = calib(*given, "--out", "o")
+    assert (code, "pipe: cannot be read: is a pipe" in err) == (2, True), err
