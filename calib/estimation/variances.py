@@ -9,7 +9,7 @@ GROSS = 9.0  # squared errors count as so many times their variance at most (our
 
 
 def variance_weights(
-    squares: np.ndarray, shapes: np.ndarray, start: np.ndarray, counts: np.ndarray | float = 1.0
+    squares: np.ndarray, shapes: np.ndarray, start: np.ndarray, counts: np.ndarray | float = 1.0, rounds: int = ROUNDS
 ) -> np.ndarray:
     """Return the most probable weights θ >= 0 (k,) of  e² ~ (shapes θ) · χ²,  by multiplicative updates.
 
@@ -20,9 +20,10 @@ def variance_weights(
         shapes: (m, k) by what their variances may grow, not negative.
         start: (k,) not negative; what is zero stays.
         counts: (m,) how many errors each is worth.
+        rounds: of the fixed point; fewer will do from weights of nearly the same errors.
     """
     weights = np.array(start, dtype=float)
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         variance = np.maximum(shapes @ weights, 1e-30)
         ratio = np.minimum(squares / variance, GROSS)
         push, pull = (counts * ratio / variance) @ shapes, (counts / variance) @ shapes

@@ -1,13 +1,14 @@
 """How far off a fitted arm may be at any pose: what its parameters leave open, and what the model itself leaves.
 
-    E |e(q)|² = κ trace J Σ Jᵀ + v_0 + v_1 d(q)² + v_2 g(q)²
+    E |e(q)|² = κ trace J Σ Jᵀ + s(q) v_0 + v_1 d(q)² + v_2 g(q)²
 
 with Σ the parameters' covariance, d the distance of q from the nearest pose that was learnt from and g that from the
-ranges of single joints that were, every joint counting by its lever [m]. κ and v are the most probable ones of errors
-on rows left out: at random (near), by regions or stations, and by the ends of every joint's range (far); both kinds
-count alike. The radius that holds 95 % is the quantile of the same rows' errors in units of that sigma: nothing is said
-of their distribution. It goes from that of the near rows to that of the far ones as d² + g² goes from the median of the
-ones to that of the others; sigmas are stated in units of the larger radius.
+ranges of single joints that were, every joint counting by its lever [m]. s says where errors are larger than elsewhere
+(`calib.geometry.uncertainty.unevenness`). κ and v are the most probable ones of errors on rows left out: at random
+(near), by regions or stations, and by the ends of every joint's range (far); both kinds count alike. The radius that
+holds 95 % comes of the same rows' errors in units of that sigma (`calib.geometry.uncertainty.left_out`): nothing is
+said of their distribution. It goes from that of the near rows to that of the far ones as d² + g² goes from the median
+of the ones to that of the others; sigmas are stated in units of the larger radius.
 """
 
 from __future__ import annotations
@@ -21,7 +22,6 @@ from scipy.spatial import KDTree
 
 from calib.data.poses.measurements import PoseMeasurements, Positions, take
 from calib.estimation.relevance import SETTLED, Gram, condensed, gram, relevance
-from calib.estimation.variances import variance_weights
 from calib.geometry.fit import plausible_deviation
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.effects import term_groups, term_sizes
@@ -29,12 +29,13 @@ from calib.geometry.model_choice.folds import Folds, random_folds
 from calib.geometry.model_choice.ladder import GROSS, ModelSelection
 from calib.geometry.observation import observe, prepare
 from calib.geometry.parameters import layout
+from calib.geometry.uncertainty.left_out import LeftOut
 from calib.geometry.uncertainty.spread import pose_sigmas
+from calib.geometry.uncertainty.unevenness import Profile, unevenness
 from calib.robot.chain import Chain
 from calib.robot.deflection import Deflection
 from calib.robot.kinematics import forward
 
-COVERED = 0.95
 SOME = 0.02  # share of the poses (our choice)
 END = 0.2  # share of the poses at each end of a joint's range that is left out (our choice)
 FEWEST = 20  # poses from which errors on rows left out are worth a model (our choice)
@@ -48,12 +49,14 @@ class Discrepancy:
 
     Attributes:
         parameters: κ, by which the parameters' covariance counts.
-        floor: v_0 [m²], what remains among the poses learnt from, the instrument's noise included.
+        floor: v_0 [m²], what remains among the poses learnt from, the instrument's noise included, where s is 1.
         far: v_1 [m²/m²], per squared distance from the nearest of them.
         beyond: v_2 [m²/m²], per squared distance from the ranges of their joints.
         radii: sigmas within which 95 % of the errors on rows left out were, near and far.
         reach: median of d² + g² of the near rows, and of the far ones [m²].
         levers: (n,) by how much the tool moves with each joint [m/rad or 1], rms over the poses.
+        profile: log s by joint; empty where errors are even.
+        placed: the radii where base and tool are placed on the rows; None where they are the same.
     """
 
     parameters: float
@@ -63,6 +66,8 @@ class Discrepancy:
     radii: tuple[float, float]
     reach: tuple[float, float]
     levers: tuple[float, ...]
+    profile: Profile = ()
+    placed: tuple[float, float] | None = None
 
     @property
     def radius(self) -> float:
@@ -127,13 +132,14 @@ class ErrorModel:
         values, vectors = np.linalg.eigh(self.covariance[np.ix_(stays, stays)])
         root = vectors * np.sqrt(np.clip(values, 0.0, None))
         spread = (root.T @ jacobian.reshape(len(root), 3 * len(block))).reshape(len(root), 3, len(block))
-        return self._sigma(np.sum(spread**2, axis=(0, 1)), block.q)
+        return self._sigma(np.sum(spread**2, axis=(0, 1)), block.q, self.discrepancy.placed)
 
-    def _sigma(self, own: np.ndarray, q: np.ndarray) -> np.ndarray:
+    def _sigma(self, own: np.ndarray, q: np.ndarray, radii: tuple[float, float] | None = None) -> np.ndarray:
         """Return that sigma (m,) [m], where the parameters' share is known: trace J Σ Jᵀ (m,) [m²]."""
         found, parts = self.discrepancy, _distances(q, self.learnt, np.array(self.discrepancy.levers))
-        plain = np.sqrt(found.parameters * own + found.floor + found.far * parts[0] + found.beyond * parts[1])
-        return plain * np.interp(parts[0] + parts[1], found.reach, found.radii) / found.radius
+        rest = unevenness(found.profile, q) * found.floor + found.far * parts[0] + found.beyond * parts[1]
+        radius = np.interp(parts[0] + parts[1], found.reach, radii or found.radii)
+        return np.sqrt(found.parameters * own + rest) * radius / found.radius
 
     def beyond(self, q: np.ndarray) -> np.ndarray:
         """Return which joints (m, n) stand outside the range that was learnt from: there a prediction extrapolates."""
@@ -207,17 +213,18 @@ def learn_errors(
         return None
     levers = _joint_levers(found.cell.chain, np.concatenate([block.q for block in measured]))
     rows = _Rows(selected, measured, torques)
-    near = np.concatenate([*rows.left_out(random_folds(measured, 5, seed), levers)])
+    near = [*rows.left_out(random_folds(measured, 5, seed), levers)]
     groups = [selected.folds, *_range_folds(measured)]
-    far = np.concatenate([errors for each in groups for errors in rows.left_out(each, levers)])
-    times = max(1, round(len(far) / len(near)))
-    scale = _most_probable(np.concatenate([np.repeat(near, times, axis=0), far]))
-    radii = _radius(near, scale), _radius(far, scale)
-    low, high = (float(np.median(rows[:, 2:].sum(axis=1))) for rows in (near, far))
+    left = LeftOut.of(near, [errors for each in groups for errors in rows.left_out(each, levers)])
+    left, profile = left.scaled(rows.poses)
+    weights, radii = left.learnt()
+    low, high = (float(np.median(left.away[of])) for of in (left.near, ~left.near))
     reach = low, max(high, low * (1.0 + 1e-9) + 1e-12)
+    wider = left.surprise(weights, reach)
     q = np.concatenate([block.q for block in measured])
-    kappa, floor, far, beyond = scale.tolist()
-    known = Discrepancy(kappa, floor, far, beyond, radii, reach, tuple(levers.tolist()))
+    wide = radii[0] * wider[0], radii[1] * wider[1]
+    kappa, floor, far, beyond = weights
+    known = Discrepancy(kappa, floor, far, beyond, wide, reach, tuple(levers.tolist()), profile, radii)
     return ErrorModel(found.cell, found.free, found.estimate.covariance, q, known)
 
 
@@ -247,6 +254,12 @@ class _Rows:
         every = max(1, -(-sum(map(len, measured)) // MOST))
         self.chosen = [np.arange(0, len(block), every) for block in measured]
         self.measured = [take(block, rows) for block, rows in zip(measured, self.chosen)]
+        self.pose, poses = [], []
+        for block in self.measured:
+            _, first, which = np.unique(block.together, return_index=True, return_inverse=True)
+            self.pose.append(which + sum(map(len, poses)))
+            poses.append(block.q[first])
+        self.poses = np.concatenate(poses)
         gross = set() if selected.loss == "none" else {(file, row) for file, row, *_ in found.outliers(GROSS)}
         self.counts = [np.array([(b.file, int(row)) not in gross for row in b.rows], bool) for b in self.measured]
         torques = [None] * len(measured) if torques is None else torques
@@ -290,7 +303,7 @@ class _Rows:
         return sum(each[1:], each[0])
 
     def left_out(self, folds: Folds, levers: np.ndarray) -> Iterator[np.ndarray]:
-        """Yield per fold of its rows (rows, 4): |e|², trace J Σ Jᵀ, squared distances from the rest."""
+        """Yield per fold of its rows (rows, 5): |e|², trace J Σ Jᵀ, squared distances from the rest, pose's number."""
         free, sizes, space = np.arange(len(self.prior)), self.coordinates.sizes, self.coordinates
         for fold in range(folds.count):
             inside = [np.flatnonzero(members[rows] == fold) for members, rows in zip(folds.members, self.chosen)]
@@ -321,7 +334,8 @@ class _Rows:
                 error = value - np.einsum("f,fim->im", found.values, jacobian)
                 own = np.sum((root.T @ jacobian[alive].reshape(len(alive), -1)) ** 2, axis=0)
                 near = _distances(self.measured[number].q[rows], learnt, levers)
-                result = np.stack([np.sum(error**2, axis=0), own.reshape(3, -1).sum(axis=0), *near], axis=1)
+                size, pose = np.sum(error**2, axis=0), self.pose[number][rows]
+                result = np.stack([size, own.reshape(3, -1).sum(axis=0), *near, pose], axis=1)
                 yield result[self.counts[number][rows]]
 
 
@@ -331,17 +345,3 @@ def _placed_anew(columns: np.ndarray, frames: np.ndarray) -> np.ndarray:
     basis, size, _ = np.linalg.svd(flat[frames].T, full_matrices=False)
     basis = basis[:, size > 1e-9 * size[0]]
     return (flat - (flat @ basis) @ basis.T).reshape(columns.shape)
-
-
-def _most_probable(rows: np.ndarray) -> np.ndarray:
-    """Return κ, v_0, v_1, v_2 of  |e|² ~ variance · χ²_3 / 3  from rows (m, 4)."""
-    size, design = rows[:, 0], np.column_stack([rows[:, 1], np.ones(len(rows)), rows[:, 2:]])
-    scale = np.array([1.0, np.median(size), 0.0, 0.0])
-    scale[2:] = 0.3 * np.median(size) / np.maximum(design[:, 2:].mean(axis=0), 1e-12)
-    return variance_weights(size, design, scale)
-
-
-def _radius(rows: np.ndarray, scale: np.ndarray) -> float:
-    """Return how many sigmas hold `COVERED` of the errors of rows (m, 4)."""
-    variance = np.column_stack([rows[:, 1], np.ones(len(rows)), rows[:, 2:]]) @ scale
-    return float(np.quantile(np.sqrt(rows[:, 0] / np.maximum(variance, 1e-30)), COVERED))

@@ -1,0 +1,102 @@
+"""What errors on rows left out of a fit tell of errors to come: what they grow with, and what holds 95 % of them.
+
+A quantile is taken at the level (n + 1) / n · 95 % of n poses (conformal prediction; Vovk, Gammerman & Shafer 2005). As
+those rows have also chosen the variances, an interval is as much wider as it has to be to hold 95 % of a fold whose
+poses took no part in it. Not where base and tool are placed on the rows: what errors of a fold share is taken up then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.estimation.variances import ROUNDS, variance_weights
+from calib.geometry.uncertainty.unevenness import Profile, Unevenness, unevenness
+
+COVERED = 0.95
+AGAIN = 100  # rounds of the search for variances without a fold's poses
+SPARE = 5  # rows of a kind that the poses outside a fold must have to tell an interval (our choice)
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """Errors on rows left out.
+
+    Attributes:
+        squares: (m,) |e|² [m²].
+        shapes: (m, 4) with what their variances may grow: trace J Σ Jᵀ, 1, squared distances from the rest.
+        away: (m,) the sum of these distances [m²].
+        pose: (m,) which pose.
+        fold: (m,) which fold.
+        near: (m,) whether it was drawn at random.
+    """
+
+    squares: np.ndarray
+    shapes: np.ndarray
+    away: np.ndarray
+    pose: np.ndarray
+    fold: np.ndarray
+    near: np.ndarray
+
+    @classmethod
+    def of(cls, near: Sequence[np.ndarray], far: Sequence[np.ndarray]) -> LeftOut:
+        """Return them from arrays (rows, 5) by fold: |e|², trace J Σ Jᵀ, the two distances², number of the pose."""
+        folds = [*near, *far]
+        rows, number = np.concatenate(folds), np.repeat(np.arange(len(folds)), [len(each) for each in folds])
+        shapes = np.column_stack([rows[:, 1], np.ones(len(rows)), rows[:, 2:4]])
+        return cls(rows[:, 0], shapes, rows[:, 2:4].sum(axis=1), rows[:, 4].astype(int), number, number < len(near))
+
+    def without(self, poses: np.ndarray) -> LeftOut:
+        """Return the rows of other poses."""
+        rows = ~np.isin(self.pose, poses)
+        return LeftOut(*(each[rows] for each in vars(self).values()))
+
+    def scaled(self, q: np.ndarray) -> tuple[LeftOut, Profile]:
+        """Return them with the shapes of an uneven arm, every fold's by the s of the other poses, and s of all.
+
+        Args:
+            q: (poses, n) [rad or m].
+        """
+        weights, _ = self.learnt()
+        squares = (self.squares / np.maximum(self.shapes @ weights, 1e-30))[self.near]
+        known, where = np.unique(self.pose[self.near], return_inverse=True)
+        found = Unevenness(q[known], np.bincount(where, squares) / np.bincount(where))
+        shapes = self.shapes.copy()
+        for fold in np.unique(self.fold):
+            rows = self.fold == fold
+            profile = found.profile(np.isin(known, self.pose[rows]))
+            shapes[rows, 1] = unevenness(profile, q[self.pose[rows]])
+        return replace(self, shapes=shapes), found.profile()
+
+    def learnt(self, start: Sequence[float] = ()) -> tuple[list[float], tuple[float, float]]:
+        """Return κ, v_0, v_1, v_2 of  |e|² ~ variance · χ²_3 / 3,  and the radii: sigmas that hold near, far errors."""
+        near, rounds = self.near, AGAIN
+        if not start:
+            middle, rounds = float(np.median(self.squares)), ROUNDS
+            start = [1.0, middle, *0.3 * middle / np.maximum(self.shapes[:, 2:].mean(axis=0), 1e-12)]
+        counts = np.where(near, max(1, round(np.sum(~near) / np.sum(near))), 1.0)
+        weights = variance_weights(self.squares, self.shapes, np.array(start), counts, rounds)
+        sizes = np.sqrt(self.squares / np.maximum(self.shapes @ weights, 1e-30))
+        return weights.tolist(), self.quantiles(sizes)
+
+    def quantiles(self, sizes: np.ndarray) -> tuple[float, float]:
+        """Return what holds 95 % of errors that are yet to come, by sizes (m,), near and far (conformal)."""
+        poses = len(np.unique(self.pose))
+        level = min(1.0, COVERED * (poses + 1) / poses)
+        first, second = (float(np.quantile(sizes[of], level)) for of in (self.near, ~self.near))
+        return first, second
+
+    def surprise(self, weights: Sequence[float], reach: tuple[float, float]) -> tuple[float, float]:
+        """Return how much wider intervals learnt without a fold's poses have to be to hold 95 % there, near and far."""
+        ratio = np.ones(len(self.squares))
+        for fold in np.unique(self.fold):
+            rows = self.fold == fold
+            rest = self.without(self.pose[rows])
+            if min(rest.near.sum(), (~rest.near).sum()) > SPARE:
+                own, radii = rest.learnt(weights)
+                sigma = np.sqrt(np.maximum(self.shapes[rows] @ own, 1e-30))
+                ratio[rows] = np.sqrt(self.squares[rows]) / (sigma * np.interp(self.away[rows], reach, radii))
+        first, second = self.quantiles(ratio)
+        return max(1.0, first), max(1.0, second)
