@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.robot.chain import Chain
+from calib.robot.chain import Chain, Joint
 
 DENSEST = 1000.0  # [kg/m³] of the arm's mass by the cube of its stretched length; arms known have 1 to 50 (our choice)
 UNEVEN = 0.1  # share by which a principal moment may be beyond the sum of the others: CAD rounds (our choice)
+TURNS = 4.0 * np.pi + 0.01  # [rad] a continuous wrist may be given two turns (our choice)
 EMPTY = 1e-6  # of M L²: moments below are rounding
 
 
 def remarks(chain: Chain) -> tuple[str, ...]:
     """Return in words what a chain's description holds that looks wrong, by joint; nothing of a sound one."""
-    return (*chain.remarks, *unstated_limits(chain), *_massless(chain), *impossible_bodies(chain))
+    return (*chain.remarks, *unstated_limits(chain), *_turns(chain), *_massless(chain), *impossible_bodies(chain))
 
 
 def unstated_limits(chain: Chain) -> tuple[str, ...]:
@@ -26,6 +27,19 @@ def unstated_limits(chain: Chain) -> tuple[str, ...]:
         f"{', '.join(names)}: {what} in the robot's description is no limit; taken as not stated"
         for what, names in found.items()
     )
+
+
+def _turns(chain: Chain) -> tuple[str, ...]:
+    """Return in words the limits of revolute joints beyond two turns either way."""
+    wide = {joint.name: _furthest(joint) for joint in chain.joints if joint.unit != "m"}
+    wide = {name: angle for name, angle in wide.items() if TURNS < angle < np.inf}
+    if not wide:
+        return ()
+    return (f"{_together([*wide])}: limits up to {max(wide.values()):g} rad in the robot's description; degrees?",)
+
+
+def _furthest(joint: Joint) -> float:
+    return max(-joint.lower, joint.upper)
 
 
 def _massless(chain: Chain) -> tuple[str, ...]:

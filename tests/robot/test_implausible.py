@@ -72,3 +72,9 @@ def test_limits_of_zero_are_told_as_not_stated():
     assert remarks(replace(chain, joints=joints)) == (
         "a: velocity 0 in the robot's description is no limit; taken as not stated",
     )
+
+
+def test_limits_of_many_turns_are_told():
+    chain = load("ur5")
+    (found,) = remarks(replace(chain, joints=(Joint("a", lower=-360.0, upper=360.0), *chain.joints[1:])))
+    assert found.startswith("a: limits of up to 360 rad") and found.endswith("degrees?")

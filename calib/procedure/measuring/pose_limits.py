@@ -35,13 +35,16 @@ from calib.procedure.measuring.constraints_file import (
 )
 from calib.procedure.measuring.sight import SeenOnly, Sight, sight_of
 from calib.robot.formats.markup import text
-from calib.robot.obstacles import Obstacle, Wall
+from calib.robot.obstacles import Obstacle, Wall, signed_distance
 from calib.robot.plausible import remarks
 from calib.robot.tables import placement
 from calib.transforms import invert
 from poses import constraints
 from poses.space import PoseConstraint, SearchSpace
 
+ABSURD = 100.0  # times the arm's reach: no cell is that large (our choice)
+BODY = 1.2  # of the reach is where a link's body ends (our choice)
+TURNS = 4.0 * np.pi  # that no joint turns either way [rad]
 NEAREST = 3  # distances that a constraint holds: the smallest ones, so that two that change places both are there
 
 
@@ -162,7 +165,7 @@ def limits_of(
     absent = {*stated.without, *without}
     try:
         margin = 0.0 if "joint-margin" in absent else _joint_margin(stated.joints, where)
-        lower, upper = _joints(stated.joints, cell, where, margin)
+        lower, upper, wide = _joints(stated.joints, cell, where, margin)
         model, checked, notes = _collision(stated, cell, source, where, absent)
         found = (*_target(stated.target, cell), *_orientation(stated, cell, where))
         sight = _sight(stated, cell, where, None if "view" in absent else model) if seen else None
@@ -174,7 +177,7 @@ def limits_of(
         kept = (*kept, *(words.get(part.name, part.name) for part in sight.targets[0]))
     clearance = (stated.collision or CollisionTable()).margin
     pairs = None if model is None or not model.pairs else model
-    notes = (*notes, *remarks(cell.chain))
+    notes = (*notes, *wide, *remarks(cell.chain))
     return Limits(lower, upper, found, notes, pairs, clearance, sight, kept, _unchecked(stated, absent, seen))
 
 
@@ -208,7 +211,11 @@ def _joint_margin(spans: Mapping[str, Any], where: str) -> float:
     return share
 
 
-def _joints(spans: Mapping[str, Any], cell: Installation, where: str, margin: float) -> tuple[np.ndarray, np.ndarray]:
+def _joints(
+    spans: Mapping[str, Any], cell: Installation, where: str, margin: float
+) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+    """Return lower and upper limits (n,), and what to say of ranges that limit nothing."""
+    notes = []
     lower, upper = (side.copy() for side in cell.chain.sampling_limits())
     limited = np.isfinite(cell.chain.lower) & np.isfinite(cell.chain.upper)
     free = np.where(limited, margin * (upper - lower), 0.0)
@@ -223,10 +230,17 @@ def _joints(spans: Mapping[str, Any], cell: Installation, where: str, margin: fl
         if not isinstance(span, tuple):
             raise UsageError(f"{place}: expected a list of 2 numbers, lower and upper, found {span}")
         low, high = _span(span, place, "length" if cell.chain.joints[j].unit == "m" else "angle")
+        turns, own = cell.chain.joints[j].unit != "m", (cell.chain.lower[j], cell.chain.upper[j])
+        if far := turns and max(-low, high) > TURNS:
+            notes.append(f'{place}: {low:g} to {high:g} rad; in degrees? Then write ["{low:g} deg", "{high:g} deg"]')
+        if low <= own[0] and high >= own[1] and not far and (low, high) != own:
+            notes.append(
+                f"{place}: {low:g} to {high:g} limits nothing: the joint's own range is {own[0]:g} to {own[1]:g}"
+            )
         lower[j], upper[j] = max(lower[j], low), min(upper[j], high)
         if not lower[j] < upper[j]:
             raise UsageError(f"{place}: nothing is left between {lower[j]:g} and {upper[j]:g}")
-    return lower, upper
+    return lower, upper, tuple(notes)
 
 
 def _span(value: tuple[Any, Any], where: str, quantity: str) -> tuple[float, float]:
@@ -287,6 +301,7 @@ def _collision(
         for k, one in enumerate(stated.obstacle, 1)
     ]
     walls, within = _walls(table.box, f"{where}: collision.box"), "self-collision" not in absent
+    idle, far = _never_act(table, obstacles, walls, cell, where)
     place = partial(_model, cell, source, table, obstacles, walls, within)
     try:
         model, shapes, notes = place(floor)
@@ -304,12 +319,42 @@ def _collision(
         more = f" and {len(model.excluded) - 3} more" if len(model.excluded) > 3 else ""
         notes = (*notes, f"not watched, since no posture parts them: {pairs}{more}")
     kept = [*([f"self-collision ({shapes})"] if within else [])]
-    kept += [] if floor is None else [f"floor at {floor:g} m"]
-    kept += ["walls of the cell"] if walls else []
-    kept += [f"obstacle {one.name}" for one in obstacles]
+    kept += [] if floor is None or "floor" in idle else [f"floor at {floor:g} m"]
+    kept += ["walls of the cell"] if not {wall.name for wall in walls} <= idle else []
+    kept += [f"obstacle {one.name}" for one in obstacles if one.name not in idle]
+    notes = (*notes, *far)
     if kept:
         kept[-1] += f", {1e3 * table.margin:g} mm off each"
     return model, tuple(kept), notes
+
+
+def _never_act(
+    table: CollisionTable, obstacles: Sequence[Obstacle], walls: Sequence[Wall], cell: Installation, where: str
+) -> tuple[set[str], tuple[str, ...]]:
+    """Return the names of what stands beyond the arm's reach, and what to say of it.
+
+    Raises:
+        UsageError: for what stands `ABSURD` times as far, and for links thicker than the arm is long.
+    """
+    slides = sum(max(-joint.lower, joint.upper) for joint in cell.chain.joints if joint.unit == "m")
+    tool = float(np.linalg.norm(cell.tools[:, :3, 3], axis=1).max(initial=0.0))
+    reach = cell.chain.stretched_length() + slides + tool
+    if table.radius is not None and table.radius > reach:
+        words = f"links of radius {table.radius:g} m in an arm that reaches {reach:.3g} m; in mm?"
+        raise UsageError(f"{where}: collision.radius: {words}")
+    base = np.zeros((1, 3))
+    away = {} if table.floor is None else {"floor": -table.floor}
+    away |= {wall.name: -wall.offset for wall in walls}
+    away |= {one.name: float(signed_distance(one, base)[0][0]) for one in obstacles}
+    beyond = {name: distance for name, distance in away.items() if distance > BODY * reach + table.margin}
+    words = [
+        f"{name}: {distance:.3g} m from the arm's base, which reaches {reach:.3g} m: it can never act; in mm?"
+        for name, distance in beyond.items()
+    ]
+    for said, distance in zip(words, beyond.values()):
+        if distance > ABSURD * reach:
+            raise UsageError(f"{where}: {said} Lengths are in m")
+    return set(beyond), tuple(words)
 
 
 def _model(

@@ -11,6 +11,7 @@ from differences import check
 
 import calib
 from calib.cli import run
+from calib.errors import UsageError
 from calib.geometry.observability import observation, targets_of
 from calib.procedure.measuring.cell_answers import cell_tables
 from calib.procedure.measuring.constraints_file import ConstraintsFile
@@ -196,3 +197,31 @@ def test_a_selection_tells_run_prediction_and_what_seeing_costs(tmp_path):
     with pytest.raises(calib.CalibError, match="of random postures keep: line of sight 0 %"):
         (tmp_path / "d.toml").write_text(CELL.replace("30 deg", "0.1 deg"))
         calib.select_poses("lwr4plus", 14, wanted, constraints=tmp_path / "d.toml")
+
+
+def _limits(text, tmp_path):
+    (tmp_path / "c.toml").write_text(text)
+    return read_limits(tmp_path / "c.toml", targets_of(load("ur5")))
+
+
+BOX = "[[obstacle]]\nname = 'wall'\nkind = 'box'\nsize = {}\nxyz = {}\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[collision]\nfloor = -300\n", "floor: 300 m from the arm's base"),
+        (BOX.format([4000, 100, 3000], [0, 1500, 1500]), "wall: 1.45e"),
+        ("[collision]\nradius = 60\n", "links of radius 60 m"),
+    ],
+)
+def test_a_cell_in_millimetres_is_refused(tmp_path, text, words):
+    with pytest.raises(UsageError, match=words):
+        _limits(text, tmp_path)
+
+
+def test_what_never_acts_is_told_and_not_said_to_be_kept(tmp_path):
+    far, near = (_limits(BOX.format([1, 1, 1], [x, 0, 0]), tmp_path) for x in (50, 1.3))
+    assert any("wall: 49.5 m" in note for note in far.notes) and not any("wall" in kept for kept in far.checked)
+    assert not any("wall:" in note for note in near.notes) and any("wall" in kept for kept in near.checked)
+    assert any("degrees?" in note for note in _limits("[joints]\nq1 = [-90, 90]\n", tmp_path).notes)
