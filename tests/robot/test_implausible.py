@@ -77,4 +77,4 @@ def test_limits_of_zero_are_told_as_not_stated():
 def test_limits_of_many_turns_are_told():
     chain = load("ur5")
     (found,) = remarks(replace(chain, joints=(Joint("a", lower=-360.0, upper=360.0), *chain.joints[1:])))
-    assert found.startswith("a: limits of up to 360 rad") and found.endswith("degrees?")
+    assert found.startswith("a: limits up to 360 rad") and found.endswith("degrees?")
