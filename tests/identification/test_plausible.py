@@ -59,7 +59,9 @@ def test_torques_of_another_robot_are_told_by_their_size(factor: float, level: s
     assert (one.level if one else None) == level
 
 
-@pytest.mark.parametrize("clock, level", [(1.03, None), (1.1, "marginal"), (2.0, "fail"), (0.5, "fail")])
+@pytest.mark.parametrize(
+    "clock, level", [(1.01, None), (1.03, "marginal"), (1.1, "marginal"), (2.0, "fail"), (0.5, "fail")]
+)
 def test_velocities_that_are_no_slopes_are_told(clock: float, level: str | None) -> None:
     one = next((one for one in found(recorded(clock=clock)) if one.name == "speed"), None)
     assert (one.level if one else None) == level
@@ -198,6 +200,65 @@ def test_an_exchange_that_leaves_the_torques_unexplained_is_not_told() -> None:
 
     assert told(0.02, 0.9) and not told(0.46, 0.85) and not told(0.02, 0.99)
     assert told(0.02, 0.5, 1) and not told(0.02, 0.9, 1)
+
+
+def logged(clock: float = 1.0, speed: float | np.ndarray = 1.0) -> Recording:
+    """Return a recording whose logger read some samples twice and missed others: its dates are counted."""
+    rng, whole = np.random.default_rng(3), recorded()
+    k = np.cumsum(rng.choice([0, 1, 2], len(whole), p=[0.06, 0.88, 0.06]))
+    k = k[k < len(whole)]
+    t = np.arange(len(k)) * (whole.t[k[-1]] / len(k)) + rng.uniform(0.0, 1e-3, len(k))
+    assert whole.v is not None
+    return replace(
+        whole, t=clock * t, q=whole.q[k], v=whole.v[k] * speed, effort=whole.effort[k], rows=np.arange(len(k))
+    )
+
+
+@pytest.mark.parametrize("clock, speed", [(1.0, 0.9), (1.0, 1.1), (1.0, 2.0), (2.0, 1.0), (0.9, 1.0), (0.1, 1.0)])
+def test_counted_dates_that_contradict_the_stamps_are_told_with_both_rates(clock: float, speed: float) -> None:
+    case = case_of(logged(clock, speed)) if clock != 0.1 else make_case("log", make_motion(logged(clock, speed)))
+    assert case.motion.sampling.clock == "counted" and case.motion.rate * clock == pytest.approx(200.0, rel=0.01)
+    (one,) = [one for one in findings([compare_sizes(case, ARM)], NAMES) if one.name == "speed"]
+    assert one.level == ("fail" if not 0.6 < clock * speed < 1.5 else "marginal")
+    rates = re.search(r"by the stamps samples come at ([0-9.]+) Hz, by the velocities at ([0-9.]+) Hz", one.words)
+    assert rates is not None and float(rates[1]) == pytest.approx(200.0 / clock, rel=0.01)
+    assert float(rates[2]) == pytest.approx(200.0 * speed, rel=0.01)
+
+
+def test_inertias_beside_masses_say_whether_stamps_or_velocities_are_wrong() -> None:
+    v = recorded().v
+    assert v is not None
+    for one, words in ((recorded(clock=2.0), "against the stamps"), (recorded(v=2.0 * v), "against the velocities")):
+        (told,) = found(one)
+        assert (told.name, told.level) == ("speed", "fail") and words in told.words
+
+
+def test_counted_dates_are_the_velocities_where_that_is_asked_for_and_agree_where_nothing_is_wrong() -> None:
+    assert found(logged()) == []
+    asked = make_motion(logged(2.0), FilterOptions(cutoff=30.0, band=10.0, clock="counted"))
+    assert asked.rate == pytest.approx(200.0, rel=0.01)
+    (note,) = [note for note in asked.notes if "as long by the measured velocities as by the stamps" in note]
+    assert float(note.split()[3]) == pytest.approx(0.5, rel=0.01)
+
+
+def test_velocities_that_do_not_follow_the_positions_are_noted() -> None:
+    v, noise = recorded().v, np.random.default_rng(1).normal(size=(len(recorded()), 3))
+    assert v is not None
+    for wrong, words in (
+        (-v, "backwards at joint1, joint2, joint3"), (0 * v, "not at joint1, joint2, joint3"), (noise, "not at joint1"),
+        (v * [1.0, 1.0, -1.0], "positions backwards at joint3"),
+    ):  # fmt: skip
+        (one,) = found(recorded(v=wrong))
+        assert (one.name, one.level) == ("speed", "pass") and words in one.words
+
+
+def test_a_motion_too_short_to_compare_velocities_is_not_remarked_upon() -> None:
+    """A date wrong by 1 % moves a joint by that share of its travel, of which little is left beside a trend."""
+    long, short = (compare_sizes(case_of(one), ARM) for one in (recorded(), recorded().cut(2.0, 3.6)))
+    assert short.speed_sigma.max() > 2.0 * long.speed_sigma.max() and long.speed_sigma.max() < 0.012
+    odd = replace(long, speed=np.array([1.0, 1.06, 0.99]))
+    assert [one.name for one in findings([odd], NAMES)] == ["speed"]
+    assert findings([replace(odd, speed_sigma=np.full(3, 0.02))], NAMES) == []
 
 
 def test_a_gap_of_the_log_is_no_slope() -> None:

@@ -9,8 +9,11 @@ seems noisy is only badly dated. Three clocks are tried, and the one under which
 ``counted`` the number of steps between two samples from the motion itself, Δk = Δq·v̄ / (T |v̄|²), where that is whole
             numbers (v̄ the mean of the two measured velocities); zero is a sample read twice, which is left out.
 
-The measure is the rms of the fourth differences of q on the even grid. All of this is our choice. Seen in real logs:
-the Panda's is counted (6 % read twice, 7 % missed), the LWR4+'s and TIAGo's are even, the UR10e's stamps are true.
+The measure is the rms of the fourth differences of q on the even grid. Counted steps are as long as the measured
+velocities say, unless the stamps say otherwise by more than `APART`: then one of the two is of another size, nobody
+knows which, the stamps' rate is kept, and that the velocities are no slopes is seen later. All of this is our choice.
+Seen in real logs: the Panda's is counted (6 % read twice, 7 % missed), the LWR4+'s and TIAGo's are even, the UR10e's
+stamps are true.
 """
 
 from __future__ import annotations
@@ -29,6 +32,7 @@ CLOCKS = ("stamps", "even", "counted")
 GAIN = 0.8  # another clock than the stamps' must bring the roughness below this share
 WHOLE = 0.1  # rms distance of the counted steps from whole numbers
 JUDGED = 0.3  # share of the steps at a speed at which they can be counted
+APART = 0.01  # share by which the rates of stamps and velocities may differ
 DRIFT = 101  # samples over which a drift of the stamps is followed
 STAY = 15  # samples over which it is judged whether the stamps stay late
 LOOK = 20_000  # samples that are compared
@@ -43,6 +47,7 @@ class Clock:
         t: (N,) [s]; those of kept samples rise strictly.
         keep: (N,) mask; False where a sample was read a second time.
         period: of one step [s].
+        times: the step by the measured velocities over that by the stamps; NaN where steps are not counted.
         roughness: clock → rms of the fourth differences of q under it, relative to that under the stamps.
     """
 
@@ -50,6 +55,7 @@ class Clock:
     t: np.ndarray
     keep: np.ndarray
     period: float
+    times: float
     roughness: dict[str, float]
 
 
@@ -64,8 +70,9 @@ def find_clock(recording: Recording, kind: str = "auto") -> Clock:
     clocks = {"stamps": (recording.t, np.ones(len(recording), dtype=bool), _step(recording.t))}
     if (even := _even_times(recording.t)) is not None:
         clocks["even"] = even
-    if (counted := _counted_times(recording)) is not None:
-        clocks["counted"] = counted
+    times = np.nan
+    if (counted := _counted_times(recording, kind == "counted")) is not None:
+        clocks["counted"], times = counted[:3], counted[3]
     if kind != "auto" and kind not in clocks:
         raise UsageError(f"clock '{kind}': the samples of {recording.file or 'this recording'} cannot be dated so")
     steps = {name: _roughness(recording.q, *clock) for name, clock in clocks.items()}
@@ -73,7 +80,7 @@ def find_clock(recording: Recording, kind: str = "auto") -> Clock:
     best = min(rough, key=lambda name: rough[name])
     chosen = kind if kind != "auto" else best if rough[best] < GAIN else "stamps"
     t, keep, period = clocks[chosen]
-    return Clock(chosen, frozen(t), frozen(keep, bool), period, rough)
+    return Clock(chosen, frozen(t), frozen(keep, bool), period, times, rough)
 
 
 def _even_times(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
@@ -88,11 +95,15 @@ def _even_times(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
     return even, np.ones(len(t), dtype=bool), float(period)
 
 
-def _counted_times(recording: Recording) -> tuple[np.ndarray, np.ndarray, float] | None:
-    """Return counted times (N,), the mask of samples not read twice, and the step [s]; None if steps are not whole.
+def _counted_times(recording: Recording, asked: bool) -> tuple[np.ndarray, np.ndarray, float, float] | None:
+    """Return counted times (N,), the mask of samples not read twice, the step [s], and that by the velocities over that
+    by the stamps; None if steps are not whole.
 
     Where the robot is too slow to count, a repeated row counts zero, any other one; a wrong count there does little,
     since a date's error acts through the speed. Long stops of the log (more than 20 steps) are dated by the stamps.
+
+    Args:
+        asked: whether this clock was asked for: steps are then as long as the velocities say, whatever the stamps do.
     """
     if recording.v is None:
         return None
@@ -109,11 +120,16 @@ def _counted_times(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]
     off = np.sqrt(np.mean((elapsed[fast] / period - count[fast]) ** 2))
     if off > WHOLE or (count[fast] < 0).any() or ((count == 0) & fast & dq.any(axis=1)).any():
         return None
-    stamped = np.round(np.diff(recording.t) / period)
+    step = np.diff(recording.t)
+    seen = fast & (step < 20 * np.median(step))
+    times = period * float(count[seen].sum()) / float(step[seen].sum())
+    if not asked and abs(times - 1.0) > APART:
+        period /= times
+    stamped = np.round(step / period)
     count = np.where(fast, count, np.where(same, 0, 1))
     count = np.where(stamped > 20, np.maximum(stamped, 1), count)
     t = np.concatenate([[0], np.cumsum(count)]) * period
-    return t + np.median(recording.t - t), np.concatenate([[True], count > 0]), period
+    return t + np.median(recording.t - t), np.concatenate([[True], count > 0]), period, times
 
 
 def _lost(t: np.ndarray, step: float) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from calib.arrays import frozen
-from calib.data.recordings.clock import find_clock
+from calib.data.recordings.clock import APART, find_clock
 from calib.data.recordings.recording import SERIES, Recording, settled
 from calib.errors import MeasurementError
 
@@ -29,6 +29,7 @@ class SamplingReport:
         lost: samples missing between others, interpolated.
         gaps: (start, length) [s] of the times without a sample that were too long to bridge, where segments end.
         dropped: (start, length) [s] of segments too short to use.
+        times: a counted step by the measured velocities over that by the stamps; NaN where steps are not counted.
     """
 
     clock: str
@@ -39,6 +40,7 @@ class SamplingReport:
     lost: int
     gaps: tuple[tuple[float, float], ...]
     dropped: tuple[tuple[float, float], ...]
+    times: float = np.nan
 
     def lines(self) -> list[str]:
         """Return what a user should be told, one finding per line."""
@@ -47,6 +49,8 @@ class SamplingReport:
         if self.clock != "stamps":
             share = self.roughness[self.clock]
             told.append(f"samples dated {self.clock}, not by their stamps: positions {1 / share:.3g} times smoother")
+        if self.clock == "counted" and abs(self.times - 1.0) > APART:
+            told.append(f"a step is {self.times:.4g} times as long by the measured velocities as by the stamps")
         if self.repeated:
             told.append(f"{self.repeated} samples were read twice; the second is left out")
         if self.lost:
@@ -113,6 +117,7 @@ def resample(recording: Recording, clock: str = "auto", gap: float = GAP, rate: 
         int(np.maximum(np.round(step[~long] / found.period) - 1, 0).sum()),
         tuple((float(t[i]), float(step[i])) for i in np.flatnonzero(long)),
         tuple((float(t[a]), float(t[b - 1] - t[a])) for a, b in spans if (a, b) not in used),
+        found.times,
     )
     return Resampled(
         frozen(np.concatenate(grids)),

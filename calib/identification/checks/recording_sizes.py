@@ -22,6 +22,9 @@ from calib.identification.rows import segments
 from calib.robot.chain import Chain
 
 ROWS, FEW = 1500, 500  # samples on which a lag is looked for, and all else
+DATED = 0.01  # share of a joint's travel by which errors of dates move its positions
+BLOCKS = 20  # of time, whose errors are independent
+FOLLOWS = 0.9  # correlation from which on measured velocities, integrated, are the positions
 TRAVEL = 0.05  # a joint that travels less says nothing of its velocity's size [rad or m]
 
 
@@ -32,7 +35,12 @@ class RecordingSizes:
     Attributes:
         name: of the case.
         masses: (n,) recorded torque of gravity over that of the robot's own masses; NaN where a joint says nothing.
-        speed: (n,) measured velocities over the slopes of the positions; NaN where there are none, or no travel.
+        speed: (n,) measured velocities over the slopes of the positions; NaN where there are none, or no travel, or
+            where the ones do not follow the others.
+        speed_sigma: (n,) its sigma.
+        follows: (n,) correlation of the measured velocities' integrals with the positions; NaN as `speed`.
+        counted: whether the samples are dated by the measured velocities.
+        rate: of the samples, by their dates [Hz].
         lag: of the torques; None where the recording is too short to tell.
         clock: inertias beside masses; None where the motion does not tell.
         other: order or zeros of the joints that explain more than those recorded; None where none is looked for.
@@ -42,6 +50,10 @@ class RecordingSizes:
     name: str
     masses: np.ndarray
     speed: np.ndarray
+    speed_sigma: np.ndarray
+    follows: np.ndarray
+    counted: bool
+    rate: float
     lag: Lag | None
     clock: ClockRatio | None = None
     other: Rearranged | None = None
@@ -64,22 +76,26 @@ def compare_sizes(
     known = newtons and case.target.shape[1] == n
     known = known and chain.inertias is not None and bool(np.any(chain.inertias[:, 9] > 0.0))
     masses = share_of_nominal(motion.t, motion.q, case.target, chain, gravity, static=True) if known else nothing
-    speed, v = nothing, motion.v_measured
+    speed, v = (nothing, nothing, nothing), motion.v_measured
     if v is not None:
         speed = _speed_ratio(motion.t, motion.q, v, motion.segment)
+    counted = motion.sampling.clock == "counted"
     bodies = _under(chain, gravity)
     many, few = (take_samples(case, bodies, count) for count in (ROWS, FEW))
     lag = None if many is None else lag_of(many, motion.rate)
     clock = clock_ratio(few, chain) if newtons and few is not None else None
     other = rearranged(few, chain) if known and few is not None else None
-    return RecordingSizes(case.name, masses, speed, lag, clock, other, motion.jumps)
+    return RecordingSizes(case.name, masses, *speed, counted, motion.rate, lag, clock, other, motion.jumps)
 
 
-def _speed_ratio(t: np.ndarray, q: np.ndarray, v: np.ndarray, segment: np.ndarray) -> np.ndarray:
-    """Return (n,) measured velocities over the slopes of the positions (N, n): ∫v dt on q, both without their trend.
+def _speed_ratio(
+    t: np.ndarray, q: np.ndarray, v: np.ndarray, segment: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (n,) measured velocities over the slopes of the positions (N, n), the sigmas, and how alike they are.
 
-    Integrals compare where slopes are noise; each segment (N,) by itself, since nobody knows the speed in a gap. NaN
-    for joints that hardly travel.
+    That is ∫v dt on q, both without their trend: integrals compare where slopes are noise; each segment (N,) by itself,
+    since nobody knows the speed in a gap. Of a short motion little is left beside its trend, while an error of the
+    dates moves the whole travel. NaN for joints that hardly travel, and the ratio where velocities do not follow.
     """
     own, seen = np.array(q), np.empty_like(q)
     for a, b in segments(segment):
@@ -89,8 +105,15 @@ def _speed_ratio(t: np.ndarray, q: np.ndarray, v: np.ndarray, segment: np.ndarra
         for x in (own, seen):
             x[a:b] -= trend @ np.linalg.lstsq(trend, x[a:b], rcond=None)[0]
     power = np.maximum((own**2).sum(axis=0), 1e-300)
-    alike = (own * seen).sum(axis=0) > 0.9 * np.sqrt(power * (seen**2).sum(axis=0))
-    return np.where(alike & (np.ptp(q, axis=0) > TRAVEL), (own * seen).sum(axis=0) / power, np.nan)
+    ratio = (own * seen).sum(axis=0) / power
+    votes = [
+        (part * rest).sum(axis=0) for part, rest in zip(*(np.array_split(x, BLOCKS) for x in (own, seen - ratio * own)))
+    ]
+    dated = DATED * np.ptp(q, axis=0) / np.maximum(np.ptp(own, axis=0), 1e-300)
+    travels = np.ptp(q, axis=0) > TRAVEL
+    follows = np.where(travels, ratio * np.sqrt(power / np.maximum((seen**2).sum(axis=0), 1e-300)), np.nan)
+    sigma = np.hypot(np.sqrt(np.sum(np.square(votes), axis=0)) / power, dated)
+    return np.where(travels & (follows > FOLLOWS), ratio, np.nan), sigma, follows
 
 
 def _under(chain: Chain, gravity: Sequence[float] | None) -> Bodies:

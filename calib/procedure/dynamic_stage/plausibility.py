@@ -5,7 +5,9 @@ fails, or holds the verdict at marginal, until the options' ``accept`` says that
 
 masses   torques that pull against the robot's own masses, or `FAR` times as much as these ask for, or a share of it:
          fail; beyond `OFF`, or `FAR` at single joints: marginal
-speed    measured velocities that are not the slope of the positions, by `SLIGHT`: marginal; by `WRONG` times: fail
+speed    measured velocities that are not the slope of the positions, surely and by `SLIGHT`, or by `COMMON` at all
+         joints alike, where either the stamps or the velocities are of another size: marginal; by `WRONG` times: fail.
+         Those that do not follow the positions at all, or backwards: a note, marginal where they date the samples
 lag      torques that come later than the positions of their row, surely and by 15 ms (``[recording] lag = …`` takes
          them earlier), or those of one joint alone: marginal; where that leaves all errors 1/`HALVES` or less: fail
 clock    inertias that are `INERT` times too large or small beside the masses that gravity tells, for the lengths of the
@@ -28,7 +30,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from calib.identification.checks.recording_sizes import RecordingSizes
+from calib.identification.checks.recording_sizes import FOLLOWS, RecordingSizes
 from calib.identification.checks.torque_lag import Lag
 from calib.identification.checks.whole_robot import ClockRatio, Rearranged
 from calib.identification.methods.loop_agreement import LoopDisagreement
@@ -36,9 +38,9 @@ from calib.identification.possible.contradiction import Contradiction
 from calib.procedure.findings import Finding
 
 FAR, OFF = 3.0, 2.2
-SLIGHT, WRONG = 0.05, 1.5
+SLIGHT, COMMON, SURELY, WRONG = 0.05, 0.02, 5.0, 1.5
 HALVES = 2.0
-INERT = 2.0
+INERT, RODS = 2.0, 0.17
 LOST = 30.0
 EXCHANGED, TURNED, UNTOLD = 0.98, 0.7, 0.3
 NO_ROBOT, NEVER, NOTICED = 5.0, 10.0, 2.0
@@ -50,6 +52,7 @@ def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Fin
     for each in sizes:
         speed = list(_speed(each, joints))
         found += [*_masses(each, joints), *speed, *([] if speed else _clock(each.name, each.clock))]
+        found += _unlike(each, joints)
         found += [*_lag(each.name, each.lag, joints), *_other(each.name, each.other, joints)]
         found += [Finding("jump", "marginal", f"{each.name}: {words}") for words in each.jumps]
     return found
@@ -120,22 +123,58 @@ def _masses(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
 def _speed(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
     """Compare measured velocities with the slopes of the positions."""
     ratio = each.speed
-    off = np.flatnonzero(np.abs(np.nan_to_num(ratio, nan=1.0) - 1.0) > SLIGHT).tolist()
+    known = np.flatnonzero(np.isfinite(ratio))
+    usual = float(np.median(ratio[known])) if len(known) else 1.0
+    alike = len(known) > 1 and np.ptp(ratio[known]) < COMMON * usual
+    least = np.maximum(SLIGHT, SURELY * each.speed_sigma)
+    off = np.flatnonzero(np.abs(np.nan_to_num(ratio, nan=1.0) - 1.0) > (COMMON if alike else least)).tolist()
     if not off:
         return
-    known = np.flatnonzero(np.isfinite(ratio))
-    usual = float(np.median(ratio[off]))
-    if len(off) == len(known) and np.ptp(ratio[off]) < 0.02 * usual:
-        what, why = (
-            "every joint",
-            f"are the stamps {max(usual, 1 / usual):.3g} times too {'large' if usual > 1 else 'small'}",
-        )
-    else:
-        what = ", ".join(f"{joints[j]} ({ratio[j]:.3g})" for j in off)
-        why = "are columns exchanged, or units"
-    far = ((ratio[off] > WRONG) | (ratio[off] < 1.0 / WRONG)).any()
-    words = f"{each.name}: the measured velocities are {usual:.3g} times the slopes of the positions at {what}: {why}?"
-    yield Finding("speed", "fail" if far else "marginal", f"{words} Accelerations and inertias rest on the stamps")
+    level = "fail" if ((ratio[off] > WRONG) | (ratio[off] < 1.0 / WRONG)).any() else "marginal"
+    words = f"{each.name}: the measured velocities are {usual:.3g} times the slopes of the positions at"
+    if alike:
+        larger = "large" if usual > 1 else "small"
+        size = f"{max(usual, 1 / usual):.3g} times too {larger}"
+        yield Finding(
+            "speed", level,
+            f"{words} every joint: by the stamps samples come at {each.rate:.5g} Hz, by the velocities at "
+            f"{usual * each.rate:.5g} Hz: are the stamps {size}, or are the velocities? {_which(each, usual)}The "
+            'stamps are taken for right here; [filter] clock = "counted" in the options takes the velocities, where '
+            "they tell one sample from the next. Accelerations and inertias rest on it",
+        )  # fmt: skip
+        return
+    named = ", ".join(f"{joints[j]} ({ratio[j]:.3g})" for j in off)
+    words = f"{each.name}: the measured velocities are not the slopes of the positions but times {named}"
+    yield Finding(
+        "speed", level, f"{words}: are columns exchanged, or units? Accelerations and inertias rest on the stamps"
+    )
+
+
+def _which(each: RecordingSizes, usual: float) -> str:
+    """Say whether inertias beside masses speak against the stamps or the velocities; empty: they do not tell."""
+    if each.clock is None:
+        return ""
+    right = abs(float(np.log(each.clock.ratio)))
+    wrong = abs(float(np.log(each.clock.ratio / usual**2)))
+    if abs(right - wrong) < 2.0 * np.hypot(RODS, each.clock.relative_sigma):
+        return ""
+    against = "stamps" if wrong < right else "velocities"
+    size = f"{each.clock.ratio:.3g} times (± {100 * each.clock.relative_sigma:.0f} %)"
+    return f"Inertias beside masses, {size} those of a robot of these lengths, speak against the {against}. "
+
+
+def _unlike(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
+    """Say which measured velocities do not follow the positions."""
+    against = [joints[j] for j in np.flatnonzero(each.follows < -FOLLOWS)]
+    other = [joints[j] for j in np.flatnonzero(np.abs(each.follows) <= FOLLOWS)]
+    ways = [f"{what} at {', '.join(at)}" for what, at in (("backwards", against), ("not", other)) if at]
+    if ways:
+        rest = "the samples are dated by them" if each.counted else "nothing rests on them here"
+        yield Finding(
+            "speed", "marginal" if each.counted else "pass",
+            f"{each.name}: the measured velocities follow the positions {' and '.join(ways)}: is a sign reversed, are "
+            f"columns exchanged, or were they not logged? {rest[0].upper()}{rest[1:]}",
+        )  # fmt: skip
 
 
 def _lag(name: str, lag: Lag | None, joints: Sequence[str]) -> Iterator[Finding]:
