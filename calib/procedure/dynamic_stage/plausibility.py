@@ -165,8 +165,8 @@ def _which(each: RecordingSizes, usual: float) -> str:
 
 def _unlike(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
     """Say which measured velocities do not follow the positions."""
-    against = [joints[j] for j in np.flatnonzero(each.follows < -FOLLOWS)]
-    other = [joints[j] for j in np.flatnonzero(np.abs(each.follows) <= FOLLOWS)]
+    against = [joints[j] for j in np.flatnonzero(each.follows < -FOLLOWS).tolist()]
+    other = [joints[j] for j in np.flatnonzero(np.abs(each.follows) <= FOLLOWS).tolist()]
     ways = [f"{what} at {', '.join(at)}" for what, at in (("backwards", against), ("not", other)) if at]
     if ways:
         rest = "the samples are dated by them" if each.counted else "nothing rests on them here"
