@@ -27,6 +27,14 @@ def test_even_errors_have_no_profile():
     assert np.allclose(unevenness(Unevenness(q, squares).profile(), q), 1.0, atol=0.25)
 
 
+def test_copies_of_few_poses_tell_nothing_impossible():
+    q, squares = drawn(10.0)
+    few = np.arange(40) % 4
+    profile = Unevenness(q[few], squares[few]).profile(np.arange(40) < 8)
+    assert np.isfinite(unevenness(profile, q)).all()
+    assert np.allclose(unevenness(Unevenness(q, np.ones(len(q))).profile(), q), 1.0, atol=0.01)
+
+
 def test_without_the_poses_of_an_end_more_is_expected_there_than_in_the_middle():
     """The loud end is not known then; that the joint is uneven is (its other end is loud, too)."""
     q, squares = drawn(1.0)

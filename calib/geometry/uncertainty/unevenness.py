@@ -9,6 +9,8 @@ Stated is exp(E f + var f / 2), the mean of s: it is larger where few poses, or 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from calib.estimation.relevance import SETTLED, Gram, gram, relevance
@@ -17,6 +19,7 @@ KNOTS = 9  # values per joint, linear in between (our choice)
 WAY = 0.5  # how far one value speaks for others, of the range (our choice)
 BEYOND = 0.2  # how far the function is stated outside the range, of it (our choice)
 LEAST = 0.02  # of the median squared error: smaller ones count as that (our choice)
+KNOWN = 1e-4  # variance of a logarithm that is known best: copies of few poses would be fitted without any error
 STILL = 1e-3  # a joint that moves by less tells nothing [rad or m]
 ROUNDS = 30  # of the search for the a_j
 
@@ -66,6 +69,7 @@ class Unevenness:
         )
 
     def _values(self, data: Gram) -> list[np.ndarray]:
+        data = replace(data, total=data.total + KNOWN * data.rows)
         found = relevance(data, self.groups, np.full(len(self.groups), 0.5), ROUNDS, SETTLED)
         alive = np.flatnonzero(found.ridge > 0.0)
         precision = data.square[np.ix_(alive, alive)] / found.noise**2 + np.diag(found.ridge[alive] ** -2.0)
