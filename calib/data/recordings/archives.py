@@ -243,6 +243,7 @@ def _member(
             size = dtype.itemsize * int(np.prod(shape[1:]))
             _skip(stream, rows.start * size)
             values = np.frombuffer(stream.read((rows.stop - rows.start) * size), dtype).reshape(-1, *shape[1:])
+        _skip(stream, 1 << 62)  # to its end: the sum that tells damage is checked there
     return values if exact else values.astype(float)
 
 
@@ -253,5 +254,6 @@ def _arrange(values: np.ndarray, order: list[int], factor: float) -> np.ndarray:
 
 
 def _skip(stream: IO[bytes], size: int) -> None:
+    """Read `size` bytes, or to the end."""
     while size > 0 and (got := len(stream.read(min(size, 1 << 22)))):
         size -= got

@@ -198,8 +198,10 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     table = to_table(found.dynamics, found.base, inputs.unit) | {"drive_gains": gain_table(inputs.gains, inputs.unit)}
     files.write_json(folder / MODEL, table)
     if inputs.gains is not None:
-        columns = (inputs.chain.joint_names, inputs.gains.gains.tolist(), inputs.gains.sigma.tolist())
-        files.write_table(folder / "drive_gains.csv", ("joint", f"gain [{inputs.unit} per A]", "sigma"), zip(*columns))
+        gains = table["drive_gains"]
+        header = ("joint", f"gain [{gains['unit']}]", "sigma", "told")
+        rows = zip(inputs.chain.joint_names, gains["values"], gains["sigma"], gains["told"])
+        files.write_table(folder / "drive_gains.csv", header, rows)
     files.write_json(folder / METRICS, metrics(outcome))
 
 

@@ -25,6 +25,7 @@ from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, joint_kinds
 from calib.robot.load import load_calibrated, resolve
 from calib.robot.plausible import remarks
+from calib.units import TORQUE
 
 LOST = 0.05  # of a recording may fall to the windows of the parallel decimation (our choice)
 QUIET = 0.02  # noise of the accelerations that is no matter, of their rms (our choice)
@@ -59,6 +60,15 @@ class IdentificationInputs:
     def unit(self) -> str:
         """Of the torques."""
         return self.currents.unit
+
+    @property
+    def row_units(self) -> tuple[str, ...]:
+        """Of each torque row; amperes of its own where its joint's gain is not told."""
+        rows = self.options.settings.torque_rows.units([joint.kind == "prismatic" for joint in self.chain.joints])
+        if self.unit == TORQUE:
+            return tuple(rows)
+        own = self.currents.own
+        return tuple(f"A of joint {k + 1}" if k in own else self.unit for k in range(len(rows)))
 
     @property
     def gains(self) -> DriveGains | None:

@@ -164,12 +164,17 @@ def metrics(outcome: IdentificationOutcome) -> dict[str, Any]:
 
 
 def gain_table(found: DriveGains | None, unit: str) -> dict[str, Any] | None:
-    """Return gains as identified, by joint: torque = gain · current; None where none were."""
+    """Return gains as identified, by joint: torque = gain · current; None where none were.
+
+    A gain that the motion does not tell is None: that joint's torque is in amperes of its own. The reference has no
+    sigma.
+    """
     if found is None:
         return None
     return {
-        "values": [float(x) for x in found.gains],
-        "sigma": [float(x) for x in found.sigma],
+        "values": [None if word == "not told" else float(x) for x, word in zip(found.gains, found.told)],
+        "sigma": [float(x) if word == "told" else None for x, word in zip(found.sigma, found.told)],
+        "told": list(found.told),
         "covariance": found.covariance.tolist(),
         "unit": f"{unit} per A",
         "scale": found.scale,
@@ -259,7 +264,7 @@ def report(inputs: IdentificationInputs, found: Assessment) -> dict[str, Any]:
         "reason": found.verdict.reason,
         "warnings": list(found.warnings),
         "rows": list(rows.titles(chain.joint_names)),
-        "units": list(rows.units([joint.kind == "prismatic" for joint in chain.joints])),
+        "units": list(inputs.row_units),
         "fit": {name: _score_table(one) for name, one in found.fit.items()},
         "validation": {
             name: _score_table(one)

@@ -100,8 +100,7 @@ def _rows(outcome: IdentificationOutcome) -> tuple[str, ...]:
 
 def _units(outcome: IdentificationOutcome) -> Sequence[str]:
     """Return the unit of each torque row; A where the model is of currents."""
-    rows = outcome.found.settings.torque_rows.units([one.kind == "prismatic" for one in outcome.inputs.chain.joints])
-    return rows if outcome.inputs.unit == "N m" else [outcome.inputs.unit] * len(rows)
+    return outcome.inputs.row_units
 
 
 def torques(

@@ -123,8 +123,7 @@ def outcome_section(outcome: IdentificationOutcome) -> Section:
     if found.loop:
         blocks.append(Text("", _loop_sentences(found.loop)))
     rows = torques.titles(chain.joint_names)
-    units = torques.units([joint.kind == "prismatic" for joint in chain.joints])
-    units = units if found.unit == "N m" else (found.unit,) * len(units)
+    units = outcome.inputs.row_units
     blocks += [
         _error_table(found.identification, found.validation, rows, units),
         *_interval_blocks(found.validation, rows, units),
@@ -191,6 +190,11 @@ def _key_figures(unseen: UnseenReport, tolerance: float = 0.0) -> list[KeyFigure
 def percent(value: float | None) -> str:
     """Return a share in percent with three digits; a dash where there is none."""
     return "–" if value is None else f"{value:.3g} %"
+
+
+def _rsd(percent: float) -> str:
+    """Return an RSD [%] in words where its size says no more."""
+    return f"{percent:.0f} %" if percent < 1000.0 else "above 1000 %"
 
 
 def _error_table(
@@ -283,7 +287,7 @@ def _model_sentences(metrics: ModelMetrics) -> list[str]:
     )
     if metrics.elimination or count.essential < count.base:
         gone = ", ".join(
-            one.name if one.rsd is None else f"{one.name} ({one.rsd:.0f} %)" for one in metrics.elimination
+            one.name if one.rsd is None else f"{one.name} ({_rsd(one.rsd)})" for one in metrics.elimination
         )
         lines.append(f"{count.essential} essential parameters; left out, with their RSD: {gone or 'none'}")
     return lines

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -144,6 +145,18 @@ def test_ros2_bags_without_ros(tmp_path, series, kind):
         np.testing.assert_array_equal(read_recording(f"{bare}@1:2", ROBOT).q, series["q"][200:400])
         refused(bare, "no joint states on '/states'", topic="/states")
         refused(bare, "has no joint 'elbow'", Joints(("elbow",)))
+
+
+def test_a_cut_does_not_hide_damage(archive):
+    path = archive()
+    assert len(read_recording(f"{path}@0:1", ROBOT)) > 0
+    with zipfile.ZipFile(path) as whole:
+        member = whole.getinfo("tau.npy")
+    content = bytearray(path.read_bytes())
+    content[member.header_offset + member.compress_size] ^= 0x40  # within the member's last rows
+    path.write_bytes(content)
+    with pytest.raises(MeasurementError, match="damaged archive"):
+        read_recording(f"{path}@0:1", ROBOT)
 
 
 def test_broken_and_foreign_files(tmp_path, archive):
