@@ -53,6 +53,21 @@ def test_torques_against_the_robots_own_masses_fail() -> None:
     assert (one.name, one.level) == ("masses", "fail") and "joint2" in one.words and "wrong way" in one.words
 
 
+@pytest.mark.parametrize("joint", [0, 1, 2])
+def test_one_joint_in_another_unit_is_named(joint: int) -> None:
+    tau = recorded().effort.copy()
+    tau[:, joint] *= 1e3
+    (one,) = [one for one in found(recorded(tau=tau)) if one.name == "limit"]
+    named = re.search(r"limit at joint(\d) ([0-9.e+]+) times", one.words)
+    assert one.level == "fail" and named is not None and int(named[1]) == joint + 1
+    assert float(named[2]) == pytest.approx(np.quantile(np.abs(tau[:, joint]), 0.99) / 60.0, rel=0.1)
+
+
+def test_torques_that_reach_no_share_of_any_limit_are_another_unit() -> None:
+    (one,) = [one for one in found(recorded(tau=1e-3 * recorded().effort)) if one.name == "limit"]
+    assert one.level == "marginal" and "kN m" in one.words
+
+
 @pytest.mark.parametrize("factor, level", [(1.5, None), (2.6, "marginal"), (4.0, "fail"), (0.2, "fail")])
 def test_torques_of_another_robot_are_told_by_their_size(factor: float, level: str | None) -> None:
     one = next((one for one in found(recorded(tau=factor * recorded().effort)) if one.name == "masses"), None)

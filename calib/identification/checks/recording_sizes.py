@@ -25,6 +25,7 @@ ROWS, FEW = 1500, 500  # samples on which a lag is looked for, and all else
 DATED = 0.01  # share of a joint's travel by which errors of dates move its positions
 BLOCKS = 20  # of time, whose errors are independent
 FOLLOWS = 0.9  # correlation from which on measured velocities, integrated, are the positions
+RARE = 0.01  # share of the samples that may be spikes
 TRAVEL = 0.05  # a joint that travels less says nothing of its velocity's size [rad or m]
 
 
@@ -35,6 +36,7 @@ class RecordingSizes:
     Attributes:
         name: of the case.
         masses: (n,) recorded torque of gravity over that of the robot's own masses; NaN where a joint says nothing.
+        limits: (n,) torques over the joints' limits, without the largest per cent of them; NaN where none is known.
         speed: (n,) measured velocities over the slopes of the positions; NaN where there are none, or no travel, or
             where the ones do not follow the others.
         speed_sigma: (n,) its sigma.
@@ -49,6 +51,7 @@ class RecordingSizes:
 
     name: str
     masses: np.ndarray
+    limits: np.ndarray
     speed: np.ndarray
     speed_sigma: np.ndarray
     follows: np.ndarray
@@ -76,6 +79,11 @@ def compare_sizes(
     known = newtons and case.target.shape[1] == n
     known = known and chain.inertias is not None and bool(np.any(chain.inertias[:, 9] > 0.0))
     masses = share_of_nominal(motion.t, motion.q, case.target, chain, gravity, static=True) if known else nothing
+    limits = nothing
+    if newtons and case.target.shape[1] == n:
+        limit = np.array([joint.effort for joint in chain.joints])
+        usual = np.quantile(np.abs(case.target), 1.0 - RARE, axis=0)
+        limits = np.where(np.isfinite(limit) & (limit > 0.0), usual / np.where(limit > 0.0, limit, 1.0), np.nan)
     speed, v = (nothing, nothing, nothing), motion.v_measured
     if v is not None:
         speed = _speed_ratio(motion.t, motion.q, v, motion.segment)
@@ -85,7 +93,7 @@ def compare_sizes(
     lag = None if many is None else lag_of(many, motion.rate)
     clock = clock_ratio(few, chain) if newtons and few is not None else None
     other = rearranged(few, chain) if known and few is not None else None
-    return RecordingSizes(case.name, masses, *speed, counted, motion.rate, lag, clock, other, motion.jumps)
+    return RecordingSizes(case.name, masses, limits, *speed, counted, motion.rate, lag, clock, other, motion.jumps)
 
 
 def _speed_ratio(

@@ -21,7 +21,7 @@ LAGS = 0.25  # largest lag that is tried [s], in steps of
 STEP = 0.005
 FREE = 0.03  # by which friction may turn over early or late by itself [s]
 SWEEPS = 30  # over the joints' own lags
-LEAST, SURE = 0.015, 3.0  # least lag that is told [s], and in sigmas
+LEAST, SURE = 0.015, 3.5  # least lag that is told [s], and in sigmas
 HELPS = 1.05  # and what is left without it over what is left with it: of another robot any lag may be the best
 ALONE, OTHERS = 0.15, 3.0  # share by which a lag of its own helps a joint, and times as much as any other joint's
 ROUNDS = 4  # of weighing joints by what is left of them
@@ -59,7 +59,7 @@ class Lag:
     def joint(self) -> int | None:
         """The one joint, from 0, that has a lag of its own as no other has; None without."""
         j, more = int(self.gains.argmax()), np.sort(self.gains) - 1.0
-        apart = abs(self.own[j] - self.seconds) > LEAST
+        apart = abs(self.own[j] - self.seconds) > LEAST and abs(self.own[j]) < LAGS - 1.5 * STEP
         return j if apart and more[-1] > max(ALONE, OTHERS * (more[-2] if len(more) > 1 else np.inf)) else None
 
 

@@ -8,7 +8,7 @@ masses   torques that pull against the robot's own masses, or `FAR` times as muc
 speed    measured velocities that are not the slope of the positions, surely and by `SLIGHT`, or by `COMMON` at all
          joints alike, where either the stamps or the velocities are of another size: marginal; by `WRONG` times: fail.
          Those that do not follow the positions at all, or backwards: a note, marginal where they date the samples
-lag      torques that come later than the positions of their row, surely and by 15 ms (``[recording] lag = …`` takes
+lag      torques that come later than the positions of their row, surely and by 17 ms (``[recording] lag = …`` takes
          them earlier), or those of one joint alone: marginal; where that leaves all errors 1/`HALVES` or less: fail
 clock    inertias that are `INERT` times too large or small beside the masses that gravity tells, for the lengths of the
          robot: marginal; beyond `FAR`: fail. Not said where measured velocities say so already
@@ -16,6 +16,8 @@ order    two joints with which exchanged the robot's own masses leave less than 
          joint's more than `UNTOLD`: marginal. Honest recordings gain nothing (1.0 and above), and where another robot,
          or a zero, is wrong, an exchange leaves that wrong
 zero     a joint with a right angle or two at whose zero they leave less than `TURNED`, likewise: marginal
+limit    torques of a joint beyond `BEYOND` times its limit, another unit there: fail; none at any joint that reaches
+         `REACHED` of its limit: marginal
 jump     a position that leaves the slope of the rows around it: marginal
 bodies   an estimate that is `NO_ROBOT` times as far from every possible robot as 95 % of right ones are: marginal;
          beyond `NEVER` times: fail. Honest recordings at hand are up to 3.6 times as far (LWR4+; Panda 1.5, TIAGo 2.3).
@@ -30,6 +32,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from calib.data.recordings.checks import BEYOND
 from calib.identification.checks.recording_sizes import FOLLOWS, RecordingSizes
 from calib.identification.checks.torque_lag import Lag
 from calib.identification.checks.whole_robot import ClockRatio, Rearranged
@@ -44,6 +47,7 @@ INERT, RODS = 2.0, 0.17
 LOST = 30.0
 EXCHANGED, TURNED, UNTOLD = 0.98, 0.7, 0.3
 NO_ROBOT, NEVER, NOTICED = 5.0, 10.0, 2.0
+REACHED = 0.01
 
 
 def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Finding]:
@@ -51,7 +55,12 @@ def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Fin
     found: list[Finding] = []
     for each in sizes:
         speed = list(_speed(each, joints))
-        found += [*_masses(each, joints), *speed, *([] if speed else _clock(each.name, each.clock))]
+        found += [
+            *_limits(each, joints),
+            *_masses(each, joints),
+            *speed,
+            *([] if speed else _clock(each.name, each.clock)),
+        ]
         found += _unlike(each, joints)
         found += [*_lag(each.name, each.lag, joints), *_other(each.name, each.other, joints)]
         found += [Finding("jump", "marginal", f"{each.name}: {words}") for words in each.jumps]
@@ -118,6 +127,26 @@ def _masses(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
         yield Finding("masses", "fail", f"{words}: {advice}")
     elif not 1.0 / OFF < usual < OFF or (share[sure] > FAR).any() or (share[sure] < 1.0 / FAR).any():
         yield Finding("masses", "marginal", f"{words}: {advice}")
+
+
+def _limits(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
+    """Compare torques with the joints' limits: what is a thousand times too large or too small is in another unit."""
+    known = np.isfinite(each.limits)
+    beyond = [f"{joints[j]} {each.limits[j]:.3g}" for j in np.flatnonzero(known & (each.limits > BEYOND)).tolist()]
+    if beyond:
+        yield Finding(
+            "limit", "fail",
+            f"{each.name}: the torques are beyond the joint's limit at {', '.join(beyond)} times, and not at the "
+            "others: are these alone in N mm, or in another unit? Bring all joints to one unit (in a table by its "
+            "header, 'tau_1 [Nmm]'), or correct the limits in the robot's file",
+        )  # fmt: skip
+    elif known.any() and (each.limits[known] < REACHED).all():
+        yield Finding(
+            "limit", "marginal",
+            f"{each.name}: no torque reaches {100 * REACHED:g} % of its joint's limit, the largest "
+            f"{100 * np.nanmax(each.limits):.2g} %: are these kN m, currents, or torques before the gear? If so, "
+            "say units: torque = 'kNm', or kind = 'current'",
+        )  # fmt: skip
 
 
 def _speed(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
