@@ -188,6 +188,8 @@ def _no_key(key: str, keys: Collection[str]) -> str:
 def _written(table: Any, loc: Sequence[Any], found: Any) -> Any:
     """Return what a file holds at a place, where that is a text that `found`, a number in SI, was made of."""
     for part in loc:
+        if isinstance(table, str):  # one text for all of a list
+            break
         try:
             table = table[part]
         except (KeyError, IndexError, TypeError):

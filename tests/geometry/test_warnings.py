@@ -9,7 +9,14 @@ import pytest
 from planted import cell, load, measure, perturb, random_joints
 
 from calib.data.poses.measurements import PoseMeasurements, Positions, take
-from calib.geometry.checks.diagnosis import BeyondStated, SetUpChange, SystematicResidual, diagnose, neighbour_floor
+from calib.geometry.checks.diagnosis import (
+    BelowStated,
+    BeyondStated,
+    SetUpChange,
+    SystematicResidual,
+    diagnose,
+    neighbour_floor,
+)
 from calib.geometry.checks.unidentified import LoosePlacement, Merged, Rank, unidentified
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit, polish_frames
@@ -98,6 +105,8 @@ def test_an_instrument_worse_than_it_states_is_named():
     (found,) = diagnose(calibrate(optimistic))
     assert isinstance(found, BeyondStated) and found.rms / found.stated == pytest.approx(10, rel=0.1)
     assert diagnose(calibrate(measured)) == []
+    (found,) = diagnose(calibrate(replace(measured, sigma=np.full((120, 3), 100 * SIGMA))))
+    assert isinstance(found, BelowStated) and found.stated / found.rms == pytest.approx(10, rel=0.1)
 
 
 def test_neighbours_differ_by_the_noise():

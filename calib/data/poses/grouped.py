@@ -61,7 +61,7 @@ def _read_distance(table: Table, options: FileOptions, layout: Layout) -> tuple[
     sigma = None if options.sigma.distance is None else np.full(len(value), options.sigma.distance)
     if layout.sigma_distance:
         column = table.numbers(layout.sigma_distance, "length", options.units.get("sigma", ""))
-        column = np.maximum(column, options.sigma.floor)[:, None]
+        column = np.where(column < 0.0, column, np.maximum(column, options.sigma.floor))[:, None]
         plausible.check_positive(column, table, (layout.sigma_distance,), "a sigma must be above 0 (see sigma.floor)")
         sigma = column[:, 0]
     return value[:, 0], sigma

@@ -203,7 +203,7 @@ def _sigma(table: Table, options: FileOptions, layout: Layout, seen: np.ndarray)
     stack = []
     for k, names in enumerate(layout.sigmas):
         sigma = _numbers(table, options, names, "length", "sigma", gaps=not seen[:, k].all())
-        sigma = np.maximum(sigma, options.sigma.floor)
+        sigma = np.where(sigma < 0.0, sigma, np.maximum(sigma, options.sigma.floor))
         advice = "a sigma must be above 0; where it was rounded to 0, set sigma.floor in the options"
         plausible.check_positive(np.where(seen[:, k : k + 1], sigma, np.nan), table, names, advice)
         _no_gaps(sigma, seen[:, k], table, names)

@@ -45,7 +45,16 @@ class BeyondStated:
     stated: float
 
 
-Diagnosis = SetUpChange | SystematicResidual | BeyondStated
+@dataclass(frozen=True)
+class BelowStated:
+    """A file's residual rms [m] far below the uncertainty that was stated [m]."""
+
+    file: str
+    rms: float
+    stated: float
+
+
+Diagnosis = SetUpChange | SystematicResidual | BeyondStated | BelowStated
 
 
 def diagnose(found: GeometricFit) -> list[Diagnosis]:
@@ -97,6 +106,8 @@ def _systematic(block: Block, part: Part) -> list[Diagnosis]:
         result.append(SystematicResidual(str(block.measured.file), rms, floor))
     if stated is not None and rms > 5.0 * stated:
         result.append(BeyondStated(str(block.measured.file), rms, stated))
+    if stated is not None and stated > 5.0 * rms:
+        result.append(BelowStated(str(block.measured.file), rms, stated))
     return result
 
 

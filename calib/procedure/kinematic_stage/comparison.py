@@ -23,6 +23,7 @@ from calib.robot.chain import Chain
 # of unseen rows: the standard deviation that the fit expects of the calibrated arm's position error there, all axes
 # together; the radius within which 95 % of such errors are to be; 1 where a joint is outside the range learnt from
 INTERVAL = ("sigma [mm]", "interval95 [mm]", "extrapolated")
+MARGIN = 3  # measured numbers per fitted parameter of a placement, below which errors prove nothing (our choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +73,7 @@ class Comparison:
         pairs: errors of the distances between pairs of positions, of each [m].
         poses: how many robot poses.
         frames: whose base and tool placement was used, in words.
-        proves: False where the rows were fitted on, or where the placement did not settle.
+        proves: False where the rows were fitted on, or where the placement did not settle or took up the errors.
         alone: errors of the calibrated robot as a URDF holds it, without corrections and with frames fitted for it
             on the same rows as theirs; None where that is all there is.
         shares_frames: True where another file's base and tool placement was used.
@@ -81,6 +82,8 @@ class Comparison:
         reprojection: rms distance of seen from predicted corners, of each arm [px]; None without images.
         intervals: what the fit's error model expected of the calibrated arm on these rows; None without one.
         settled: False where the placement of base and tool on these rows did not settle: their errors mean nothing.
+        placed_by: how many numbers were measured, and how many parameters of the placement were fitted to them, where
+            that leaves too little to prove anything (`MARGIN`).
     """
 
     blocks: tuple[PoseMeasurements, ...]
@@ -96,6 +99,7 @@ class Comparison:
     repeated: Mapping[str, Any] | None = None
     reprojection: tuple[float, float] | None = None
     settled: bool = True
+    placed_by: tuple[int, int] | None = None
     intervals: Intervals | None = None
 
     def table(self) -> dict[str, object]:
@@ -152,12 +156,14 @@ def compare_unseen(
 ) -> Comparison:
     """Return both arms' errors on unseen rows, their frames refitted where the rows have frames of their own."""
     block = unseen.block
-    torques, settled = [torque_of(block)], True
+    torques, settled, thin = [torque_of(block)], True, None
     if unseen.own_frames:
         placed = [placed_on(cell, block, torques, settings) for cell in (nominal, calibrated)]
         nominal, calibrated = (each.cell for each in placed)
         alone = None if alone is None else placed_on(alone, block, torques, settings).cell
         settled = all(each.solution.status.good for each in placed)
+        numbers, fitted = sum(piece.part.value.size for piece in placed[1].pieces), len(placed[1].free)
+        thin = (numbers, fitted) if numbers < MARGIN * fitted else None
         words = "base and tool placement refitted on these rows"
     elif unseen.held_out:
         words = "those of the fit"
@@ -171,6 +177,9 @@ def compare_unseen(
     if expected is not None and isinstance(block, Positions) and sizes is not None:
         sigma = expected.sigma_on(calibrated, block, torques[0], unseen.own_frames)
         found = replace(found, intervals=_intervals(expected, block, sigma, sizes))
+    if settled and thin is not None:
+        words = f"base and tool placement: {thin[1]} parameters fitted to {thin[0]} numbers of these rows"
+        return replace(found, placed_by=thin, proves=False, frames=words)
     if settled:
         return found
     return replace(found, settled=False, proves=False, frames="base and tool placement did not settle on these rows")

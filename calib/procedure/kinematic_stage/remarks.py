@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements
 from calib.geometry.accuracy import NATURE
-from calib.geometry.checks.diagnosis import BeyondStated, Diagnosis, SetUpChange, SystematicResidual
+from calib.geometry.checks.diagnosis import BelowStated, BeyondStated, Diagnosis, SetUpChange, SystematicResidual
 from calib.geometry.checks.unidentified import (
     HeldByPrior,
     LeftNominal,
@@ -49,6 +49,11 @@ def remark(finding: Diagnosis | Unidentified) -> str:
                 f"{_named(file)}: the residual ({1e3 * rms:.3f} mm rms) is {rms / stated:.0f} times the stated "
                 f"uncertainty ({1e3 * stated:.3f} mm): no geometry of this form explains the measurements to the "
                 "instrument's accuracy. The parameters' σ are scaled up accordingly, yet such errors are not random."
+            )
+        case BelowStated(file, rms, stated):
+            return (
+                f"{_named(file)}: the stated uncertainty ({1e3 * stated:.3g} mm) is {stated / rms:.0f} times the "
+                f"residual ({1e3 * rms:.3g} mm rms): in another unit? The parameters' σ are too large by as much."
             )
         case Rank(rank, parameters, tolerance, last, below):
             gap = "" if below is None else f"; singular values fall from {last:.1e} to {below:.1e} there"

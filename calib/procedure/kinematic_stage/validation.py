@@ -24,6 +24,7 @@ from calib.geometry.weighing import Settings
 from calib.procedure.findings import Verdict
 from calib.procedure.kinematic_stage.comparison import (
     INTERVAL,
+    MARGIN,
     Comparison,
     compare,
     compare_unseen,
@@ -197,8 +198,13 @@ def _doubtful(validation: Mapping[str, Comparison]) -> list[str]:
             rows = ", ".join(f"row {numbers[k]} ({1e3 * sizes[k]:.3g} mm)" for k in far[:5])
             rest = np.delete(sizes, far)
             without = 1e3 * float(np.sqrt(np.mean(rest**2)))
+            beyond = None if each.intervals is None else each.intervals.beyond
+            outside = 0 if beyond is None or len(beyond) != len(sizes) else int(np.count_nonzero(beyond[far]))
+            why = "measured wrongly?"
+            if outside > len(far) / 2:
+                why = f"{outside} of these {len(far)} are outside the range learnt from: the model extrapolates."
             result.append(
-                f"{name}: {rows} far off the median of {1e3 * np.median(sizes):.3g} mm; measured wrongly? They count, "
+                f"{name}: {rows} far off the median of {1e3 * np.median(sizes):.3g} mm; {why} They count, "
                 f"for the verdict too; without them the rms is {without:.3f} mm"
             )
     return result
@@ -208,7 +214,7 @@ def _interval_notes(validation: Mapping[str, Comparison]) -> list[str]:
     """Say how many errors on unseen rows are within the interval that the fit states, and where it extrapolates."""
     result = []
     for name, each in validation.items():
-        if (found := each.intervals) is None or not each.settled:
+        if (found := each.intervals) is None or not each.settled or each.placed_by is not None:
             continue
         result.append(
             f"{name}: {100 * found.covered:.1f} % of {len(found.size)} errors are within the 95 % interval "
@@ -223,8 +229,14 @@ def _interval_notes(validation: Mapping[str, Comparison]) -> list[str]:
 
 
 def _unsettled(validation: Mapping[str, Comparison]) -> list[str]:
-    """Name unseen files on which the placement of base and tool did not settle."""
-    return [
+    """Name unseen files on which the placement of base and tool did not settle, or took up most of the errors."""
+    thin = {name: each.placed_by for name, each in validation.items() if each.settled and each.placed_by is not None}
+    few = [
+        f"{name} is not scored: base and tool placement take {fitted} parameters of its {measured} measured numbers, "
+        f"which leaves too few to judge by; measure {MARGIN * fitted} numbers or more, or from a station of the fit"
+        for name, (measured, fitted) in thin.items()
+    ]
+    return few + [
         f"{name} is not scored: base and tool placement did not settle on its rows, which hardly tell both; measure it "
         "from a station of the fit, or let it hold poses that turn about more than one axis"
         for name, each in validation.items()

@@ -248,3 +248,13 @@ def test_a_pipe_that_nobody_fills_is_refused(cell, calib, given):
     cell.write("a.csv", cell.measure(10))
     code, _, err = calib(*given, "--out", "o")
     assert (code, "pipe: cannot be read: is a pipe" in err) == (2, True), err
+
+
+def test_what_is_refused_is_quoted_as_it_was_written(cell, calib):
+    rows = [row | {f"sigma_{axis}": -1e-5 for axis in "xyz"} for row in cell.measure(20)]
+    file = cell.write("a.csv", rows)
+    code, _, err = calib("fit", "ur5", file, "--out", "o")
+    assert (code, "found -1e-05" in err) == (2, True), err
+    Path("o.toml").write_text('[sigma]\nposition = "1 mm"\n')
+    code, _, err = calib("fit", "ur5", file, "--options", "o.toml", "--out", "o")
+    assert (code, "found '1 mm'" in err) == (2, True), err

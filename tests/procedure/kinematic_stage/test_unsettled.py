@@ -41,3 +41,13 @@ def test_a_placement_that_ran_out_of_steps_proves_nothing(monkeypatch: pytest.Mo
     assert any(f"{name} is not scored: base and tool placement did not settle" in line for line in again.warnings)
     assert name not in again.verdict.reason and "cross-validation" in again.verdict.reason
     assert not any("95 % interval" in line for line in again.warnings)
+
+
+def test_a_file_that_its_own_placement_explains_proves_nothing(cell, calib) -> None:
+    """Six positions are eighteen numbers, base and tool nine parameters; twelve positions leave enough."""
+    file, other = cell.write("a.csv", cell.measure(60)), cell.measure(12, 1)
+    for count, scored in ((6, False), (12, True)):
+        few = cell.write("few.csv", other[:count])
+        _, out, err = calib("fit", "ur5", file, "--model", "offsets", "--validate", few, "--refit-frames", "--out", "o")
+        assert ("few.csv is not scored: base and tool placement take 9" in out) is not scored, err
+        assert ("on few.csv, unseen" in out) is scored
