@@ -260,8 +260,9 @@ def test_velocities_that_do_not_follow_the_positions_are_noted() -> None:
     v, noise = recorded().v, np.random.default_rng(1).normal(size=(len(recorded()), 3))
     assert v is not None
     for wrong, words in (
-        (-v, "backwards at joint1, joint2, joint3"), (0 * v, "not at joint1, joint2, joint3"), (noise, "not at joint1"),
-        (v * [1.0, 1.0, -1.0], "positions backwards at joint3"),
+        (-v, "run backwards at joint1, joint2, joint3"), (0 * v, "are other ones at joint1, joint2, joint3"),
+        (noise, "are other ones at joint1"),
+        (v * [1.0, 1.0, -1.0], "they run backwards at joint3:"),
     ):  # fmt: skip
         (one,) = found(recorded(v=wrong))
         assert (one.name, one.level) == ("speed", "pass") and words in one.words

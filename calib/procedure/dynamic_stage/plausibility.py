@@ -196,13 +196,15 @@ def _unlike(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
     """Say which measured velocities do not follow the positions."""
     against = [joints[j] for j in np.flatnonzero(each.follows < -FOLLOWS).tolist()]
     other = [joints[j] for j in np.flatnonzero(np.abs(each.follows) <= FOLLOWS).tolist()]
-    ways = [f"{what} at {', '.join(at)}" for what, at in (("backwards", against), ("not", other)) if at]
+    ways = [
+        f"{what} {', '.join(at)}" for what, at in (("run backwards at", against), ("are other ones at", other)) if at
+    ]
     if ways:
-        rest = "the samples are dated by them" if each.counted else "nothing rests on them here"
         yield Finding(
             "speed", "marginal" if each.counted else "pass",
-            f"{each.name}: the measured velocities follow the positions {' and '.join(ways)}: is a sign reversed, are "
-            f"columns exchanged, or were they not logged? {rest[0].upper()}{rest[1:]}",
+            f"{each.name}: the measured velocities are not the slopes of the positions: they {' and '.join(ways)}: is "
+            "a sign reversed, are columns exchanged, or were they not logged? "
+            + ("The samples are dated by them" if each.counted else "Nothing rests on them here"),
         )  # fmt: skip
 
 
