@@ -63,6 +63,16 @@ def test_one_joint_in_another_unit_is_named(joint: int) -> None:
     assert float(named[2]) == pytest.approx(np.quantile(np.abs(tau[:, joint]), 0.99) / 60.0, rel=0.1)
 
 
+@pytest.mark.parametrize("factor, level", [(1.0, None), (2.0, "marginal"), (10.0, "fail")])
+def test_a_gain_that_takes_a_joint_beyond_its_limit_is_told(factor: float, level: str | None) -> None:
+    usual = np.quantile(np.abs(recorded().effort[:, 2]), 0.99)
+    arm = replace(ARM, joints=(*ARM.joints[:2], replace(ARM.joints[2], effort=1.1 * usual)))
+    case = case_of(recorded(tau=recorded().effort * [1.0, 1.0, factor]))
+    told = [one for one in findings([compare_sizes(case, arm)], NAMES) if one.name == "limit"]
+    assert [one.level for one in told] == ([level] if level else [])
+    assert all("limit at joint3" in one.words for one in told)
+
+
 def test_torques_that_reach_no_share_of_any_limit_are_another_unit() -> None:
     (one,) = [one for one in found(recorded(tau=1e-3 * recorded().effort)) if one.name == "limit"]
     assert one.level == "marginal" and "kN m" in one.words

@@ -16,8 +16,8 @@ order    two joints with which exchanged the robot's own masses leave less than 
          joint's more than `UNTOLD`: marginal. Honest recordings gain nothing (1.0 and above), and where another robot,
          or a zero, is wrong, an exchange leaves that wrong
 zero     a joint with a right angle or two at whose zero they leave less than `TURNED`, likewise: marginal
-limit    torques of a joint beyond `BEYOND` times its limit, another unit there: fail; none at any joint that reaches
-         `REACHED` of its limit: marginal
+limit    torques of a joint beyond `BEYOND` times its limit, another unit there: fail; beyond `OVER` times, a wrong gain
+         or limit: marginal, as where none at any joint reaches `REACHED` of its limit. Recordings at hand: 0.2 to 0.7
 jump     a position that leaves the slope of the rows around it: marginal
 bodies   an estimate that is `NO_ROBOT` times as far from every possible robot as 95 % of right ones are: marginal;
          beyond `NEVER` times: fail. Honest recordings at hand are up to 3.6 times as far (LWR4+; Panda 1.5, TIAGo 2.3).
@@ -47,7 +47,7 @@ INERT, RODS = 2.0, 0.17
 LOST = 30.0
 EXCHANGED, TURNED, UNTOLD = 0.98, 0.7, 0.3
 NO_ROBOT, NEVER, NOTICED = 5.0, 10.0, 2.0
-REACHED = 0.01
+OVER, REACHED = 1.2, 0.01
 
 
 def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Finding]:
@@ -139,6 +139,12 @@ def _limits(each: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
             f"{each.name}: the torques are beyond the joint's limit at {', '.join(beyond)} times, and not at the "
             "others: are these alone in N mm, or in another unit? Bring all joints to one unit (in a table by its "
             "header, 'tau_1 [Nmm]'), or correct the limits in the robot's file",
+        )  # fmt: skip
+    elif over := [f"{joints[j]} {each.limits[j]:.2g}" for j in np.flatnonzero(known & (each.limits > OVER)).tolist()]:
+        yield Finding(
+            "limit", "marginal",
+            f"{each.name}: the torques are beyond the joint's limit at {', '.join(over)} times, more than 1 % of the "
+            "time: is a gain wrong, a unit, or the limit in the robot's file?",
         )  # fmt: skip
     elif known.any() and (each.limits[known] < REACHED).all():
         yield Finding(
