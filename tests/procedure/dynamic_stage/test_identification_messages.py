@@ -68,7 +68,7 @@ def test_figures_have_units_at_their_axes():
     outcome: Any = SimpleNamespace(
         fit={"train": SimpleNamespace(raw=PredictionErrors(5.0, np.full(3, 5.0), np.zeros(3), 1))}, validation={},
         repeated={}, found=SimpleNamespace(settings=SimpleNamespace(torque_rows=MOTOR)),
-        inputs=SimpleNamespace(unit="N m", chain=replace(planted.arm(), joints=joints)),
+        inputs=SimpleNamespace(unit="N m", row_units=("N", "N m", "N m"), chain=replace(planted.arm(), joints=joints)),
     )  # fmt: skip
     figure = dynamics_figures.file_torques(one, np.asarray(one.target), outcome)
     units = [f"{joint.name} [{unit}]: 5 % left" for joint, unit in zip(joints, ("N", "N m", "N m"))]
