@@ -324,6 +324,8 @@ def fit_geometry(
         if poses is not None:
             raise UsageError("poses of a parallel robot are not chosen here, so that nothing was predicted of its fit")
         return _of_parallel(robot, listed(measured), listed(validate), settings, chosen, progress)
+    if progress is not None:
+        progress("reading")
     given = inputs.gather(
         robot, listed(measured), listed(validate), options=chosen, settings=settings, base=base, tip=tip
     )
