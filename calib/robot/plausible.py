@@ -12,9 +12,14 @@ TURNS = 4.0 * np.pi + 0.01  # [rad] a continuous wrist may be given two turns (o
 EMPTY = 1e-6  # of M L²: moments below are rounding
 
 
-def remarks(chain: Chain) -> tuple[str, ...]:
-    """Return in words what a chain's description holds that looks wrong, by joint; nothing of a sound one."""
-    return (*chain.remarks, *unstated_limits(chain), *_turns(chain), *_massless(chain), *impossible_bodies(chain))
+def remarks(chain: Chain, bodies: bool = True) -> tuple[str, ...]:
+    """Return in words what a chain's description holds that looks wrong, by joint; nothing of a sound one.
+
+    Args:
+        bodies: with those that cannot exist.
+    """
+    found = (*chain.remarks, *unstated_limits(chain), *_turns(chain), *_massless(chain))
+    return (*found, *impossible_bodies(chain)) if bodies else found
 
 
 def unstated_limits(chain: Chain) -> tuple[str, ...]:

@@ -19,8 +19,9 @@ from calib.identification.checks.whole_robot import Rearranged
 from calib.identification.identify import identify
 from calib.identification.possible.contradiction import Contradiction, contradiction
 from calib.identification.settings import IdentificationSettings
-from calib.procedure.dynamic_stage.plausibility import findings, impossible
+from calib.procedure.dynamic_stage.plausibility import described, findings, impossible
 from calib.procedure.findings import Finding, Verdict, settled
+from calib.robot.load import load
 
 NAMES = ("joint1", "joint2", "joint3")
 ARM = replace(planted.arm(), joints=tuple(replace(joint, effort=60.0) for joint in planted.arm().joints))
@@ -315,3 +316,14 @@ def test_a_contradiction_is_remarked_by_its_size() -> None:
     levels = [[one.level for one in impossible(Contradiction(10.0 * times, 10.0, 3.0))] for times in (4.0, 6.0, 12.0)]
     assert levels == [[], ["marginal"], ["fail"]] and impossible(None) == []
     assert impossible(Contradiction(120.0, 10.0, 0.1)) == []
+
+
+def test_a_description_that_cannot_be_allows_no_pass():
+    chain = load("lwr4plus")
+    assert described(chain) == []
+    bodies = np.array(chain.inertias)
+    bodies[2, 9] = -1.0
+    wrong = described(replace(chain, inertias=bodies))
+    assert Verdict("pass", "good").held_by(settled(wrong, ())).level == "marginal"
+    assert "a negative mass (M = -1 kg)" in wrong[0].words and 'accept = ["description"]' in wrong[0].told
+    assert Verdict("pass", "good").held_by(settled(wrong, ["description"])).level == "pass"

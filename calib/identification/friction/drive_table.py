@@ -17,22 +17,34 @@ class Drives:
 
     Attributes:
         values: (n, 4) armature [kg m² or kg], damping [N m s/rad or N s/m], friction, offset [N m or N].
+        sigma: (n, 4) of them; None where no covariance is known.
         left: names of terms that no such table holds: couplings, richer friction.
     """
 
     values: np.ndarray
     left: tuple[str, ...]
+    sigma: np.ndarray | None = None
 
 
-def drive_table(dynamics: Dynamics) -> Drives:
-    """Return the drive terms of an identified model by joint, those of motor and link side added."""
+def drive_table(dynamics: Dynamics, covariance: np.ndarray | None = None) -> Drives:
+    """Return the drive terms of an identified model by joint, those of motor and link side added.
+
+    Args:
+        dynamics: the model.
+        covariance: of all its parameters.
+    """
     model = dynamics.model
     values, left = np.zeros((model.bodies.n, 4)), []
-    for one, value in zip(model.columns, dynamics.values[model.inertial :]):
+    adds = np.zeros((*values.shape, len(dynamics.values)))
+    for k, (one, value) in enumerate(zip(model.columns, dynamics.values[model.inertial :]), model.inertial):
         if not one.acts or value == 0.0:
             continue
         if one.shape in PLAIN and one.joint is not None:
             values[one.joint, PLAIN[one.shape]] += value
+            adds[one.joint, PLAIN[one.shape], k] = 1.0
         else:
             left.append(one.name)
-    return Drives(values, tuple(left))
+    if covariance is None:
+        return Drives(values, tuple(left))
+    variance = np.einsum("nki,ij,nkj->nk", adds, covariance, adds)
+    return Drives(values, tuple(left), np.sqrt(np.clip(variance, 0.0, None)))

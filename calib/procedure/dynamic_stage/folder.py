@@ -195,10 +195,10 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     first = (*inputs.unseen, *inputs.cases)[0]
     expected = outcome.assessment.intervals.get(first.name)
     _write_torques(first, outcome.predictions[first.name], expected, folder / "torques_1.csv")
-    table = to_table(found.dynamics, found.base, inputs.unit) | {"drive_gains": gain_table(inputs.gains, inputs.unit)}
+    gains = gain_table(inputs.gains, inputs.unit)
+    table = to_table(found.dynamics, found.base, inputs.unit) | {"drive_gains": gains}
     files.write_json(folder / MODEL, table)
-    if inputs.gains is not None:
-        gains = table["drive_gains"]
+    if gains is not None:
         header = ("joint", f"gain [{gains['unit']}]", "sigma", "told")
         rows = zip(inputs.chain.joint_names, gains["values"], gains["sigma"], gains["told"])
         files.write_table(folder / "drive_gains.csv", header, rows)

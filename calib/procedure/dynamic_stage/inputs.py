@@ -138,7 +138,10 @@ def gather(
         like = motions[0] if len(motions) >= len(recordings) else None
         motion = read_motion(each, chain, options.file_settings(path), like)
         motions.append(_referred(motion, path, chain, options) if len(motions) < len(recordings) else motion)
-    notes = [*remarks(chain), *(f"{name}: {note}" for name, motion in zip(names, motions) for note in motion.notes)]
+    notes = [
+        *remarks(chain, bodies=False),
+        *(f"{name}: {note}" for name, motion in zip(names, motions) for note in motion.notes),
+    ]
     count = len(recordings)
     found = find_gains(chain, options, dict(zip(paths, motions)), paths[:count], say)
     options = found.options

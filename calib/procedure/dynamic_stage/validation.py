@@ -143,7 +143,7 @@ def assess(
     labels = settings.torque_rows.numbered(inputs.chain.n)
     sizes = [compare_sizes(case, inputs.chain, settings.gravity, inputs.unit == TORQUE) for case in inputs.cases]
     odd = plausibility.findings(sizes, inputs.chain.joint_names) + plausibility.impossible(findings.contradiction)
-    odd += plausibility.another_loop(findings.unlike)
+    odd += plausibility.another_loop(findings.unlike) + plausibility.described(inputs.chain)
     odd = settled(odd, inputs.options.accept)
     verdict = judge(fit, proofs, repeated, excitation, wrong, labels)
     verdict = with_intervals(verdict, {name: expected[name] for name in proofs if name in expected}, labels)

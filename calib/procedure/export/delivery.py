@@ -25,6 +25,7 @@ from calib.procedure.kinematic_stage.folder import (
 )
 from calib.robot.calibrated import ROBOT
 from calib.robot.formats.markup import with_comment
+from calib.robot.plausible import impossible_bodies
 
 COPIED = (ROBOT, TERMS, FORMULA)
 OFFSETS, UR_KINEMATICS = "joint_offsets.csv", "ur_kinematics.yaml"
@@ -86,7 +87,10 @@ def _write(fit: Path, source: Path, out: Path) -> list[str]:
     made = (
         "the given URDF with calibrated joint origins, all else kept" if given else "written from the calibrated table"
     )
-    notes = [f"robot.urdf: {made}; {read}"]
+    notes = [
+        f"robot.urdf: {made}; {read}",
+        *(f"AS THE SOURCE HAS IT: {each}" for each in impossible_bodies(found.chain)),
+    ]
     geometry.export_offsets(found, out / OFFSETS)
     notes.append("robot.toml, joint_offsets.csv")
     try:

@@ -6,7 +6,8 @@ robot.urdf            the source with calibrated joint origins, masses and frict
                       as it was. ``<inertial>`` of a link: origin at its centre of mass, axes of the link.
                       ``<dynamics damping friction>``: Fv and Fc. URDF has no place for motor inertia: see drives.csv.
 robot.xml             MJCF for MuJoCo: bodies, armature (Ia), damping (Fv), frictionloss (Fc); no meshes.
-drives.csv            joint, armature, damping, friction, offset: for simulators that take them by hand.
+drives.csv            joint, armature, damping, friction, offset, and the sigma of each: for simulators that take them
+                      by hand. A sigma is empty where the model has no such term.
 joint_origins.yaml    with --urdf: origins as tesseract reads them, ``<calibration_config filename=.../>`` in the SRDF:
                       calibration / joints / name / position x y z [m], orientation x y z w.
 parameters.json       names, units, values and covariances of geometry and dynamics, base and standard parameters, and
@@ -27,9 +28,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from calib import files
 from calib.folders import write_staged
-from calib.procedure.export.identified import IdentifiedRobot, consistency_lines, drive_notes, read
+from calib.procedure.export.identified import IdentifiedRobot, consistency_lines, drive_notes, mass_notes, read
 from calib.procedure.export.masses import MJCF, as_mjcf, as_urdf
 from calib.procedure.export.parameters import PARAMETERS, parameters
 from calib.procedure.kinematic_stage.folder import URDF
@@ -39,6 +42,7 @@ from calib.robot.formats.markup import text
 from calib.robot.formats.tesseract import joint_origins
 
 TABLE = ("joint", "armature", "damping", "friction", "offset", "armature_unit", "damping_unit", "friction_unit")
+SIGMAS = ("armature_sigma", "damping_sigma", "friction_sigma", "offset_sigma")
 WRITTEN = (URDF, MJCF, "drives.csv", "joint_origins.yaml", PARAMETERS)
 
 
@@ -77,14 +81,16 @@ def deliver_dynamics(identified: Path, source: Path | None, out: Path, prior: st
         "robot.xml: MJCF with armature, damping and frictionloss; Pinocchio reads the same poses and torques to 1e-9",
         "drives.csv, parameters.json" + ("" if source is None else ", joint_origins.yaml (tesseract's SRDF)"),
     ]
+    notes += mass_notes(given)
     return [*lines, *consistency_lines(given.found, given.information.b), *notes, *drive_notes(given)]
 
 
 def _export_drives(given: IdentifiedRobot, out: Path) -> Path:
     """Write the drives' table."""
-    rows = []
-    for joint, row in zip(given.chain.joints, given.drives.values):
+    rows, values = [], given.drives.values
+    sigmas = np.zeros(values.shape) if given.drives.sigma is None else given.drives.sigma
+    for joint, row, sigma in zip(given.chain.joints, values, sigmas):
         linear = joint.kind == "prismatic"
         units = ("kg", "N s/m", "N") if linear else ("kg m²", "N m s/rad", "N m")
-        rows.append((joint.name, *map(float, row), *units))
-    return files.write_table(out, TABLE, rows)
+        rows.append((joint.name, *map(float, row), *units, *(float(one) or None for one in sigma)))
+    return files.write_table(out, (*TABLE, *SIGMAS), rows)

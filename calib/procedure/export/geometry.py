@@ -164,10 +164,11 @@ def check_readback(edited: str, where: str, chain: Chain) -> str:
 def export_offsets(robot: CalibratedChain, out: Path) -> Path:
     """Write calibrated minus nominal of each joint's own value: what a controller adds to the angle it reads.
 
-    The sigmas are left out where the fit has joint corrections: the offsets are then for whoever does not apply them.
+    Where the fit has joint corrections, offsets and their sigmas are those of the best geometry without them: for
+    whoever does not apply them.
     """
     nominal, sigma = nominal_of(robot), np.full(len(robot.chain.elements), np.nan)
-    if robot.covariance is not None and robot.corrections is None:
+    if robot.covariance is not None:
         sigma = np.sqrt(np.diag(robot.covariance))
     rows = []
     for joint, k in zip(robot.chain.joints, robot.chain.moving):

@@ -16,6 +16,9 @@ from calib.identification.possible.solve import PossibleBodies, find_possible
 from calib.procedure.export import geometry
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
+from calib.robot.plausible import impossible_bodies
+
+UNLIKE = 3.0  # times a body's mass in the description from which on it is named (our choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +61,8 @@ def read(folder: Path, prior: str = "entropic") -> IdentifiedRobot:
     found = find_possible(information, prior=prior)
     own = bodies_of(information.chain).count
     bodies = found.dynamics.values[: 10 * own].reshape(own, 10)
-    return IdentifiedRobot(geometry.read(folder), information, found, bodies, drive_table(found.dynamics))
+    table = drive_table(found.dynamics, found.covariance)
+    return IdentifiedRobot(geometry.read(folder), information, found, bodies, table)
 
 
 def consistency_lines(found: PossibleBodies, b: int) -> list[str]:
@@ -76,6 +80,26 @@ def consistency_lines(found: PossibleBodies, b: int) -> list[str]:
             "(friction, gains, a payload), or the sigmas are too small"
         )
     return [*lines, *found.notes]
+
+
+def mass_notes(given: IdentifiedRobot) -> list[str]:
+    """Return what the bodies written weigh, how that compares with the description's, and what of these cannot be."""
+    names, masses = given.chain.joint_names, given.bodies[:, 9]
+    notes = [f"masses written, behind each joint: {', '.join(f'{mass:.3g}' for mass in masses)} kg"]
+    if given.chain.inertias is not None:
+        theirs = given.chain.inertias[:, 9]
+        pairs = zip(names, masses, theirs)
+        unlike = [
+            f"{name} {mass:.3g} kg ({own:.3g})" for name, mass, own in pairs if not own / UNLIKE < mass < own * UNLIKE
+        ]
+        if unlike:
+            notes.append(
+                f"masses unlike the robot's description by more than {UNLIKE:g} times (that in brackets): "
+                f"{', '.join(unlike)}; torques tell sums of masses, not each"
+            )
+    if wrong := impossible_bodies(given.chain):
+        notes.append(f"THE ROBOT'S DESCRIPTION CANNOT BE: {'; '.join(wrong)}")
+    return notes
 
 
 def drive_notes(given: IdentifiedRobot) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,9 +18,14 @@ from calib.cli.shared import make_console
 from calib.config import check_keys
 from calib.dynamics.torque_rows import MOTOR
 from calib.errors import UsageError
+from calib.identification.gains import DriveGains
+from calib.identification.identify_options import IdentifyOptions
 from calib.identification.scores import PredictionErrors
+from calib.procedure.dynamic_stage.gains import FoundGains
+from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.metrics import ReplayController, ReplayMetrics
 from calib.procedure.report import console, dynamics_figures, dynamics_section
+from calib.robot.calibrated import CalibratedChain
 from calib.units import motion_units
 
 
@@ -65,15 +71,22 @@ def test_names_in_brackets_reach_the_console():
 def test_figures_have_units_at_their_axes():
     one = planted.case("train", 0)
     joints = (replace(planted.arm().joints[0], kind="prismatic"), *planted.arm().joints[1:])
+    arm, options = CalibratedChain(replace(planted.arm(), joints=joints)), IdentifyOptions()
+    inputs = IdentificationInputs(
+        arm, Path(), (), (), options, (), FoundGains(options, None, None, "N m", ())
+    )  # fmt: skip
     outcome: Any = SimpleNamespace(
         fit={"train": SimpleNamespace(raw=PredictionErrors(5.0, np.full(3, 5.0), np.zeros(3), 1))}, validation={},
         repeated={}, found=SimpleNamespace(settings=SimpleNamespace(torque_rows=MOTOR)),
-        inputs=SimpleNamespace(unit="N m", row_units=("N", "N m", "N m"), chain=replace(planted.arm(), joints=joints)),
+        inputs=inputs,
     )  # fmt: skip
     figure = dynamics_figures.file_torques(one, np.asarray(one.target), outcome)
     units = [f"{joint.name} [{unit}]: 5 % left" for joint, unit in zip(joints, ("N", "N m", "N m"))]
     assert [axis.get_title(loc="left") for axis in figure.axes] == units
     assert not any(axis.get_legend() for axis in figure.axes), "a legend inside would cover the curve"
+    gains = DriveGains(np.ones(3), np.zeros((3, 3)), (), np.zeros(0), np.ones(3), "", (2,))
+    amperes = replace(inputs, currents=FoundGains(options, gains.gains, gains, "A of joint 2", ()))
+    assert amperes.row_units == ("A of joint 2", "A of joint 2", "A of joint 3"), "a gain not told: its own amperes"
     assert motion_units(["revolute"] * 2) == ("rad", "rad/s", "rad/s²", "N m")
     assert motion_units(["revolute", "prismatic"])[3] == "N m, N"
 

@@ -11,6 +11,9 @@ import pytest
 import yaml
 
 from calib import export
+from calib.procedure.export.geometry import export_offsets
+from calib.robot.calibrated import CalibratedChain, CorrectedChain
+from calib.robot.deflection import Deflection, Term
 from calib.robot.formats import urdf
 from calib.robot.formats.urdf_write import write_new
 from calib.robot.kinematics import forward
@@ -84,6 +87,16 @@ def test_offsets_are_what_a_controller_adds(cell, calib, fitted):
     for row, k in zip(rows, chain.moving):
         assert float(row["offset"]) == pytest.approx(chain.values[k] - nominal.values[k], abs=1e-12)
     assert float(rows[0]["offset"]) == 0.0  # the first joint's offset cannot be told from the station
+
+
+def test_offsets_beside_corrections_have_the_sigmas_of_the_geometry_without_them(tmp_path):
+    chain = load("ur5")
+    moved = CorrectedChain(chain, Deflection((Term("theta2", "cos", 1, 1),), np.array([1e-3]), chain))
+    covariance = np.diag(np.arange(1.0, len(chain.elements) + 1.0)) * 1e-8
+    export_offsets(CalibratedChain(chain, chain, covariance, moved), tmp_path / "offsets.csv")
+    with (tmp_path / "offsets.csv").open(newline="") as file:
+        sigmas = [float(row["sigma"]) for row in csv.DictReader(file)]
+    np.testing.assert_allclose(sigmas, np.sqrt(1e-8 * (chain.moving + 1.0)))
 
 
 def test_ur_kinematics_give_the_calibrated_poses_in_the_frames_of_ur_description(cell, calib, fitted):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import re
@@ -95,6 +96,12 @@ def test_urdf_mjcf_and_tables_hold_the_same_robot(tmp_path, kind):
     assert standard["values"][9] == pytest.approx(1.2 * 4.5, rel=0.5), "its own mass turns about a still axis"
     assert table["geometry"]["names"] == list(given.chain.names)
     assert all(margin > 0.0 for margin in table["dynamics"]["consistency"]["margins_m"].values())
+    place = standard["names"].index("Ia2")
+    with (tmp_path / "out" / "drives.csv").open(newline="") as file:
+        drive = [*csv.DictReader(file)][1]
+    assert float(drive["armature"]) == pytest.approx(standard["values"][place])
+    assert float(drive["armature_sigma"]) == pytest.approx(standard["covariance"][place][place] ** 0.5)
+    assert any(note.startswith("masses written, behind each joint: ") for note in notes)
 
 
 def check_torques_with_pinocchio(path: Path, given: identified.IdentifiedRobot) -> None:
