@@ -56,6 +56,12 @@ def poses_kind(joint_names: Sequence[str]) -> files.Kind:
     return files.table("list of planned poses", fits)
 
 
+def filled_in(path: Path, joints: int) -> bool:
+    """Tell whether a list of planned poses of an arm holds anything beside its joints: measurements, by hand."""
+    lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()[1:]
+    return any(cell.strip() for line in lines for cell in re.split("[,;\t]", line)[joints:])
+
+
 def read_poses(
     path: str | Path,
     joints: Sequence[str],

@@ -16,7 +16,7 @@ from calib.data.poses.fit_options import FileOptions, FitOptions, read_options
 from calib.data.poses.image_folders import is_image_folder
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.data.poses.pixels import Pixels
-from calib.data.poses.plans import check_against, read_poses, write_poses
+from calib.data.poses.plans import check_against, filled_in, read_poses, write_poses
 from calib.errors import RobotError, UsageError
 from calib.geometry.weighing import Settings
 from calib.procedure.kinematic_stage import fit as fitting
@@ -115,6 +115,12 @@ def select(session: Session, say: Say) -> list[str]:
     from calib.procedure.session.pose_plan import plan
 
     chain, wanted = chain_of(session), session.settings.poses
+    for path in (session.path(f"2-poses/{name}") for name in (POSES, UNSEEN)):
+        if path.exists() and filled_in(path, chain.n):
+            raise UsageError(
+                f"{path} holds more than the poses to measure, and would be written over: bring measurements in "
+                f"{session.path('3-measured')}, and put the plain list back or remove it"
+            )
     say("choosing poses")
     chosen = plan(session, robot_file(session), chain, say)
     kinds = [joint.kind for joint in chain.joints]

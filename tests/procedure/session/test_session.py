@@ -95,6 +95,14 @@ def test_what_a_person_replaced_is_kept_and_said(finished: Session) -> None:
     assert "checked" in urdf.read_text()
 
 
+def test_measurements_filled_into_the_plan_are_not_written_over(planned: Session) -> None:
+    path = planned.path("2-poses/poses.csv")
+    first, *rest = path.read_text().splitlines()
+    path.write_text("\n".join([f"{first},x,y,z", *(f"{line},0.1,0.2,0.3" for line in rest)]) + "\n")
+    kept = path.read_bytes()
+    assert cli.run(["redo", str(planned.folder), "select"]) == 2 and path.read_bytes() == kept
+
+
 def test_redo_makes_a_step_and_all_behind_it_again(finished: Session) -> None:
     urdf = finished.path("6-export/robot.urdf")
     original = urdf.read_text()
