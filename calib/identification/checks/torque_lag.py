@@ -5,12 +5,14 @@ squares weighed by what is left of each joint. Bodies of each joint's own bend a
 where torques are 100 ms late. Friction turns over later than its speed does, as long as joints bend before they slide,
 and would pass for a lag of 20 ms (the Panda's wrist); so sign(v) may come `FREE` earlier and later, at each joint, and
 friction tells nothing of the lag: masses and inertias do. The least of the residual is found by a parabola; its sigma
-takes each joint's vote for one draw. All of this and its thresholds are our choice.
+takes each joint's vote for one draw, and both halves of the recording for two: short ones agree on none. All of this
+and its thresholds are our choice.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,7 +25,9 @@ FREE = 0.03  # by which friction may turn over early or late by itself [s]
 SWEEPS = 30  # over the joints' own lags
 LEAST, SURE = 0.015, 3.5  # least lag that is told [s], and in sigmas
 HELPS = 1.05  # and what is left without it over what is left with it: of another robot any lag may be the best
-ALONE, OTHERS = 0.15, 3.0  # share by which a lag of its own helps a joint, and times as much as any other joint's
+KNOWN = 0.5  # share of the joints' torques that may be left: a model that leaves more knows no lag
+ALONE, OTHERS = 0.2, 3.0  # share by which a lag of its own helps a joint, and times as much as any other joint's
+ALIKE = 0.5  # share of that lag by which those of both halves may differ from it
 ROUNDS = 4  # of weighing joints by what is left of them
 UNSURE = 0.005  # sigma that a friction of another form brings [s]: real recordings as they are show lags of 4 ms rms
 LONG = 2.0  # time with samples below which a motion tells no lag: bodies then stand for it [s]
@@ -39,6 +43,7 @@ class Lag:
         factor: what is left as recorded over what is left shifted, joints weighed by what is left of them.
         own: (n,) lags of the joints, each for itself [s].
         gains: (n,) what is left of a joint at the common lag over what is left at its own, the others at theirs.
+        joint: the one, from 0, with a lag of its own as no other has, in both halves of the recording; None without.
     """
 
     seconds: float
@@ -48,19 +53,13 @@ class Lag:
     factor: float
     own: np.ndarray
     gains: np.ndarray
+    joint: int | None
 
     @property
     def told(self) -> bool:
         """Whether all torques come late, surely, and by enough."""
         least = max(LEAST, SURE * self.sigma)
-        return least < abs(self.seconds) < LAGS - STEP and self.factor > HELPS
-
-    @property
-    def joint(self) -> int | None:
-        """The one joint, from 0, that has a lag of its own as no other has; None without."""
-        j, more = int(self.gains.argmax()), np.sort(self.gains) - 1.0
-        apart = abs(self.own[j] - self.seconds) > LEAST and abs(self.own[j]) < LAGS - 1.5 * STEP
-        return j if apart and more[-1] > max(ALONE, OTHERS * (more[-2] if len(more) > 1 else np.inf)) else None
+        return least < abs(self.seconds) < LAGS - STEP and self.factor > HELPS and self.after < KNOWN
 
 
 def lag_of(samples: MotionSamples, rate: float) -> Lag | None:
@@ -70,9 +69,34 @@ def lag_of(samples: MotionSamples, rate: float) -> Lag | None:
         samples: of the recording.
         rate: of its motion [Hz].
     """
-    m, n = samples.q.shape
+    m = len(samples.index)
     if m * float(np.median(np.diff(samples.index))) < LONG * rate:
         return None
+    whole = _lag_in(samples, rate)
+    halves = [_lag_in(_part(samples, half), rate) for half in (slice(0, m // 2), slice(m // 2, m))]
+    apart = abs(halves[0].seconds - halves[1].seconds) / 2.0
+    return replace(whole, sigma=float(np.hypot(whole.sigma, apart)), joint=_alone(whole, halves))
+
+
+def _alone(whole: Lag, halves: Sequence[Lag]) -> int | None:
+    """Return the joint with a lag of its own as no other has, in the whole and alike in its halves; None without."""
+    j, more = int(whole.gains.argmax()), np.sort(whole.gains) - 1.0
+    late = whole.own[j] - whole.seconds
+    if abs(late) < LEAST or abs(whole.own[j]) > LAGS - 1.5 * STEP or len(more) < 2:
+        return None
+    if more[-1] < max(ALONE, OTHERS * more[-2]):
+        return None
+    return j if all(abs(half.own[j] - half.seconds - late) < ALIKE * abs(late) for half in halves) else None
+
+
+def _part(samples: MotionSamples, part: slice) -> MotionSamples:
+    picked = {name: getattr(samples, name)[part] for name in ("index", "q", "v", "a")}
+    return MotionSamples(**picked, effort=samples.effort, velocity=samples.velocity, bodies=samples.bodies)
+
+
+def _lag_in(samples: MotionSamples, rate: float) -> Lag:
+    """Return the lag of least squares, its sigma by the joints' votes."""
+    n = samples.q.shape[1]
     shifts = np.arange(-LAGS, LAGS + STEP / 2, STEP)
     recorded = np.full(n, len(shifts) // 2)
     places, times = samples.index + shifts[:, None] * rate, np.arange(len(samples.effort))
@@ -97,6 +121,7 @@ def lag_of(samples: MotionSamples, rate: float) -> Lag | None:
         factor=float(np.sqrt(fit.common[recorded[0]] / max(fit.common[at], 1e-300))),
         own=shifts[alone],
         gains=np.array([fit.gain(alone, j, at) for j in range(n)]),
+        joint=None,
     )
 
 
