@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.shared import progress, say
+from calib.cli.shared import Overwrite, progress, say
 
 app = typer.Typer()
 
@@ -25,6 +25,7 @@ def board(
     ] = None,
     dictionary: Annotated[str | None, typer.Option(help="of the markers: 4x4_50 to 7x7_1000, apriltag_36h11")] = None,
     paper: Annotated[str | None, typer.Option(help="a4, a3, a2, a1 or a0; by default the smallest that fits")] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Make a board to print at true scale; a ruler checks the print.
 
@@ -33,7 +34,7 @@ def board(
     """
     from calib.procedure.measuring import boards
 
-    for line in boards.make(out, kind, columns, rows, square, marker, dictionary, paper):
+    for line in boards.make(out, kind, columns, rows, square, marker, dictionary, paper, overwrite):
         say(line)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from calib.data.camera import board as boards
 from calib.data.camera.board import KINDS, Board
 from calib.data.camera.corner_file import Found
 from calib.data.poses.image_folders import JOINTS, find_corners, joint_table, problem_words, read_own_board
-from calib.errors import MeasurementError, UsageError
+from calib.errors import CalibError, MeasurementError, UsageError
 
 Show = Callable[[str], None]
 USUAL = {"charuco": ("5x5_100", 0.7, 9), "chessboard": ("5x5_100", 0.7, 10), "apriltag": ("apriltag_36h11", 0.3, 9)}
@@ -22,7 +23,7 @@ GRID = (12, 9)  # cells of the image that coverage counts (our choice)
 
 def make(
     out: Path, kind: str, columns: int | None, rows: int, square: float, marker: float | None, words: str | None,
-    paper: str | None,
+    paper: str | None, overwrite: bool = False,
 ) -> list[str]:  # fmt: skip
     """Write ``board.toml``, ``board.pdf`` and ``board.svg``; return what to do with them.
 
@@ -31,9 +32,10 @@ def make(
         kind, columns, rows, words, paper: see `calib.data.camera.board`; a dictionary, and the paper's name. None: the
             usual ones.
         square, marker: [mm].
+        overwrite: replace another board that is there, whose squares somebody may have measured.
 
     Raises:
-        UsageError: for a board that cannot be, or does not fit onto its paper.
+        UsageError: for a board that cannot be, or does not fit onto its paper, and for another that is there already.
     """
     from calib.data.camera import board_print
     from calib.data.camera.detection import FEWEST
@@ -53,6 +55,12 @@ def make(
         size = board_print.page_size(made, (paper or "").lower())
     except ValueError as error:
         raise UsageError(f"this board cannot be: {error}") from None
+    there = out / boards.FILE
+    if not overwrite and there.exists() and not _as_printed(out):
+        raise UsageError(
+            f"{there} is not as it was printed: somebody measured its squares, or it is another's; nothing changed. "
+            "Take another folder (--out), or say --overwrite"
+        )
     files.write(out / "board.pdf", board_print.pdf(made, size))
     files.write(out / "board.svg", board_print.svg(made, size))
     boards.write_board(made, out / boards.FILE)
@@ -63,6 +71,22 @@ def make(
         f"several squares together and put the size of one into {out / boards.FILE}: the robot's lengths get their "
         "scale from it",
     ]
+
+
+def _as_printed(out: Path) -> bool:
+    """Tell whether a folder's ``board.toml`` is that of its ``board.svg``, as `make` left both."""
+    from calib.data.camera import board_print
+
+    try:
+        found, drawn = boards.read_board(out), (out / "board.svg").read_bytes()
+        sizes = []
+        for paper in ("", *board_print.PAPERS):
+            with suppress(ValueError):  # a paper that it does not fit onto
+                sizes.append(board_print.page_size(found, paper))
+        drawings = (board_print.svg(found, size) for size in dict.fromkeys(sizes))
+        return any((one.encode() if isinstance(one, str) else one) == drawn for one in drawings)
+    except (OSError, ValueError, CalibError):
+        return False
 
 
 def look(folder: Path, show: Show) -> list[str]:

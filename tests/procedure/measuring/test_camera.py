@@ -112,6 +112,16 @@ def test_images_without_a_board_are_an_error(tmp_path, capsys):
     assert "none of 2 images is of use (ChArUco" in capsys.readouterr().err
 
 
+def test_a_board_that_was_measured_is_kept(tmp_path):
+    for _ in range(2):
+        assert run(["board", "--out", str(tmp_path)]) == 0
+    path = tmp_path / "board.toml"
+    path.write_text(path.read_text().replace("square = 0.03 ", "square = 0.0297 "))
+    kept = path.read_bytes()
+    assert run(["board", "--out", str(tmp_path)]) == 2 and path.read_bytes() == kept
+    assert run(["board", "--out", str(tmp_path), "--overwrite"]) == 0 and path.read_bytes() != kept
+
+
 def test_boards_are_made_and_impossible_ones_refused(tmp_path, capsys):
     given = ["--square", "25", "--columns", "7", "--rows", "5", "--paper", "A4"]
     assert run(["board", "--out", str(tmp_path), *given]) == 0
