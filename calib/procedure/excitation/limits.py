@@ -42,7 +42,7 @@ from calib.errors import UsageError
 from calib.geometry.observability import targets_of
 from calib.procedure.measuring.constraints_file import DEFAULTS, ConstraintsFile, Point
 from calib.procedure.measuring.pose_limits import Limits, limits_of
-from calib.robot.chain import Chain
+from calib.robot.chain import Chain, Joint
 from calib.robot.kinematics import joint_frames, joint_jacobian, sweep
 from calib.robot.plausible import impossible_bodies
 from poses.space import PoseConstraint
@@ -158,7 +158,7 @@ def read_motion_limits(
     needed = {"velocity": velocity}
     if chain.inertias is not None if predicted is None else predicted:
         needed["effort"] = torque
-    unlimited = _unlimited(chain, needed, source)
+    unlimited = check_stated(chain.joints, needed, str(source or chain.name))
     margin = number(own["margin"], f"{where}: torque.margin") if "margin" in own else None
     if margin is not None and not 0.0 <= margin < 1.0:
         raise UsageError(f"{where}: torque.margin: expected a share of the limit, from 0 to below 1, found {margin:g}")
@@ -193,28 +193,39 @@ def check_bodies(chain: Chain, torque: np.ndarray) -> None:
         )
 
 
-def _unlimited(chain: Chain, bounds: Mapping[str, np.ndarray], source: Path | None) -> list[str]:
+def check_stated(joints: Sequence[Joint], bounds: Mapping[str, np.ndarray], where: str, file: bool = True) -> list[str]:
     """Return in words which joints have no limit of speed (of torque), where nothing was written for one.
+
+    Args:
+        joints: n of them.
+        bounds: by ``velocity`` and ``effort``, (n,) with what a limits file states; only the ones that count.
+        where: the robot's file, for messages.
+        file: whether a limits file may state them.
 
     Raises:
         UsageError: where something was written that is none, and no limits file says better.
     """
     notes = []
     for what, table, units in (
-        ("velocity", "velocity", ("90 deg/s", "0.5 m/s")),
-        ("effort", "torque", ("100 Nm", "100 N")),
-    ):
-        none = np.isinf(bounds.get(what, np.zeros(chain.n)))
-        for joint in (joint for joint, free in zip(chain.joints, none) if free):
+        ("velocity", "velocity", ("90 deg/s", "0.5 m/s")), ("effort", "torque", ("100 Nm", "100 N"))
+    ):  # fmt: skip
+        none = np.isinf(bounds.get(what, np.zeros(len(joints)))).tolist()
+        free = [joint for joint, one in zip(joints, none) if one]
+        for joint in free:
             wrong = next((one for one in joint.unstated if one.startswith(what)), None)
             if wrong is not None:
                 unit = units[joint.kind != "revolute"]
-                advice = f'correct it there, or state it in a limits file: [{table}] {joint.name} = "{unit}"'
-                place = f"{source or chain.name}, joint '{joint.name}'"
-                raise UsageError(f"{place}: {wrong} is no limit, and no motion is designed without one; {advice}")
-        if none.any():
-            names = ", ".join(name for name, free in zip(chain.joint_names, none) if free)
-            notes.append(f"no {table} limit is known of {names}: NOT limited; state it in a limits file ([{table}])")
+                advice = (
+                    f'or state it in a limits file: [{table}] {joint.name} = "{unit}"' if file else f"such as {unit}"
+                )
+                place = f"{where}, joint '{joint.name}'"
+                raise UsageError(
+                    f"{place}: {wrong} is no limit, and no motion is designed without one; correct it there, {advice}"
+                )
+        if free:
+            names = ", ".join(joint.name for joint in free)
+            place = f"in a limits file ([{table}])" if file else f"in the robot's file ({what})"
+            notes.append(f"no {table} limit is known of {names}: NOT limited; state it {place}")
     return notes
 
 

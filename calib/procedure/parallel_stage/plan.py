@@ -19,6 +19,7 @@ from calib.errors import MeasurementError, UsageError
 from calib.mechanism.closure import ClosedRobot, NoPosture, coordinates_of
 from calib.mechanism.distribution import distributed
 from calib.mechanism.parallel_model import ParallelModel, make_parallel_model
+from calib.procedure.excitation.limits import check_stated
 from calib.procedure.excitation.settings import DEFAULT_PLAN, PlanSettings
 from calib.procedure.parallel_stage.excite import read_model
 from calib.procedure.parallel_stage.fit import read_coordinates, read_rows
@@ -127,7 +128,7 @@ def plan_parallel(
     if limits is not None or drives is not None:
         raise UsageError("limits and drives are in a parallel robot's own file (velocity, effort) and in its model")
     law, notes = _law(robot, model, settings)
-    bounds = _bounds(known, law)
+    bounds, unlimited = _bounds(known, law)
     points = _read_waypoints(waypoints, known)
     say("the path")
     paths = _paths(known, points, settings.lines)
@@ -138,7 +139,7 @@ def plan_parallel(
     timings = tuple(time_optimal(path, bounds, law, rate=settings.rate) for path in own)
     torque = None if law is None else law.torque
     motion = joined([track(one.path, one.profile, settings.rate, torque) for one in timings])
-    return ParallelPlan(robot, timings, motion, coordinates_of(known, known.locate(motion.q)), notes)
+    return ParallelPlan(robot, timings, motion, coordinates_of(known, known.locate(motion.q)), (*notes, *unlimited))
 
 
 def _read_waypoints(path: Path, known: ClosedRobot) -> np.ndarray:
@@ -184,16 +185,19 @@ def _law(
     return _PlatformDynamics(replace(model, terms=terms), values, settings.payloads), ()
 
 
-def _bounds(known: ClosedRobot, law: _PlatformDynamics | None) -> TimingLimits:
+def _bounds(known: ClosedRobot, law: _PlatformDynamics | None) -> tuple[TimingLimits, list[str]]:
+    """Return the limits of timing, and in words which are not known."""
     joints = known.robot.joints
     torque = np.array([joint.effort if law is not None else np.inf for joint in joints])
     velocity = np.array([joint.velocity for joint in joints])
+    counting = {"velocity": velocity} | ({} if law is None else {"effort": torque})
+    notes = check_stated(joints, counting, known.robot.name, file=False)
     if not (np.isfinite(torque).any() or np.isfinite(velocity).any()):
         raise UsageError(
             f"robot '{known.robot.name}' has no limits of speed or torque; state velocity or effort of its actuated "
             "joints in its file"
         )
-    return TimingLimits(velocity, np.full(len(joints), np.inf), torque)
+    return TimingLimits(velocity, np.full(len(joints), np.inf), torque), notes
 
 
 def _paths(known: ClosedRobot, points: np.ndarray, lines: bool) -> list[JointPath]:
