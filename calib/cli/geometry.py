@@ -142,8 +142,10 @@ def select(
     from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
     from calib.procedure.measuring.constraints_file import beside
     from calib.procedure.measuring.run import RunSettings
+    from calib.procedure.parallel_stage.robots import refuse_parallel
 
     named = beside(constraints).values() if constraints else ()
+    refuse_parallel(robot, "choosing poses", "spread them over its workspace by hand")
     chain, _ = load_robot(robot, existing, FitOptions(), base, tip)
     check_targets(out, chain, plots, [robot, existing, constraints, *named], run=run, overwrite=overwrite)
     targets = tuple(tuple(numbers(text, 3, "--tool")) for text in tool or [])
