@@ -23,7 +23,7 @@ from calib.robot.chain import Chain
 
 ROWS, FEW = 1500, 500  # samples on which a lag is looked for, and all else
 DATED = 0.01  # share of a joint's travel by which errors of dates move its positions
-BLOCKS = 20  # of time, whose errors are independent
+DRAWS = 6  # independent errors in what velocities leave of the positions: those with a dead zone drift for long
 FOLLOWS = 0.9  # correlation from which on measured velocities, integrated, are the positions
 RARE = 0.01  # share of the samples that may be spikes
 TRAVEL = 0.05  # a joint that travels less says nothing of its velocity's size [rad or m]
@@ -114,13 +114,10 @@ def _speed_ratio(
             x[a:b] -= trend @ np.linalg.lstsq(trend, x[a:b], rcond=None)[0]
     power = np.maximum((own**2).sum(axis=0), 1e-300)
     ratio = (own * seen).sum(axis=0) / power
-    votes = [
-        (part * rest).sum(axis=0) for part, rest in zip(*(np.array_split(x, BLOCKS) for x in (own, seen - ratio * own)))
-    ]
     dated = DATED * np.ptp(q, axis=0) / np.maximum(np.ptp(own, axis=0), 1e-300)
     travels = np.ptp(q, axis=0) > TRAVEL
     follows = np.where(travels, ratio * np.sqrt(power / np.maximum((seen**2).sum(axis=0), 1e-300)), np.nan)
-    sigma = np.hypot(np.sqrt(np.sum(np.square(votes), axis=0)) / power, dated)
+    sigma = np.hypot(np.sqrt(((seen - ratio * own) ** 2).sum(axis=0) / power / DRAWS), dated)
     return np.where(travels & (follows > FOLLOWS), ratio, np.nan), sigma, follows
 
 
