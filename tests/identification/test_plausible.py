@@ -124,6 +124,14 @@ def test_friction_that_turns_over_late_is_no_lag(late: float) -> None:
     assert lag is not None and lag.seconds == pytest.approx(late, abs=0.008) and lag.told == (late > 0)
 
 
+def test_halves_that_disagree_and_short_motion_tell_no_lag() -> None:
+    late, early = recorded(0.1).effort, recorded(-0.02).effort
+    tau = np.where(recorded().t[:, None] < 10.0, late, early)
+    lag = compare_sizes(case_of(recorded(tau=tau)), ARM).lag
+    assert lag is not None and lag.sigma > 0.05 and not lag.told
+    assert compare_sizes(case_of(recorded(0.1).cut(2.0, 4.5)), ARM).lag is None
+
+
 def test_one_joint_that_comes_late_is_no_clock_and_named() -> None:
     tau = recorded().effort.copy()
     tau[:, 2] = recorded(0.05).effort[:, 2]
