@@ -9,8 +9,8 @@ import pytest
 
 from calib.errors import RobotError
 from calib.robot.chain import Joint
+from calib.robot.description_checks import impossible_bodies, remarks
 from calib.robot.load import load
-from calib.robot.plausible import impossible_bodies, remarks
 
 
 @pytest.mark.parametrize("change", [{"velocity": -1.0}, {"effort": -5.0}, {"velocity": np.nan}])

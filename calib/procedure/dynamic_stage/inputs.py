@@ -23,8 +23,8 @@ from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.gains import FoundGains, find_gains
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, joint_kinds
+from calib.robot.description_checks import remarks
 from calib.robot.load import load_calibrated, resolve
-from calib.robot.plausible import remarks
 from calib.units import TORQUE
 
 LOST = 0.05  # of a recording may fall to the windows of the parallel decimation (our choice)

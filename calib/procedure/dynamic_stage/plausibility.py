@@ -22,7 +22,7 @@ jump     a position that leaves the slope of the rows around it: marginal
 bodies   an estimate that is `NO_ROBOT` times as far from every possible robot as 95 % of right ones are: marginal;
          beyond `NEVER` times: fail. Honest recordings at hand are up to 3.6 times as far (LWR4+; Panda 1.5, TIAGo 2.3).
          Not said where that robot leaves less than `NOTICED` % of the torque more: precise data find 0.1 % of a gain
-description  bodies of the robot's description that cannot exist (`calib.robot.plausible`): marginal, since what the
+description  bodies of it that cannot exist (`calib.robot.description_checks`): marginal, since what the
          torques do not tell is drawn to them, and the recordings are held against them
 loop     an estimate that takes the loop for granted (cloe, clie) and that recorded torques refute, see
          `calib.identification.methods.loop_agreement`: marginal; where it leaves `LOST` % of a torque: fail
@@ -42,7 +42,7 @@ from calib.identification.methods.loop_agreement import LoopDisagreement
 from calib.identification.possible.contradiction import Contradiction
 from calib.procedure.findings import Finding
 from calib.robot.chain import Chain
-from calib.robot.plausible import impossible_bodies
+from calib.robot.description_checks import impossible_bodies
 
 FAR, OFF = 3.0, 2.2
 SLIGHT, COMMON, SURELY, WRONG = 0.05, 0.02, 5.0, 1.5

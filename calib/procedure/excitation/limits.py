@@ -43,8 +43,8 @@ from calib.geometry.observability import targets_of
 from calib.procedure.measuring.constraints_file import DEFAULTS, ConstraintsFile, Point
 from calib.procedure.measuring.pose_limits import Limits, limits_of
 from calib.robot.chain import Chain, Joint
+from calib.robot.description_checks import impossible_bodies
 from calib.robot.kinematics import joint_frames, joint_jacobian, sweep
-from calib.robot.plausible import impossible_bodies
 from poses.space import PoseConstraint
 from trajectories.basis import SampledMotion
 from trajectories.constraints import BoxLimit, MotionConstraint, box_limits

@@ -24,8 +24,8 @@ from calib.procedure.kinematic_stage.folder import (
     ValidationFolder,
 )
 from calib.robot.calibrated import ROBOT
+from calib.robot.description_checks import impossible_bodies
 from calib.robot.formats.markup import with_comment
-from calib.robot.plausible import impossible_bodies
 
 COPIED = (ROBOT, TERMS, FORMULA)
 OFFSETS, UR_KINEMATICS = "joint_offsets.csv", "ur_kinematics.yaml"

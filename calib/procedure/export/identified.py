@@ -16,7 +16,7 @@ from calib.identification.possible.solve import PossibleBodies, find_possible
 from calib.procedure.export import geometry
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
-from calib.robot.plausible import impossible_bodies
+from calib.robot.description_checks import impossible_bodies
 
 UNLIKE = 3.0  # times a body's mass in the description from which on it is named (our choice)
 

@@ -25,11 +25,11 @@ from calib.robot import calibrated, description
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, joint_kinds
 from calib.robot.deflection import Deflection
+from calib.robot.description_checks import remarks
 from calib.robot.formats.markup import text
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.kinematics import forward
 from calib.robot.load import load, resolve
-from calib.robot.plausible import remarks
 
 
 @dataclass(frozen=True)

@@ -34,9 +34,9 @@ from calib.procedure.measuring.constraints_file import (
     rising,
 )
 from calib.procedure.measuring.sight import SeenOnly, Sight, sight_of
+from calib.robot.description_checks import remarks
 from calib.robot.formats.markup import text
 from calib.robot.obstacles import Obstacle, Wall, signed_distance
-from calib.robot.plausible import remarks
 from calib.robot.tables import placement
 from calib.transforms import invert
 from poses import constraints

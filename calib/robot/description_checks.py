@@ -7,9 +7,7 @@ import numpy as np
 from calib.robot.chain import Chain, Joint
 
 DENSEST = 1000.0  # [kg/m³] of the arm's mass by the cube of its stretched length; arms known have 1 to 50 (our choice)
-UNEVEN = (
-    1.0  # share by which a moment may exceed the sum of the others: CAD and rounded sets do by up to 0.7 (our choice)
-)
+UNEVEN = 1.0  # share by which a moment may exceed the sum of the others: rounded sets do by up to 0.7 (our choice)
 TURNS = 4.0 * np.pi + 0.01  # [rad] a continuous wrist may be given two turns (our choice)
 EMPTY = 1e-6  # of M L²: moments below are rounding
 
