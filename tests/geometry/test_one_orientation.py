@@ -78,3 +78,18 @@ def test_task_files_beside_spread_poses_do_not_hide_the_model(hidden):
     after, before = (rms(replace(each.cell, station_names=("station", "1", "2")), unseen)
                      for each in (found.fit, found.nominal))  # fmt: skip
     assert after < 0.2 * before
+
+
+def test_rows_that_do_not_tell_their_own_tool_are_left_out_one_by_one():
+    """Regions of a driven surface, a tool of its own on the arm, were asked where that tool is, whatever the model."""
+    cell = probe(0, 0.0)
+    q = np.random.default_rng(5).uniform(-2.0, 2.0, (40, 6))
+    blocks = [measure(cell, q, 0), measure(cell, driven(cell.nominal, "surface", 12, 0.02, 3), 1)]
+    names = ("spread", "surface")
+    blocks = [
+        replace(each, station=name, tool=np.full(len(each), k), tool_names=names)
+        for k, (each, name) in enumerate(zip(blocks, names))
+    ]
+    found = select_model(install(cell.nominal, blocks), blocks, model="geometry")
+    assert found.folds.blind == names
+    assert found.rungs[-1].model == "geometry" and found.rungs[-1].cross_validated < 0.15e-3

@@ -57,11 +57,16 @@ def transfer_folds(measured: Sequence[PoseMeasurements], seed: int = 0) -> Folds
     return region_folds(measured, seed=seed)
 
 
-def divide(folds: Folds, blind: np.ndarray, measured: Sequence[PoseMeasurements], seed: int = 0) -> Folds:
+def divide(
+    folds: Folds, blind: np.ndarray, measured: Sequence[PoseMeasurements], seed: int = 0, scattered: bool = False
+) -> Folds:
     """Return folds in which those that `blind` (count,) marks are divided: each of their regions is left out by itself.
 
     What is left out as a whole has to be predicted by the rest. Where the rest cannot tell the tool (it holds one
     orientation, say), errors there say nothing of any model; those on a part, the other part being fitted, do.
+
+    Args:
+        scattered: in place of a region leave out every third row of one, for rows that do not tell a tool of their own.
     """
     members, count = [np.array(fold) for fold in folds.members], 0
     for fold in range(folds.count):
@@ -71,7 +76,9 @@ def divide(folds: Folds, blind: np.ndarray, measured: Sequence[PoseMeasurements]
         else:
             chosen = [(take(block, rows), k) for k, (block, rows) in enumerate(zip(measured, inside)) if len(rows)]
             new = [np.zeros(0, dtype=int) for _ in measured]
-            for (_, k), fresh in zip(chosen, region_folds([block for block, _ in chosen], seed=seed).members):
+            parts = [block for block, _ in chosen]
+            divided = random_folds(parts, 3, seed) if scattered else region_folds(parts, seed=seed)
+            for (_, k), fresh in zip(chosen, divided.members):
                 new[k] = fresh
         for each, rows, fresh in zip(members, inside, new):
             each[rows] = count + fresh
@@ -79,10 +86,10 @@ def divide(folds: Folds, blind: np.ndarray, measured: Sequence[PoseMeasurements]
     names = [
         block.station if block.has_instrument else block.file
         for block, fold in zip(measured, folds.members)
-        if len(fold) and blind[fold[0]]
+        if blind[fold].any()
     ]
-    kind = folds.kind if not blind.all() else "regions"
-    return Folds(kind, count, tuple(members), tuple(dict.fromkeys(names)))
+    kind = folds.kind if scattered or not blind.all() else "regions"
+    return Folds(kind, count, tuple(members), tuple(dict.fromkeys((*folds.blind, *names))))
 
 
 def region_folds(

@@ -158,8 +158,11 @@ class _Climber:
         self.best, self.rungs, self.chosen = self.nominal, [], "frames"
         self.stiff = self.nominal
         if folds.kind == "stations" and not folds.blind and all(isinstance(block, Positions) for block in measured):
-            blind = blind_folds(self.nominal, measured, folds, torques)
-            self.folds = divide(folds, blind, measured, seed) if blind.any() else folds
+            for scattered in (False, True):
+                blind = blind_folds(self.nominal, measured, self.folds, torques)
+                if not blind.any():
+                    break
+                self.folds = divide(self.folds, blind, measured, seed, scattered)
         self.steps = 0
         self.offered: tuple[Term, ...] = ()
         self.drawn = not all(block.has_instrument for block in measured)
