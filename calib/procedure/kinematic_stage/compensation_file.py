@@ -95,7 +95,7 @@ def _extrapolation(commands: Commands, fitted: Fitted) -> list[str]:
     out = commands.beyond & commands.reached[:, None]
     if not out.any():
         return []
-    names = ", ".join(name for name, one in zip(fitted.cell.chain.joint_names, out.any(axis=0)) if one)
+    names = ", ".join(fitted.cell.chain.joint_names[j] for j in np.unique(np.nonzero(out)[1]).tolist())
     return [
         f"EXTRAPOLATED: {int(out.any(axis=1).sum())} of {int(commands.reached.sum())} targets have joints outside the "
         f"range that was measured ({names}): no measurement proves the arm there; measure poses like them"
