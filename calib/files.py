@@ -27,6 +27,7 @@ from calib.records import shielded
 if TYPE_CHECKING:  # the commands' help is written without loading it
     import numpy as np
 
+MAKER = "armature-calib"  # by which figures and recordings are known as ours
 LARGEST = 1 << 26  # bytes of a table that an earlier run may have left (our choice)
 _staged: ContextVar[list[tuple[str, Path]] | None] = ContextVar("staged", default=None)
 
@@ -222,7 +223,7 @@ def _again(cell: str) -> str:
         return cell
 
 
-PICTURE = marked("figure", ".png", b"armature-calib")
+PICTURE = marked("figure", ".png", MAKER.encode())
 
 
 def check_writable(folder: Path) -> None:

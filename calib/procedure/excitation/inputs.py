@@ -124,7 +124,7 @@ def read_inputs(
         UsageError, MeasurementError: for a file that is none, or belongs to another robot.
     """
     chain, source = load_rigid(robot, None, base, tip)
-    known = read_motion_limits(limits, chain, source, predicted=None if model is None else True)
+    known = read_motion_limits(limits, chain, source, predicted=model is not None)
     dynamics = read_model(chain, model, settings.drives, known)
     locked = _read_locked(settings.lock, chain, known.positions)
     prior = read_prior(settings.existing, dynamics, chain)

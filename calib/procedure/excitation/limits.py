@@ -128,7 +128,7 @@ def read_motion_limits(
     chain: Chain,
     source: Path | None = None,
     given_way: bool = False,
-    predicted: bool | None = None,
+    predicted: bool = False,
 ) -> MotionLimits:
     """Read the limits of a motion; where nothing else is stated it keeps what poses keep (`limits_of`).
 
@@ -137,7 +137,8 @@ def read_motion_limits(
         source: the robot's file, for its collision shapes.
         given_way: the motion goes where its user says: what is not stated is not kept, since capsules and a floor that
             we think of should not forbid a way that somebody knows.
-        predicted: torques are, so that their limits count; default where the chain's masses are known.
+        predicted: torques are, by an identified model, so that their limits count; so they do where the chain's masses
+            are known.
 
     Raises:
         UsageError: for an unknown key or a value that a key cannot have, and for limits of 0 or below in the robot's
@@ -156,7 +157,7 @@ def read_motion_limits(
     amounts = {key: value for key, value in own.items() if key not in MARGINS}
     torque = _per_joint(amounts, f"{where}: torque", chain, efforts, ("torque", "force"))
     needed = {"velocity": velocity}
-    if chain.inertias is not None if predicted is None else predicted:
+    if predicted or chain.inertias is not None:
         needed["effort"] = torque
     unlimited = check_stated(chain.joints, needed, str(source or chain.name))
     margin = number(own["margin"], f"{where}: torque.margin") if "margin" in own else None
@@ -173,11 +174,15 @@ def read_motion_limits(
     constraints += _places(stated, found, points)
     if found.collision is not None:
         constraints.append(_clearance(found))
-    notes = (*found.notes, *unlimited, *([f"kept: {', '.join(found.checked)}"] if found.checked else []))
-    notes += (f"NOT checked: {', '.join(found.unchecked)}",) if found.unchecked else ()
+    notes = [*found.notes, *unlimited]
     if found.collision is None:
-        notes = (*found.notes, *unlimited, _unchecked(path))
-    return MotionLimits(tuple(constraints), torque, margin, deviations, friction, stated.frequency.resonance, notes)
+        notes.append(_unchecked(path))
+    else:
+        sets = (("kept", found.checked), ("NOT checked", found.unchecked))
+        notes += [f"{words}: {', '.join(names)}" for words, names in sets if names]
+    return MotionLimits(
+        tuple(constraints), torque, margin, deviations, friction, stated.frequency.resonance, tuple(notes)
+    )
 
 
 def check_bodies(chain: Chain, torque: np.ndarray) -> None:
@@ -209,19 +214,15 @@ def check_stated(joints: Sequence[Joint], bounds: Mapping[str, np.ndarray], wher
     for what, table, units in (
         ("velocity", "velocity", ("90 deg/s", "0.5 m/s")), ("effort", "torque", ("100 Nm", "100 N"))
     ):  # fmt: skip
-        none = np.isinf(bounds.get(what, np.zeros(len(joints)))).tolist()
-        free = [joint for joint, one in zip(joints, none) if one]
-        for joint in free:
-            wrong = next((one for one in joint.unstated if one.startswith(what)), None)
-            if wrong is not None:
-                unit = units[joint.kind != "revolute"]
-                advice = (
-                    f'or state it in a limits file: [{table}] {joint.name} = "{unit}"' if file else f"such as {unit}"
-                )
-                place = f"{where}, joint '{joint.name}'"
-                raise UsageError(
-                    f"{place}: {wrong} is no limit, and no motion is designed without one; correct it there, {advice}"
-                )
+        free = [joint for joint, bound in zip(joints, bounds.get(what, ())) if np.isinf(bound)]
+        unstated = [(one, words) for one in free for words in one.unstated if words.startswith(what)]
+        for joint, wrong in unstated[:1]:
+            unit = units[joint.kind != "revolute"]
+            advice = f'or state it in a limits file: [{table}] {joint.name} = "{unit}"' if file else f"such as {unit}"
+            raise UsageError(
+                f"{where}, joint '{joint.name}': {wrong} is no limit, and no motion is designed without one; correct "
+                f"it there, {advice}"
+            )
         if free:
             names = ", ".join(joint.name for joint in free)
             place = f"in a limits file ([{table}])" if file else f"in the robot's file ({what})"

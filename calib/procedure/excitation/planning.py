@@ -130,7 +130,7 @@ def plan(
     if settings.payloads and model is None:
         raise UsageError(f"payloads {', '.join(settings.payloads)}: they are identified ones: name the model")
     chain, source = load_rigid(robot, waypoints, base, tip)
-    known = read_motion_limits(limits, chain, source, given_way=True, predicted=None if model is None else True)
+    known = read_motion_limits(limits, chain, source, given_way=True, predicted=model is not None)
     law, notes, uncertain = _law(chain, model, settings.payloads, drives, known)
     lower, upper, bounds = _bounds(chain, known, law)
     arm = chain if model is None else read_dynamics(model)[0]

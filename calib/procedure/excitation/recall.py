@@ -56,9 +56,9 @@ def check_target(out: Path, folder: Path, log: str, overwrite: bool = False) -> 
 
     So is a recording that is no averaged period of this motion, unless `overwrite`.
     """
-    files.check_target(out, [folder, *(folder / name for name in (coefficients.NAME, METRICS)), log], SUFFIXES)
     kind = files.Kind("averaged period of this motion", SUFFIXES, lambda path: _is_average(path, folder))
-    files.check_results([(out, kind)], overwrite=overwrite)
+    read = [folder, *(folder / name for name in (coefficients.NAME, METRICS)), log]
+    files.check_results([(out, kind)], read, overwrite)
 
 
 def _is_average(path: Path, folder: Path) -> bool:

@@ -34,7 +34,7 @@ from calib.procedure.measuring.constraints_file import (
     rising,
 )
 from calib.procedure.measuring.sight import SeenOnly, Sight, sight_of
-from calib.robot.description_checks import remarks
+from calib.robot.description_checks import TURNS, remarks
 from calib.robot.formats.markup import text
 from calib.robot.obstacles import Obstacle, Wall, signed_distance
 from calib.robot.tables import placement
@@ -44,7 +44,6 @@ from poses.space import PoseConstraint, SearchSpace
 
 ABSURD = 100.0  # times the arm's reach: no cell is that large (our choice)
 BODY = 1.2  # of the reach is where a link's body ends (our choice)
-TURNS = 4.0 * np.pi  # that no joint turns either way [rad]
 NEAREST = 3  # distances that a constraint holds: the smallest ones, so that two that change places both are there
 
 

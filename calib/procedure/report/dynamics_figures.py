@@ -54,7 +54,7 @@ def file_torques(case: Case, predicted: np.ndarray, outcome: IdentificationOutco
     kind = "fitted" if case.name in outcome.fit else "repeat" if case.name in outcome.repeated else "unseen"
     found = {**outcome.fit, **outcome.validation}[case.name].raw
     title = f"{case.name} ({kind}): {found.total:.3g} % of the torque unexplained"
-    labels, units = _rows(outcome), _units(outcome)
+    labels, units = _rows(outcome), outcome.inputs.row_units
     target = np.asarray(case.target)
     return torques(case.motion.t, target, predicted, labels, units, title, found.joints.tolist())
 
@@ -76,7 +76,7 @@ def _friction(outcome: IdentificationOutcome) -> Figure:
     terms = list(zip(model.columns, found.dynamics.values[model.inertial :]))
     n, rows = case.motion.n, case.target.shape[1]
     v, observed = np.asarray(case.motion.v), np.asarray(case.target - outcome.predictions[case.name])[:, rows - n :]
-    curves, units = [], _units(outcome)[rows - n :]
+    curves, units = [], outcome.inputs.row_units[rows - n :]
     observed = observed.copy()
     for j in range(n):
         own = [one for one in terms if one[0].form.of_velocity and one[0].joint == j]
@@ -96,11 +96,6 @@ def _friction(outcome: IdentificationOutcome) -> Figure:
 def _rows(outcome: IdentificationOutcome) -> tuple[str, ...]:
     """Return the names of the torque rows."""
     return outcome.found.settings.torque_rows.titles(outcome.inputs.chain.joint_names)
-
-
-def _units(outcome: IdentificationOutcome) -> Sequence[str]:
-    """Return the unit of each torque row; A where the model is of currents."""
-    return outcome.inputs.row_units
 
 
 def torques(

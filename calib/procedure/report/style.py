@@ -317,7 +317,7 @@ def png(figure: Figure, dpi: float = DPI) -> bytes:
     image.putpalette(palette.tolist())
     buffer = io.BytesIO()
     told = PngInfo()
-    told.add_text("Software", "armature-calib")  # by which `calib.files.PICTURE` knows it
+    told.add_text("Software", files.MAKER)
     image.save(buffer, "png", dpi=(dpi, dpi), pnginfo=told)
     return buffer.getvalue()
 

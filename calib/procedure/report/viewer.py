@@ -27,8 +27,7 @@ ARM, BEFORE, AFTER, SEEN, LIMIT = (
 GAP = 1.0  # between one part and the next [s]
 EACH = 0.2  # that a pose stands still [s]
 FILE = "session.rrd"
-APPLICATION = "armature-calib"
-RECORDING = files.marked("recording for Rerun", ".rrd", APPLICATION.encode())
+RECORDING = files.marked("recording for Rerun", ".rrd", files.MAKER.encode())
 
 
 def available() -> bool:
@@ -60,7 +59,7 @@ def write(folder: str | Path, path: str | Path, robot: str | None = None) -> Sce
     rr = _rerun()
     with tempfile.TemporaryDirectory() as place:
         temporary = Path(place) / "scene.rrd"
-        recording = rr.RecordingStream(APPLICATION, recording_id=scene.title)
+        recording = rr.RecordingStream(files.MAKER, recording_id=scene.title)
         recording.save(temporary, default_blueprint=_blueprint(scene))
         _send(recording, scene)
         recording.flush()
@@ -87,7 +86,7 @@ def spawn(folder: str | Path, robot: str | None = None) -> Scene:
     """Open Rerun's window on what a folder holds."""
     scene = viewing.read(folder, robot)
     rr = _rerun()
-    recording = rr.RecordingStream(APPLICATION, recording_id=scene.title)
+    recording = rr.RecordingStream(files.MAKER, recording_id=scene.title)
     try:
         recording.spawn(default_blueprint=_blueprint(scene))
     except Exception as error:
