@@ -112,7 +112,7 @@ def identify(
     found = identify_model(
         model, cases, settings, nominal=nominal, states=states, cad=_known_masses(robot.chain),
         shape=np.where(model.bodies.coordinates[:, None] >= 0, rods(robot.chain, model), 0.0).ravel(),
-        progress=progress,
+        effort=_torque_limits(robot.chain), progress=progress,
     )  # fmt: skip
     return cast(Identification, found)  # its model is the chain's
 
@@ -126,6 +126,7 @@ def identify_model(
     states: States | None = None,
     cad: np.ndarray | None = None,
     shape: np.ndarray | None = None,
+    effort: np.ndarray | None = None,
     progress: Progress | None = None,
 ) -> Identification[RegressorModel]:
     """Identify the parameters of a model that is linear in them from recordings.
@@ -141,6 +142,7 @@ def identify_model(
         states: to choose base columns over; None: the model's own.
         cad: the first of the model's parameters by the robot's description; None where it holds no masses.
         shape: the same of a robot of one kilogram, where it holds none; None: not known either.
+        effort: (n,) torque limits of the joints, up to a factor; None: not known.
         progress: called with a few words at each stage.
 
     Raises:
@@ -166,7 +168,9 @@ def identify_model(
     _require_enough(rows, base)
     say("first fit")
     whole, source = (shape, "sizes") if cad is None else (cad, "cad")
-    prior = find_prior(model, base, rows, whole, source, noise) if _drawn(method, model, settings, source) else None
+    prior = None
+    if _drawn(method, model, settings, source):
+        prior = find_prior(model, base, rows, whole, source, noise, effort=effort)
     first = first_fit(rows, noise) if prior is None else prior.first
     friction, loads = _richer_friction(model, base, rows, cases, decimator, first, prior, settings, progress)
     own = [None if k < model.inertial else model.columns[k - model.inertial] for k in base.kept]
@@ -176,7 +180,7 @@ def identify_model(
     )
     if prior is not None and friction.terms:
         say("sizes beside richer friction")
-        prior = find_prior(model, base, full, whole, prior.source, noise, np.array(friction.groups), prior)
+        prior = find_prior(model, base, full, whole, prior.source, noise, np.array(friction.groups), prior, effort)
     problem = IdentificationProblem(
         model, base, cases, decimator, full, (*own, *friction.terms),
         np.concatenate([np.full(base.b, -1), friction.groups]), noise, prior, settings.loop, cad,
@@ -220,6 +224,12 @@ def _known_masses(chain: Chain) -> np.ndarray | None:
     """Return the standard parameters (10 B,) of a chain's description; None where it holds no masses."""
     known = chain.inertias is not None and np.any(chain.inertias[:, 9] > 0.0)
     return standard_parameters(chain) if known else None
+
+
+def _torque_limits(chain: Chain) -> np.ndarray | None:
+    """Return the joints' torque limits (n,) by the robot's description; None where one has none."""
+    limits = np.array([joint.effort for joint in chain.joints])
+    return limits if (np.isfinite(limits) & (limits > 0.0)).all() else None
 
 
 def _sees_drives(model: RegressorModel) -> TypeGuard[IdentificationModel]:
