@@ -213,22 +213,22 @@ def _terms(candidates: FrictionCandidates, name: str) -> list[DriveTerm]:
     found: list[DriveTerm] = []
     for j in range(candidates.n):
         v = np.concatenate([np.abs(case.motion.v[:, j]) for case in candidates.cases])
-        peak = float(np.quantile(v, 0.98))
+        peak, edge = float(np.quantile(v, 0.98)), float(v.max())
         if peak <= 0.0:
             continue
         travel = float(np.ptp(np.concatenate([case.motion.q[:, j] for case in candidates.cases])))
         v0 = float(candidates.v0[j])
         terms = {
-            "load": lambda: drives.load_dependent(j, v0, viscous=True),  # noqa: B023
+            "load": lambda: drives.load_dependent(j, v0, viscous=True, edge=edge),  # noqa: B023
             "cable": lambda: drives.cable(j, travel),  # noqa: B023
             "presliding": lambda: drives.presliding(j, [travel * x for x in WIDTHS], v0),  # noqa: B023
             "stribeck": lambda: (
                 *drives.stribeck(j, 0.05 * peak, v0=v0),  # noqa: B023
                 replace(drives.stribeck(j, 0.2 * peak, v0=v0)[0], name=f"Fs{j + 1}.2"),  # noqa: B023
             ),
-            "asymmetric": lambda: drives.asymmetric(j),  # noqa: B023
-            "root": lambda: drives.root(j, v0),  # noqa: B023
-            "cubic": lambda: drives.cubic(j),  # noqa: B023
+            "asymmetric": lambda: drives.asymmetric(j, edge),  # noqa: B023
+            "root": lambda: drives.root(j, v0, edge),  # noqa: B023
+            "cubic": lambda: drives.cubic(j, edge),  # noqa: B023
         }[name]()
         found += [replace(one, linear=bool(candidates.linear[j])) for one in terms]
     return found
