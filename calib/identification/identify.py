@@ -22,13 +22,15 @@ from calib.estimation.triangles import condition_numbers
 from calib.identification.cases import Case
 from calib.identification.friction.friction_ladder import FrictionCandidates, FrictionSelection, select_friction
 from calib.identification.friction.ripple import Ripple, find_all
-from calib.identification.friction.time_folds import estimate
+from calib.identification.left_out.regimes import regimes
+from calib.identification.left_out.tempering import tempered_prior
+from calib.identification.left_out.time_folds import estimate
 from calib.identification.methods.bias import LoopTest, compare_with_loop, require_loop, require_robot
 from calib.identification.methods.loop_agreement import LoopDisagreement, disagreement
 from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate
 from calib.identification.methods.registry import METHODS, method_named
 from calib.identification.prediction import Dynamics, Model, predict
-from calib.identification.prior import FirstFit, Prior, find_prior, residual_inflation, scaled
+from calib.identification.prior import TEMPERING, FirstFit, Prior, find_prior, residual_inflation, scaled
 from calib.identification.rods import rods
 from calib.identification.rows import (
     ObservationRows,
@@ -170,7 +172,12 @@ def identify_model(
     whole, source = (shape, "sizes") if cad is None else (cad, "cad")
     prior = None
     if _drawn(method, model, settings, source):
-        prior = find_prior(model, base, rows, whole, source, noise, effort=effort)
+        prior = tempered_prior(
+            lambda tempering, start: find_prior(
+                model, base, rows, whole, source, noise, start=start, effort=effort, tempering=tempering
+            ),
+            rows, regimes(rows, cases, decimator),
+        )  # fmt: skip
     first = first_fit(rows, noise) if prior is None else prior.first
     friction, loads = _richer_friction(model, base, rows, cases, decimator, first, prior, settings, progress)
     own = [None if k < model.inertial else model.columns[k - model.inertial] for k in base.kept]
@@ -180,7 +187,8 @@ def identify_model(
     )
     if prior is not None and friction.terms:
         say("sizes beside richer friction")
-        prior = find_prior(model, base, full, whole, prior.source, noise, np.array(friction.groups), prior, effort)
+        groups = np.array(friction.groups)
+        prior = find_prior(model, base, full, whole, source, noise, groups, prior, effort, prior.tempering)
     problem = IdentificationProblem(
         model, base, cases, decimator, full, (*own, *friction.terms),
         np.concatenate([np.full(base.b, -1), friction.groups]), noise, prior, settings.loop, cad,
@@ -254,7 +262,8 @@ def _richer_friction(
     plain = Dynamics(model, base.to_standard(values))
     loads = nothing if settings.friction in ("standard", "ripple") else [plain.transmitted(case) for case in cases]
     candidates = FrictionCandidates(
-        cases, rows, loads, decimator, std, tau, np.array(per_joint(settings.v0, model.n, "v0")), model.prismatic,
+        cases, rows, loads, decimator, std, tau if prior is None else TEMPERING * tau,
+        np.array(per_joint(settings.v0, model.n, "v0")), model.prismatic,
         None if prior is None else prior.rows, settings.apart, model.torque_rows,
     )  # fmt: skip
     return select_friction(candidates, settings.friction, progress), loads

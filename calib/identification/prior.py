@@ -15,10 +15,11 @@ is largest (MacKay 1992, automatic relevance of groups),
 
 with [R z] the triangle of the whitened [W y] and P the prior covariance, times a wide prior of their logarithms: what
 a kind would be if it alone explained `SHARE` of all torque (offsets: `OFFSET`), within a factor exp(`WIDTH`) (our
-choice), and bounded: without a bound, motion that hardly shows a kind is explained by large parameters that cancel. Rows are weighed by their joint's residual, which tells as many independent values as
-its autocorrelation lets it, but not fewer than one in `MAX_INFLATION`: residuals of a short record look like one wave
-whatever the model is. For the values, not for their covariance, they count `UNMODELLED` times less: what the model
-lacks is no noise, and differs on other motion.
+choice), and bounded: without a bound, motion that hardly shows a kind is explained by large parameters that cancel.
+Rows are weighed by their joint's residual, which tells as many independent values as its autocorrelation lets it, but
+not fewer than one in `MAX_INFLATION`: residuals of a short record look like one wave whatever the model is. For the
+values, not for their covariance, they count `TEMPERING` times less, or as many more times as regimes left out ask for:
+what the model lacks is no noise, and differs on other motion.
 
 Directions that the motion tells well do not feel the prior; those that it does not tell follow the whole robot. It does
 not make the parameters those of possible bodies: that is the semidefinite fit of another module; but `bounded` keeps
@@ -51,7 +52,7 @@ MAX_DEVIATION = 3.0  # of the whole robot's parameters of a kind, rms, or of wha
 NEAREST = 0.03  # of the whole robot's parameters of a kind, rms: no CAD is known to be nearer (our choice)
 WHOLE = 1.0  # the same of κ, of which the size is known: the whole robot explains all torque (our choice)
 MAX_INFLATION = 10.0  # rows of a residual that count as one, at most, where they are weighed (our choice)
-UNMODELLED = 2.0  # times as many count as one for the values: chosen on motion other than learnt from
+TEMPERING = 2.0  # times as many count as one for the values, at least: chosen on motion other than learnt from
 EXACT = 1e-9  # of the largest joint's torque: exact data must not turn into infinite weights
 NOISE = 0.03  # of a joint's torque: the residual at the start (our choice); larger ones start on the smooth side
 ROUNDS = 12
@@ -79,6 +80,7 @@ class Prior:
         sizes: kind → σ, and ``whole`` → κ.
         source: of u, ``cad`` or ``sizes``.
         first: the fit with it, of the base parameters alone.
+        tempering: how many times less residuals count for the values than for their covariance.
     """
 
     covariance: np.ndarray
@@ -86,6 +88,7 @@ class Prior:
     sizes: Mapping[str, float]
     source: str
     first: FirstFit
+    tempering: float = TEMPERING
 
     @property
     def rows(self) -> np.ndarray:
@@ -106,7 +109,7 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class _Sizes:
-    """Prior standard deviations exp(E t) of p parameters and of k directions, as a function of logarithms t of sizes."""
+    """Prior standard deviations exp(E t) of p parameters and of k directions by the logarithms t of sizes."""
 
     names: tuple[str, ...]
     member: np.ndarray  # (p + k,) which size each has
@@ -129,6 +132,7 @@ def find_prior(
     groups: np.ndarray | None = None,
     start: Prior | None = None,
     effort: np.ndarray | None = None,
+    tempering: float = TEMPERING,
 ) -> Prior:
     """Return the prior of the base parameters whose sizes the evidence chose.
 
@@ -138,8 +142,9 @@ def find_prior(
         source: of `whole`: ``cad`` or ``sizes``.
         noise: (rows,) of the torques up to a common factor; None: from the residuals.
         groups: (k,) of the columns of richer friction, each of a size of its own, which serves here alone.
-        start: the prior without that friction, to start from.
+        start: the prior without that friction, or of another tempering, to start from.
         effort: (n,) torque limits of the joints, up to a factor; None: joints alike.
+        tempering: see `Prior`.
     """
     n = rows[0].target.shape[1]
     data = pool(triangulate(rows), n)
@@ -161,7 +166,7 @@ def find_prior(
         for name, size in start.sizes.items():
             t[sizes.names.index(name)] = np.log(size)
     for _ in range(ROUNDS):
-        tempered = UNMODELLED * tau
+        tempered = tempering * tau
         factor = retriangulate((data.factors / (std * np.sqrt(tempered))[:, None, None]).reshape(-1, len(columns) + 1))
         t = _most_probable(factor, columns, sizes, t)
         before, (values, covariance) = values, _posterior(factor, columns, sizes.deviations(t))
@@ -177,7 +182,7 @@ def find_prior(
     return Prior(
         frozen(own + whole_part @ whole_part.T), frozen(np.sqrt(np.diag(own))),
         {name: float(np.exp(one)) for name, one in zip(sizes.names, t) if name}, source,
-        FirstFit(frozen(std), frozen(tau), frozen(values[: base.b])),
+        FirstFit(frozen(std), frozen(tau), frozen(values[: base.b])), tempering,
     )  # fmt: skip
 
 
@@ -304,8 +309,8 @@ def _most_probable(factor: np.ndarray, columns: np.ndarray, sizes: _Sizes, start
         return value, away / sizes.width - np.bincount(sizes.member, told, len(t))
 
     found = scipy.optimize.minimize(
-        lost, np.clip(start, sizes.least, sizes.most), jac=True, method="L-BFGS-B", bounds=np.column_stack([sizes.least, sizes.most]),
-        options={"maxiter": 60, "ftol": 1e-8},
+        lost, np.clip(start, sizes.least, sizes.most), jac=True, method="L-BFGS-B",
+        bounds=np.column_stack([sizes.least, sizes.most]), options={"maxiter": 60, "ftol": 1e-8},
     )  # fmt: skip
     return np.asarray(found.x)
 

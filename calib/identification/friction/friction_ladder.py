@@ -24,7 +24,8 @@ from calib.dynamics.drives import DriveTerm
 from calib.dynamics.torque_rows import MOTOR, TorqueRows
 from calib.errors import UsageError
 from calib.identification.cases import Case
-from calib.identification.friction.time_folds import CrossValidation
+from calib.identification.left_out.regimes import regimes
+from calib.identification.left_out.time_folds import CrossValidation
 from calib.identification.rows import ObservationRows, observe_terms, triangulate
 
 GAIN = 0.02  # a step has to lower a joint's rms error on unseen time by this share (our choice)
@@ -177,13 +178,18 @@ def _try(
     if forced:
         return columns, validation.errors(np.array([*base, *taken, *columns])), everyone
     half = validation.errors(np.array([*base, *taken]), 2)
+    far = validation.extrapolated(np.array([*base, *taken]))
     at, some = everyone, columns
     for _ in range(2):  # with the joints left that it pays at, once more
         tried = np.array([*base, *taken, *some])
-        new, other = validation.errors(tried), validation.errors(tried, 2)
+        new, other, beyond = validation.errors(tried), validation.errors(tried, 2), validation.extrapolated(tried)
         at = tuple(
-            j for j in at if _pays(felt(error, j), felt(new, j)) and _carries(felt(half, j), felt(other, j))
-        )  # fmt: skip
+            j
+            for j in at
+            if _pays(felt(error, j), felt(new, j))
+            and _carries(felt(half, j), felt(other, j))
+            and _extrapolates(felt(far, j), felt(beyond, j))
+        )
         some, before = [k for k in some if joint[k] in at], some
         if not some:
             return [], error, ()
@@ -197,6 +203,15 @@ def _try(
 def _carries(before: np.ndarray, after: np.ndarray) -> bool:
     """Say whether a joint's squared errors, one half of the time predicting the other, did not grow by `GAIN`."""
     return bool(after.sum() <= (1.0 + GAIN) ** 2 * before.sum())
+
+
+def _extrapolates(before: np.ndarray, after: np.ndarray) -> bool:
+    """Say whether a joint's squared errors in the regimes left out (k,) did not grow, in their geometric mean."""
+    used = (before > 0.0) & (after > 0.0)
+    return bool(np.log(after[used] / before[used]).mean() <= MARGIN) if used.any() else True
+
+
+MARGIN = 0.0
 
 
 def _pays(before: np.ndarray, after: np.ndarray) -> bool:
@@ -262,6 +277,7 @@ def _cross_validation(
         candidates.inflation,
         group,
         _padded(candidates.prior, len(every)),
+        regimes(rows, candidates.cases, candidates.decimator),
     ), place
 
 

@@ -15,11 +15,11 @@ from calib.estimation.samples import SampleFit, Samples, irls, stack
 from calib.estimation.total import tls
 from calib.estimation.triangles import Triangles, combine, retriangulate
 from calib.identification.friction.passivity import braking, driving
-from calib.identification.friction.time_folds import estimate
+from calib.identification.left_out.time_folds import estimate
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate, attempted
 from calib.identification.parameter_constraints import Constraints, hold
 from calib.identification.prediction import Dynamics
-from calib.identification.prior import UNMODELLED, Prior, bounded, residual_inflation, weighing
+from calib.identification.prior import Prior, bounded, residual_inflation, weighing
 
 COLUMN_NOISE = 0.01  # of a column's rms: what filtered derivatives miss (our choice)
 MAX_COST = 1.2  # of a joint's squared residuals, above which braking friction is not what was recorded (our choice)
@@ -112,18 +112,18 @@ def _drawn(
 def _settled(problem: IdentificationProblem, prior: Prior) -> tuple[LinearFit, np.ndarray, np.ndarray, np.ndarray]:
     """Return the fit with a prior, its rows (k, p), and the (rows,) std and inflation that its own residuals say.
 
-    The values count residuals `UNMODELLED` times less than their covariance does; drives' inertia is positive and
+    The values count residuals `Prior.tempering` times less than their covariance does; drives' inertia is positive and
     friction brakes, which the covariance does not know. Not so the friction of a joint that the data say it drives:
     that says that something is wrong, and is to be seen.
     """
     pooled, noise = problem.pooled, problem.noise
-    std, tau = prior.first.std, prior.first.inflation
-    fit, covariance, known = _drawn(problem, prior, std, UNMODELLED * tau)
+    std, tau, tempering = prior.first.std, prior.first.inflation, prior.tempering
+    fit, covariance, known = _drawn(problem, prior, std, tempering * tau)
     for _ in range(ROUNDS):
         own = fit.estimate
-        std, tau = weighing(problem.rows, pooled, own.values, own.covariance, std, UNMODELLED * tau, noise)
-        fit, covariance, known = _drawn(problem, prior, std, UNMODELLED * tau)
-    values = _braking(problem, fit.estimate.values, std * np.sqrt(UNMODELLED * tau), known)
+        std, tau = weighing(problem.rows, pooled, own.values, own.covariance, std, tempering * tau, noise)
+        fit, covariance, known = _drawn(problem, prior, std, tempering * tau)
+    values = _braking(problem, fit.estimate.values, std * np.sqrt(tempering * tau), known)
     stated = ridge(pooled, np.zeros(len(values)), covariance, std * np.sqrt(tau))
     return replace(stated, estimate=replace(stated.estimate, values=values)), known, std, tau
 
