@@ -129,20 +129,22 @@ def without_effect(label: str) -> tuple[DriveTerm, ...]:
     )
 
 
-def coupled(first: int, second: int, v0: float = V0, label: str | None = None) -> tuple[DriveTerm, ...]:
-    """Return Iam, Fvm, Fcm of a gear whose motor turns with the sum of two joints (the TX40 wrist: 4, 5).
+def coupled(
+    first: int, second: int, v0: float = V0, label: str | None = None, weight: float = 1.0
+) -> tuple[DriveTerm, ...]:
+    """Return Iam, Fvm, Fcm of a gear whose motor turns with q_first + weight q_second (the TX40 wrist: 4, 5, 1).
 
         tau_first += Iam a_second + Fvm v_second + Fcm sign(v_first + v_second), and the other way round
 
-    (Gautier & Janot's TX40 model; the joints' own Ia Fv Fc hold the rest.)
+    for a weight of 1 (Gautier & Janot's TX40 model; the joints' own Ia Fv Fc hold the rest); of -1: the difference.
     """
     label = str(second + 1) if label is None else label
-    crossed = ((first, ((second, 1.0),)), (second, ((first, 1.0),)))
-    total: Motion = ((first, 1.0), (second, 1.0))
+    crossed = ((first, ((second, weight),)), (second, ((first, weight),)))
+    total = ((first, ((first, 1.0), (second, weight))), (second, ((first, weight), (second, 1.0))))
     return (
         DriveTerm(f"Iam{label}", "acceleration", crossed),
         DriveTerm(f"Fvm{label}", "velocity", crossed),
-        DriveTerm(f"Fcm{label}", "sign", ((first, total), (second, total)), (v0,)),
+        DriveTerm(f"Fcm{label}", "sign", total, (v0,)),
     )
 
 

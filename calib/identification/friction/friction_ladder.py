@@ -1,13 +1,14 @@
 """A ladder of friction, a forward selection, joint by joint, as far as unseen time rewards it.
 
-    standard → + load → + presliding (→ + cable) → + stribeck → + asymmetric → + root → + cubic → + ripple
+    standard → + coupling → + load → + presliding (→ + cable) → + stribeck → + asymmetric → + root → + cubic → + ripple
 
 Every step is tried on top of those taken: all joints get its terms, every time block is predicted by a fit to the
 others, and the terms stay at the joints whose error on unseen time falls by `GAIN`, and does not grow where one half of
 the time predicts the other: neighbouring blocks judge what holds between them, not what holds elsewhere. Terms of a
 step have a ridge per joint, chosen by evidence, so that a rich step (ripple) may offer more than the data can tell.
 
-Cables are offered where sensors see them behind the gears, apart from friction; by name, anywhere. A term is judged by
+A coupling is a gear whose motor turns with two joints; it is offered for pairs of joints of which what the standard
+model leaves is explained by the other's motion. Cables are offered where sensors see them behind the gears, apart from friction; by name, anywhere. A term is judged by
 the rows that it acts on, each in units of its own residuals.
 """
 
@@ -18,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.data.signals.decimation import Decimator
+from calib.data.signals.decimation import Decimator, kept
 from calib.dynamics import drives
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.torque_rows import MOTOR, TorqueRows
@@ -31,7 +32,8 @@ from calib.identification.rows import ObservationRows, observe_terms, triangulat
 GAIN = 0.02  # a step has to lower a joint's rms error on unseen time by this share (our choice)
 WIDTHS = (0.0005, 0.002, 0.008, 0.03)  # of presliding, shares of a joint's travel (our choice)
 WINS = 0.6  # and on this share of the blocks
-STEPS = ("load", "presliding", "cable", "stribeck", "asymmetric", "root", "cubic")
+MIN_EXPLAINED, MAX_PAIRS = 0.05, 3  # of two joints' squared residuals, by a coupling; pairs offered (our choice)
+STEPS = ("coupling", "load", "presliding", "cable", "stribeck", "asymmetric", "root", "cubic")
 NAMES = ("auto", "standard", *STEPS, "ripple")
 
 Progress = Callable[[str], None]
@@ -90,6 +92,8 @@ class FrictionCandidates:
         apart: rows in a unit of their own, which no total holds.
         prior: (k, b + 1) what is known of the base parameters (`calib.identification.prior`); None for nothing.
         torque_rows: which torques the rows are; those of the motors among them.
+        values: (b,) of a first fit of the base columns.
+        coupled: pairs of joints, from 0, whose coupling is part of the model already.
     """
 
     cases: Sequence[Case]
@@ -103,6 +107,8 @@ class FrictionCandidates:
     prior: np.ndarray | None = None
     apart: tuple[int, ...] = ()
     torque_rows: TorqueRows = MOTOR
+    values: np.ndarray | None = None
+    coupled: frozenset[tuple[int, ...]] = frozenset()
 
     @property
     def n(self) -> int:
@@ -125,6 +131,7 @@ def select_friction(
     sensed = candidates.torque_rows.sensed
     steps_tried = [name for name in STEPS if wanted == name or (wanted == "auto" and (sensed or name != "cable"))]
     offered = {name: _terms(candidates, name) for name in steps_tried}
+    offered = {name: terms for name, terms in offered.items() if terms or name == wanted}
     every = [one for terms in offered.values() for one in terms]
     validation, place = _cross_validation(candidates, offered, every)
     base = np.arange(validation.data.parameters - len(every))
@@ -166,17 +173,17 @@ def _try(
     candidates: FrictionCandidates,
 ) -> tuple[list[int], np.ndarray, tuple[int, ...]]:
     """Return the columns that stay, the errors with them, and their joints."""
-    joint = {k: every[k - len(base)].acts[0][0] for k in columns}
-    everyone = tuple(sorted(set(joint.values())))
+    joints = {k: _joints(every[k - len(base)]) for k in columns}
+    everyone = tuple(sorted(set(joints.values())))
     side = every[columns[0] - len(base)].side
 
-    def felt(squares: np.ndarray, j: int) -> np.ndarray:
-        """Return the squared errors (blocks,) of the rows that see the terms of a joint, in units of their own."""
-        rows = candidates.torque_rows.of_side(side, j, candidates.n)
+    def felt(squares: np.ndarray, own: tuple[int, ...]) -> np.ndarray:
+        """Return the squared errors (blocks,) of the rows that see the terms of joints, in units of their own."""
+        rows = [row for j in own for row in candidates.torque_rows.of_side(side, j, candidates.n)]
         return np.sum(squares[:, rows] / validation.std[rows] ** 2, axis=1)
 
     if forced:
-        return columns, validation.errors(np.array([*base, *taken, *columns])), everyone
+        return columns, validation.errors(np.array([*base, *taken, *columns])), _flat(everyone)
     half = validation.errors(np.array([*base, *taken]), 2)
     far = validation.extrapolated(np.array([*base, *taken]))
     at, some = everyone, columns
@@ -184,20 +191,29 @@ def _try(
         tried = np.array([*base, *taken, *some])
         new, other, beyond = validation.errors(tried), validation.errors(tried, 2), validation.extrapolated(tried)
         at = tuple(
-            j
-            for j in at
-            if _pays(felt(error, j), felt(new, j))
-            and _carries(felt(half, j), felt(other, j))
-            and _extrapolates(felt(far, j), felt(beyond, j))
+            own
+            for own in at
+            if _pays(felt(error, own), felt(new, own))
+            and _carries(felt(half, own), felt(other, own))
+            and _extrapolates(felt(far, own), felt(beyond, own))
         )
-        some, before = [k for k in some if joint[k] in at], some
+        some, before = [k for k in some if joints[k] in at], some
         if not some:
             return [], error, ()
         if some == before:
             break
     else:
         new = validation.errors(np.array([*base, *taken, *some]))
-    return some, new, at
+    return some, new, _flat(at)
+
+
+def _joints(one: DriveTerm) -> tuple[int, ...]:
+    """Return the joints whose torques a term acts on."""
+    return tuple(sorted({row for row, _ in one.acts}))
+
+
+def _flat(at: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
+    return tuple(sorted({joint for own in at for joint in own}))
 
 
 def _carries(before: np.ndarray, after: np.ndarray) -> bool:
@@ -208,10 +224,7 @@ def _carries(before: np.ndarray, after: np.ndarray) -> bool:
 def _extrapolates(before: np.ndarray, after: np.ndarray) -> bool:
     """Say whether a joint's squared errors in the regimes left out (k,) did not grow, in their geometric mean."""
     used = (before > 0.0) & (after > 0.0)
-    return bool(np.log(after[used] / before[used]).mean() <= MARGIN) if used.any() else True
-
-
-MARGIN = 0.0
+    return bool(np.log(after[used] / before[used]).mean() <= 0.0) if used.any() else True
 
 
 def _pays(before: np.ndarray, after: np.ndarray) -> bool:
@@ -226,6 +239,8 @@ def _pays(before: np.ndarray, after: np.ndarray) -> bool:
 def _terms(candidates: FrictionCandidates, name: str) -> list[DriveTerm]:
     """Return a step's terms of all joints."""
     found: list[DriveTerm] = []
+    if name == "coupling":
+        return _couplings(candidates)
     for j in range(candidates.n):
         v = np.concatenate([np.abs(case.motion.v[:, j]) for case in candidates.cases])
         peak, edge = float(np.quantile(v, 0.98)), float(v.max())
@@ -249,6 +264,40 @@ def _terms(candidates: FrictionCandidates, name: str) -> list[DriveTerm]:
     return found
 
 
+def _couplings(candidates: FrictionCandidates) -> list[DriveTerm]:
+    """Return the terms of couplings that explain most of what the standard model leaves of two joints' torques."""
+    n, found = candidates.n, []
+    if candidates.values is None or not candidates.torque_rows.motors_alone:
+        return []
+    left, motions = [], []
+    for part, case in zip(candidates.rows, candidates.cases):
+        left.append(np.where(part.present, part.target - part.matrix @ candidates.values, 0.0))
+        own = kept(case.motion.segment, candidates.decimator)
+        motions.append([getattr(case.motion, key)[own] for key in "qva"])
+    residual = np.concatenate(left) / candidates.std
+    motion = [np.concatenate(series).T for series in zip(*motions)]
+    for i in range(n):
+        for j in range(i + 1, n):
+            if candidates.linear[i] != candidates.linear[j] or (i, j) in candidates.coupled:
+                continue
+            for weight in (1.0, -1.0):
+                terms = drives.coupled(i, j, float(candidates.v0[j]), f"{i + 1}.{j + 1}", weight)
+                columns = np.zeros((len(terms), n, len(residual)))
+                drives.fill(terms, columns, [*motion, None], np.zeros((0, len(residual))))
+                pair = [i, j]
+                w = (columns[:, pair] / candidates.std[pair][:, None]).reshape(len(terms), -1).T
+                y = residual[:, pair].T.ravel()
+                explained = 1.0 - np.sum((y - w @ np.linalg.lstsq(w, y, rcond=None)[0]) ** 2) / max(y @ y, 1e-300)
+                found.append((explained, pair, terms))
+    found = sorted((one for one in found if one[0] > MIN_EXPLAINED), key=lambda one: -one[0])
+    best = {tuple(pair): terms for _, pair, terms in reversed(found)}  # of each pair the better sign
+    return [
+        replace(term, linear=bool(candidates.linear[pair[0]]))
+        for pair, terms in list(reversed(best.items()))[:MAX_PAIRS]
+        for term in terms
+    ]
+
+
 def _cross_validation(
     candidates: FrictionCandidates, offered: dict[str, list[DriveTerm]], every: list[DriveTerm]
 ) -> tuple[CrossValidation, dict[str, list[int]]]:
@@ -263,7 +312,7 @@ def _cross_validation(
     for name, terms in offered.items():
         place[name] = list(range(start, start + len(terms)))
         for k, one in enumerate(terms):
-            if k and one.acts[0][0] != terms[k - 1].acts[0][0]:
+            if k and _joints(one) != _joints(terms[k - 1]):
                 number += 1
             group[start + k] = number
         start += len(terms)
