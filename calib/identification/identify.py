@@ -264,7 +264,7 @@ def _richer_friction(
     candidates = FrictionCandidates(
         cases, rows, loads, decimator, std, tau if prior is None else TEMPERING * tau,
         np.array(per_joint(settings.v0, model.n, "v0")), model.prismatic,
-        None if prior is None else prior.rows, settings.apart, model.torque_rows, values,
+        None if prior is None else prior.rows, settings.apart, model.torque_rows,
         frozenset(tuple(sorted({row for row, _ in one.acts})) for one in model.columns if len(one.acts) > 1),
     )  # fmt: skip
     return select_friction(candidates, settings.friction, progress), loads

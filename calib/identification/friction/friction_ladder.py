@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -32,7 +33,8 @@ from calib.identification.rows import ObservationRows, observe_terms, triangulat
 GAIN = 0.02  # a step has to lower a joint's rms error on unseen time by this share (our choice)
 WIDTHS = (0.0005, 0.002, 0.008, 0.03)  # of presliding, shares of a joint's travel (our choice)
 WINS = 0.6  # and on this share of the blocks
-MIN_EXPLAINED, MAX_PAIRS = 0.05, 3  # of two joints' squared residuals, by a coupling; pairs offered (our choice)
+SAMPLES = 3000  # of the rows that couplings are sought in, about
+MIN_EXPLAINED = 0.05  # of two joints' squared residuals, by a coupling that is offered (our choice)
 STEPS = ("coupling", "load", "presliding", "cable", "stribeck", "asymmetric", "root", "cubic")
 NAMES = ("auto", "standard", *STEPS, "ripple")
 
@@ -92,7 +94,6 @@ class FrictionCandidates:
         apart: rows in a unit of their own, which no total holds.
         prior: (k, b + 1) what is known of the base parameters (`calib.identification.prior`); None for nothing.
         torque_rows: which torques the rows are; those of the motors among them.
-        values: (b,) of a first fit of the base columns.
         coupled: pairs of joints, from 0, whose coupling is part of the model already.
     """
 
@@ -107,7 +108,6 @@ class FrictionCandidates:
     prior: np.ndarray | None = None
     apart: tuple[int, ...] = ()
     torque_rows: TorqueRows = MOTOR
-    values: np.ndarray | None = None
     coupled: frozenset[tuple[int, ...]] = frozenset()
 
     @property
@@ -265,37 +265,49 @@ def _terms(candidates: FrictionCandidates, name: str) -> list[DriveTerm]:
 
 
 def _couplings(candidates: FrictionCandidates) -> list[DriveTerm]:
-    """Return the terms of couplings that explain most of what the standard model leaves of two joints' torques."""
-    n, found = candidates.n, []
-    if candidates.values is None or not candidates.torque_rows.motors_alone:
+    """Return the terms of couplings of neighbours that explain what the standard model leaves of both torques.
+
+    A joint is in one coupling at most, and its motor turns with the sum or the difference, whichever explains more.
+    """
+    n = candidates.n
+    if not candidates.torque_rows.motors_alone:
         return []
-    left, motions = [], []
+    matrix, target, motion = _sampled(candidates)
+    basis = np.linalg.qr((matrix / candidates.std[:, None]).reshape(-1, matrix.shape[2]))[0]
+    y = (target / candidates.std).ravel()
+    left = y - basis @ (basis.T @ y)
+    size = np.sum(left.reshape(-1, n) ** 2, axis=0)
+    found = []
+    for i, j in pairwise(range(n)):
+        if candidates.linear[i] != candidates.linear[j] or (i, j) in candidates.coupled:
+            continue
+        for weight in (1.0, -1.0):
+            terms = drives.coupled(i, j, float(candidates.v0[j]), f"{i + 1}.{j + 1}", weight)
+            columns = np.zeros((len(terms), n, len(target)))
+            drives.fill(terms, columns, [*motion, None], np.zeros((0, len(target))))
+            seen = (columns.transpose(2, 1, 0) / candidates.std[:, None]).reshape(-1, len(terms))
+            seen -= basis @ (basis.T @ seen)
+            rest = left - seen @ np.linalg.lstsq(seen, left, rcond=None)[0]
+            explained = float((left @ left - rest @ rest) / max(size[[i, j]].sum(), 1e-300))
+            if explained > MIN_EXPLAINED:
+                found.append((explained, terms))
+    taken: list[DriveTerm] = []
+    for _, terms in sorted(found, key=lambda one: -one[0]):
+        if not {row for one in taken for row in _joints(one)} & set(_joints(terms[0])):
+            taken += [replace(one, linear=bool(candidates.linear[_joints(one)[0]])) for one in terms]
+    return taken
+
+
+def _sampled(candidates: FrictionCandidates) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Return some `SAMPLES` of the rows to learn from, (M, n, b) and (M, n), and the motion there, q v a (n, M) each."""
+    parts = []
     for part, case in zip(candidates.rows, candidates.cases):
-        left.append(np.where(part.present, part.target - part.matrix @ candidates.values, 0.0))
         own = kept(case.motion.segment, candidates.decimator)
-        motions.append([getattr(case.motion, key)[own] for key in "qva"])
-    residual = np.concatenate(left) / candidates.std
-    motion = [np.concatenate(series).T for series in zip(*motions)]
-    for i in range(n):
-        for j in range(i + 1, n):
-            if candidates.linear[i] != candidates.linear[j] or (i, j) in candidates.coupled:
-                continue
-            for weight in (1.0, -1.0):
-                terms = drives.coupled(i, j, float(candidates.v0[j]), f"{i + 1}.{j + 1}", weight)
-                columns = np.zeros((len(terms), n, len(residual)))
-                drives.fill(terms, columns, [*motion, None], np.zeros((0, len(residual))))
-                pair = [i, j]
-                w = (columns[:, pair] / candidates.std[pair][:, None]).reshape(len(terms), -1).T
-                y = residual[:, pair].T.ravel()
-                explained = 1.0 - np.sum((y - w @ np.linalg.lstsq(w, y, rcond=None)[0]) ** 2) / max(y @ y, 1e-300)
-                found.append((explained, pair, terms))
-    found = sorted((one for one in found if one[0] > MIN_EXPLAINED), key=lambda one: -one[0])
-    best = {tuple(pair): terms for _, pair, terms in reversed(found)}  # of each pair the better sign
-    return [
-        replace(term, linear=bool(candidates.linear[pair[0]]))
-        for pair, terms in list(reversed(best.items()))[:MAX_PAIRS]
-        for term in terms
-    ]
+        used = part.present.all(axis=1)
+        parts.append([x[used] for x in (part.matrix, part.target, *(getattr(case.motion, key)[own] for key in "qva"))])
+    matrix, target, *motion = (np.concatenate(series) for series in zip(*parts))
+    every = slice(None, None, max(1, len(target) // SAMPLES))
+    return matrix[every], target[every], [series[every].T for series in motion]
 
 
 def _cross_validation(
