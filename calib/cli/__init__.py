@@ -16,10 +16,7 @@ import typer
 from typer.main import get_command
 
 from calib.cli import camera, dynamics, geometry, motion, session, study
-
-# many small matrices: BLAS threads only get in each other's way (a fit on two busy cores: 9 s against 19 s)
-for _pool in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(_pool, "1")
+from calib.workers.threads import limit_process
 
 # a command makes a million objects as it loads and hardly a cycle: walking all of them again and again for garbage was
 # 6 % of its time (numbers of new objects, of young and of middle-aged collections; Python's own are 700, 10, 10)
@@ -59,6 +56,8 @@ def options(
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit with one of the codes above."""
     gc.set_threshold(*GARBAGE)
+    if arguments is None:  # the process is this command's
+        limit_process()
     if not os.environ.get("CALIB_DEBUG"):  # what numpy and others say to programmers helps nobody at a cell
         warnings.filterwarnings("ignore")
     try:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from calib.cli.shared import Base, Overwrite, Plots, Seed, Tip, exit_failed, make_console, reporting, say
+from calib.errors import CalibError, UsageError, command_line
 
 if TYPE_CHECKING:
     from calib.procedure.session.questions import Answers
@@ -76,7 +77,6 @@ def new(
     stands on the certificate.
     """
     from calib.api.sessions import new_session
-    from calib.errors import command_line
     from calib.procedure.parallel_stage.robots import refuse_parallel
     from calib.procedure.session.questions import Answers, checked
 
@@ -98,7 +98,6 @@ def _asked(given: Answers) -> Answers:
     """Ask for what was not given, at a terminal."""
     import sys
 
-    from calib.errors import CalibError, UsageError
     from calib.procedure.session.questions import QUESTIONS, with_answer
 
     if not sys.stdin.isatty():
@@ -175,7 +174,6 @@ def demo(
     plots: Plots = True,
 ) -> None:
     """Calibrate a simulated robot; compare with the hidden truth."""
-    from calib.errors import command_line
     from calib.procedure.session import demo as demonstration
 
     with reporting() as (say, progress):
@@ -228,7 +226,6 @@ def run(
 
 
 def _go_on(folder: Path, command: str, again: str = "", plots: bool = True) -> None:
-    from calib.errors import command_line
     from calib.procedure.session import commands
 
     typed = command_line(command, folder, *([again] if again else []))
@@ -251,7 +248,6 @@ def view(
     overwrite: Overwrite = False,
 ) -> None:
     """Show robot, errors, poses, motions or torques in Rerun."""
-    from calib.errors import UsageError, command_line
     from calib.files import check_results
     from calib.procedure.parallel_stage.robots import refuse_parallel
     from calib.procedure.report import viewer
