@@ -51,7 +51,7 @@ def loaded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
     return processes.stages(tmp_path_factory.mktemp("loaded"))
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def data() -> Path:
     """Return the folder of real recordings, or skip."""
     if not DATA.is_dir():
