@@ -14,7 +14,7 @@ import numpy as np
 
 from calib.data.signals.persistency import ExcitationReport, repeats, report_excitation
 from calib.identification.cases import Case
-from calib.identification.checks.recording_sizes import compare_sizes
+from calib.identification.checks.recording_sizes import compare_sizes, signs_of
 from calib.identification.friction.passivity import driven
 from calib.identification.methods.loop_agreement import LoopDisagreement
 from calib.identification.possible.contradiction import Contradiction
@@ -144,6 +144,8 @@ def assess(
     sizes = [compare_sizes(case, inputs.chain, settings.gravity, inputs.unit == TORQUE) for case in inputs.cases]
     odd = plausibility.findings(sizes, inputs.chain.joint_names) + plausibility.impossible(findings.contradiction)
     odd += plausibility.another_loop(findings.unlike) + plausibility.described(inputs.chain)
+    signs = {case.name: signs_of(case, inputs.chain, settings.gravity) for case in (*inputs.cases, *inputs.unseen)}
+    odd += plausibility.wrong_signs(signs, inputs.chain.joint_names)
     odd = settled(odd, inputs.options.accept)
     verdict = judge(fit, proofs, repeated, excitation, wrong, labels)
     verdict = with_intervals(verdict, {name: expected[name] for name in proofs if name in expected}, labels)
