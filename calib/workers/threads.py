@@ -13,11 +13,10 @@ from collections.abc import Generator, Iterator
 from contextlib import closing, contextmanager
 from functools import cache
 from threading import Lock
-from typing import Any, TypeVar
+from typing import Any
 
 VARIABLES = tuple(f"{name}_NUM_THREADS" for name in ("OPENBLAS", "OMP", "MKL", "BLIS"))
 
-T = TypeVar("T")
 _changing, _before, _most = Lock(), dict[Any, int](), dict[Any, int]()
 _calls = 0
 
@@ -40,7 +39,7 @@ def one_blas_thread() -> Iterator[None]:
                 _before.clear()
 
 
-def limited_steps(steps: Generator[T]) -> Iterator[T]:
+def limited_steps(steps: Generator[Any, Any, Any]) -> Iterator[Any]:
     """Yield what a generator does, with one thread while it works and the caller's own number between."""
     ended = object()
     with closing(steps):
