@@ -75,7 +75,7 @@ def _checked(function: Callable[..., Any], name: str, annotated: Any, method: bo
         if not (len(args) > method or kwargs):  # nothing is given beside the defaults
             return function(*args)
         from calib.config_types import shown
-        from calib.errors import UsageError
+        from calib.errors import UsageError, quiet
 
         wanted, hints = expected()
         try:
@@ -90,7 +90,8 @@ def _checked(function: Callable[..., Any], name: str, annotated: Any, method: bo
                     raise UsageError(f"{argument} {shown(value)}: expected {_words(hint)}")
                 found = _TABLE if hasattr(value, "to_csv") else f"found {shown(value)}"
                 raise UsageError(f"{name}: {argument}: expected {_words(hint)}, {found}")
-        return function(*args, **kwargs)
+        with quiet():
+            return function(*args, **kwargs)
 
     return call
 

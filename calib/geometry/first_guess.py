@@ -43,6 +43,7 @@ UNITS = {
     25.4: "are they mm under a header that says in",
     0.03937: "are they in under a header that says mm",
 }
+MIN_SPREAD = 1e-3  # of predicted positions, from which they are held against the measured ones [m] (our choice)
 TURN, TURNED = 0.05, 6.0  # poses that turn by more tell a tool well whatever they turn by [rad] (our choice)
 ENOUGH = 300  # rows of a block that a guess is made from (our choice)
 
@@ -90,22 +91,30 @@ def check_scale(block: PoseMeasurements, arm: np.ndarray) -> None:
         arm: (m, 4, 4) poses of the tip that the joints predict.
 
     Raises:
-        MeasurementError: for a ratio beyond `WRONG_UNIT`, with the unit that would explain it.
+        MeasurementError: for a ratio beyond `WRONG_UNIT`, with the unit that would explain it; for positions on a line.
     """
     if not isinstance(block, Positions) or len(block) < 3:
         return
-    measured, predicted = (np.linalg.norm(x.std(axis=0)) for x in (block.position, arm[:, :3, 3]))
-    if predicted < 1e-3:
+    spreads = (np.linalg.svd(x - x.mean(axis=0), compute_uv=False) for x in (block.position, arm[:, :3, 3]))
+    (measured, second), (predicted, across) = ((np.linalg.norm(x), x[1]) / np.sqrt(len(block)) for x in spreads)
+    if predicted < MIN_SPREAD:
         return
-    ratio = float(measured / predicted)
+    ratio = max(float(measured / predicted), 1e-300)
     if 1.0 / WRONG_UNIT < ratio < WRONG_UNIT:
+        if second < across / WRONG_UNIT and across > MIN_SPREAD:
+            raise MeasurementError(
+                f"the measured positions lie on a line, within {1e3 * second:.3g} mm, where the robot's joints make it "
+                f"move {1e3 * across:.3g} mm across: are two of x, y, z constant or the same column, or were points "
+                "repeated? Measure poses all over the workspace",
+                block.file,
+            )
         return
     factor = min(UNITS, key=lambda each: abs(np.log(ratio / each)))
     likely = f": {UNITS[factor]}?" if abs(np.log(ratio / factor)) < np.log(2.0) else "."
     raise MeasurementError(
         f"the measured positions spread over {measured:.4g} m where the robot's joints make it move over "
-        f"{predicted:.4g} m, {ratio:.3g} times as much{likely} State the unit in the header, as in 'x [mm]', or look "
-        "whether this is the right robot",
+        f"{predicted:.4g} m, {measured / predicted:.3g} times as much{likely} State the unit in the header, as in "
+        "'x [mm]', or look whether this is the right robot",
         block.file,
     )
 

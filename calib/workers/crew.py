@@ -11,7 +11,7 @@ from reprlib import repr as shortened
 from threading import Lock
 from typing import Any, Protocol
 
-from calib.errors import TaskLost
+from calib.errors import TaskLost, quiet
 
 THREADS = tuple(f"{name}_NUM_THREADS" for name in ("OPENBLAS", "OMP", "MKL", "BLIS", "NUMBA"))
 
@@ -125,7 +125,8 @@ def run_call(
     try:
         hear()
         function, arguments = pickle.loads(call)
-        return dumps((function(*arguments), None))
+        with quiet():
+            return dumps((function(*arguments), None))
     except BaseException as error:
         hush()
         where = f"in a worker process:\n{traceback.format_exc()}"
