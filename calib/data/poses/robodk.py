@@ -26,11 +26,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from calib.arrays import frozen
 from calib.data.csv_table import Table, read_header, read_table, row_width
 from calib.data.poses.fit_options import FileOptions
+from calib.data.poses.plausible import turns
 from calib.errors import MeasurementError
 
 QUATERNION = ("qx", "qy", "qz", "qw")
@@ -107,12 +107,9 @@ def _with_quaternion(table: Table, options: FileOptions) -> tuple[Table, tuple[s
             message += " State it: units.orientation = 'deg' or 'rad' in the options, or [deg] in the header"
             raise MeasurementError(message, table.file, int(table.rows[0]), "w")
         angles = np.deg2rad(angles)
-    if options.euler == "vector":
-        rotation = Rotation.from_rotvec(angles)
-    else:
-        rotation = Rotation.from_euler("xyz" if options.euler == "wpr" else "XYZ", angles)
-    meaning = {"wpr": "Rz(r) Ry(p) Rx(w)", "xyz": "Rx(w) Ry(p) Rz(r)", "vector": "a rotation vector"}[options.euler]
-    quaternion = tuple(frozen(column) for column in rotation.as_quat(canonical=True).T)
+    euler = options.euler or "wpr"
+    meaning = {"wpr": "Rz(r) Ry(p) Rx(w)", "xyz": "Rx(w) Ry(p) Rz(r)", "vector": "a rotation vector"}.get(euler, euler)
+    quaternion = tuple(frozen(column) for column in turns(angles, table, ("w", "p", "r"), euler).T)
     return (
         Table(
             table.file,
