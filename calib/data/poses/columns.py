@@ -216,10 +216,14 @@ def _find_orientation(table: Table, options: FileOptions, joints: Sequence[str])
 
 
 def _angles(table: Table, options: FileOptions, joints: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of three angles, capital letters or not, that are no joints; () if there are none."""
+    """Return the names of three angles, capital letters or not, that are no joints; () if there are none.
+
+    Columns named by one small letter (a, b, c) are anything, unless the options state what angles mean.
+    """
     if any(name in options.columns for name in ANGLES[0]):
         return _family(table, options, ANGLES[0])
-    known = {name.lower(): name for name in table.header if name not in joints}
+    any_name = (name for name in table.header if name not in joints)
+    known = {name.lower(): name for name in any_name if options.euler or len(name) > 1 or name.isupper()}
     forms = [[name + suffix for name in names] for names in ANGLES for suffix in SUFFIXES]
     complete = [tuple(known[name] for name in form) for form in forms if all(name in known for name in form)]
     if len(complete) > 1:
