@@ -1,6 +1,6 @@
 """CSV tables: a header with units, columns in SI, and complaints that name the row and the column.
 
-Separator tab, semicolon, bar or comma (the first of these that the header has), or blanks, where the first row of
+Separator tab, semicolon, comma or bar (the first of these that the header has), or blanks, where the first row of
 numbers has as many cells by them as the header; UTF-8 with or without a byte order mark; lines that begin with ``#``
 are comments; the decimal mark is a point. Where no line but a comment names the columns (numpy's savetxt), the last
 comment before the numbers is the header.
@@ -203,7 +203,7 @@ def _headless(cells: Sequence[str], path: str | Path) -> bool:
 def _separator(line: str, ahead: Callable[[], str]) -> str:
     """Return the separator of a first line; `ahead` returns the line behind it."""
     line = re.sub(r'"[^"]*"', "", line)
-    if mark := next((mark for mark in "\t;|" if mark in line), "," if "," in line else ""):
+    if mark := next((mark for mark in "\t;,|" if mark in line), ""):
         return mark
     if all(_is_number(cell) for cell in line.split()):
         return " "  # numpy's savetxt
