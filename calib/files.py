@@ -376,9 +376,8 @@ def _cell(value: Any) -> Any:
 
 def _headed(header: Sequence[str]) -> io.StringIO:
     text = io.StringIO()
-    misread = header[0].startswith("#") or any(
-        mark in name for name in header for mark in (";\t" if len(header) > 1 else ";\t| ")
-    )
+    marks = ";\t" if len(header) > 1 else ";\t| "
+    misread = header[0].startswith("#") or any(mark in name for name in header for mark in marks)
     quoting = csv.QUOTE_ALL if misread else csv.QUOTE_MINIMAL
     csv.writer(text, lineterminator="\n", quoting=quoting).writerow(map(_cell, header))
     return text

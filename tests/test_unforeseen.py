@@ -25,7 +25,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     "error, code, words",
     [
-        (KeyError("axis"), 4, "an error that nobody foresaw: KeyError: 'axis'; calib-bug-"),
+        (KeyError("axis"), 4, "internal error: KeyError: 'axis'; a bug report was written: calib-bug-"),
         (PermissionError(13, "Permission denied", "/x/y.csv"), 2, "/x/y.csv: Permission denied"),
         (MemoryError("Unable to allocate 373. GiB"), 2, "Unable to allocate 373. GiB"),
         (BrokenPipeError(32, "Broken pipe"), 141, ""),

@@ -71,7 +71,8 @@ def read_robodk(path: str | Path, joints: int, options: FileOptions) -> Read:
         notes += more
     columns = {**options.columns, **{f"q{i + 1}": name for i, name in enumerate(names[:6])}}
     kind = options.kind or ("pose" if pose else "position")
-    return table, replace(options, columns=columns, kind=kind), (f"read as RoboDK's {kind}s", *notes)
+    read = f"read as RoboDK's {kind}s: joints in deg, positions in mm where the header says nothing else"
+    return table, replace(options, columns=columns, kind=kind), (read, *notes)
 
 
 def read_three_smr(path: str | Path, joints: int, options: FileOptions) -> Read:
