@@ -17,6 +17,7 @@ from calib.errors import RobotError
 
 AXES = ("tx", "ty", "tz", "rx", "ry", "rz")
 GRAVITY = (0.0, 0.0, -9.81)
+MAX_NUMBER = 1e12  # of masses, moments and lengths [SI] (our choice)
 MAX_GRAVITY = 100.0  # [m/s²] (our choice)
 
 
@@ -132,8 +133,8 @@ class Chain:
         object.__setattr__(self, "gravity", frozen(self.gravity))
         check_gravity(self.gravity, f"'{self.name}': ")
         for what in ("tail", "inertias"):
-            if (value := getattr(self, what)) is not None and not np.isfinite(value).all():
-                raise RobotError(f"'{self.name}': {what}: found a number that is not finite")
+            if (value := getattr(self, what)) is not None and not (np.abs(value) < MAX_NUMBER).all():
+                raise RobotError(f"'{self.name}': {what}: found a number that is not finite, or beyond {MAX_NUMBER:g}")
         if self.inertias is not None:
             object.__setattr__(self, "inertias", frozen(self.inertias))
         for what, names in (("joint", self.joint_names), ("element", self.names)):

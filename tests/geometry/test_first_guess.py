@@ -137,3 +137,13 @@ def test_too_few_rows_are_refused_in_words(kind, count):
     measured = take(measure(truth, kind, 6, 0), np.arange(count))
     with pytest.raises(MeasurementError, match=f"{count} usable rows"):
         install(truth.chain, [measured])
+
+
+def test_positions_on_a_line_are_refused_and_radians_under_degrees_named():
+    truth = cell(load("ur5"), 1)
+    block = measure(truth, "position", 30, 1)
+    line = np.outer(np.linspace(0.0, 1.0, len(block)), [0.3, 0.4, 0.5])
+    with pytest.raises(MeasurementError, match="lie on a line"):
+        install(truth.chain, [replace(block, position=line)])
+    with pytest.raises(MeasurementError, match="are the joints rad under a header that says deg"):
+        install(truth.chain, [replace(block, q=np.radians(block.q))])
