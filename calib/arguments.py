@@ -74,13 +74,15 @@ def _checked(function: Callable[..., Any], name: str, annotated: Any, method: bo
 
     @wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
+        from calib.errors import quiet
+        from calib.workers.threads import limited_steps, one_blas_thread
+
         if len(args) > method or kwargs:  # something is given beside the defaults
             _refuse_other_types(name, *expected(), args, kwargs)
         if method:
-            return function(*args, **kwargs)
-        from calib.workers.threads import limited_steps, one_blas_thread
-
-        with one_blas_thread():
+            with quiet():
+                return function(*args, **kwargs)
+        with one_blas_thread(), quiet():
             result = function(*args, **kwargs)
         return limited_steps(result) if isgenerator(result) else result
 

@@ -144,7 +144,7 @@ def check_target(out: Path, inputs: Iterable[str | Path | None], suffixes: Seque
     """
     if _reached(out) and out.is_dir():
         raise UsageError(f"{out} is a folder; give a file to write to")
-    check_writable(out.absolute().parent)
+    check_writable(out.absolute().parent, out)
     check_not_input([out], inputs)
     if suffixes and out.suffix not in suffixes:
         raise UsageError(f"{out}: give a file with the suffix {' or '.join(suffixes)}")
@@ -226,18 +226,19 @@ def _again(cell: str) -> str:
 PICTURE = marked("figure", ".png", MAKER.encode())
 
 
-def check_writable(folder: Path) -> None:
-    """Refuse, before any work is done, a folder that cannot be written to, or made.
+def check_writable(folder: Path, target: Path | None = None) -> None:
+    """Refuse, before any work is done, a folder that cannot be written to, or made, for `target` (the folder itself).
 
     Raises:
-        UsageError: with the folder and the reason.
+        UsageError: with the target, the folder and the reason.
     """
     nearest = next(one for one in (folder, *folder.absolute().parents) if _reached(one))
     try:
         with tempfile.TemporaryFile(dir=nearest):
             pass
     except OSError as error:
-        raise UsageError(f"cannot write to {nearest}: {error.strerror or error}; nothing was changed there") from error
+        message = f"cannot write {target or folder}: {error.strerror or error} in {nearest}; nothing was changed there"
+        raise UsageError(message) from error
 
 
 def _reached(path: Path) -> bool:
@@ -289,6 +290,8 @@ def check_regular(path: str | Path, streams: bool = False) -> None:
     Raises:
         OSError: with the reason.
     """
+    if str(path).encode(errors="ignore").decode() != str(path):
+        raise OSError(errno.EILSEQ, "its name is no UTF-8: rename the file", str(path))
     mode = os.stat(path).st_mode
     handed = streams and str(path).startswith(("/dev/fd/", "/dev/stdin", "/proc/self/fd/"))
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode) or handed or str(path) == os.devnull):
@@ -373,7 +376,8 @@ def _cell(value: Any) -> Any:
 
 def _headed(header: Sequence[str]) -> io.StringIO:
     text = io.StringIO()
-    misread = header[0].startswith("#") or any(mark in name for name in header for mark in ";\t")
+    marks = ";\t" if len(header) > 1 else ";\t| "
+    misread = header[0].startswith("#") or any(mark in name for name in header for mark in marks)
     quoting = csv.QUOTE_ALL if misread else csv.QUOTE_MINIMAL
     csv.writer(text, lineterminator="\n", quoting=quoting).writerow(map(_cell, header))
     return text

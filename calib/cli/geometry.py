@@ -197,8 +197,6 @@ def export(
 
     A result whose verdict is no pass is marked so, with the reason; with fail, for inspection only, the exit code is 1.
     """
-    import warnings
-
     from calib.errors import UsageError
     from calib.files import together
     from calib.procedure.export import delivery, geometry
@@ -210,7 +208,7 @@ def export(
 
         if out or ur_kinematics or offsets:
             raise UsageError("--into writes all files into one folder; leave --out, --ur-kinematics and --offsets out")
-        with progress() as show, warnings.catch_warnings(action="ignore"):  # what it warns of is the first line
+        with progress() as show:
             show("all forms, and each file read back")
             lines = export_all(folder, into, urdf=urdf, prior=prior)
         say_written(lines, into, delivery.worst(delivery.verdicts(folder)))

@@ -11,7 +11,7 @@ from reprlib import repr as shortened
 from threading import Lock
 from typing import Any, Protocol
 
-from calib.errors import TaskLost
+from calib.errors import TaskLost, quiet
 from calib.workers.threads import limit_worker
 
 Answer = tuple[int, Any, BaseException | None]  # task, result, or what the task raised
@@ -125,7 +125,8 @@ def run_call(
         hear()
         limit_worker()
         function, arguments = pickle.loads(call)
-        return dumps((function(*arguments), None))
+        with quiet():
+            return dumps((function(*arguments), None))
     except BaseException as error:
         hush()
         where = f"in a worker process:\n{traceback.format_exc()}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +11,6 @@ import numpy as np
 
 from calib import files
 from calib.dynamics.base import expressions
-from calib.errors import UsageError
 from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
 from calib.folders import METRICS, REPORT, check_target, write_staged
 from calib.identification.cases import Case
@@ -36,7 +34,7 @@ from calib.procedure.dynamic_stage.metric_tables import (
 )
 from calib.procedure.dynamic_stage.validation import Assessment, ModelFindings
 from calib.procedure.dynamic_stage.verdict import Resting
-from calib.records import read_record
+from calib.records import read_json
 from calib.robot import calibrated
 from calib.units import per_ampere
 
@@ -149,10 +147,7 @@ class UnseenFolder:
 
 
 def _read(kind: type[T], path: Path) -> T:
-    try:
-        return read_record(kind, json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError) as error:
-        raise UsageError(f"{path} cannot be read ({error}); identify again") from error
+    return read_json(path, "identify again", kind)
 
 
 def check_identification_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:

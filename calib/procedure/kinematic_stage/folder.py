@@ -6,7 +6,6 @@ A fit's folder is written whole, beside its place, then moved there. Nothing els
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -27,7 +26,7 @@ from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import Findings, FitMetrics, ValidationMetrics
 from calib.procedure.kinematic_stage.tables import HEADER, estimate_table, read_covariance, write_residuals
 from calib.procedure.kinematic_stage.validation import Arms, Assessment, nominal_arm, write_errors
-from calib.records import read_record, shielded
+from calib.records import read_json, shielded
 from calib.robot import calibrated
 from calib.robot.calibrated import CorrectedChain
 from calib.robot.chain import Joint
@@ -139,6 +138,13 @@ class FitFolder:
 
 
 @dataclass(frozen=True)
+class _Schema:
+    """By which version a JSON file was written."""
+
+    schema: int = 1
+
+
+@dataclass(frozen=True)
 class _EarlyReport:
     """What ``report.json`` of schema 1 holds of the findings."""
 
@@ -190,13 +196,10 @@ class ValidationFolder:
 
 
 def _read(kind: type[T], path: Path) -> T:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        if isinstance(content, Mapping) and content.get("schema", 1) > SCHEMA:
-            raise UsageError(f"{path}: schema {content['schema']} of a later version, this one reads up to {SCHEMA}")
-        return read_record(kind, content)
-    except (OSError, ValueError, TypeError) as error:
-        raise UsageError(f"{path} cannot be read ({error}); fit again") from error
+    schema = read_json(path, "fit again", _Schema).schema
+    if schema > SCHEMA:
+        raise UsageError(f"{path}: schema {schema} of a later version, this one reads up to {SCHEMA}")
+    return read_json(path, "fit again", kind)
 
 
 def check_fit_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -22,7 +21,7 @@ from calib.procedure.kinematic_stage.folder import metrics
 from calib.procedure.kinematic_stage.metrics import FitMetrics, ValidationMetrics
 from calib.procedure.kinematic_stage.tables import estimate_table
 from calib.procedure.measuring.image_findings import ImageCoverage, image_coverage
-from calib.records import read_record
+from calib.records import read_json, read_record
 from calib.transforms import invert
 
 SCHEMA = 2
@@ -224,10 +223,7 @@ def read(path: Path) -> Report:
     Raises:
         UsageError: where it is missing or made by another version.
     """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        if content.get("schema") not in READ:
-            raise UsageError(f"{path}: schema {content.get('schema')}, this version reads {SCHEMA}; fit again")
-        return read_record(Report, content)
-    except (OSError, ValueError) as error:
-        raise UsageError(f"{path}: {error}; fit again") from error
+    schema = read_json(path, "fit again").get("schema")
+    if schema not in READ:
+        raise UsageError(f"{path}: schema {schema}, this version reads {SCHEMA}; fit again")
+    return read_json(path, "fit again", Report)

@@ -7,7 +7,6 @@ All points are in the base of the arm that is drawn.
 from __future__ import annotations
 
 import csv
-import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from calib.dynamics.torque_rows import MOTOR, ROWS
 from calib.errors import CalibError, UsageError
 from calib.geometry import installation_file
 from calib.geometry.installation import Installation, see
+from calib.identification import model_file
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.excitation import coefficients
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
@@ -301,7 +301,7 @@ def _torque_rows(place: Path, chain: Chain | None, count: int) -> tuple[tuple[st
     for folder in (IdentificationFolder(place), IdentificationFolder(place.parent)):
         if chain is None or not folder.model.is_file():
             continue
-        table = json.loads(folder.model.read_text(encoding="utf-8"))
+        table = model_file.read_table(folder.path)
         rows, unit = ROWS.get(table.get("kind", ""), MOTOR), table.get("unit", "N m")
         if rows.count(chain.n) == count:
             kind = f"{' motor' if rows.motors_alone else ''} {'torque' if unit == 'N m' else 'current'}"

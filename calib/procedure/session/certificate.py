@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from calib import files
@@ -22,7 +21,7 @@ from calib.procedure.report.page import Section, Text
 from calib.procedure.session.dynamics_steps import recordings
 from calib.procedure.session.folder import CHECKED, MARK, SELECTION, Session, read_state
 from calib.procedure.session.geometry_steps import measured_files, robot_file
-from calib.records import read_record
+from calib.records import read_json, read_lines
 
 Say = Callable[[str], None]
 ROLES = {
@@ -74,15 +73,14 @@ def _whole_report(session: Session) -> fit_report.Report:
     if found.schema >= SCHEMA:
         return fit_report.read(place.report)
     fit = fit_report.read(session.fit.report)
-    content = json.loads(place.rows.read_text()) if place.rows.exists() and found.validation else []
-    whole = replace(found, warnings=(*fit.metrics.warnings, *found.warnings))
-    return fit.with_unseen(whole, read_record(tuple[RowErrors, ...], content))
+    known = place.rows.exists() and found.validation
+    rows = read_json(place.rows, "validate again", tuple[RowErrors, ...]) if known else ()
+    return fit.with_unseen(replace(found, warnings=(*fit.metrics.warnings, *found.warnings)), rows)
 
 
 def _arrival_notes(session: Session, place: str, unseen: str) -> list[str]:
     """Return what was said of files as they came: those to learn from, and those that the step `unseen` looked at."""
-    path = session.path(f"{place}/{CHECKED}")
-    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    lines = read_lines(session.path(f"{place}/{CHECKED}"))
     files_there = measured_files(session)[1] if place == "3-measured" else recordings(session)[1]
     said = read_state(session).notes(unseen)
     names = tuple(f"{each.name}: " for each in files_there)
@@ -98,9 +96,7 @@ def _with_arrival(section: Section, lines: list[str]) -> Section:
 
 def _simulated(session: Session) -> list[tuple[str, str]]:
     """Return lines under Setup of a session whose files a simulated cell brought; none of a real one."""
-    path = session.path(MARK)
-    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-    return [("simulated", line) for line in lines if line.strip()]
+    return [("simulated", line) for line in read_lines(session.path(MARK)) if line.strip()]
 
 
 def _setup(session: Session, found: fit_report.Report) -> list[tuple[str, str]]:
@@ -116,7 +112,7 @@ def _setup(session: Session, found: fit_report.Report) -> list[tuple[str, str]]:
         ("instrument", f"{instrument.name}, {_used(session, found.metrics)}{stated}{turning}"),
         ("session made", settings.created.replace("T", " ")),
         ("measurements", _named([*fitted[0], *fitted[1]])),
-        ("pose plan", _session_plan(session)),
+        ("pose plan", _session_plan(session).words),
         *_pose_checks(session),
         ("model", found.metrics.model),
         ("tolerance", certificate.tolerance(settings.fit.tolerance_mm)),
@@ -161,12 +157,20 @@ def _named(paths: list[Path]) -> str:
     return ", ".join(path.name for path in paths)
 
 
-def _session_plan(session: Session) -> str:
-    """Return in a few words how the poses were chosen."""
+@dataclass(frozen=True)
+class _Plan:
+    """What ``selection.json`` says for people: how the poses were chosen, what they were held against, what not."""
+
+    words: str = "chosen by hand"
+    checked: tuple[str, ...] = ()
+    unchecked: tuple[str, ...] = ()
+
+
+def _session_plan(session: Session) -> _Plan:
     path = session.path(SELECTION)
     if not session.settings.poses.plan or not path.exists():
-        return "poses not planned here"
-    return str(json.loads(path.read_text()).get("words", "chosen by hand"))
+        return _Plan("poses not planned here")
+    return read_json(path, "calib redo makes it again", _Plan)
 
 
 def _filed(paths: list[Path]) -> list[Path]:
@@ -179,11 +183,8 @@ def _filed(paths: list[Path]) -> list[Path]:
 
 def _pose_checks(session: Session) -> list[tuple[str, str]]:
     """Return lines on what the planned poses were held against, and what was not known."""
-    path = session.path(SELECTION)
-    if not session.settings.poses.plan or not path.exists():
-        return []
-    found = json.loads(path.read_text())
-    rows = [("poses kept", found.get("checked")), ("poses NOT checked for", found.get("unchecked"))]
+    found = _session_plan(session)
+    rows = [("poses kept", found.checked), ("poses NOT checked for", found.unchecked)]
     return [(words, ", ".join(names)) for words, names in rows if names]
 
 

@@ -24,6 +24,7 @@ from calib.procedure.report import viewer
 from calib.procedure.session import dynamics_steps, steps
 from calib.procedure.session.commands import NewSession, begin
 from calib.procedure.session.folder import MARK, SETTINGS, Session, locked, open_session, verdict_of
+from calib.records import read_lines
 from calib.robot import calibrated, library
 from calib.robot.load import load
 from calib.simulation.cells import camera_files, measured_files
@@ -248,7 +249,7 @@ def simulate_measurements(session: Session, cell: Cell, seed: int) -> None:
 def _mark(session: Session, note: str) -> None:
     """Write down in the session that its files are a simulated cell's; the certificate says so."""
     path, line = session.path(MARK), SIMULATED.format(note=note)
-    known = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    known = read_lines(path)
     files.write(path, "\n".join([*known, *([line] if line not in known else [])]) + "\n")
 
 

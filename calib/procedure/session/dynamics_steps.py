@@ -5,11 +5,9 @@ The same functions as `calib excite` and `calib identify`; only the files are th
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -25,10 +23,12 @@ from calib.procedure.excitation import coefficients, prediction
 from calib.procedure.excitation.coefficients import Periodic
 from calib.procedure.session import arrival
 from calib.procedure.session.folder import CUTS, MOTION_CHECKED, Session
+from calib.records import read_json
 from calib.robot.chain import Chain
 from calib.robot.load import load_calibrated
 
 Say = Callable[[str], None]
+Cuts = Mapping[str, tuple[float, float] | None]  # of recordings, by their names [s]
 SUFFIXES = (".csv", ".npz", ".mcap", ".bag", ".db3")
 SHORTER, OTHER = (
     0.8,
@@ -163,7 +163,7 @@ def designed_motions(session: Session) -> dict[str, Periodic]:
     return {name: coefficients.read(folder) for name, folder in folders.items() if folder.exists()}
 
 
-def _cut_paths(paths: list[Path], cuts: dict[str, Any]) -> list[str]:
+def _cut_paths(paths: list[Path], cuts: Cuts) -> list[str]:
     """Return paths with the cut that holds the motion."""
     marked = {path: cuts.get(path.name) for path in paths}
     return [str(path) if cut is None else f"{path}@{cut[0]:.6g}:{cut[1]:.6g}" for path, cut in marked.items()]
@@ -176,7 +176,7 @@ def identify(session: Session, say: Say) -> list[str]:
     draw = None
     if session.plots:
         from calib.procedure.report.dynamics_figures import write as draw
-    cuts = json.loads(session.path(CUTS).read_text(encoding="utf-8"))
+    cuts = read_json(session.path(CUTS), "calib redo makes it again", Cuts)
     given = inputs.gather(
         session.fit.path, _cut_paths(recordings(session)[0], cuts), options=options_of(session),
         seed=session.settings.seed, progress=say,
@@ -200,7 +200,7 @@ def identify(session: Session, say: Say) -> list[str]:
 
 def predict(session: Session, say: Say) -> list[str]:
     """Hold the identified model against motion it has not seen, and judge."""
-    cuts = json.loads(session.path(CUTS).read_text(encoding="utf-8"))
+    cuts = read_json(session.path(CUTS), "calib redo makes it again", Cuts)
     training, unseen = recordings(session)
     notes, aside = [], {}
     for path in unseen:

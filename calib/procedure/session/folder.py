@@ -38,6 +38,7 @@ from calib.config import parse
 from calib.config_types import Text
 from calib.errors import CalibError, SessionError, command_line
 from calib.folders import CERTIFICATE, METRICS
+from calib.folders import SESSION as SETTINGS
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.session.settings import SCHEMA, SessionSettings, check_schema, read_settings, written
@@ -47,7 +48,7 @@ DYNAMIC = ("6-excitation", "7-recorded", "8-dynamics")
 VERDICTS = ("pass", "marginal", "fail")  # from good to bad
 EXPORT = {False: "6-export", True: "9-export"}  # without, with dynamics
 MARK = "simulated.txt"
-SETTINGS, CHECKED = "session.toml", "checked.txt"
+CHECKED = "checked.txt"
 SUMMARY, SELECTION, CUTS = "1-robot/summary.txt", "2-poses/selection.json", "7-recorded/cuts.json"
 PREDICTED = "2-poses/predicted.png"  # sigma of the tool over the workspace
 PREDICTION = "2-poses/poses_prediction.json"  # what the poses will tell: calib fit --selection
