@@ -271,7 +271,7 @@ def _constraints(
 ) -> tuple[tuple[MotionConstraint, ...], tuple[MotionConstraint, ...], tuple[str, ...]]:
     """Return what the search keeps, and what is verified: the torque with the model's own Coulomb sign."""
     if dynamics.values is None or not np.isfinite(limits.torque).any():
-        return limits.constraints, limits.constraints, ("no torque limit is checked",)
+        return limits.constraints, limits.constraints, ()
     margin, notes = limits.margin, ()
     if margin is None:
         margin = 0.0 if dynamics.friction else GUARD
