@@ -112,6 +112,18 @@ def test_constraints(constraint):
     check(f, evaluate(spot, basis, y, sharp).rows @ directions, np.zeros(6), tolerance=1e-6)
 
 
+def test_extra_times_count_for_constraints_alone():
+    spot = problem(OBJECTIVES[0], (constraints()[0], constraints()[4]), stretch=(0.5, 2.0))
+    closer = replace(spot, extra=np.array([0.37, 1.21, 1.22]), tightening=np.array([0.003, 0.1]))
+    y, sharp = drawn(1), (8.0, 20.0)
+    one, two = (evaluate(each, each.basis(), y, sharp) for each in (spot, closer))
+    assert one.total == pytest.approx(two.total, rel=1e-12) and len(two.motion) == len(one.motion) + 3
+    np.testing.assert_allclose(one.slopes, two.slopes, rtol=1e-9, atol=1e-12)
+    f, directions = along(lambda z: evaluate(closer, closer.basis(), z, sharp).constraints, y)
+    check(f, two.rows @ directions, np.zeros(6), tolerance=1e-6)
+    assert (two.constraints[-1] > one.constraints[-1] + 0.09).all()
+
+
 @pytest.mark.parametrize("constraint", constraints(), ids=lambda c: c.name)
 def test_the_smoothed_constraint_lies_above_the_largest_value(constraint):
     motion = FAMILY.basis(np.linspace(0, 6, 60, endpoint=False)).motion(drawn())

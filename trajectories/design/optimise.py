@@ -65,11 +65,12 @@ def design(
         search.interrupted = True
     if not search.found:
         raise _nothing(problem, search.stuck, len(tasks))
-    best = min(polished or search.found, key=lambda one: one.merit)
+    best, *others = sorted(polished or search.found, key=lambda one: one.merit)
+    others += sorted(search.found, key=lambda one: one.merit) if polished else []
     share = sum(one.feasible * one.evaluations for one in search.found) / search.spent
     return replace(
         best, evaluations=search.spent, feasible=share, seconds=time.perf_counter() - began,
-        interrupted=search.interrupted,
+        interrupted=search.interrupted, others=tuple(one for one in others if one is not best),
     )  # fmt: skip
 
 
@@ -140,7 +141,7 @@ def _nothing(problem: ExcitationProblem, stuck: list[Stuck], starts: int) -> Not
     return NothingFeasible(
         f"no feasible motion in {_counted(starts)}: the nearest one breaks the {worst.name} limit "
         f"({worst.labels[column]}) by {max(excess, 0.0):.3g} {worst.unit} at t = {motion.times[row]:.3g} s; widen that "
-        "limit, take a longer period, or allow more starts",
+        "limit or take a longer period",
         worst.name, excess, worst.unit,
     )  # fmt: skip
 

@@ -40,7 +40,7 @@ from calib.config import check_keys, parse, read_toml, strict
 from calib.config_types import Name, NotNegative, Numeric, Real, Spread, Whole, number  # fmt: skip
 from calib.errors import UsageError
 from calib.geometry.observability import targets_of
-from calib.procedure.excitation.motion_bounds import DEFAULT_ORIGIN, DEFAULT_RISE, MotionBounds
+from calib.procedure.excitation.motion_bounds import DEFAULT_ORIGIN, DEFAULT_RISE, PLACE, MotionBounds
 from calib.procedure.measuring.constraints_file import DEFAULTS, ConstraintsFile, Point
 from calib.procedure.measuring.pose_limits import Limits, limits_of
 from calib.robot.chain import Chain
@@ -49,9 +49,16 @@ from calib.robot.kinematics import joint_frames, joint_jacobian, sweep
 from poses.space import PoseConstraint
 from trajectories.basis import SampledMotion
 from trajectories.constraints import BoxLimit, MotionConstraint, box_limits
+from trajectories.errors import NothingFeasible
 from trajectories.places import Clearance, Workspace
 
 MARGINS = ("margin", "deviations")  # keys of [torque] that are no joint's
+STATED_IN = {
+    "position": "[joints]", "velocity": "[velocity]", "acceleration": "[acceleration]", "jerk": "[jerk]",
+    "torque": "[torque] (a joint's, or margin)", "workspace": "[target] (height, axis_distance) and [[point]]",
+    "clearance": "[collision] (margin, radius, floor) and [[obstacle]]",
+}  # fmt: skip
+"""Tables of the limits file by the name of the constraint."""
 
 
 @strict
@@ -186,6 +193,14 @@ def read_motion_limits(
     return MotionLimits(
         tuple(constraints), bounds, torque, margin, deviations, friction, stated.frequency.resonance, tuple(notes)
     )
+
+
+def located(error: NothingFeasible) -> NothingFeasible:
+    """Return the error with the place where a user can change the limit that no motion keeps."""
+    if error.constraint not in STATED_IN:
+        return error
+    place = f"the limit is that of {STATED_IN[error.constraint]} {PLACE}"
+    return NothingFeasible(f"{error}; {place}", error.constraint, error.excess, error.unit)
 
 
 def check_bodies(chain: Chain, torque: np.ndarray) -> None:

@@ -23,7 +23,7 @@ MAX_TORQUE = 1e5  # [N m or N] (our choice)
 MAX_EXCESS = 0.01  # of a limit, by which a written sample may be beyond it: rounding to whole samples
 DEFAULT_RISE = 2.0  # [1/s] default acceleration limit over the speed limit: full speed in half a second (our choice)
 DEFAULT_ORIGIN = f"default, {DEFAULT_RISE:g}/s times the speed limit: none is stated"
-LIMITS_FILE = "in the limits file, such as {} (--limits, or [dynamics] limits in session.toml)"
+PLACE = "in the limits file (--limits, or [dynamics] limits in session.toml)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class MotionBounds:
     acceleration: np.ndarray
     torque: np.ndarray
     origin: Mapping[str, str]
-    place: str = LIMITS_FILE
+    place: str = f"{PLACE}, such as {{}}"
 
     def __post_init__(self) -> None:
         for what, kinds, advice in (
@@ -84,8 +84,7 @@ class MotionBounds:
                 words = f"{size:.4g} {motion_units([joint.kind])[number]}" if size <= most else "none"
                 alike.setdefault(words, []).append(joint)
             sizes = "; ".join(f"{words} {self._named(joints)}" for words, joints in alike.items())
-            origin = "" if [*alike] == ["none"] else f" ({self.origin[kind]})"
-            result.append(f"{kind} limits: {sizes}{origin}")
+            result.append(f"{kind} limits: " + ("none" if [*alike] == ["none"] else f"{sizes} ({self.origin[kind]})"))
         return result
 
     def check(self, track: Setpoints) -> None:

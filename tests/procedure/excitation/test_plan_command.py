@@ -289,7 +289,7 @@ def test_no_plan_without_a_limit_of_acceleration(room, capsys, stated):
     words = ("plan", "ur10e", "--waypoints", "way.csv", "--limits", "limits.toml", "--out", "out")
     assert run(*words) == 2
     said = capsys.readouterr().err
-    assert "nothing limits the acceleration of" in said and "[acceleration] all = 5.0 (--limits" in said
+    assert "nothing limits the acceleration of" in said and "such as [acceleration] all = 5.0" in said
     assert said.count("\n") == 1 and not Path("out").exists()
     with pytest.raises(CalibError, match="nothing limits the acceleration"):
         planning.plan("ur10e", Path("way.csv"))
