@@ -40,7 +40,14 @@ from calib.config import check_keys, parse, read_toml, strict
 from calib.config_types import Name, NotNegative, Numeric, Real, Spread, Whole, number  # fmt: skip
 from calib.errors import UsageError
 from calib.geometry.observability import targets_of
-from calib.procedure.excitation.motion_bounds import DEFAULT_ORIGIN, DEFAULT_RISE, PLACE, MotionBounds
+from calib.procedure.excitation.motion_bounds import (
+    DEFAULT_ORIGIN,
+    DEFAULT_RISE,
+    MAX_ACCELERATION,
+    MAX_TORQUE,
+    PLACE,
+    MotionBounds,
+)
 from calib.procedure.measuring.constraints_file import DEFAULTS, ConstraintsFile, Point
 from calib.procedure.measuring.pose_limits import Limits, limits_of
 from calib.robot.chain import Chain
@@ -228,7 +235,7 @@ def _bounds(
     tables = {"velocity": stated.velocity, "torque": stated.torque}
     origin = {kind: f"robot description, {path}" if table else "robot description" for kind, table in tables.items()}
     origin["acceleration"] = str(path)
-    free = np.isinf(acceleration) & np.isinf(torque)
+    free = (acceleration > MAX_ACCELERATION) & (torque > MAX_TORQUE)
     if default and free.any():
         origin["acceleration"] = DEFAULT_ORIGIN if np.isinf(acceleration).all() else f"{path}, or {DEFAULT_ORIGIN}"
         acceleration = np.where(free, DEFAULT_RISE * velocity, acceleration)

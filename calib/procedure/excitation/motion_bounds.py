@@ -18,7 +18,7 @@ from calib.units import motion_units
 from trajectories.setpoints import Setpoints
 
 MAX_SPEED = 100.0  # [rad/s or m/s] a number above that is no limit of a robot's joint (our choice)
-MAX_ACCELERATION = 1000.0  # [rad/s² or m/s²] (our choice)
+MAX_ACCELERATION = 3000.0  # [rad/s² or m/s²] direct drives of fast parallel robots reach 1300 (our choice)
 MAX_TORQUE = 1e5  # [N m or N] (our choice)
 MAX_EXCESS = 0.01  # of a limit, by which a written sample may be beyond it: rounding to whole samples
 DEFAULT_RISE = 2.0  # [1/s] default acceleration limit over the speed limit: full speed in half a second (our choice)
@@ -88,15 +88,21 @@ class MotionBounds:
         return result
 
     def check(self, track: Setpoints) -> None:
-        """Refuse a track that is beyond the speeds and accelerations.
+        """Refuse a track that is beyond its limits of speed and acceleration, or beyond what any joint can do.
+
+        Light links and high torque limits allow accelerations that no robot has.
 
         Raises:
             UsageError: naming the joint.
         """
-        for kind, values in (("velocity", track.v), ("acceleration", track.a)):
-            share = np.abs(values).max(axis=0) / getattr(self, kind)
-            if not share.max() <= 1.0 + MAX_EXCESS:
-                name = self.joints[int(np.argmax(share))].name
+        for kind, values, most, example in (
+            ("velocity", track.v, MAX_SPEED, '[velocity] all = "90 deg/s"'),
+            ("acceleration", track.a, MAX_ACCELERATION, "[acceleration] all = 5.0"),
+        ):
+            peak, limit = np.abs(values).max(axis=0), np.minimum(getattr(self, kind), most)
+            j = int(np.argmax(peak / limit))
+            if not peak[j] <= (1.0 + MAX_EXCESS) * limit[j]:
                 raise UsageError(
-                    f"{self.robot}: the motion takes {share.max():.0%} of the {kind} limit of {name}: not written"
+                    f"{self.robot}: the {kind} of {self.joints[j].name} reaches {peak[j]:.4g} in this motion, beyond "
+                    f"{limit[j]:.4g}, and it is not written; state a limit {self.place.format(example)}"
                 )

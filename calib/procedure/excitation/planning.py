@@ -155,6 +155,7 @@ def plan(
     timings, bounds, sigma = _timed(paths, bounds, law, uncertain, known.deviations, chain, settings.rate)
     torque = None if law is None else law.torque
     motion = joined([track(one.path, one.profile, settings.rate, torque) for one in timings])
+    known.bounds.check(motion)
     lead, remarks = None, ()
     if settings.start is not None:
         lead, remarks = approach_to(settings.start, motion.q[0], settings.rate, known, chain)

@@ -327,7 +327,7 @@ def test_bad_input_is_refused_with_exit_code_2(cell, calib, extra, options, word
 @pytest.mark.parametrize(
     ("extra", "changed", "words"),
     [
-        ("[torque]\nall = 0.05", {}, "breaks the torque limit"),
+        ("[torque]\nall = 0.05", {"lock": ("joint2=1.57",)}, r"breaks the torque limit .*that of \[torque\]"),
         pytest.param("", {"hard": ("wrist=0.9",)}, "hard goal torque slack of joints 6, 7", marks=pytest.mark.slow),
     ],
 )

@@ -304,6 +304,12 @@ def test_no_plan_without_a_limit_of_acceleration(room, capsys, stated):
 
 def test_a_motion_beyond_its_bounds_is_not_written(room):
     planned = planning.plan("lwr4plus", room / "way.csv")
-    with pytest.raises(CalibError, match="of the velocity limit of"):
+    with pytest.raises(CalibError, match=r"the velocity of joint\d reaches .* and it is not written"):
         motion_folder.write_plan(replace(planned, track=replace(planned.track, v=2 * planned.track.v)), room / "out")
     assert not (room / "out").exists()
+
+
+def test_torque_limits_that_no_robot_has_limit_no_acceleration(room):
+    joints = tuple(replace(joint, effort=1e4) for joint in CHAIN.joints)
+    with pytest.raises(CalibError, match=r"the acceleration of joint\d reaches \d+ in this motion, beyond 3000"):
+        planning.plan(CalibratedChain(replace(CHAIN, joints=joints)), room / "way.csv")
