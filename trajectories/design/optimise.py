@@ -65,12 +65,11 @@ def design(
         search.interrupted = True
     if not search.found:
         raise _nothing(problem, search.stuck, len(tasks))
-    best, *others = sorted(polished or search.found, key=lambda one: one.merit)
-    others += sorted(search.found, key=lambda one: one.merit) if polished else []
+    best = min(polished or search.found, key=lambda one: one.merit)
     share = sum(one.feasible * one.evaluations for one in search.found) / search.spent
     return replace(
         best, evaluations=search.spent, feasible=share, seconds=time.perf_counter() - began,
-        interrupted=search.interrupted, others=tuple(one for one in others if one is not best),
+        interrupted=search.interrupted,
     )  # fmt: skip
 
 

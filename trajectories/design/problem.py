@@ -18,7 +18,7 @@ from trajectories.constraints import MotionConstraint, Product, Regressor, Smoot
 from trajectories.design.objectives import Excitation, Objective, Observed, Value, observed
 from trajectories.errors import BadInput
 
-CLOSER = 8  # instants per sample at which a motion is looked at between them (our choice)
+INSTANTS = 2000  # over a period at which a motion is looked at between its samples (our choice)
 NEAR = 0.1  # of a constraint's scale: instants so near to what is broken are looked at besides (our choice)
 MOST_EXTRA = 500  # instants that are added at a time
 
@@ -204,7 +204,7 @@ def critical_times(
     y: np.ndarray,
     beyond: float,
     constraints: Sequence[MotionConstraint] = (),
-    count: int = 0,
+    count: int = INSTANTS,
 ) -> np.ndarray:
     """Return the times over the family's period [s] at which a motion is near the constraints that it breaks.
 
@@ -212,9 +212,9 @@ def critical_times(
         y: (x, factor on the period if that is free).
         beyond: share of its scale by which a constraint has to be broken to count.
         constraints: default the problem's.
-        count: instants to look at; 0: `CLOSER` for each of the problem's samples.
+        count: instants to look at.
     """
-    times = sample_times(problem.family.period, count or CLOSER * problem.samples)
+    times = sample_times(problem.family.period, count)
     x, factor = (y[:-1], float(y[-1])) if problem.free_period else (y, problem.stretch[0])
     motion = stretched(problem.family.basis(times).motion(x), factor)
     near = np.zeros(len(times), dtype=bool)

@@ -60,7 +60,7 @@ S_RANGE = (-4.0, 12.0)
 REPAIR = 30  # evaluations to bring a stage's last motion back inside
 SMALLER = 4  # times that a motion is halved which cannot be brought back inside
 DEEP = 0.02  # of a constraint's scale: a motion that breaks it by more between the samples leads nowhere (our choice)
-RETRIES = 4  # of a stage that ends with such a motion
+RETRIES = 3  # of a stage that ends with such a motion
 
 
 class _Spent(Exception):
@@ -81,7 +81,6 @@ class SearchResult:
         seconds: it took.
         seed: of its start; `interrupted`: ended by Ctrl-C.
         times: of the history, processor seconds since its start.
-        others: what other starts ended with, the best first.
     """
 
     x: np.ndarray
@@ -95,7 +94,6 @@ class SearchResult:
     seed: int = 0
     interrupted: bool = False
     times: tuple[float, ...] = ()
-    others: tuple[SearchResult, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,8 +123,8 @@ def one_start(
 ) -> SearchResult | Stuck:
     """Search from one random start (its number) or from given variables.
 
-    Where the best motion of a stage breaks a limit between the samples by more than `DEEP`, the stage goes back to the
-    last one that did not, and looks at the instants where that was, too.
+    Where the best motion of a stage breaks a limit between the samples by more than `DEEP`, the stage goes on with the
+    instants where that was, from there or, where that cannot be repaired, from the last motion that did not.
 
     Args:
         evaluations: most, if all of `STAGES` are gone through.
@@ -146,15 +144,18 @@ def one_start(
             if number:
                 run, y = run.continued(run.reached(y), *_at_stage(problem, stage, extra))
             most = max(2, round(evaluations * stage.share))
-            for _ in range(RETRIES):
+            for again in range(RETRIES, -1, -1):
                 run.sharpness = stage.sharpness
                 y = run.solve(run.inside(y), most, method, stage.tolerance)
                 y = run.repaired(y, REPAIR)  # SLSQP travels outside, and may have ended there
                 deep = np.zeros(0) if run.best is None else run.broken(run.best)
-                if not len(deep):
-                    break
                 extra = np.union1d(extra, deep)
-                run, y = run.continued(run.last_unbroken(), *_at_stage(problem, stage, extra))
+                if not len(deep) or not again:
+                    break
+                back = run.last_unbroken()
+                run, y = run.continued(run.reached(y), *_at_stage(problem, stage, extra))
+                y = run.repaired(y)
+                y = back if run.best is None else y
     except KeyboardInterrupt:
         if run.best is None:
             raise

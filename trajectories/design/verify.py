@@ -13,17 +13,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trajectories.basis import Family, SampledMotion, sample_times
+from trajectories.basis import Family, SampledMotion
 from trajectories.constraints import BoxLimit, MotionConstraint
 from trajectories.design.problem import ExcitationProblem, critical_times
-from trajectories.design.search import STAGES, SearchResult, Stuck, one_start
+from trajectories.design.search import STAGES, SearchResult, one_start
 from trajectories.design.starts import shrunk
 from trajectories.errors import NothingFeasible
 
 BLOCK = 2000
-OTHERS = 3  # starts besides the best whose motions are searched again
 EVALUATIONS = 240  # of a search that goes on from a motion, if all its stages are gone through
-CLOSER = 3  # instants per sample that are added where all of a motion is looked at closer
 
 
 @dataclass(frozen=True)
@@ -107,100 +105,48 @@ def ensured(
 ) -> tuple[SearchResult, Verification]:
     """Return a motion that passes `verify_motion`.
 
-    One that does not is searched again from there, with the instants near what it breaks and further inside the limits
-    that it breaks; then what other starts found is; then a smaller motion about the pose that is furthest inside.
+    One that does not is searched again from there, with the instants near what it breaks, and further inside the limits
+    that it breaks. Where that does not help, it is made smaller about its pose that is furthest inside.
 
     Args:
         constraints: to verify against, one for each of the problem's; default these.
-        rounds: of searching again, from each motion.
+        rounds: of searching again.
 
     Raises:
         NothingFeasible: where none of that helps.
     """
-    checked = problem.constraints if constraints is None else constraints
-    refining = _Refining(problem, checked, instants, rounds)
-    first, small = None, None
-    for one in (found, *found.others[:OTHERS]):
-        run, report = refining.refined(one)
+    checked, tighter, original = constraints or problem.constraints, problem, found
+
+    def verified(x: np.ndarray) -> Verification:
+        return verify_motion(problem.family, x, checked, factor=found.factor, instants=instants)
+
+    report = verified(found.x)
+    for _ in range(rounds):
         if report.feasible:
-            return refining.told(run, found), report
-        first = first or report
-        if run.interrupted:
-            break
-    for one in (found, *found.others[:OTHERS]):
-        if (small := refining.smaller(one)) is not None:
-            run, report = refining.refined(small, uniform=True)
-            run, report = (run, report) if report.feasible else (small, refining.report(small))
-            return refining.told(run, found), report
-    worst = min(first.margins, key=lambda one: one.share)
+            return found, report
+        y = np.append(found.x, found.factor) if problem.free_period else found.x
+        lacking = np.array([max(-report.worst[one.name].share, 0.0) for one in checked])
+        further = np.where(lacking > 0.0, np.minimum(1.2 * lacking, 0.01) + 1e-4, 0.0)  # our choice
+        extra = np.union1d(tighter.extra, critical_times(problem, y, 0.0, checked, instants))
+        tighter = replace(tighter, extra=extra, tightening=tighter.tightening + further)
+        again = one_start(tighter, EVALUATIONS, "slsqp", found.seed, y, STAGES[2:])
+        found = replace(found, evaluations=found.evaluations + again.evaluations)
+        if isinstance(again, SearchResult):
+            found = replace(
+                again, history=original.history, evaluations=found.evaluations, seconds=found.seconds + again.seconds,
+                interrupted=found.interrupted or again.interrupted,
+            )  # fmt: skip
+            report = verified(found.x)
+    for share in 0.8 ** np.arange(21):
+        small = shrunk(problem, found.x, share)
+        if (proof := verified(small)).feasible:
+            return replace(found, x=small), proof
+    worst = min(report.margins, key=lambda one: one.share)
     raise NothingFeasible(
-        f"no motion was found that keeps the {worst.name} limit ({worst.label}) between its samples, too: the best one "
-        f"breaks it by {-worst.margin:.3g} {worst.unit} at t = {worst.time:.3g} s",
+        f"feasible at the samples, but between them the {worst.name} limit ({worst.label}) is broken by "
+        f"{-worst.margin:.3g} {worst.unit} at t = {worst.time:.3g} s; widen that limit or take a longer period",
         worst.name, -worst.margin, worst.unit,
     )  # fmt: skip
-
-
-@dataclass
-class _Refining:
-    """Searches again where a motion breaks limits between the samples; see `ensured`."""
-
-    problem: ExcitationProblem
-    checked: Sequence[MotionConstraint]
-    instants: int
-    rounds: int
-    spent: int = 0
-    seconds: float = 0.0
-
-    def report(self, found: SearchResult) -> Verification:
-        return verify_motion(self.problem.family, found.x, self.checked, factor=found.factor, instants=self.instants)
-
-    def told(self, run: SearchResult, found: SearchResult) -> SearchResult:
-        """Return a run with the history of the search that it ends."""
-        return replace(
-            run, history=found.history, times=found.times, evaluations=found.evaluations + self.spent,
-            feasible=found.feasible, seconds=found.seconds + self.seconds,
-            interrupted=found.interrupted or run.interrupted, others=(),
-        )  # fmt: skip
-
-    def refined(self, found: SearchResult, uniform: bool = False) -> tuple[SearchResult, Verification]:
-        """Return what searching again from a motion comes to.
-
-        Args:
-            uniform: look closer everywhere from the beginning, as a motion that goes elsewhere needs it.
-        """
-        report, tighter = self.report(found), self.problem
-        for number in range(self.rounds):
-            if report.feasible and not (uniform and number == 0):
-                break
-            y = np.append(found.x, found.factor) if self.problem.free_period else found.x
-            tighter = self._tighter(tighter, report, y, uniform)
-            run = one_start(tighter, EVALUATIONS, "slsqp", found.seed, y, STAGES[1:] if uniform else STAGES[2:])
-            self.spent += run.evaluations
-            if isinstance(run, Stuck):
-                break
-            self.seconds += run.seconds
-            found, report = run, self.report(run)
-        return found, report
-
-    def _tighter(
-        self, problem: ExcitationProblem, report: Verification, y: np.ndarray, uniform: bool
-    ) -> ExcitationProblem:
-        """Return the problem with the instants near what is broken, and further inside that."""
-        extra = np.union1d(problem.extra, critical_times(problem, y, 0.0, self.checked, self.instants))
-        if uniform:
-            extra = np.union1d(extra, sample_times(problem.family.period, CLOSER * problem.samples))
-        lacking = {name: max(-one.share, 0.0) for name, one in report.worst.items()}
-        further = np.array([lacking.get(one.name, 0.0) for one in self.checked])
-        further = np.where(further > 0.0, np.minimum(1.2 * further, 0.01) + 1e-4, 0.0)  # our choice
-        return replace(problem, extra=extra, tightening=problem.tightening + further)
-
-    def smaller(self, found: SearchResult) -> SearchResult | None:
-        """Return the motion made so small that it keeps the limits, or None."""
-        for share in 0.8 ** np.arange(1, 21):
-            small = replace(found, x=shrunk(self.problem, found.x, share))
-            if self.report(small).feasible:
-                return small
-        return None
 
 
 def _margins(

@@ -30,7 +30,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -325,12 +324,7 @@ def _places(stated: LimitsFile, found: Limits, points: Points) -> list[MotionCon
 
 def _clearance(found: Limits) -> Clearance:
     names = tuple(f"{one} - {two}" for one, two in found.collision.pairs)
-    return Clearance(found.collision.distances, partial(_distance_product, found.collision), names, found.clearance)
-
-
-def _distance_product(collision: Any, q: np.ndarray, G: np.ndarray) -> np.ndarray:
-    """Return the slopes (N, n) of Σ G · distances."""
-    return np.einsum("mk,mkn->mn", G, collision.gradients(q))
+    return Clearance(found.collision.distances, found.collision.gradients, names, found.clearance)
 
 
 def _per_joint(
