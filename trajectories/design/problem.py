@@ -20,7 +20,7 @@ from trajectories.errors import BadInput
 
 INSTANTS = 2000  # over a period at which a motion is looked at between its samples (our choice)
 NEAR = 0.1  # of a constraint's scale: instants so near to what is broken are looked at besides (our choice)
-MOST_EXTRA = 500  # instants that are added at a time
+MOST_EXTRA = 150  # instants that are added at a time
 
 
 @dataclass(frozen=True, eq=False)
