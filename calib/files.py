@@ -356,8 +356,14 @@ def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence
     return write(path, text.getvalue())
 
 
-def write_numbers(path: str | Path, header: Sequence[str], values: np.ndarray, names: Sequence[str] = ()) -> Path:
-    """Write values (N, k), a name before each row or none, as `write_table` does, in half its time: logs are long."""
+def write_numbers(
+    path: str | Path, header: Sequence[str], values: np.ndarray, names: Sequence[str] = (), notes: Sequence[str] = ()
+) -> Path:
+    """Write values (N, k), a name before each row or none, as `write_table` does, in half its time: logs are long.
+
+    Args:
+        notes: comment lines above the header.
+    """
     text = _headed(header)
     line = ",".join(["%.12g"] * values.shape[1]) + "\n"
     if names:
@@ -367,7 +373,12 @@ def write_numbers(path: str | Path, header: Sequence[str], values: np.ndarray, n
             text.write(line % tuple(row))
     else:
         text.write((line * len(values)) % tuple(values.ravel().tolist()))
-    return write(path, text.getvalue())
+    return write(path, remarks(notes) + text.getvalue())
+
+
+def remarks(notes: Sequence[str]) -> str:
+    """Return lines as comments of a CSV, TOML or YAML file."""
+    return "".join(f"# {note}\n" for note in notes)
 
 
 def _cell(value: Any) -> Any:

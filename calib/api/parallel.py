@@ -12,9 +12,9 @@ import numpy as np
 from calib.api.rendering import as_text, data_frame
 from calib.arguments import checked
 from calib.estimation.estimate import Estimate
-from calib.procedure.excitation.parallel import ParallelDesign
 from calib.procedure.findings import Verdict
 from calib.procedure.parallel_stage import folder
+from calib.procedure.parallel_stage.design import ParallelDesign
 from calib.procedure.parallel_stage.fit import ParallelFit
 from calib.procedure.parallel_stage.identify import ParallelOutcome
 from calib.procedure.parallel_stage.plan import ParallelPlan, plan_lines, plan_metrics

@@ -31,8 +31,8 @@ from calib.mechanism.closure import closed
 from calib.mechanism.computed_torque import ComputedTorque, ParallelRun, simulate
 from calib.mechanism.distribution import distributed, overconstraint
 from calib.mechanism.parallel_model import make_parallel_model, rows_named
-from calib.procedure.excitation.parallel import ParallelDesign, design_parallel
 from calib.procedure.excitation.settings import ExcitationSettings
+from calib.procedure.parallel_stage.design import ParallelDesign, design_parallel
 
 RATE, SECONDS = 1000.0, 6.0  # of a recording: Hz, s
 PAYLOAD = {"M5": 5.37, "MX5": -0.127, "ZZ5": 0.0161}  # truth: mass as weighed, the others as the papers identify them

@@ -90,7 +90,7 @@ def begin(folder: Path, wanted: NewSession) -> Session:
     check_keys(wanted.motion, [key.name for key in fields(DynamicsSection)], "keys of [dynamics]")
     device, source = instrument_named(wanted.instrument), resolve(wanted.robot)
     chain = load(wanted.robot, wanted.base or None, wanted.tip or None)
-    copied, named = _limits(wanted.limits, chain, source)
+    copied, named = _limits(wanted.limits, chain, source, wanted.dynamics)
     measured = InstrumentSection(device.label, device.measures, device.sigma_position, device.sigma_orientation)
     if wanted.tool is not None:
         x, y, z = (float(value) for value in wanted.tool)
@@ -103,12 +103,15 @@ def begin(folder: Path, wanted: NewSession) -> Session:
     return create(folder, source, settings, copied | meshes_beside(source))
 
 
-def _limits(stated: Path | Mapping[str, Any] | None, chain: Chain, source: Path) -> tuple[dict[str, Path | str], str]:
+def _limits(
+    stated: Path | Mapping[str, Any] | None, chain: Chain, source: Path, motions: bool
+) -> tuple[dict[str, Path | str], str]:
     """Return what is to be copied of stated limits, which are read once to see that they can be, and its name."""
     if stated is None:
         return {}, ""
     if isinstance(stated, Path):
-        read_motion_limits(stated, chain, source)
+        if motions:
+            read_motion_limits(stated, chain, source)
         read_limits(stated, targets_of(chain), source)
         return {LIMITS: stated, **beside(stated)}, LIMITS
     told = parse(ConstraintsFile, stated, "the cell")

@@ -108,7 +108,8 @@ def excite(session: Session, say: Say) -> list[str]:
             f"{name}: {designed.period:g} s, condition number {cond.raw:.3g} raw, {cond.normalised:.3g} "
             f"normalised, {len(designed.inputs.model.exact.names)} columns; every limit is kept"
         )
-        notes += [f"{name}: {note}" for note in designed.notes if first]
+        told = (*designed.inputs.limits.bounds.lines(), *designed.notes)
+        notes += [f"{name}: {note}" for note in told if first]
     if limits is None:
         notes.append("only the robot's own limits were kept: watch for collisions, or name a limits file")
     return notes
