@@ -2,9 +2,9 @@
 
     python examples/dualv/study.py --out dualv-study [--seeds 5] [--readme]
 
-A simulated DualV (Briot, Gautier & Krut 2013, two papers) runs a designed motion without and with a payload of 5.37 kg,
+A simulated DualV (Briot, Gautier & Krut 2013, two papers) runs designed motions without and with a payload of 5.37 kg,
 under computed torque with an internal preload. IDIM-WLS on the platform's coordinates and PIM-WLS on the power identify
-it from encoders and motor torques alone, once for each seed of motion and noise; the papers' Table II stands beside.
+it from encoders and motor torques alone, from two motions at a time; the papers' Table II stands beside.
 The truth obeys the model, its friction and noise are chosen: methods are compared, not a real robot's errors with the
 papers'.
 """
@@ -64,10 +64,13 @@ COORDINATES = ("x", "y", "rz")
 MARKS = ("<!-- the table is written by --readme -->", "<!-- end of the table -->")
 
 
+Runs = dict[str, ParallelRun]  # of one motion, by load
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("dualv-study"))
-    parser.add_argument("--seeds", type=int, default=SEEDS, help="of motion and noise; two at least")
+    parser.add_argument("--seeds", type=int, default=SEEDS, help="of motions and noise; three at least")
     parser.add_argument("--workers", type=int, default=2, help="local processes for the designs")
     parser.add_argument("--readme", action="store_true", help="put the tables into the README beside this script")
     options = parser.parse_args()
@@ -78,7 +81,7 @@ def main() -> None:
         designs = list(pool.map(designed, seeds))
     robot = Robot()
     runs = [{label: robot.run(designs[k], LOADS[label], k) for label in LOADS} for k in seeds]
-    found = [Trial(robot, runs[k], runs[(k + 1) % len(runs)]["loaded"]) for k in seeds]
+    found = [Trial(robot, *(runs[(k + later) % len(runs)] for later in range(3))) for k in seeds]
     figures(robot, found[0], options.out)
     metrics = report(designs, found)
     spent = sum(now - then for now, then in zip(os.times()[:4], used))
@@ -128,17 +131,18 @@ class Robot:
 class Method:
     """What one method makes of the recordings: IDIM on the platform's coordinates, or PIM on the power."""
 
-    def __init__(self, robot: Robot, name: str, runs: dict[str, ParallelRun], other: ParallelRun):
+    def __init__(self, robot: Robot, name: str, seen: tuple[Runs, Runs], other: Runs):
         rows = rows_named(robot.known, "platform" if name == "idim" else "power")
         self.model = make_parallel_model(robot.known, ["Ia Fv Fc"], v0=0.05, rows=rows, payloads=["5"])
 
-        def case(label: str, run: ParallelRun, carried: tuple[str, ...]) -> Case:
+        def case(motion: int, runs: Runs, load: str) -> Case:
+            run, label = runs[load], f"{load}, motion {motion}"
             recording = Recording(run.t, run.q, run.tau, "torque", robot.known.robot.joint_names, file=label)
-            return make_case(label, make_motion(recording, FILTER), rows, carried=carried)
+            return make_case(label, make_motion(recording, FILTER), rows, carried=LOADS[load])
 
-        self.unseen = case("other motion", other, LOADS["loaded"])
+        self.unseen = case(2, other, "loaded")
         settings = IdentificationSettings(prior="none", essential="none", torque_rows=rows)
-        cases = [case(label, run, LOADS[label]) for label, run in runs.items()]
+        cases = [case(k, runs, load) for k, runs in enumerate(seen) for load in LOADS]
         self.found: Identification = identify_model(self.model, cases, settings)
         pooled = self.found.fitted.pooled
         self.all = self.found.fitted.estimate
@@ -172,10 +176,10 @@ def _others(names: tuple[str, ...]) -> list[str]:
 
 
 class Trial:
-    """Both methods on the recordings of one seed, held against another seed's loaded motion."""
+    """Both methods on two motions without and with the payload, held against a third with it."""
 
-    def __init__(self, robot: Robot, runs: dict[str, ParallelRun], other: ParallelRun):
-        self.idim, self.pim = (Method(robot, name, runs, other) for name in ("idim", "pim"))
+    def __init__(self, robot: Robot, one: Runs, two: Runs, other: Runs):
+        self.idim, self.pim = (Method(robot, name, (one, two), other) for name in ("idim", "pim"))
         base = self.idim.found.base
         own = dict(zip(robot.model.names, robot.values))
         standard = np.array([own.get(name, 0.0) for name in self.idim.model.names])
