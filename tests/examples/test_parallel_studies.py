@@ -20,7 +20,7 @@ BOUNDS = {"| value": 0.05, "| stated": 0.6, "| relative": 0.3, "| |": 0.6}
 @pytest.mark.slow
 def test_dualv_is_identified_by_both_models_and_its_payload_weighed(tmp_path):
     """Sixteen inertial base parameters, the payload to 1 %, IDIM tighter than PIM, equal legs tighter than unequal
-    ones, other motion predicted better than the paper's 0.099, 0.084, 0.149: with each of three seeds."""
+    ones, other motion predicted better than the paper's 0.099, 0.084, 0.149: in each of three trials."""
     command = [sys.executable, str(EXAMPLES / "dualv" / "study.py"), "--seeds", "3", "--out", str(tmp_path)]
     subprocess.run(command, check=True, capture_output=True, text=True)
     metrics = json.loads((tmp_path / "metrics.json").read_text())
