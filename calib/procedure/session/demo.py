@@ -158,6 +158,7 @@ def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, 
         f"hidden truth, over {TRUTH} poses of the whole joint range: the tool is off by {before:.3f} mm rms with the "
         f"nominal arm, {after:.3f} mm with the calibrated one"
     ]
+    truth: dict[str, object] = {"position_mm": {"nominal": before, "calibrated": after, "urdf_alone": bare}}
     if bare > after:
         lines[0] += f" ({bare:.3f} mm with its URDF alone, without the joint corrections)"
     notes = [cell.note]
@@ -170,12 +171,14 @@ def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, 
         true = true_base(dynamics.model, cell, arm, session.settings.seed, middle)
         within, count = share_within(true, read_estimate(session.identification.path))
         notes.append(arm.note)
+        truth |= {"torque_percent": torques.identified, "within_two_sigma": within, "base_parameters": count}
         lines.append(
             "hidden truth, on a motion nobody has seen: noise-free torques are predicted to "
             f"{torques.identified:.2f} % ({torques.nominal:.1f} % behind the gears by the nominal masses, with the "
             f"true friction); of {count} base parameters {within:.0%} are within two sigmas of the truth"
         )
     files.write(session.path("truth.txt"), "\n".join([*notes, *lines]) + "\n")
+    files.write_json(session.path("truth.json"), truth)
     for line in lines:
         say(line)
     return before, after
