@@ -47,6 +47,9 @@ def fit(
     tolerance: Annotated[
         float | None, typer.Option(metavar="MM", help="rms on unseen poses, in mm, above which the verdict is fail")
     ] = None,
+    deliverable: Annotated[
+        str, typer.Option(help="what the verdict is about: urdf (robot.urdf alone), or corrections (with them)")
+    ] = "urdf",
     base: Base = None,
     tip: Tip = None,
     seed: Seed = 0,
@@ -67,7 +70,7 @@ def fit(
 
     settings = FitSettings(
         model, loss, folds, stations, tools, holdout, refit_frames,
-        None if tolerance is None else 1e-3 * tolerance, seed,
+        None if tolerance is None else 1e-3 * tolerance, deliverable, seed,
     )  # fmt: skip
     check_destination("fit", robot, out, [options, *measured, *(validate or [])])
 
@@ -213,7 +216,7 @@ def export(
         with progress() as show, warnings.catch_warnings(action="ignore"):  # what it warns of is the first line
             show("all forms, and each file read back")
             lines = export_all(folder, into, urdf=urdf, prior=prior)
-        say_written(lines, into, delivery.worst(delivery.verdicts(folder)))
+        say_written(lines, into, delivery.verdicts(folder).level)
         return
     if (urdf is None) != (out is None) or not (urdf or ur_kinematics or offsets):
         raise UsageError(
@@ -221,12 +224,11 @@ def export(
         )
     found = geometry.read(folder)
     geometry.check_targets(folder, urdf, out, ur_kinematics, offsets, overwrite)
-    verdicts = delivery.verdicts(folder)
-    judged = delivery.remark(verdicts)
+    own = delivery.verdicts(folder).of("corrections" if for_corrections else "urdf", dynamics=True)
     with together():
-        read = geometry.export_urdf(found, urdf, out, for_corrections, judged) if urdf and out else ""
+        read = geometry.export_urdf(found, urdf, out, for_corrections, own.remark) if urdf and out else ""
         if ur_kinematics:
-            geometry.export_ur_kinematics(found, ur_kinematics, judged)
+            geometry.export_ur_kinematics(found, ur_kinematics, own.remark)
         if offsets:
             geometry.export_offsets(found, offsets)
     if urdf and out:
@@ -239,13 +241,10 @@ def export(
     if offsets:
         say(f"{offsets}: offset of each joint, the rest of the geometry left out; --model offsets fits the best ones")
     if found.corrections is not None:
-        note = f"note: the corrections in {folder}/joint_corrections.csv are in none of these files"
-        left = geometry.without_corrections(folder)
-        note += f": {left}" if left else ""
-        say(note)
-    if judged:
-        say(judged)
-    exit_failed(delivery.worst(verdicts))
+        say(f"note: the corrections in {folder}/joint_corrections.csv are in none of these files")
+    if own.level:
+        say(str(own))
+    exit_failed(own.level)
 
 
 @app.command()

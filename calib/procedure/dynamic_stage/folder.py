@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import json
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -97,6 +99,11 @@ class IdentificationFolder:
     def tables(self) -> tuple[Path, Path]:
         """The estimate, and its covariance."""
         return self.path / ESTIMATE, self.path / COVARIANCE
+
+    @property
+    def torques(self) -> list[Path]:
+        """Torques measured and predicted on motion that is unseen, where there is any."""
+        return sorted(self.unseen.path.glob("torques_*.csv")) or [self.path / "torques_1.csv"]
 
     @property
     def unseen(self) -> UnseenFolder:
@@ -208,19 +215,36 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
 def _write_torques(case: Case, predicted: np.ndarray, expected: TorqueIntervals | None, path: Path) -> Path:
     """Write measured and predicted torques (N, rows) of a recording and its joints (N, n), at about `TORQUE_RATE`.
 
-    Where it is known, with the standard deviation expected of the errors, and 1 where the model extrapolates.
+    Where it is known, with the standard deviation expected of the errors, and 1 where the model extrapolates; without a
+    payload on board with speeds and accelerations, too, for `read_motion`.
     """
-    motion, rows = case.motion, case.target.shape[1]
+    motion = case.motion
     step = max(1, round(motion.rate / TORQUE_RATE))
-    names = [f"{what}_{j + 1}" for what in ("measured", "predicted") for j in range(rows)]
-    joints = [f"q{j + 1}" for j in range(motion.q.shape[1])]
-    table = np.column_stack([motion.t, case.target, predicted, motion.q])[::step]
-    if expected is None:
-        return files.write_numbers(path, ["t [s]", *names, *joints], table)
-    near = np.searchsorted(expected.index, np.arange(len(motion))[::step])
-    table = np.column_stack([table, expected.sigma[near], expected.beyond[near]])
-    sigmas = [f"sigma_{j + 1}" for j in range(rows)]
-    return files.write_numbers(path, ["t [s]", *names, *joints, *sigmas, "extrapolated"], table)
+    columns = {"measured_": np.asarray(case.target), "predicted_": predicted, "q": np.asarray(motion.q)}
+    if expected is not None:
+        near = np.searchsorted(expected.index, np.arange(len(motion)))
+        columns |= {"sigma_": expected.sigma[near], "extrapolated": expected.beyond[near]}
+    if not case.carried:
+        columns |= {"v": np.asarray(motion.v), "a": np.asarray(motion.a)}
+    names = [f"{what}{j + 1}" if one.ndim > 1 else what for what, one in columns.items() for j in range(one[0].size)]
+    return files.write_numbers(path, ["t [s]", *names], np.column_stack([motion.t, *columns.values()])[::step])
+
+
+def read_motion(path: Path) -> dict[str, np.ndarray] | None:
+    """Read what `_write_torques` has left: measured, predicted (N, rows), q, v, a (N, n); None without v and a.
+
+    Raises:
+        UsageError: where the file is damaged.
+    """
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            header = next(csv.reader(file))
+            table = np.loadtxt(file, delimiter=",", ndmin=2)
+        pick = lambda what: table[:, [k for k, name in enumerate(header) if re.fullmatch(rf"{what}\d+", name)]]  # noqa: E731
+        found = {what.rstrip("_"): pick(what) for what in ("measured_", "predicted_", "q", "v", "a")}
+    except (OSError, ValueError, IndexError, StopIteration) as error:
+        raise UsageError(f"{path} cannot be read ({error}); identify again") from error
+    return found if found["v"].size else None
 
 
 def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     import jinja2
 
 FileRow = tuple[str, str, str, str]  # name, what it is, bytes, SHA-256
-WORDS = {"pass": "PASS", "marginal": "MARGINAL", "fail": "FAIL"}
 EDITED = "edited by hand"
 SHORT = 12  # hexadecimal digits of a SHA-256 on the first sheet
 LISTED = 6  # files on the first sheet
@@ -139,7 +138,7 @@ def versions() -> str:
 def render(page: Page) -> str:
     """Return the page as HTML."""
     style = resources.files("calib.procedure.report").joinpath("certificate.css").read_text(encoding="utf-8")
-    return _template().render(page=page, style=style, words=WORDS)
+    return _template().render(page=page, style=style)
 
 
 @cache
@@ -153,18 +152,20 @@ def _template() -> jinja2.Template:
     return environment.from_string(source)
 
 
-def write_fit(outcome: Outcome, folder: Path, plots: bool = True) -> None:
+def write_fit(outcome: Outcome, folder: Path, plots: bool = True, page: bool = True) -> None:
     """Write ``report.json``, the figures, and a certificate of the fit alone into a fit's folder.
 
     Args:
         plots: whether there are to be figures; the certificate is written without them, too.
+        page: whether there is to be a certificate.
     """
     report = fit_report.collect(outcome)
     fit_report.write(report, FitFolder(folder).report)
     drawn = draw(report) if plots else {}
     for name, figure in drawn.items():
         files.write(folder / f"plot_{name}.png", figure.png)
-    files.write(folder / CERTIFICATE, render(of_fit(report, drawn, outcome.inputs)))
+    if page:
+        files.write(folder / CERTIFICATE, render(of_fit(report, drawn, outcome.inputs)))
 
 
 def draw(report: Report) -> Mapping[str, Picture]:

@@ -22,7 +22,7 @@ from calib.procedure.measuring.camera_view import camera_view
 from calib.procedure.measuring.constraints_file import ConstraintsFile, beside
 from calib.procedure.measuring.pose_limits import limits_of, read_limits
 from calib.procedure.session import instructions, steps
-from calib.procedure.session.folder import Session, create, locked, open_session, verdict_of
+from calib.procedure.session.folder import Session, create, locked, open_session
 from calib.procedure.session.questions import instrument_named
 from calib.procedure.session.settings import (
     DynamicsSection,
@@ -140,13 +140,13 @@ def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", 
         state = steps.run_next(session, say, progress, command)
     if state is not None:
         return _Stop(("", *instructions.asks(session, state)))
-    return _Stop(_ending(session), verdict_of(session))
+    return _Stop(_ending(session), session.verdicts().level)
 
 
 def _ending(session: Session) -> tuple[str, ...]:
     """Return what is said of a session that has come to its end: a failed one's robot is for inspection only."""
     page, robot = session.path(CERTIFICATE), session.path(f"{session.export}/{URDF}")
-    level = verdict_of(session)
+    level = session.verdicts().level
     if level == "fail":
         return ("", f"certificate: {page}", f"verdict fail: exported for inspection only, do not use: {robot}")
     held = "" if level == "pass" else f" (verdict {level}: {robot.parent.name}/README.txt says why)"

@@ -23,6 +23,7 @@ from calib.procedure.dynamic_stage import inputs
 from calib.procedure.dynamic_stage.validation import assess
 from calib.procedure.excitation import coefficients, prediction
 from calib.procedure.excitation.coefficients import Periodic
+from calib.procedure.findings import UNJUDGED
 from calib.procedure.session import arrival
 from calib.procedure.session.folder import CUTS, MOTION_CHECKED, Session
 from calib.robot.chain import Chain
@@ -182,6 +183,7 @@ def identify(session: Session, say: Say) -> list[str]:
         seed=session.settings.seed, progress=say,
     )  # fmt: skip
     outcome = identifying.run(given, progress=say)
+    outcome = replace(outcome, assessment=replace(outcome.assessment, verdict=UNJUDGED))
     say("writing")
     identification_outputs.write_folder(outcome, session.identification.path, draw, owned=True)
     found = outcome.found
@@ -216,4 +218,4 @@ def predict(session: Session, say: Say) -> list[str]:
     place.unseen.write(given, found)
     known = place.metrics().warnings
     fresh = [words for words in found.warnings if words not in known]
-    return [*notes, f"verdict {found.verdict.level}: {found.verdict.reason}", *fresh]
+    return [*notes, str(found.verdict), *fresh]

@@ -17,14 +17,16 @@ from rich.text import Text
 from calib import bug_reports, files
 from calib.errors import CalibError, TaskLost, UsageError, exit_code
 from calib.procedure.dynamic_stage.metrics import UnseenReport
+from calib.procedure.findings import LEVELS
+from calib.procedure.report import console
 from calib.procedure.session import instructions, steps
-from calib.procedure.session.folder import SETTINGS, locked, open_session, verdict_of
+from calib.procedure.session.folder import SETTINGS, locked, open_session
 from calib.records import read_record
 from calib.workers import Workers
 
 LOG = "run.log"
 DONE, WAITS, FAILED = "done", "waits", "failed"
-COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red", DONE: "green", WAITS: "yellow", FAILED: "red"}
+COLOURS = {**console.COLOURS, DONE: "green", WAITS: "yellow", FAILED: "red"}
 
 
 @dataclass(frozen=True)
@@ -123,7 +125,7 @@ def _go_on(folder: Path, say: Callable[[str], None], command: str, plots: bool) 
             say(words)
         words = f"{waiting.words} (step {waiting.step.name}); {LOG} says what to bring"
         return FleetRow(str(folder), WAITS, words=words, asks=asks)
-    verdict = verdict_of(session)
+    verdict = session.verdicts().level
     pairs = [(one.nominal.main, one.calibrated.main) for one in session.validation.metrics().validation.values()]
     rms = [(before.rms, after.rms) for before, after in pairs if before is not None and after is not None]
     errors, torque = max(rms, key=lambda pair: pair[1], default=(None, None)), None
@@ -158,7 +160,7 @@ def remarks(outcomes: Sequence[FleetRow]) -> Iterator[str]:
 def summary(outcomes: Sequence[FleetRow], seconds: float) -> str:
     """Return one line on all of them."""
     counts = {state: sum(one.state == state for one in outcomes) for state in (DONE, WAITS, FAILED)}
-    judged = {level: sum(one.verdict == level for one in outcomes) for level in ("pass", "marginal", "fail")}
+    judged = {level: sum(one.verdict == level for one in outcomes) for level in LEVELS}
     words = ", ".join(f"{count} {level}" for level, count in judged.items() if count)
     parts = [f"{counts[DONE]} of {len(outcomes)} done" + (f" ({words})" if words else "")]
     parts += [f"{counts[state]} {words}" for state, words in ((WAITS, "waiting"), (FAILED, "failed")) if counts[state]]

@@ -12,7 +12,9 @@ session.toml     what is to be calibrated, with what, how; written by `calib new
                  name starts with validation; a file whose name holds a payload's label was recorded with it on board:
                  `calib formats recordings`
 8-dynamics/      the identified model; unseen/ holds it against the validation motion
-9-export/  certificate.html
+9-export/        the calibrated robot in the forms other programs read; README.txt says which file is for whom
+certificate.html
+verdict.json     the verdict of the session, of each stage, and of each exported file
                  Without dynamics there are no 6 to 8, and the export is 6-export.
 state.json       which step was made from which files (SHA-256), when, by which version; written whole or not at all
 simulated.txt    there where a simulated cell brought files (calib demo); the certificate then says that it is simulated
@@ -37,17 +39,17 @@ from calib import files
 from calib.config import parse
 from calib.config_types import Text
 from calib.errors import CalibError, SessionError, command_line
-from calib.folders import CERTIFICATE, METRICS
+from calib.folders import CERTIFICATE, METRICS, OFFSETS, PARAMETERS
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
+from calib.procedure.findings import Verdict, Verdicts
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.session.settings import SCHEMA, SessionSettings, check_schema, read_settings, written
 
 FOLDERS = ("1-robot", "2-poses", "3-measured", "4-fit", "5-validation")
 DYNAMIC = ("6-excitation", "7-recorded", "8-dynamics")
-VERDICTS = ("pass", "marginal", "fail")  # from good to bad
 EXPORT = {False: "6-export", True: "9-export"}  # without, with dynamics
 MARK = "simulated.txt"
-SETTINGS, CHECKED = "session.toml", "checked.txt"
+SETTINGS, CHECKED, VERDICT = "session.toml", "checked.txt", "verdict.json"
 SUMMARY, SELECTION, CUTS = "1-robot/summary.txt", "2-poses/selection.json", "7-recorded/cuts.json"
 PREDICTED = "2-poses/predicted.png"  # sigma of the tool over the workspace
 PREDICTION = "2-poses/poses_prediction.json"  # what the poses will tell: calib fit --selection
@@ -129,19 +131,17 @@ class Session:
         steps = {name: asdict(record) for name, record in state.steps.items()}
         files.write_json(self.path("state.json"), {"schema": SCHEMA, "steps": steps, **running})
 
-    def verdicts(self) -> dict[str, tuple[str, str]]:
-        """Return verdict and reason of each stage."""
+    def verdicts(self) -> Verdicts:
+        """Return the verdict of each stage; dynamics that were not exported are good for prediction only."""
         geometry = self.validation.metrics()
-        found = {"geometry": (geometry.verdict, geometry.reason)}
+        found = {"geometry": Verdict(geometry.verdict, geometry.reason)}
         if self.dynamic:
-            dynamics = self.identification.unseen.verdict()
-            found["dynamics"] = (dynamics.verdict, dynamics.reason)
-        return found
-
-
-def verdict_of(session: Session) -> str:
-    """Return the worse of the stages' verdicts."""
-    return max((verdict for verdict, _ in session.verdicts().values()), key=VERDICTS.index)
+            unseen = self.identification.unseen.verdict()
+            found["dynamics"] = Verdict(unseen.verdict, unseen.reason)
+            written = self.path(f"{self.export}/{OFFSETS}").exists()
+            if written and not self.path(f"{self.export}/{PARAMETERS}").exists():
+                found["dynamics"] = found["dynamics"].for_prediction("the dynamics could not be exported")
+        return Verdicts(found, geometry.deliverables)
 
 
 def create(

@@ -6,7 +6,7 @@ Lengths in m, angles in rad. Every key, what it may be, its default and its comm
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from operator import attrgetter
 from pathlib import Path, PurePath
 from textwrap import wrap
@@ -36,7 +36,7 @@ from calib.identification.friction.friction_ladder import NAMES as FRICTION
 from calib.identification.methods.registry import METHODS
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, HARMONICS
-from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSettings
+from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, DELIVERABLES, FitSettings
 from poses.indices import Index
 from poses.select import Method
 
@@ -44,7 +44,7 @@ SCHEMA = 2
 READ = (1, SCHEMA)  # a session of schema 1 knows no dynamics; it goes on as geometry alone
 TORQUES = ("motor", "link", "both")
 MOST_SAMPLES = 20_000_000  # of a designed motion (our choice): 160 MB per joint and derivative
-LATER = {("fit", "tolerance_mm")}  # keys that sessions made before do not have
+LATER = {"tolerance_mm", "holdout", "deliverable"}  # keys of [fit] that sessions made before do not have
 FILES = ("robot.file", "poses.constraints", "fit.options", "dynamics.limits", "dynamics.options")
 COLUMN, WIDTH = 41, 118  # where comments begin and end
 _HEAD = (
@@ -130,6 +130,16 @@ class FitSection:
             "only means better than the nominal robot"
         ),
     ] = 0.0
+    deliverable: Annotated[
+        str,
+        OneOf(DELIVERABLES),
+        About("what the verdict is about: robot.urdf alone, or corrections: with joint_corrections.csv"),
+    ] = FitSettings.deliverable
+    holdout: Annotated[
+        float,
+        Real(least=0.0, most=0.9, words="a share from 0 to 0.9"),
+        About("share of the measured poses that is not fitted but judged on, for want of a validation file; 0: none"),
+    ] = FitSettings.holdout
 
 
 @strict
@@ -204,7 +214,7 @@ def read_settings(path: Path) -> SessionSettings:
     found = parse(SessionSettings, table, str(path), SessionError)
     for section in ("robot", "instrument", "poses", "fit"):
         for key in fields(getattr(found, section)):
-            if key.name not in table[section] and (section, key.name) not in LATER:
+            if key.name not in table[section] and not (section == "fit" and key.name in LATER):
                 raise SessionError(f"{path}: {section}.{key.name} is missing; its default is {key.default!r}")
     for key in FILES:
         name = attrgetter(key)(found)
@@ -229,6 +239,13 @@ def check_schema(path: Path, found: Any) -> None:
     raise SessionError(
         f"{path}: schema {shown(found)} is not known to this version, which reads {known}; make a new session"
     )
+
+
+def default_keys(section: str) -> dict[str, Any]:
+    """Return the keys of a section that have defaults, with these; of a key outside sections nothing."""
+    kind = get_type_hints(SessionSettings).get(section)
+    keys = fields(kind) if is_dataclass(kind) else ()
+    return {key.name: key.default for key in keys if key.default is not MISSING}
 
 
 def written(settings: SessionSettings) -> str:

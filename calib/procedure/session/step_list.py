@@ -21,6 +21,7 @@ from calib.procedure.session.folder import (
     SELECTION,
     SUMMARY,
     UNSEEN,
+    VERDICT,
     WAYS,
     Session,
 )
@@ -185,7 +186,7 @@ STEPS = (
     ),
     SessionStep(
         "export", "write the calibrated robot", ("robot",), _exported, geometry_steps.export,
-        ("6-export/*", "9-export/*", "9-export/dynamics/*"),
+        ("6-export/*", "9-export/*", VERDICT),
     ),
     SessionStep(
         "certificate", "print the certificate",

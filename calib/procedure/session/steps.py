@@ -29,6 +29,7 @@ from calib.procedure.session.folder import (
     StepRecord,
     read_state,
 )
+from calib.procedure.session.settings import default_keys
 from calib.procedure.session.step_list import STEPS, SessionStep
 
 Say = Callable[[str], None]
@@ -116,7 +117,7 @@ def _missing(session: Session, step: SessionStep) -> str:
     fit, unseen = geometry_steps.measured_files(session)
     if step.name == "measure" and not fit:
         return "a file of measured poses"
-    if step.name == "validate" and session.settings.poses.validation and not unseen:
+    if step.name == "validate" and session.settings.poses.validation and not (unseen or session.settings.fit.holdout):
         return "a file of measured validation poses"
     if step.name in ("record", "predict"):
         training, unseen = dynamics_steps.recordings(session)
@@ -146,20 +147,28 @@ def _inputs(session: Session, step: SessionStep) -> dict[str, str]:
 def _changes(before: Mapping[str, str], now: Mapping[str, str]) -> str:
     """Say what differs between two sets of fingerprints."""
     changed = [name for name in now if name in before and not _same(name, before[name], now[name])]
-    added, gone = sorted(set(now) - set(before)), sorted(set(before) - set(now))
+    added = [name for name in sorted(set(now) - set(before)) if not _same(name, "{}", now[name])]
+    gone = sorted(set(before) - set(now))
     parts = [f"{name} has changed" for name in changed]
     parts += [f"{name} is new" for name in added] + [f"{name} is gone" for name in gone]
     return ", ".join(parts)
 
 
 def _same(name: str, before: str, now: str) -> bool:
-    """Compare two fingerprints; those of settings by value, so that 3 is 3.0."""
+    """Compare two fingerprints; of settings by value: 3 is 3.0, and a key that was not there had its default.
+
+    A single key that was not there is ``{}`` before.
+    """
     if before == now or not name.startswith(SETTINGS):
         return before == now
-    try:
-        return json.loads(before) == json.loads(now)
-    except ValueError:
-        return False
+    section, _, key = name.removeprefix(f"{SETTINGS} [").partition("]")
+    values = [json.loads(mark) for mark in (before, now)]
+    if key:
+        values = [{} if mark == "{}" else {key.strip(): value} for mark, value in zip((before, now), values)]
+    if not all(isinstance(value, dict) for value in values):
+        return values[0] == values[1]
+    defaults = default_keys(section)
+    return defaults | values[0] == defaults | values[1]
 
 
 def run_next(session: Session, say: Say, progress: Say, command: str = "calib next") -> State | None:

@@ -16,7 +16,7 @@ from calib.errors import MeasurementError
 from calib.identification.model_file import read_dynamics
 from calib.procedure.session import commands, demo, instructions, steps
 from calib.procedure.session.commands import NewSession, begin
-from calib.procedure.session.folder import Session, open_session, verdict_of
+from calib.procedure.session.folder import Session, open_session
 from calib.simulation.cells.truth import torque_errors
 from calib.simulation.cells.virtual_cells import virtual_cell
 
@@ -125,7 +125,7 @@ def test_it_ends_in_one_certificate_of_both(whole: Session) -> None:
     own = found["validation"]["validation.csv"]
     assert "<inertia " in whole.path("9-export/robot.urdf").read_text() and whole.path("9-export/robot.xml").exists()
     assert "What was exported" in page
-    assert own["evidence"] and verdict_of(whole) == "marginal"  # errors that no model holds remain
+    assert own["evidence"] and whole.verdicts().level == "marginal"  # errors that no model holds remain
 
 
 @pytest.mark.slow
