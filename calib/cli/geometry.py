@@ -253,7 +253,8 @@ def compensate(
     targets: Annotated[Path, typer.Argument(help="CSV of nominal joints or tool poses: calib formats targets")],
     out: Annotated[Path, typer.Option(help="CSV file of joint commands")],
     frame: Annotated[
-        str, typer.Option(help="what the targets are in: base (of the calibrated robot), nominal, or a station")
+        str,
+        typer.Option(help="what the targets are in: base (of the calibrated robot), nominal, or a station"),
     ] = "base",
     tool: Annotated[
         str, typer.Option(help="what stands there: flange, a tool of the fit, or x,y,z[,roll,pitch,yaw] [m, rad]")
@@ -273,7 +274,14 @@ def compensate(
     overwrite: Overwrite = False,
     seed: Seed = 0,
 ) -> None:
-    """Turn targets into joint commands that put the real tool there."""
+    """Turn targets into joint commands that put the real tool there.
+
+    Targets of a workpiece that the instrument has measured: --frame STATION (the file's name, see the fit's report).
+
+    Targets taught with the robot, or commands that are to change least: --frame nominal.
+
+    Targets of an offline model of the cell, which stand in the robot's base: --frame base.
+    """
     from calib.api import kinematic
     from calib.files import check_results
     from calib.procedure.export.geometry import results
