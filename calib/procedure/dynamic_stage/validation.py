@@ -172,7 +172,7 @@ def _with_replays(verdict: Verdict, tracking: Tracking) -> Verdict:
     """Return the verdict with it said where the model is one to predict torques with, not to simulate."""
     if not any(one.added.any() for one in tracking.replays):
         return verdict
-    words = "its inertias are those of no possible robot: predict torques with it, simulate the exported one"
+    words = "its inertias are not physically consistent: predict torques with it, simulate the exported robot"
     return replace(verdict, reason=f"{verdict.reason}; {words}")
 
 

@@ -172,8 +172,9 @@ def mark(out: Path, found: Verdicts) -> list[str]:
     if not readme.exists() or readme.read_text(encoding="utf-8", errors="replace").startswith("verdict "):
         head = [str(found) if found.level else "verdict unknown", *([str(known)] if known else []), ""]
         files.write(readme, "\n".join([*head, *_uses(out, judged), ""]))
-    aside = [f"{name}: {judged[name].remark}" for name in (URDF, CORRECTED_URDF) if name in judged]
-    return [found.remark] * bool(found.remark) + [line for line in aside if f": verdict {found.level}" not in line]
+    aside = {name: own for name, own in judged.items() if name in (URDF, CORRECTED_URDF) and own.level != found.level}
+    lines = [found.remark, *(own.remark and f"{name}: {own.remark}" for name, own in aside.items())]
+    return [line for line in lines if line]
 
 
 def _uses(out: Path, judged: Mapping[str, Verdicts]) -> Iterator[str]:
@@ -181,7 +182,7 @@ def _uses(out: Path, judged: Mapping[str, Verdicts]) -> Iterator[str]:
     holds = "identified masses and friction" if (out / PARAMETERS).exists() else "masses as in the source"
     for name, use in USES.items():
         if (out / name).exists():
-            yield f"{name}: {use}" + (f"; calibrated geometry, {holds}" if name == URDF else "")
+            yield f"{name}: {use}" + (f"; geometry with {holds}" if name == URDF else "")
             if name in judged and judged[name].level:
                 yield f"    {judged[name]}" if name in (URDF, CORRECTED_URDF) else f"    verdict {judged[name].level}"
     if (out / PARAMETERS).exists():

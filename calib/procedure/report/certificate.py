@@ -20,6 +20,8 @@ from calib.folders import CERTIFICATE
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.folder import FitFolder
 from calib.procedure.kinematic_stage.inputs import Inputs
+from calib.procedure.kinematic_stage.metrics import FitMetrics
+from calib.procedure.kinematic_stage.validation import ARM
 from calib.procedure.report import fit_report, geometry_section
 from calib.procedure.report.fit_report import Report
 from calib.procedure.report.page import Page, Picture, Section, Table, Text
@@ -120,11 +122,12 @@ def unseen_role(role: str, seen: bool, judged: str) -> str:
     return f"{role}, {'NOT unseen' if seen else 'unseen'} by {judged}"
 
 
-def tolerance(millimetres: float | None) -> str:
-    """Return what a verdict of pass means, in words."""
+def tolerance(millimetres: float | None, found: FitMetrics) -> str:
+    """Return what a verdict of pass means, and of which deliverable, in words."""
+    of = f"; judged: {ARM[found.deliverable]}" if len(found.deliverables) > 1 else ""
     if not millimetres:
-        return "none was given: pass means better than the nominal robot on unseen poses, or nothing to gain"
-    return f"{millimetres:g} mm rms on unseen poses"
+        return f"none was given: pass means better than the nominal robot on unseen poses, or nothing to gain{of}"
+    return f"{millimetres:g} mm rms on unseen poses{of}"
 
 
 @cache
@@ -187,7 +190,7 @@ def of_fit(report: Report, drawn: Mapping[str, Picture], inputs: Inputs | None =
         ("robot", f"{report.robot}, {report.base} to {report.tip}, {len(report.joints)} joints"),
         *named,
         ("model", report.metrics.model),
-        ("tolerance", tolerance(report.metrics.tolerance_mm)),
+        ("tolerance", tolerance(report.metrics.tolerance_mm, report.metrics)),
         ("seed", str(report.metrics.seed)),
         ("toolkit", versions()),
     )

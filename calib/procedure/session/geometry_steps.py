@@ -19,6 +19,7 @@ from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.data.poses.pixels import Pixels
 from calib.data.poses.plans import check_against, filled_in, read_poses, write_poses
 from calib.errors import RobotError, UsageError
+from calib.folders import write_staged
 from calib.geometry.weighing import Settings
 from calib.procedure.findings import UNJUDGED
 from calib.procedure.kinematic_stage import fit as fitting
@@ -35,7 +36,9 @@ from calib.procedure.report import certificate, fit_report
 from calib.procedure.report.geometry_section import error_words, parameter_words
 from calib.procedure.session import arrival
 from calib.procedure.session.folder import POSES, POSES_CHECKED, SELECTION, SUMMARY, UNSEEN, VERDICT, WAYS, Session
+from calib.robot import calibrated
 from calib.robot.chain import Chain
+from calib.robot.load import load_calibrated
 from calib.units import JOINT
 
 Say = Callable[[str], None]
@@ -110,7 +113,13 @@ def describe(session: Session, say: Say) -> list[str]:
     lines += ["", "elements, base to tip [m, rad]"]
     lines += [f"  {element.name:<24} {element.axis}  {element.value:.9g}" for element in chain.elements]
     files.write(session.path(SUMMARY), "\n".join(lines) + "\n")
-    return [lines[0]]
+    if session.geometric:
+        return [lines[0]]
+    robot = session.settings.robot
+    known = load_calibrated(robot_file(session), robot.base or None, robot.tip or None)
+    session.fit.path.mkdir(exist_ok=True)
+    calibrated.write(session.fit.path, replace(known, nominal=known.nominal or known.chain))
+    return [lines[0], "nothing is measured: this geometry is taken as calibrated"]
 
 
 def select(session: Session, say: Say) -> list[str]:
@@ -275,7 +284,7 @@ def export(session: Session, say: Say) -> list[str]:
     out = session.path(session.export)
     lines = _exported(session, out, say)
     found = session.verdicts()
-    judged = {name: one.table() for name, one in by_file(out, found).items()}
+    judged = {name: one.table() for name, one in by_file(out, found).items() if one.level}
     whole = {"schema": 1, **found.table(), "deliverable": session.settings.fit.deliverable, "files": judged}
     known = prediction(out)
     files.write_json(session.path(VERDICT), whole | {"exported_prediction": known and asdict(known)})
@@ -286,7 +295,11 @@ def _exported(session: Session, out: Path, say: Say) -> list[str]:
     from calib.procedure.export.delivery import USES, deliver
 
     source = robot_file(session)
-    lines = deliver(session.fit.path, source, out)
+    if session.geometric:
+        lines = deliver(session.fit.path, source, out)
+    else:
+        lines, known = [calibrated.ROBOT], session.fit.robot.read_bytes()
+        write_staged(out, USES, lambda staging: files.write(staging / calibrated.ROBOT, known))
     if not session.dynamic:
         return lines
     from calib.procedure.export.dynamics import deliver_dynamics
@@ -300,7 +313,7 @@ def _exported(session: Session, out: Path, say: Say) -> list[str]:
         found = deliver_dynamics(session.identification.path, source if source.suffix == ".urdf" else None, out)
     except (RobotError, UsageError) as error:  # the geometry stands by itself
         return [*lines, f"the dynamics were not exported: {error}"]
-    return [*found, *lines[1:]]
+    return [*found, *(lines[1:] if session.geometric else lines)]
 
 
 def clear_staging(session: Session) -> None:

@@ -43,6 +43,7 @@ from poses.select import Method
 SCHEMA = 2
 READ = (1, SCHEMA)  # a session of schema 1 knows no dynamics; it goes on as geometry alone
 TORQUES = ("motor", "link", "both")
+NOTHING = "nothing"  # is measured: the geometry is taken as it is described
 MOST_SAMPLES = 20_000_000  # of a designed motion (our choice): 160 MB per joint and derivative
 LATER = {"tolerance_mm", "holdout", "deliverable"}  # keys of [fit] that sessions made before do not have
 FILES = ("robot.file", "poses.constraints", "fit.options", "dynamics.limits", "dynamics.options")
@@ -81,7 +82,9 @@ class InstrumentSection:
 
     name: Text
     measures: Annotated[
-        str, OneOf(("pose", "position", "pixels")), About("pose (with orientation), position or pixels")
+        str,
+        OneOf(("pose", "position", "pixels", NOTHING)),
+        About("pose (with orientation), position or pixels; nothing: the geometry is taken as it is described"),
     ]
     sigma_position: Annotated[MetresOrZero, About("of one measurement, per axis; 0: to be estimated")] = 0.0
     sigma_orientation: RadiansOrZero = 0.0
@@ -169,6 +172,11 @@ class DynamicsSection:
     ] = IdentificationSettings.friction
     method: Annotated[str, OneOf(tuple(METHODS)), About("or ols, irls, tls")] = IdentificationSettings.method
     options: Annotated[Beside, About("a TOML file beside this one; see `calib formats identify-options`")] = ""
+    holdout: Annotated[
+        float,
+        Real(least=0.0, most=0.9, words="a share from 0 to 0.9"),
+        About("share of each recording, its end, that is not learnt from but judged on, for want of another; 0: none"),
+    ] = 0.0
     tolerance_percent: Annotated[
         NotNegative, About("largest torque error on unseen motion that is good enough; 0: none")
     ] = 0.0

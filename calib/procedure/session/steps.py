@@ -48,7 +48,8 @@ class State:
 
 def _steps_of(session: Session) -> tuple[SessionStep, ...]:
     """Return the steps of a session."""
-    return tuple(step for step in STEPS if session.dynamic or not step.dynamic)
+    left_out = {"dynamics": not session.dynamic, "geometry": not session.geometric}
+    return tuple(step for step in STEPS if not left_out.get(step.stage))
 
 
 def find(session: Session, name: str) -> SessionStep:
@@ -61,10 +62,9 @@ def find(session: Session, name: str) -> SessionStep:
     for number, step in enumerate(own, 1):
         if name in (step.name, str(number)):
             return step
-    if name in (step.name for step in STEPS):
-        raise SessionError(
-            f"this session is about geometry only; for '{name}' write wanted = true under [dynamics] in session.toml"
-        )
+    if stage := next((step.stage for step in STEPS if step.name == name), ""):
+        key = "wanted = true under [dynamics]" if stage == "dynamics" else "what measures under [instrument]"
+        raise SessionError(f"this session leaves the {stage} out; for '{name}' write {key} in session.toml")
     raise SessionError(f"no step '{name}'; there are {', '.join(step.name for step in own)}")
 
 
@@ -123,7 +123,8 @@ def _missing(session: Session, step: SessionStep) -> str:
         training, unseen = dynamics_steps.recordings(session)
         if step.name == "record" and not training:
             return "a recording of the training motion"
-        if step.name == "predict" and session.settings.dynamics.validation and not unseen:
+        wanted = session.settings.dynamics
+        if step.name == "predict" and wanted.validation and not (unseen or wanted.holdout):
             return "a recording of the validation motion"
     absent = [path for path in step.inputs(session) if not path.exists()]
     own = [path for path in absent if not path.name.startswith(PLANS)]
