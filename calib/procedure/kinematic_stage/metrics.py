@@ -112,6 +112,10 @@ class ComparedRows:
     parameters: int = 0
     interval95: _IntervalCoverage | None = None
 
+    def judged(self, deliverable: str) -> _ArmErrors:
+        """Return the errors of what is to be delivered."""
+        return self.calibrated if deliverable != "urdf" or self.urdf_alone is None else self.urdf_alone
+
 
 @dataclass(frozen=True)
 class LadderStep:

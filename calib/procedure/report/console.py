@@ -12,7 +12,7 @@ from rich.text import Text as RichText
 from calib.procedure.findings import LEVELS
 from calib.procedure.report.page import Block, Section, Table, Text
 
-COLOURS = dict(zip(LEVELS, ("green", "green", "yellow", "red")))
+COLOURS: dict[str, str] = dict(zip(LEVELS, ("green", "green", "yellow", "red")))
 
 
 def rendered(blocks: Iterable[Block]) -> Iterator[RenderableType]:

@@ -103,9 +103,12 @@ def _key_figures(report: Report) -> list[KeyFigure]:
     Of the worst unseen rows; without any, those of cross-validation, where it judged; else of the fit's rows.
     """
     metrics, proofs = report.metrics, report.metrics.proofs
-    if not proofs and (left := _left_out(metrics)):
-        return [left]
-    name, proof = max(proofs.items(), key=lambda item: _main_rms(item[1]), default=("fit", metrics.fit))
+    if not proofs and (folds := _left_out(metrics)):
+        return [folds]
+    left = {name: rows.judged(metrics.deliverable).main for name, rows in proofs.items()}
+    worst = {found.rms: name for name, found in left.items() if found}
+    name = worst[max(worst)] if worst else next(iter(proofs), "fit")
+    proof = proofs.get(name, metrics.fit)
     own = next((rows for rows in report.sets if rows.name == name), None)
     basis = f"{proof.poses} {'unseen' if proofs else 'fitted'} poses"
     arms = (
@@ -125,11 +128,11 @@ def _key_figures(report: Report) -> list[KeyFigure]:
         spread = f"± {sigma:.2g} {unit}" if np.isfinite(sigma) else ""
         judged = metrics.tolerance_mm and before is proof.nominal.main
         allowed = f"{metrics.tolerance_mm:g} mm" if judged else ""
-        name = f"{label} {words}".strip()
+        what = f"{label} {words}".strip()
         result.append(
-            KeyFigure(f"{name}, rms", _size(before.rms, unit), _size(after.rms, unit), spread, basis, allowed)
+            KeyFigure(f"{what}, rms", _size(before.rms, unit), _size(after.rms, unit), spread, basis, allowed)
         )
-        result.append(KeyFigure(f"{name}, largest", _size(before.max, unit), _size(after.max, unit), "", basis))
+        result.append(KeyFigure(f"{what}, largest", _size(before.max, unit), _size(after.max, unit), "", basis))
     return result
 
 
@@ -141,12 +144,9 @@ def _left_out(metrics: FitMetrics) -> KeyFigure | None:
     before = nominal.rms if found.nominal_cross_validated is None else 1e3 * found.nominal_cross_validated
     label = "position" if metrics.fit.nominal.position_mm else "distance"
     allowed = f"{metrics.tolerance_mm:g} mm" if metrics.tolerance_mm else ""
-    after = _size(1e3 * found.cross_validated, "mm")
+    alone = metrics.fit.judged(metrics.deliverable) is metrics.fit.urdf_alone
+    after = _size(1e3 * ((alone and found.rigid_cross_validated) or found.cross_validated), "mm")
     return KeyFigure(f"{label}, rms", _size(before, "mm"), after, "", "rows left out in turn", allowed)
-
-
-def _main_rms(rows: ComparedRows) -> float:
-    return rows.calibrated.main.rms if rows.calibrated.main else 0.0
 
 
 def _size(value: float, unit: str) -> str:

@@ -126,13 +126,15 @@ def _go_on(folder: Path, say: Callable[[str], None], command: str, plots: bool) 
         words = f"{waiting.words} (step {waiting.step.name}); {LOG} says what to bring"
         return FleetRow(str(folder), WAITS, words=words, asks=asks)
     verdict = session.verdicts().level
-    pairs = [(one.nominal.main, one.calibrated.main) for one in session.validation.metrics().validation.values()]
+    found = session.validation.metrics() if session.geometric else None
+    sets = found.validation.values() if found else ()
+    pairs = [(one.nominal.main, one.judged(found.deliverable).main) for one in sets if found]
     rms = [(before.rms, after.rms) for before, after in pairs if before is not None and after is not None]
     errors, torque = max(rms, key=lambda pair: pair[1], default=(None, None)), None
     if session.dynamic:
         unseen = read_record(UnseenReport, json.loads(session.identification.unseen.report.read_text(encoding="utf-8")))
-        sets = (unseen.validation or unseen.fit).values()
-        torque = max((one.raw.relative_error_percent.total or 0.0 for one in sets), default=None)
+        scores = (unseen.validation or unseen.fit).values()
+        torque = max((one.raw.relative_error_percent.total or 0.0 for one in scores), default=None)
     return FleetRow(str(folder), DONE, verdict, "", *errors, torque, code=1 if verdict == "fail" else 0)
 
 

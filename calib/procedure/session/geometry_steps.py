@@ -298,8 +298,8 @@ def _exported(session: Session, out: Path, say: Say) -> list[str]:
     if session.geometric:
         lines = deliver(session.fit.path, source, out)
     else:
-        lines, known = [calibrated.ROBOT], session.fit.robot.read_bytes()
-        write_staged(out, USES, lambda staging: files.write(staging / calibrated.ROBOT, known))
+        lines = [calibrated.ROBOT]
+        write_staged(out, USES, partial(_copy, session.fit.robot))
     if not session.dynamic:
         return lines
     from calib.procedure.export.dynamics import deliver_dynamics
@@ -314,6 +314,10 @@ def _exported(session: Session, out: Path, say: Say) -> list[str]:
     except (RobotError, UsageError) as error:  # the geometry stands by itself
         return [*lines, f"the dynamics were not exported: {error}"]
     return [*found, *(lines[1:] if session.geometric else lines)]
+
+
+def _copy(source: Path, folder: Path) -> None:
+    files.write(folder / source.name, source.read_bytes())
 
 
 def clear_staging(session: Session) -> None:

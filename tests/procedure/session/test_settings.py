@@ -171,7 +171,7 @@ def test_what_cannot_be_leaves_no_session(tmp_path: Path) -> None:
         ("tool = [0.05, 0.0, 0.05]", "tool = [0.1, 0.2]", r"instrument.tool: expected three numbers \[m\]"),
         ("tool = [0.05, 0.0, 0.05]", "tool = ['a', 'b', 'c']", r"instrument.tool: expected three numbers \[m\]"),
         ("tool = [0.05, 0.0, 0.05]", "tool = [nan, 0, 0]", r"expected three numbers \[m\], found \[nan, 0, 0\]"),
-        ('measures = "position"', 'measures = "foo"', "measures: expected one of pose, position, pixels, nothing, found"),
+        ('measures = "position"', 'measures = "foo"', "measures: expected one of pose, position, pixels, nothing"),
         ("fit = 40", "fit = 0", "poses.fit: expected a whole number, 1 or more, found 0"),
         ('index = "O1"', 'index = "o1"', "poses.index: expected one of O1, .*did you mean 'O1'"),
         ('method = "detmax"', 'method = "detmx"', "poses.method: expected one of .*did you mean 'detmax'"),
