@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import json
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from calib import files
+from calib.data.csv_table import read_table
 from calib.dynamics.base import expressions
 from calib.errors import UsageError
 from calib.estimate_files import COVARIANCE, ESTIMATE, write_covariance, write_estimate
@@ -230,21 +229,11 @@ def _write_torques(case: Case, predicted: np.ndarray, expected: TorqueIntervals 
     return files.write_numbers(path, ["t [s]", *names], np.column_stack([motion.t, *columns.values()])[::step])
 
 
-def read_motion(path: Path) -> dict[str, np.ndarray] | None:
-    """Read what `_write_torques` has left: measured, predicted (N, rows), q, v, a (N, n); None without v and a.
-
-    Raises:
-        UsageError: where the file is damaged.
-    """
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            header = next(csv.reader(file))
-            table = np.loadtxt(file, delimiter=",", ndmin=2)
-        pick = lambda what: table[:, [k for k, name in enumerate(header) if re.fullmatch(rf"{what}\d+", name)]]  # noqa: E731
-        found = {what.rstrip("_"): pick(what) for what in ("measured_", "predicted_", "q", "v", "a")}
-    except (OSError, ValueError, IndexError, StopIteration) as error:
-        raise UsageError(f"{path} cannot be read ({error}); identify again") from error
-    return found if found["v"].size else None
+def read_motion(path: Path) -> dict[str, np.ndarray]:
+    """Read what `_write_torques` has left: measured, predicted (N, rows) and q, v, a (N, n); empty without v and a."""
+    table = read_table(path)
+    found = {name: table.block(name) for name in ("measured_", "predicted_", "q", "v", "a")}
+    return {name.rstrip("_"): one for name, one in found.items() if one is not None} if found["v"] is not None else {}
 
 
 def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[Any, ...]]:

@@ -88,8 +88,8 @@ def exported_prediction(given: IdentifiedRobot, folder: Path) -> ExportedPredict
     """
     dynamics, found = without_left(given.found.dynamics), []
     for path in IdentificationFolder(folder).torques:
-        motion = read_motion(path) if path.is_file() else None
-        if motion is None:
+        motion = read_motion(path) if path.is_file() else {}
+        if not motion:
             continue
         torque = dynamics.model.torque(dynamics.values, motion["q"], motion["v"], motion["a"], ())
         size = np.linalg.norm(motion["measured"]) / 100.0

@@ -141,16 +141,13 @@ class Session:
 
     def verdicts(self) -> Verdicts:
         """Return the verdict of each stage; dynamics that were not exported are good for prediction only."""
-        found, geometry = {}, self.validation.metrics() if self.geometric else None
-        if geometry is not None:
-            found["geometry"] = Verdict(geometry.verdict, geometry.reason)
-        if self.dynamic:
-            unseen = self.identification.unseen.verdict()
-            found["dynamics"] = Verdict(unseen.verdict, unseen.reason)
-            robot, dynamics = (self.path(f"{self.export}/{name}").exists() for name in (ROBOT, PARAMETERS))
-            if robot and not dynamics:
-                found["dynamics"] = found["dynamics"].for_prediction("the dynamics could not be exported")
-        return Verdicts(found, {} if geometry is None else geometry.deliverables)
+        geometry = self.validation.metrics() if self.geometric else None
+        judged = {"geometry": geometry, "dynamics": self.identification.unseen.verdict() if self.dynamic else None}
+        found = {stage: Verdict(one.verdict, one.reason) for stage, one in judged.items() if one}
+        out = self.path(self.export)
+        if self.dynamic and (out / ROBOT).exists() and not any(out.rglob(PARAMETERS)):
+            found["dynamics"] = found["dynamics"].for_prediction("the dynamics could not be exported")
+        return Verdicts(found, geometry.deliverables if geometry else {})
 
 
 def create(
