@@ -22,7 +22,7 @@ from calib.procedure.measuring.camera_view import camera_view
 from calib.procedure.measuring.constraints_file import ConstraintsFile, beside
 from calib.procedure.measuring.pose_limits import limits_of, read_limits
 from calib.procedure.session import instructions, steps
-from calib.procedure.session.folder import Session, create, locked, open_session
+from calib.procedure.session.folder import VERDICT, Session, create, locked, open_session
 from calib.procedure.session.questions import instrument_named
 from calib.procedure.session.settings import (
     NOTHING,
@@ -152,7 +152,8 @@ def _ending(session: Session) -> tuple[str, ...]:
     level = session.verdicts().level
     if level == "fail":
         return ("", f"certificate: {page}", f"verdict fail: exported for inspection only, do not use: {robot}")
-    held = "" if level == "pass" else f" (verdict {level}: {robot.parent.name}/README.txt says why)"
+    why = VERDICT if session.path(VERDICT).exists() else f"{robot.parent.name}/README.txt"
+    held = "" if level == "pass" else f" (verdict {level}: {why} says why)"
     return ("", f"done; certificate: {page}", f"robot: {robot}{held}" if robot.exists() else "no robot was exported")
 
 

@@ -271,7 +271,7 @@ def test_a_failed_robots_files_say_so_until_it_does_not_fail(finished: Session, 
     edit(settings, "tolerance_mm = 0.001", "tolerance_mm = 0.0")
     assert cli.run(["next", "--no-plots", str(finished.folder)]) == 0
     assert (place / "robot.urdf").read_bytes() == before and (place / "README.txt").read_text() == marginal
-    assert "(verdict marginal: 6-export/README.txt says why)" in capsys.readouterr().out
+    assert "(verdict marginal: verdict.json says why)" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("head", [b"", b"\xef\xbb\xbf", b'<?xml version="1.0"?>', b'\xef\xbb\xbf<?xml version="1.0"?>'])
