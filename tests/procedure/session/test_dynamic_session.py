@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -109,8 +110,19 @@ def test_without_a_plan_no_motion_is_designed_or_presented(waiting: Session) -> 
 @pytest.mark.slow
 def test_it_ends_in_one_certificate_of_both(whole: Session) -> None:
     assert set(kinds(whole).values()) == {steps.DONE}
-    given = {path.name for folder in ("9-export", "9-export/dynamics") for path in whole.path(folder).glob("*")}
-    assert {"robot.urdf", "robot.xml", "drives.csv", "parameters.json"} <= given
+    given = {path.name for path in whole.path("9-export").rglob("*")}
+    assert {
+        "robot.urdf",
+        "robot.xml",
+        "drives.csv",
+        "parameters.json",
+        "README.txt",
+    } <= given and "dynamics" not in given
+    joints = [
+        re.findall("(?m)^    <origin .*", whole.path(f"{place}/robot.urdf").read_text())
+        for place in ("4-fit", "9-export")
+    ]
+    assert joints[0] == joints[1], "the calibrated geometry"
     page = whole.path("certificate.html").read_text()
     for words in (
         "Torque errors",
