@@ -10,8 +10,10 @@ drives.csv            joint, armature, damping, friction, offset, and the sigma 
                       by hand. A sigma is empty where the model has no such term.
 joint_origins.yaml    with --urdf: origins as tesseract reads them, ``<calibration_config filename=.../>`` in the SRDF:
                       calibration / joints / name / position x y z [m], orientation x y z w.
-parameters.json       names, units, values and covariances of geometry and dynamics, base and standard parameters, and
-                      what consistency cost.
+parameters.json       names, units, values and covariances of geometry and dynamics, base and standard parameters, what
+                      consistency cost, and ``prediction``: unexplained torque [%] by the exported robot (robot.urdf
+                      with drives.csv) and by the identified model, at the samples of the ``torques_N.csv`` named there.
+README.txt            what each file is for, and the verdict on it.
 
 Masses are those of bodies that can exist (`calib.identification.possible.solve`). What the torques do not tell is drawn
 to the robot's own masses: by the entropic (log-det) prior, which keeps off the border of what can exist; with ``--prior
