@@ -215,7 +215,7 @@ def _write_torques(case: Case, predicted: np.ndarray, expected: TorqueIntervals 
     """Write measured and predicted torques (N, rows) of a recording and its joints (N, n), at about `TORQUE_RATE`.
 
     Where it is known, with the standard deviation expected of the errors, and 1 where the model extrapolates; without a
-    payload on board with speeds and accelerations, too, for `read_motion`.
+    payload on board with speeds and accelerations, too, for `read_torques`.
     """
     motion = case.motion
     step = max(1, round(motion.rate / TORQUE_RATE))
@@ -229,7 +229,7 @@ def _write_torques(case: Case, predicted: np.ndarray, expected: TorqueIntervals 
     return files.write_numbers(path, ["t [s]", *names], np.column_stack([motion.t, *columns.values()])[::step])
 
 
-def read_motion(path: Path) -> dict[str, np.ndarray]:
+def read_torques(path: Path) -> dict[str, np.ndarray]:
     """Read what `_write_torques` has left: measured, predicted (N, rows) and q, v, a (N, n); empty without v and a."""
     table = read_table(path)
     found = {name: table.block(name) for name in ("measured_", "predicted_", "q", "v", "a")}

@@ -13,7 +13,7 @@ from calib.identification.model_file import MODEL, refuse_currents
 from calib.identification.possible.information import Information
 from calib.identification.possible.information import read as read_information
 from calib.identification.possible.solve import PossibleBodies, find_possible
-from calib.procedure.dynamic_stage.folder import IdentificationFolder, read_motion
+from calib.procedure.dynamic_stage.folder import IdentificationFolder, read_torques
 from calib.procedure.export import geometry
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
@@ -88,7 +88,7 @@ def exported_prediction(given: IdentifiedRobot, folder: Path) -> ExportedPredict
     """
     dynamics, found = without_left(given.found.dynamics), []
     for path in IdentificationFolder(folder).torques:
-        motion = read_motion(path) if path.is_file() else {}
+        motion = read_torques(path) if path.is_file() else {}
         if not motion:
             continue
         torque = dynamics.model.torque(dynamics.values, motion["q"], motion["v"], motion["a"], ())

@@ -45,7 +45,6 @@ READ = (1, SCHEMA)  # a session of schema 1 knows no dynamics; it goes on as geo
 TORQUES = ("motor", "link", "both")
 NOTHING = "nothing"  # is measured: the geometry is taken as it is described
 MOST_SAMPLES = 20_000_000  # of a designed motion (our choice): 160 MB per joint and derivative
-LATER = {"tolerance_mm", "holdout", "deliverable"}  # keys of [fit] that sessions made before do not have
 FILES = ("robot.file", "poses.constraints", "fit.options", "dynamics.limits", "dynamics.options")
 COLUMN, WIDTH = 41, 118  # where comments begin and end
 _HEAD = (
@@ -210,7 +209,7 @@ class SessionSettings:
 
 
 def read_settings(path: Path) -> SessionSettings:
-    """Read ``session.toml``; one of schema 1 gets no dynamics, missing keys of [dynamics] their defaults.
+    """Read ``session.toml``; one of schema 1 gets no dynamics, missing keys their defaults.
 
     Raises:
         SessionError: where it was made by a newer version, is damaged, or a value cannot be.
@@ -220,10 +219,6 @@ def read_settings(path: Path) -> SessionSettings:
     if table["schema"] == 1:
         table.setdefault("dynamics", {"wanted": False})
     found = parse(SessionSettings, table, str(path), SessionError)
-    for section in ("robot", "instrument", "poses", "fit"):
-        for key in fields(getattr(found, section)):
-            if key.name not in table[section] and not (section == "fit" and key.name in LATER):
-                raise SessionError(f"{path}: {section}.{key.name} is missing; its default is {key.default!r}")
     for key in FILES:
         name = attrgetter(key)(found)
         if name and (path.parent / name).is_dir():

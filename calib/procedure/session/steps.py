@@ -163,7 +163,10 @@ def _same(name: str, before: str, now: str) -> bool:
     if before == now or not name.startswith(SETTINGS):
         return before == now
     section, _, key = name.removeprefix(f"{SETTINGS} [").partition("]")
-    values = [json.loads(mark) for mark in (before, now)]
+    try:
+        values = [json.loads(mark) for mark in (before, now)]
+    except ValueError:
+        return False
     if key:
         values = [{} if mark == "{}" else {key.strip(): value} for mark, value in zip((before, now), values)]
     if not all(isinstance(value, dict) for value in values):

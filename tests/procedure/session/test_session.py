@@ -203,7 +203,6 @@ def test_what_arrives_is_checked(measured: Session, change, message: str, capsys
         ("schema = 2", "schema = 0", "not known"),
         ('model = "auto"', "model = 3", r"fit.model: expected one of auto, .*, found 3"),
         ('loss = "auto"', 'los = "auto"', r"fit: there is no key 'los' \(did you mean 'loss'\?\)"),
-        ('loss = "auto"', "", "fit.loss is missing; its default is 'auto'"),
         ("[poses]", "[poses", "is no TOML"),
         ("seed = 1", 'seed = "one"', "seed"),
     ],
