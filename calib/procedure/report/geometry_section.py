@@ -132,7 +132,8 @@ def _key_figures(report: Report) -> list[KeyFigure]:
         result.append(
             KeyFigure(f"{what}, rms", _size(before.rms, unit), _size(after.rms, unit), spread, basis, allowed)
         )
-        result.append(KeyFigure(f"{what}, largest", _size(before.max, unit), _size(after.max, unit), "", basis))
+        if arm == next(iter(arms)):
+            result.append(KeyFigure(f"{what}, largest", _size(before.max, unit), _size(after.max, unit), "", basis))
     return result
 
 
