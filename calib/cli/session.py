@@ -26,7 +26,7 @@ def new(
     ] = None,
     instrument: Annotated[
         str | None,
-        typer.Option(help="cmm, tracker, tracker6d, mocap, camera, camera-poses, other-pose, other-position"),
+        typer.Option(help="cmm, tracker, tracker6d, mocap, camera, camera-poses, other-pose, other-position, none"),
     ] = None,
     tool: Annotated[
         str | None, typer.Option(help="x,y,z: where the target roughly sits in the tip's frame [m]")
@@ -59,6 +59,9 @@ def new(
     dynamics: Annotated[
         bool | None, typer.Option("--dynamics/--geometry-only", help="identify the dynamics, too (default)")
     ] = None,
+    dynamics_only: Annotated[
+        bool, typer.Option("--dynamics-only", help="measure nothing: the description is taken as calibrated")
+    ] = False,
     payload: Annotated[
         list[str] | None, typer.Option(help="label=kg of a body to record with as well; may be repeated")
     ] = None,
@@ -77,11 +80,16 @@ def new(
     stands on the certificate.
     """
     from calib.api.sessions import new_session
+    from calib.errors import command_line
     from calib.procedure.parallel_stage.robots import refuse_parallel
     from calib.procedure.session.questions import Answers, checked
 
     refuse_parallel(robot, "calib new")
     told = tuple(obstacle) if obstacle else None
+    if dynamics_only:
+        if instrument not in (None, "none"):
+            raise UsageError(f"--dynamics-only measures nothing; the instrument is {instrument}")
+        instrument = "none"
     given = Answers(
         robot, instrument, tool, limits, dynamics, tuple(payload or ()), torques, instrument_at, cone, facing, box,
         told, mounting, lens, board, carried, stands,

@@ -71,6 +71,11 @@ class Table:
         cells = self.cells[self.index(name)]
         return [f"{cell:.12g}" for cell in cells] if cells.dtype == float else [plain_text(str(cell)) for cell in cells]
 
+    def block(self, head: str) -> np.ndarray | None:
+        """Return columns head1, head2, … as (m, n) floats; None without any."""
+        names = [name for name in self.header if name.startswith(head) and name[len(head) :].isdigit()]
+        return np.column_stack([self.numbers(name) for name in names]) if names else None
+
     def numbers(self, name: str, dimension: str = "", unit: str = "", gaps: bool = False) -> np.ndarray:
         """Return a column (m,) as floats in SI.
 

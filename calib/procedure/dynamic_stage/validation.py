@@ -35,7 +35,7 @@ from calib.procedure.dynamic_stage.verdict import (
 )
 from calib.procedure.findings import Verdict, settled
 from calib.simulation.loop.controllers import Controller
-from calib.units import TORQUE
+from calib.units import TORQUE, without_gains
 
 REPEAT = 0.5  # share of states met in training from which on a validation file proves nothing (our choice)
 
@@ -157,6 +157,7 @@ def assess(
         else track(inputs, dynamics, predictions, findings.controller)
     )  # fmt: skip
     verdict = _with_replays(verdict, tracking)
+    verdict = verdict.for_prediction(f"torques are {without_gains(inputs.unit)}") if amperes else verdict
     said = (
         *amperes, *(one.told for one in odd), *overlaps(inputs.cases, inputs.unseen),
         *warnings(inputs.cases, inputs.unseen, validation, repeated, excitation, inputs.chain),
@@ -173,7 +174,7 @@ def _with_replays(verdict: Verdict, tracking: Tracking) -> Verdict:
     """Return the verdict with it said where the model is one to predict torques with, not to simulate."""
     if not any(one.added.any() for one in tracking.replays):
         return verdict
-    words = "its inertias are those of no possible robot: predict torques with it, simulate the exported one"
+    words = "its inertias are not physically consistent: predict torques with it, simulate the exported robot"
     return replace(verdict, reason=f"{verdict.reason}; {words}")
 
 

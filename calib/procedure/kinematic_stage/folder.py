@@ -184,12 +184,6 @@ class ValidationFolder:
         files.write_json(self.judged, found.table() | {"schema": SCHEMA})
         return self.metrics()
 
-    def take_over(self, fit: FitMetrics) -> ValidationMetrics:
-        """Write the fit's own verdict, where no validation was asked for."""
-        found = ValidationMetrics({}, fit.verdict, fit.reason, fit.warnings, SCHEMA)
-        files.write_json(self.judged, asdict(found))
-        return found
-
     def metrics(self) -> ValidationMetrics:
         """Read numbers and verdict; of schema 1 the warnings are without the fit's."""
         return _read(ValidationMetrics, self.judged)
@@ -247,7 +241,7 @@ def metrics(outcome: Outcome) -> dict[str, object]:
     return {
         "schema": SCHEMA,
         "fit": {"parameters": len(outcome.selection.fit.free), **outcome.fit.table()},
-        "validation": outcome.assessment.table()["validation"],
+        **outcome.assessment.table(),
         "model": outcome.selection.chosen,
         "ladder": [
             {
@@ -256,15 +250,13 @@ def metrics(outcome: Outcome) -> dict[str, object]:
                 "cross_validated_mm": 1e3 * rung.cross_validated,
                 "kept": rung.kept,
                 "note": rung.note,
+                "corrections": rung.corrections,
             }
             for rung in outcome.selection.rungs
         ],
-        "seed": outcome.seed,
+        "seed": outcome.wanted.seed,
         "status": outcome.selection.fit.solution.status.name.lower(),
-        "verdict": outcome.verdict.level,
-        "reason": outcome.verdict.reason,
-        "tolerance_mm": None if outcome.tolerance is None else 1e3 * outcome.tolerance,
-        "warnings": list(outcome.warnings),
+        "tolerance_mm": None if outcome.wanted.tolerance is None else 1e3 * outcome.wanted.tolerance,
         "not_identifiable": list(outcome.unclear),
         "outliers": [
             {
@@ -291,8 +283,8 @@ def _record(outcome: Outcome) -> dict[str, object]:
         **{f"nominal_{kind}": table for kind, table in frames.items()},
         "files": [block.file for block in inputs.fit],
         "model": outcome.selection.chosen,
-        "seed": outcome.seed,
-        "verdict": f"{outcome.verdict.level}: {outcome.verdict.reason}",
+        "seed": outcome.wanted.seed,
+        **({"verdict": f"{outcome.verdict.level}: {outcome.verdict.reason}"} if outcome.verdict.level else {}),
         "covariance": COVARIANCE,
     }
 

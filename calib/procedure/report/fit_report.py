@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -65,7 +65,7 @@ class RowErrors:
         name: of the set; ``fit``, or a validation file's.
         unseen: whether the fit had not seen them.
         poses: how many robot poses.
-        nominal, calibrated: by nature, the errors of that arm [m, rad].
+        nominal, calibrated, urdf_alone: by nature, the errors of that arm [m, rad].
         expected: radius within which 95 % of the calibrated arm's errors are to be [m]; empty where none is known.
         q: (rows, n) joints, and points (rows, 3) in the arm's base, where there is one error per row.
     """
@@ -78,6 +78,7 @@ class RowErrors:
     q: tuple[tuple[float, ...], ...] = ()
     points: tuple[tuple[float, ...], ...] = ()
     expected: tuple[float, ...] = ()
+    urdf_alone: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -123,8 +124,11 @@ class Report:
             verdict=found.verdict,
             reason=found.reason,
             warnings=found.warnings,
+            deliverables=found.deliverables,
+            deliverable=found.deliverable,
         )
-        return replace(self, metrics=metrics, sets=(*self.sets, *sets))
+        fresh = {one.name for one in sets}
+        return replace(self, metrics=metrics, sets=(*(one for one in self.sets if one.name not in fresh), *sets))
 
 
 def fit_metrics(outcome: Outcome) -> FitMetrics:
@@ -163,12 +167,12 @@ def collect(outcome: Outcome) -> Report:
 
 def rows_of(name: str, comparison: Comparison, unseen: bool) -> RowErrors:
     """Return one set of rows: sizes of errors, and where they were measured if there is one error per row."""
-    nominal, calibrated = (
-        {nature: _plain(size) for nature in NATURES if (size := getattr(found, nature)) is not None}
-        for found in comparison.errors
+    nominal, calibrated, alone = (
+        {nature: _plain(size) for nature in NATURES if (size := getattr(found, nature, None)) is not None}
+        for found in (*comparison.errors, comparison.alone)
     )
     q = np.concatenate([block.q for block in comparison.blocks])
-    rows = RowErrors(name, unseen, comparison.poses, nominal, calibrated)
+    rows = RowErrors(name, unseen, comparison.poses, nominal, calibrated, urdf_alone=alone)
     if len(comparison.errors[1].main) != len(q):
         return rows
     expected = () if comparison.intervals is None else _plain(comparison.intervals.radius)

@@ -283,7 +283,7 @@ def _rehearsed(path: Path, chain: Chain) -> Played:
 
 def _played(path: Path, folder: Path) -> Played:
     table = read_table(path)
-    return Played(_name(path, folder), table.numbers("t"), _needed(table, "q", path), _block(table, "v"))
+    return Played(_name(path, folder), table.numbers("t"), _needed(table, "q", path), table.block("v"))
 
 
 def _torques(path: Path, folder: Path, chain: Chain | None) -> Torques:
@@ -291,9 +291,7 @@ def _torques(path: Path, folder: Path, chain: Chain | None) -> Torques:
     measured, predicted = (_needed(table, f"{what}_", path) for what in ("measured", "predicted"))
     t = table.cells[table.index("t")]
     rows, units = _torque_rows(path.parent, chain, measured.shape[1])
-    return Torques(
-        _name(path, folder), rows, units, np.asarray(t, dtype=float), measured, predicted, _block(table, "q")
-    )
+    return Torques(_name(path, folder), rows, units, np.asarray(t, dtype=float), measured, predicted, table.block("q"))
 
 
 def _torque_rows(place: Path, chain: Chain | None, count: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -313,15 +311,9 @@ def _torque_rows(place: Path, chain: Chain | None, count: int) -> tuple[tuple[st
     return tuple(f"{name} torque" for name in names), ("N m or N",) * count
 
 
-def _block(table: Table, letter: str) -> np.ndarray | None:
-    """Return columns letter1, letter2, … as (N, n); None without any."""
-    names = [name for name in table.header if name.startswith(letter) and name[len(letter) :].isdigit()]
-    return np.column_stack([table.numbers(name) for name in names]) if names else None
-
-
 def _needed(table: Table, letter: str, path: Path) -> np.ndarray:
     """Return columns letter1, letter2, … as (N, n), which the file has to hold."""
-    found = _block(table, letter)
+    found = table.block(letter)
     if found is None:
         raise UsageError(f"{path} has no columns {letter}1, {letter}2, …; was it written by this toolkit?")
     return found

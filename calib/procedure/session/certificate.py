@@ -20,7 +20,7 @@ from calib.procedure.report.fit_report import RowErrors
 from calib.procedure.report.page import Section, Text
 from calib.procedure.session.dynamics_steps import recordings
 from calib.procedure.session.folder import CHECKED, MARK, SELECTION, Session, read_state
-from calib.procedure.session.geometry_steps import measured_files, robot_file
+from calib.procedure.session.geometry_steps import chain_of, measured_files, robot_file
 from calib.records import read_json, read_lines
 
 Say = Callable[[str], None]
@@ -36,10 +36,12 @@ def certify(session: Session, say: Say) -> list[str]:
     from calib.procedure.report import dynamics_section, geometry_section
 
     say("drawing" if session.plots else "writing")
-    whole = _whole_report(session)
-    section = geometry_section.certificate_section(whole, certificate.draw(whole) if session.plots else {})
-    judged = [_with_arrival(section, _arrival_notes(session, "3-measured", "validate"))]
-    notes = [f"geometry {section.verdict}: {section.reason}"]
+    judged, setup = [], _dynamic_robot(session)
+    if session.geometric:
+        whole = _whole_report(session)
+        section = geometry_section.certificate_section(whole, certificate.draw(whole) if session.plots else {})
+        judged = [_with_arrival(section, _arrival_notes(session, "3-measured", "validate"))]
+        setup = _measured_setup(session, whole)
     if session.dynamic:
         dynamics = dynamics_section.read(session.identification.path)
         exported = read_state(session).notes("export")
@@ -51,13 +53,15 @@ def certify(session: Session, say: Say) -> list[str]:
             drawn = draw_dynamics(dynamics, session.identification.path, motions)
         tolerance = session.settings.dynamics.tolerance_percent
         section = dynamics_section.certificate_section(dynamics, drawn, exported, tolerance)
+        own = session.verdicts().stages["dynamics"]
+        section = replace(section, verdict=own.level, reason=own.reason)
         judged.append(_with_arrival(section, _arrival_notes(session, "7-recorded", "predict")))
-        notes.append(f"dynamics {section.verdict}: {section.reason}")
+    notes = [f"{section.title.lower()} {section.verdict}: {section.reason}" for section in judged]
     lines = _simulated(session)
     page = certificate.certificate(
         f"{'Simulated calibration' if lines else 'Calibration'} of {session.settings.name}",
         f"{'SIMULATED: ' if lines else ''}{session.settings.instrument.name}, {session.settings.created[:10]}",
-        _setup(session, whole),
+        [*lines, *setup, *_made_by(session)],
         judged,
         listed(session),
     )
@@ -99,14 +103,33 @@ def _simulated(session: Session) -> list[tuple[str, str]]:
     return [("simulated", line) for line in read_lines(session.path(MARK)) if line.strip()]
 
 
-def _setup(session: Session, found: fit_report.Report) -> list[tuple[str, str]]:
-    """Return what stands under Setup on the certificate."""
+def _dynamic_robot(session: Session) -> list[tuple[str, str]]:
+    """Return what stands under Setup of a session that takes the geometry as it is described."""
+    chain = chain_of(session)
+    return [
+        ("robot", f"{chain.name}, {chain.base} to {chain.tip}, {chain.n} joints"),
+        ("description", f"{session.settings.robot.given}, taken as calibrated"),
+        ("session made", session.settings.created.replace("T", " ")),
+    ]
+
+
+def _made_by(session: Session) -> list[tuple[str, str]]:
+    """Return the lines under Setup that every session has."""
+    return [
+        *_dynamic_setup(session),
+        ("seed", str(session.settings.seed)),
+        ("command", command_line("next", session.folder.name)),
+        ("toolkit", certificate.versions()),
+    ]
+
+
+def _measured_setup(session: Session, found: fit_report.Report) -> list[tuple[str, str]]:
+    """Return what stands under Setup on the certificate of a fit."""
     settings, fitted = session.settings, measured_files(session)
     instrument = settings.instrument
     stated = f", σ {1e6 * instrument.sigma_position:g} µm" if instrument.sigma_position else ", σ estimated"
     turning = f", {1e3 * instrument.sigma_orientation:g} mrad" if instrument.sigma_orientation else ""
     return [
-        *_simulated(session),
         ("robot", f"{found.robot}, {found.base} to {found.tip}, {len(found.joints)} joints"),
         ("description", settings.robot.given),
         ("instrument", f"{instrument.name}, {_used(session, found.metrics)}{stated}{turning}"),
@@ -115,11 +138,7 @@ def _setup(session: Session, found: fit_report.Report) -> list[tuple[str, str]]:
         ("pose plan", _session_plan(session).words),
         *_pose_checks(session),
         ("model", found.metrics.model),
-        ("tolerance", certificate.tolerance(settings.fit.tolerance_mm)),
-        *_dynamic_setup(session),
-        ("seed", str(settings.seed)),
-        ("command", command_line("next", session.folder.name)),
-        ("toolkit", certificate.versions()),
+        ("tolerance", certificate.tolerance(settings.fit.tolerance_mm, found.metrics)),
     ]
 
 
@@ -202,9 +221,10 @@ def listed(session: Session) -> list[FileRow]:
         if session.settings.dynamics.plan:  # else other motions were played
             wanted += sorted(session.path("6-excitation").glob(f"*/{SAMPLES}"))
         wanted += [*session.identification.tables, session.identification.model]
-    wanted += [*session.fit.tables, *exported[1:]]
+    wanted += [*(session.fit.tables if session.geometric else ()), *exported[1:]]
     made = {name: mark for step in read_state(session).steps.values() for name, mark in step.outputs.items()}
-    rows, seen = [], [name for name, found in session.validation.metrics().validation.items() if not found.unseen]
+    judged = session.validation.metrics().validation if session.geometric else {}
+    rows, seen = [], [name for name, found in judged.items() if not found.unseen]
     for path in wanted:
         name = path.relative_to(session.folder)
         role = ROLES[name.parts[0]]

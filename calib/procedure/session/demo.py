@@ -23,7 +23,7 @@ from calib.procedure.kinematic_stage.folder import URDF
 from calib.procedure.report import viewer
 from calib.procedure.session import dynamics_steps, steps
 from calib.procedure.session.commands import NewSession, begin
-from calib.procedure.session.folder import MARK, SETTINGS, Session, locked, open_session, verdict_of
+from calib.procedure.session.folder import MARK, SETTINGS, Session, locked, open_session
 from calib.records import read_lines
 from calib.robot import calibrated, library
 from calib.robot.load import load
@@ -116,7 +116,9 @@ def run(
         return DemoResult(session, "", (), time.perf_counter() - started, _stopped(session, waiting))
     before, after = _compare_with_truth(session, cell, say)
     seconds = time.perf_counter() - started
-    return DemoResult(session, verdict_of(session), _results(session), seconds, (), before, after, _largest_memory())
+    return DemoResult(
+        session, session.verdicts().level, _results(session), seconds, (), before, after, _largest_memory()
+    )
 
 
 def _largest_memory() -> float:

@@ -16,14 +16,16 @@ from rich.text import Text
 from calib import bug_reports, files
 from calib.errors import CalibError, TaskLost, UsageError, complaint
 from calib.procedure.dynamic_stage.metrics import UnseenReport
+from calib.procedure.findings import LEVELS
+from calib.procedure.report import console
 from calib.procedure.session import instructions, steps
-from calib.procedure.session.folder import SETTINGS, locked, open_session, verdict_of
+from calib.procedure.session.folder import SETTINGS, locked, open_session
 from calib.records import read_json
 from calib.workers import Workers
 
 LOG = "run.log"
 DONE, WAITS, FAILED = "done", "waits", "failed"
-COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red", DONE: "green", WAITS: "yellow", FAILED: "red"}
+COLOURS = {**console.COLOURS, DONE: "green", WAITS: "yellow", FAILED: "red"}
 
 
 @dataclass(frozen=True)
@@ -122,14 +124,16 @@ def _go_on(folder: Path, say: Callable[[str], None], command: str, plots: bool) 
             say(words)
         words = f"{waiting.words} (step {waiting.step.name}); {LOG} says what to bring"
         return FleetRow(str(folder), WAITS, words=words, asks=asks)
-    verdict = verdict_of(session)
-    pairs = [(one.nominal.main, one.calibrated.main) for one in session.validation.metrics().validation.values()]
+    verdict = session.verdicts().level
+    found = session.validation.metrics() if session.geometric else None
+    sets = found.validation.values() if found else ()
+    pairs = [(one.nominal.main, one.judged(found.deliverable).main) for one in sets if found]
     rms = [(before.rms, after.rms) for before, after in pairs if before is not None and after is not None]
     errors, torque = max(rms, key=lambda pair: pair[1], default=(None, None)), None
     if session.dynamic:
         unseen = read_json(session.identification.unseen.report, "identify again", UnseenReport)
-        sets = (unseen.validation or unseen.fit).values()
-        torque = max((one.raw.relative_error_percent.total or 0.0 for one in sets), default=None)
+        scores = (unseen.validation or unseen.fit).values()
+        torque = max((one.raw.relative_error_percent.total or 0.0 for one in scores), default=None)
     return FleetRow(str(folder), DONE, verdict, "", *errors, torque, code=1 if verdict == "fail" else 0)
 
 
@@ -157,7 +161,7 @@ def remarks(outcomes: Sequence[FleetRow]) -> Iterator[str]:
 def summary(outcomes: Sequence[FleetRow], seconds: float) -> str:
     """Return one line on all of them."""
     counts = {state: sum(one.state == state for one in outcomes) for state in (DONE, WAITS, FAILED)}
-    judged = {level: sum(one.verdict == level for one in outcomes) for level in ("pass", "marginal", "fail")}
+    judged = {level: sum(one.verdict == level for one in outcomes) for level in LEVELS}
     words = ", ".join(f"{count} {level}" for level, count in judged.items() if count)
     parts = [f"{counts[DONE]} of {len(outcomes)} done" + (f" ({words})" if words else "")]
     parts += [f"{counts[state]} {words}" for state, words in ((WAITS, "waiting"), (FAILED, "failed")) if counts[state]]
