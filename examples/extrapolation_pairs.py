@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import extrapolation_simulated as simulated
@@ -26,6 +27,8 @@ class Prepared:
         options: text of the options file.
         masses: whether the URDF has them.
         payload: carried in the test.
+        joints: that were recorded, where the description has others.
+        apart: joints in another unit, which no total holds; from 0.
     """
 
     robot: Path
@@ -34,6 +37,8 @@ class Prepared:
     options: str = ""
     masses: bool = False
     payload: dict | None = None
+    joints: tuple[str, ...] = ()
+    apart: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -58,6 +63,7 @@ Span = tuple[float, float]
 FOLDERS = {"Panda": ("franka_panda_inria", 2), "UR10e": ("ur10e_innopolis", 1), "KR300": ("kuka_kr300_tuk", 1),
            "TX40": ("staubli_tx40", 5), "TIAGo": ("tiago_laas", 1), "LWR4+": ("kuka_lwr4plus_iit", 1)}  # fmt: skip
 FILES = {"Panda": "traj1_first60pct", "TX40": "tx40_first_5p4s", "TIAGo": "dynamic", "LWR4+": "measurements_1"}
+TIAGO_JOINTS = ("torso_lift_joint", *(f"arm_{k}_joint" for k in range(1, 8)))
 USED = {"TIAGo": (9.0, 67.0), "LWR4+": (2.5, 22.5)}  # [s]
 
 
@@ -65,7 +71,7 @@ def _read(robot: str, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     folder, every = FOLDERS[robot]
     prefix = {"UR10e": "ur-20_", "KR300": "traj_"}.get(robot, "")
     log = np.load(DATA / folder / f"{prefix}{name}.npz")
-    gains = UR10E_GAINS if robot == "UR10e" else log["drive_gain"] if "drive_gain" in log else 1.0
+    gains = UR10E_GAINS if robot == "UR10e" else log.get("drive_gain", 1.0)
     tau = log["tau"] if "tau" in log else gains * log["i"]
     first, end = log["use_range"] if "use_range" in log else (0, len(tau))
     rows = slice(first, end, every)
@@ -89,7 +95,7 @@ def _halves(robot: str, name: str, window: float, by: Callable[..., float]) -> l
     low, high = USED.get(robot, (t[0], t[-1]))
     edges = np.linspace(low, high, round((high - low) / window) + 1)
     v = np.gradient(q, axis=0) / np.gradient(t)[:, None] / np.ptp(q, axis=0)
-    value = np.array([by(q[inside], v[inside]) for a, b in zip(edges, edges[1:]) for inside in [(t >= a) & (t < b)]])
+    value = np.array([by(q[inside], v[inside]) for a, b in pairwise(edges) for inside in [(t >= a) & (t < b)]])
     upper = value > np.median(value)
     halves: list[list[tuple[str, Span]]] = [[], []]
     for k, side in enumerate(upper.astype(int)):
@@ -111,7 +117,8 @@ def _open(
         learnt, unseen = train() if callable(train) else (train, test)
         urdf = DATA / FOLDERS[robot][0] / "model.urdf"
         logs = [_parts(robot, each, folder / stem) for each, stem in ((learnt, "train"), (unseen, "test"))]
-        return Prepared(urdf, *logs, options, "<mass" in urdf.read_text())
+        wanted, apart = (TIAGO_JOINTS, (0,)) if robot == "TIAGo" else ((), ())
+        return Prepared(urdf, *logs, options, "<mass" in urdf.read_text(), joints=wanted, apart=apart)
 
     return Pair(f"{robot}, {title}", across, prepare, quick)
 

@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.signal import butter, filtfilt
 
-CUTOFF, RATE = 6.0, 100.0  # of the positions' low-pass, and of the rows [Hz]
+RATE = 100.0  # of the rows [Hz]
 ROUNDS, MAX_ROWS_AS_ONE = 60, 10.0
 SCALES = [1, 0.3, 0.3, 0.3, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1]  # of a body's parameters: m, m c, inertias
 
@@ -22,12 +22,12 @@ SCALES = [1, 0.3, 0.3, 0.3, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1]  # of a body's paramet
 class Log:
     """Observation matrices (N, n, 14 n) and torques (N, n) [N m or N] of a file, at instants t (N,) [s]."""
 
-    def __init__(self, model: pin.Model, path: Path, payload: dict | None = None):
+    def __init__(self, model: pin.Model, path: Path, cutoff: float, payload: dict | None = None):
         log = np.load(path)
         rate = 1.0 / np.median(np.diff(log["t"]))
         grid = np.arange(log["t"][0], log["t"][-1], 1.0 / rate)
         q, tau = (np.column_stack([np.interp(grid, log["t"], c) for c in log[key].T]) for key in ("q", "tau"))
-        smooth = filtfilt(*butter(4, CUTOFF / (rate / 2)), q, axis=0)
+        smooth = filtfilt(*butter(4, cutoff / (rate / 2)), q, axis=0)
         v = np.gradient(smooth, 1 / rate, axis=0)
         a = np.gradient(v, 1 / rate, axis=0)
         every = slice(None, None, max(1, round(rate / RATE)))
@@ -70,21 +70,33 @@ def _evidence(rows: np.ndarray, tau: np.ndarray, mean: np.ndarray, scale: np.nda
 
 
 def predict(
-    urdf: Path, train: Sequence[Path], test: Path, payload: dict | None = None, cad: bool = False
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return instants (N,) and torques (N, n) predicted on one file from others.
+    urdf: Path,
+    train: Sequence[Path],
+    test: Sequence[Path],
+    cutoff: float = 6.0,
+    payload: dict | None = None,
+    joints: Sequence[str] = (),
+) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
+    """Return instants (N,) and torques (N, n) predicted on each test file, regularised towards ``zero`` and ``cad``.
 
     Args:
-        payload: mass [kg] and com [m] in the tip's frame, of the body carried in the test.
-        cad: regularise towards the description's inertias in place of zero.
+        cutoff: of the positions' low-pass [Hz].
+        payload: mass [kg] and com [m] in the tip's frame, of the body carried in the tests.
+        joints: that were recorded, where the description has others.
     """
     model = pin.buildModelFromUrdf(str(urdf))
-    logs, unseen = [Log(model, path) for path in train], Log(model, test, payload)
-    n = unseen.tau.shape[1]
+    if joints:
+        locked = [model.getJointId(name) for name in list(model.names)[1:] if name not in joints]
+        model = pin.buildReducedModel(model, locked, pin.neutral(model))
+    logs, unseen = [Log(model, x, cutoff) for x in train], [Log(model, x, cutoff, payload) for x in test]
+    n = model.nv
     scale = np.r_[np.tile(SCALES, n), np.ones(n), np.ones(n), np.full(n, 0.3), np.ones(n)]
     groups = np.r_[np.tile([0, 1, 1, 1, 2, 2, 2, 2, 2, 2], n), np.repeat([3, 4, 5, 6], n)]
-    mean = np.zeros(len(scale))
-    if cad:
-        mean[: 10 * n] = np.concatenate([inertia.toDynamicParameters() for inertia in model.inertias[1:]])
     rows, tau = (np.concatenate([getattr(log, key) for log in logs]) for key in ("rows", "tau"))
-    return unseen.t, unseen.rows @ _evidence(rows, tau, mean, scale, groups) + unseen.carried
+    result = {}
+    for name, share in (("zero", 0.0), ("cad", 1.0)):
+        mean = np.zeros(len(scale))
+        mean[: 10 * n] = share * np.concatenate([inertia.toDynamicParameters() for inertia in model.inertias[1:]])
+        found = _evidence(rows, tau, mean, scale, groups)
+        result[name] = [(log.t, log.rows @ found + log.carried) for log in unseen]
+    return result
