@@ -1,6 +1,7 @@
 """How well identified dynamics predict other motion, beside plain ridge regressions, over many pairs of recordings.
 
 CALIB_DATA=... python examples/extrapolation.py [--quick] [--only TEXT ...] [--jobs 2] [--out FOLDER]
+    [--beside results.json] [--markdown real_recordings.md]
 
 Errors are 100 ‖τ - τ̂‖ / ‖τ‖ on the test, measured and predicted torques low-passed alike, over the joints of one unit.
 *Ridge* is regularised towards zero, positions low-passed at 6 Hz (`extrapolation_ridge.py`); *best ridge* is the best
@@ -35,6 +36,7 @@ import calib
 
 CUTOFF, RATE, BORDER = 10.0, 100.0, 0.3  # of both sides of the comparison [Hz, Hz, s]
 MAX_SECONDS = 300  # for a pair
+MARK = "<!-- examples/extrapolation.py -->"
 CUTOFFS = (6.0, 15.0)  # of the ridges' positions [Hz]
 
 
@@ -45,7 +47,7 @@ def state() -> str:
     return hashlib.sha1(b"".join(path.read_bytes() for path in files)).hexdigest()[:12]
 
 
-def _errors(test: list[Path], predicted: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+def squared_errors(test: list[Path], predicted: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
     """Return Σ (τ - τ̂)² and Σ τ² per joint (n,) of predictions (instants, torques) of recordings."""
     sums = []
     for path, (t, tau) in zip(test, predicted):
@@ -59,19 +61,21 @@ def _errors(test: list[Path], predicted: list[tuple[np.ndarray, np.ndarray]]) ->
     return left, size
 
 
-def _ours(files: Prepared, folder: Path) -> tuple[list[tuple[np.ndarray, np.ndarray]], float]:
-    """Return the toolkit's predictions of the test files, and the share of their samples inside 95 % intervals [%]."""
+def identified_pair(files: Prepared, folder: Path) -> calib.DynamicsModel:
+    """Return what the toolkit identifies from a pair's training files, judged on its test files."""
     options = folder / "options.toml"
     options.write_text(files.options)
-    model = calib.identify_dynamics(
-        files.robot, [str(x) for x in files.train], validate=[str(x) for x in files.test], options=options
-    )
-    outcome = model.outcome
+    train, test = ([str(path) for path in paths] for paths in (files.train, files.test))
+    return calib.identify_dynamics(files.robot, train, validate=test, options=options)
+
+
+def _ours(files: Prepared, folder: Path) -> tuple[list[tuple[np.ndarray, np.ndarray]], float | None]:
+    """Return the toolkit's predictions of the test files, and the share of their samples inside 95 % intervals [%]."""
+    outcome = identified_pair(files, folder).outcome
     predicted = [(case.motion.t, np.asarray(outcome.predictions[case.name])) for case in outcome.inputs.unseen]
     found = getattr(getattr(outcome, "assessment", None), "intervals", {}).values()
-    weights = [one.beyond.size for one in found]
-    covered = 100.0 * np.average([one.covered for one in found], weights=weights) if weights else np.nan
-    return predicted, float(covered)
+    inside = [one.inside[one.known].ravel() for one in found]
+    return predicted, 100.0 * float(np.concatenate(inside).mean()) if inside else None
 
 
 def _ridges(files: Prepared) -> dict:
@@ -80,7 +84,7 @@ def _ridges(files: Prepared) -> dict:
     for cutoff in CUTOFFS:
         both = ridge.predict(files.robot, files.train, files.test, cutoff, files.payload, files.joints)
         for name in ("zero", "cad") if files.masses else ("zero",):
-            found[f"{cutoff:g} Hz, {name}"] = _percent(*_errors(files.test, both[name]), files.apart)
+            found[f"{cutoff:g} Hz, {name}"] = _percent(*squared_errors(files.test, both[name]), files.apart)
     return found
 
 
@@ -96,7 +100,7 @@ def run(name: str) -> dict:
         ready = time.process_time()
         try:
             predicted, covered = _ours(files, folder)
-            ours = _percent(*_errors(files.test, predicted), files.apart)
+            ours = _percent(*squared_errors(files.test, predicted), files.apart)
             result |= {"ours": ours, "coverage": covered, "refused": ""}
         except Exception as error:  # one pair's failure is a row of the table
             result |= {"ours": None, "coverage": None, "refused": f"{type(error).__name__}: {error}"}
@@ -123,26 +127,35 @@ def ratios(one: dict) -> tuple[float, float]:
     return one["ours"]["total"] / plain["total"], one["ours"]["total"] / best
 
 
-HEAD = (
-    "| pair | regime | ridge | best ridge | toolkit | ratio | to best | worst joint (ridge) | within 95 % | s |\n"
-    "|---|---|---|---|---|---|---|---|---|---|"
-)
+def head(before: dict) -> str:
+    """Return the table's head."""
+    names = ["pair", "regime", "ridge", "best ridge", *(["before"] if before else []), "toolkit", "ratio", "to best"]
+    names += ["worst joint (ridge)", "within 95 %", "s"]
+    return f"| {' | '.join(names)} |\n|{'---|' * len(names)}"
 
 
-def row(one: dict) -> str:
-    """Return a line of the table."""
+def line(one: dict, before: dict) -> str:
+    """Return a line of the table; `before`: the errors of another version by pair, None where it refused."""
     plain = one["ridges"][f"{CUTOFFS[0]:g} Hz, zero"]
     best = min(one["ridges"], key=lambda name: one["ridges"][name]["total"])
-    told = f"| {one['pair']} | {'across' if one['across'] else 'same'} | {plain['total']:.1f} % | "
-    told += f"{one['ridges'][best]['total']:.1f} % ({best}) | "
+    cells = [one["pair"], "across" if one["across"] else "same", _share(plain["total"])]
+    cells.append(f"{_share(one['ridges'][best]['total'])} ({best})")
+    if before:
+        cells.append(_share(before.get(one["pair"])))
+    cells.append(_share(one["ours"] and one["ours"]["total"]))
     if one["ours"] is None:
-        return f"{told}– | – | – | {one['refused'][:80]} | – | {one['seconds']:.0f} |"
-    joints, (ratio, strict) = one["ours"]["joints"], ratios(one)
-    worst = int(np.argmax(joints))
-    return (
-        f"{told}{one['ours']['total']:.1f} % | {ratio:.2f} | {strict:.2f} | {worst + 1}: {joints[worst]:.0f} % "
-        f"({plain['joints'][worst]:.0f} %) | {one['coverage']:.0f} % | {one['seconds']:.0f} |"
-    )
+        cells += ["–", "–", one["refused"][:80], "–"]
+    else:
+        joints = one["ours"]["joints"]
+        worst = int(np.argmax(joints))
+        cells += [f"{x:.2f}" for x in ratios(one)]
+        cells.append(f"{worst + 1}: {joints[worst]:.0f} % ({plain['joints'][worst]:.0f} %)")
+        cells.append("–" if one["coverage"] is None else f"{one['coverage']:.0f} %")
+    return f"| {' | '.join([*cells, format(one['seconds'], '.0f')])} |"
+
+
+def _share(value: float | None) -> str:
+    return "refused" if value is None else f"{value:.1f} %"
 
 
 def summary(rows: list[dict]) -> list[str]:
@@ -157,8 +170,9 @@ def summary(rows: list[dict]) -> list[str]:
         own = [x for x in rows if wanted(x)]
         if own:
             cells = [f"{x.max():.2f} | {np.median(x):.2f} | {(x > 1.1).sum()}" for x in np.array([*map(ratios, own)]).T]
-            covered = np.array([x["coverage"] for x in own if x["ours"]], dtype=float)
-            lines.append(f"| {name} | {len(own)} | {' | '.join(cells)} | {np.nanmean(covered):.0f} % |")
+            covered = [x["coverage"] for x in own if x["coverage"] is not None]
+            mean = f"{np.mean(covered):.0f} %" if covered else "–"
+            lines.append(f"| {name} | {len(own)} | {' | '.join(cells)} | {mean} |")
     return lines
 
 
@@ -168,6 +182,8 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", default=[], help="pairs whose names contain any of these")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("extrapolation"), help="where results are kept")
+    parser.add_argument("--beside", type=Path, help="results.json of another version: a column of its errors")
+    parser.add_argument("--markdown", type=Path, help="document whose tables between the marks are replaced")
     wanted = parser.parse_args()
     tree = state()
     kept = wanted.out / tree
@@ -176,7 +192,8 @@ def main() -> None:
         pair for pair in PAIRS
         if (pair.quick or not wanted.quick) and (not wanted.only or any(x in pair.name for x in wanted.only))
     ]  # fmt: skip
-    print(HEAD, flush=True)
+    before = errors_by_pair(wanted.beside) if wanted.beside else {}
+    print(head(before), flush=True)
     rows = []
     with ProcessPoolExecutor(wanted.jobs, mp_context=get_context("spawn")) as pool:
         paths = [kept / f"{hashlib.sha1(pair.name.encode()).hexdigest()[:12]}.json" for pair in chosen]
@@ -185,9 +202,18 @@ def main() -> None:
             if task is not None:
                 path.write_text(json.dumps(task.result()))
             rows.append(json.loads(path.read_text()))
-            print(row(rows[-1]), flush=True)
+            print(line(rows[-1], before), flush=True)
     (wanted.out / "results.json").write_text(json.dumps({"tree": tree, "rows": rows}, indent=1))
     print("\n".join(["", *summary(rows)]))
+    if wanted.markdown:
+        lines = [*summary(rows), "", head(before), *(line(one, before) for one in rows)]
+        first, _, rest = wanted.markdown.read_text().partition(MARK)
+        wanted.markdown.write_text(f"{first}{MARK}\n" + "\n".join(lines) + f"\n{MARK}{rest.partition(MARK)[2]}")
+
+
+def errors_by_pair(path: Path) -> dict[str, float | None]:
+    """Return the errors [%] in a results.json by pair; None where the toolkit refused."""
+    return {x["pair"]: x["ours"] and x["ours"]["total"] for x in json.loads(path.read_text())["rows"]}
 
 
 if __name__ == "__main__":

@@ -244,60 +244,67 @@ class Simulated:
         return Prepared(given, *files, options, self.masses, PAYLOAD if self.payload else None)
 
 
-def _slow(seconds: float, **settings) -> tuple:
+def slow(seconds: float, **settings) -> tuple:
     return fourier, seconds, {"reach": 0.35, "speed": 0.12, "period": 12.0, **settings}
 
 
-def _rich(seconds: float, **settings) -> tuple:
+def rich(seconds: float, **settings) -> tuple:
     return fourier, seconds, {"reach": 0.7, "speed": 0.5, **settings}
 
 
 FAST = (fourier, 12.0, {"reach": 0.8, "speed": 0.9, "period": 6.0})
+FASTER = (fourier, 12.0, {"reach": 0.6, "speed": 0.35, "period": 8.0})
 POOR = (sine, 25.0, {})
 MADE = [
     Simulated("LWR4+ sensors, one sinusoid → fast", "lwr4plus", "simple", POOR, FAST, True, behind=True, quick=True),
-    Simulated("LWR4+ sensors, one sinusoid → rich", "lwr4plus", "position", POOR, _rich(12), True, behind=True,
+    Simulated("LWR4+ sensors, one sinusoid → rich", "lwr4plus", "position", POOR, rich(12), True, behind=True,
               masses=False, quick=True),
-    Simulated("LWR4+ sensors, half a sinusoid → fast", "lwr4plus", "lugre", (sine, 7.0, {}), FAST, True, behind=True),
-    Simulated("Panda sensors, one sinusoid → fast", "panda", "stribeck", POOR, FAST, True, behind=True, masses=False,
-              quick=True),
-    Simulated("Panda sensors, slow → fast with payload", "panda", "lugre", _slow(20), FAST, True, behind=True,
+    Simulated("LWR4+ sensors, half a sinusoid → faster", "lwr4plus", "lugre", (sine, 7.0, {}), FASTER, True,
+              behind=True),
+    Simulated("Panda sensors, one sinusoid → faster", "panda", "stribeck", POOR, FASTER, True, behind=True,
+              masses=False, quick=True),
+    Simulated("iiwa sensors, one sinusoid → faster", "iiwa14", "lugre", POOR, FASTER, True, behind=True, masses=False),
+    Simulated("LWR4+ sensors, one small sinusoid → faster", "lwr4plus", "simple", (sine, 25.0, {"reach": 0.2}),
+              FASTER, True, behind=True, masses=False),
+    Simulated("Panda sensors, slow → fast with payload", "panda", "lugre", slow(20), FAST, True, behind=True,
               masses=False, payload=True),
-    Simulated("iiwa sensors, one sinusoid → fast with payload", "iiwa14", "stribeck", POOR, FAST, True, behind=True,
+    Simulated("iiwa sensors, one sinusoid → faster with payload", "iiwa14", "stribeck", POOR, FASTER, True, behind=True,
               payload=True),
-    Simulated("iiwa sensors, each joint alone → all", "iiwa14", "position", (each_alone, 28.0, {}), _rich(12), True,
+    Simulated("iiwa sensors, each joint alone → all", "iiwa14", "position", (each_alone, 28.0, {}), rich(12), True,
               behind=True, masses=False, quick=True),
-    Simulated("iiwa sensors, 1.5 s → rich", "iiwa14", "simple", _rich(1.5), _rich(12), False, behind=True),
-    Simulated("Panda sensors, 10 s → rich", "panda", "position", _rich(10), _rich(12), False, behind=True,
+    Simulated("iiwa sensors, 1.5 s → rich", "iiwa14", "simple", rich(1.5), rich(12), False, behind=True),
+    Simulated("Panda sensors, 10 s → rich", "panda", "position", rich(10), rich(12), False, behind=True,
               masses=False),
-    Simulated("LWR4+ sensors, 3 s → rich", "lwr4plus", "asymmetric", _rich(3), _rich(12), False, behind=True),
+    Simulated("LWR4+ sensors, 3 s → rich", "lwr4plus", "asymmetric", rich(3), rich(12), False, behind=True),
     Simulated("LWR4+ motors, one sinusoid → fast", "lwr4plus", "lugre", POOR, FAST, True),
-    Simulated("iiwa motors, slow → fast", "iiwa14", "stribeck", _slow(20), FAST, True, masses=False),
-    Simulated("RV-2SQ, 2 s → rich", "rv2sq", "stribeck", _rich(2), _rich(10), False, quick=True),
-    Simulated("RV-2SQ, 2 s → points", "rv2sq", "lugre", _rich(2), (points, 10.0, {}), True),
-    Simulated("RV-2SQ, cold 20 s → warm fast", "rv2sq", "warming", _rich(20), FAST, True, cold=True),
-    Simulated("RV-2SQ, points → rich", "rv2sq", "asymmetric", (points, 15.0, {}), _rich(10), True),
-    Simulated("RV-2SQ, 10 s → rich with payload", "rv2sq", "position", _rich(10), _rich(10), True, payload=True),
-    Simulated("TX40, 5 s → rich", "tx40", "stribeck", _rich(5), _rich(10), False, coupled=True, quick=True),
-    Simulated("TX40, 5 s → rich, coupling not stated", "tx40", "lugre", _rich(5), _rich(10), False, coupled=True,
+    Simulated("iiwa motors, slow → fast", "iiwa14", "stribeck", slow(20), FAST, True, masses=False),
+    Simulated("RV-2SQ, 2 s → rich", "rv2sq", "stribeck", rich(2), rich(10), False, quick=True),
+    Simulated("RV-2SQ, 2 s → points", "rv2sq", "lugre", rich(2), (points, 10.0, {}), True),
+    Simulated("RV-2SQ, cold 20 s → warm fast", "rv2sq", "warming", rich(20), FAST, True, cold=True),
+    Simulated("RV-2SQ, points → rich", "rv2sq", "asymmetric", (points, 15.0, {}), rich(10), True),
+    Simulated("RV-2SQ, 10 s → rich with payload", "rv2sq", "position", rich(10), rich(10), True, payload=True),
+    Simulated("TX40, 5 s → rich", "tx40", "stribeck", rich(5), rich(10), False, coupled=True, quick=True),
+    Simulated("TX40, 5 s → rich, coupling not stated", "tx40", "lugre", rich(5), rich(10), False, coupled=True,
               stated=False, quick=True),
-    Simulated("TX40, 5 s slow → fast, coupling not stated", "tx40", "stribeck", _slow(5), FAST, True, coupled=True,
+    Simulated("TX40, 5 s slow → fast, coupling not stated", "tx40", "stribeck", slow(5), FAST, True, coupled=True,
               stated=False),
-    Simulated("TX40, each joint alone → all", "tx40", "simple", (each_alone, 24.0, {}), _rich(10), True,
+    Simulated("TX40, each joint alone → all", "tx40", "simple", (each_alone, 24.0, {}), rich(10), True,
               coupled=True),
     Simulated("TX40, one sinusoid → fast with payload", "tx40", "lugre", POOR, FAST, True, coupled=True, payload=True),
-    Simulated("TX40, 2 s → fast", "tx40", "asymmetric", _rich(2), FAST, True, coupled=True),
-    Simulated("UR10e, 2 s → rich", "ur10e", "lugre", _rich(2), _rich(10), False, masses=False, quick=True),
-    Simulated("UR10e, 2 s of points → rich", "ur10e", "stribeck", (points, 2.5, {}), _rich(10), True, masses=False),
-    Simulated("UR10e, one sinusoid → fast with payload", "ur10e", "stribeck", POOR, FAST, True, payload=True,
+    Simulated("TX40, 2 s → fast", "tx40", "asymmetric", rich(2), FAST, True, coupled=True),
+    Simulated("UR10e, 2 s → rich", "ur10e", "lugre", rich(2), rich(10), False, masses=False, quick=True),
+    Simulated("UR5, 2 s → faster", "ur5", "position", rich(2), FASTER, True, masses=False),
+    Simulated("UR5, one sinusoid → faster", "ur5", "stribeck", POOR, FASTER, True),
+    Simulated("UR10e, 2 s of points → rich", "ur10e", "stribeck", (points, 2.5, {}), rich(10), True, masses=False),
+    Simulated("UR10e, one sinusoid → faster with payload", "ur10e", "stribeck", POOR, FASTER, True, payload=True,
               quick=True),
-    Simulated("UR10e, each joint alone → all", "ur10e", "position", (each_alone, 24.0, {}), _rich(10), True,
+    Simulated("UR10e, each joint alone → all", "ur10e", "position", (each_alone, 24.0, {}), rich(10), True,
               masses=False),
-    Simulated("UR10e, 60 s → rich", "ur10e", "lugre", _rich(60), _rich(10), False, rate=100.0),
-    Simulated("UR5, 5 s → points", "ur5", "position", _rich(5), (points, 10.0, {}), True),
-    Simulated("UR5, cold 15 s → warm", "ur5", "warming", _rich(15), _rich(10), False, masses=False, cold=True),
-    Simulated("UR5, slow → fast", "ur5", "asymmetric", _slow(30), FAST, True, rate=100.0),
-    Simulated("UR5, 8 s → rich", "ur5", "stribeck", _rich(8), _rich(10), False, masses=False),
+    Simulated("UR10e, 60 s → rich", "ur10e", "lugre", rich(60), rich(10), False, rate=100.0),
+    Simulated("UR5, 5 s → points", "ur5", "position", rich(5), (points, 10.0, {}), True),
+    Simulated("UR5, cold 15 s → warm", "ur5", "warming", rich(15), rich(10), False, masses=False, cold=True),
+    Simulated("UR5, slow → fast", "ur5", "asymmetric", slow(30), FAST, True, rate=100.0),
+    Simulated("UR5, 8 s → rich", "ur5", "stribeck", rich(8), rich(10), False, masses=False),
 ]  # fmt: skip
 
 PAIRS = [*OPEN, *(Pair(f"sim. {one.name}", one.across, one.prepare, one.quick) for one in MADE)]

@@ -18,7 +18,7 @@ import calib
 
 LIBRARY = Path(calib.__file__).parent / "robot/library"
 FINE = 1000.0  # of the simulation [Hz]
-NOISE, ENCODER = 0.003, 2e-5  # of torques as a share of their limits, of positions [rad]
+SENSORS, MOTORS, ENCODER = 0.001, 0.003, 2e-5  # noise of torques as a share of their limits, of positions [rad]
 BEHIND = 0.05  # share of the friction that sensors behind the gears see
 MASS, SHIFT = 0.06, 8e-3  # by how much the description's masses and centres are off, 1 sigma [1, m]
 PAYLOAD = {"mass": 2.0, "com": [0.02, -0.03, 0.08]}
@@ -257,6 +257,7 @@ def record(
         model.appendBodyToJoint(n, body, next(x for x in model.frames if x.name == "flange").placement)
     data = model.createData()
     bodies = np.array([pin.rnea(model, data, *x) for x in zip(q[::every], v[::every], a[::every])])
-    tau = bodies + drives[::every] + NOISE * robot.effort * rng.standard_normal(bodies.shape)
+    noise = (SENSORS if behind else MOTORS) * robot.effort * rng.standard_normal(bodies.shape)
+    tau = bodies + drives[::every] + noise
     np.savez(path, t=t[::every], q=q[::every] + ENCODER * rng.standard_normal(bodies.shape), tau=tau)
     return path
