@@ -239,7 +239,9 @@ def learn_errors(
     q = np.concatenate([block.q for block in measured])
     wide = radii[0] * wider[0], radii[1] * wider[1]
     outside = left.wider(weights, wide, reach, rows.poses)
-    known = Discrepancy(*weights, wide, reach, tuple(levers.tolist()), profile, radii, outside)
+    kappa, floor, near_by, beyond = weights
+    lengths = tuple(levers.tolist())
+    known = Discrepancy(kappa, floor, near_by, beyond, wide, reach, lengths, profile, radii, outside)
     return ErrorModel(found.cell, found.free, found.estimate.covariance, q, known)
 
 
