@@ -80,7 +80,6 @@ def new(
     stands on the certificate.
     """
     from calib.api.sessions import new_session
-    from calib.errors import command_line
     from calib.procedure.parallel_stage.robots import refuse_parallel
     from calib.procedure.session.questions import Answers, checked
 
