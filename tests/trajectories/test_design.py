@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import cache, partial
 
 import excited_arm as arm
@@ -230,13 +231,12 @@ def test_verification_finds_what_happens_between_samples():
 
 
 @pytest.mark.slow
-def test_a_motion_infeasible_between_coarse_samples_is_searched_again():
-    spot = problem(samples=14, tightening=0.0)
-    run = one_start(spot, 120, "slsqp", 1, 0)
-    assert isinstance(run, SearchResult)
-    assert not verify_motion(spot.family, run.x, spot.constraints).feasible
-    again, proof = ensured(spot, run)
-    assert proof.feasible and again.evaluations > run.evaluations
+def test_a_motion_that_breaks_its_limits_is_searched_again():
+    spot, found = designed()
+    larger = replace(found, x=1.1 * found.x)
+    assert not verify_motion(spot.family, larger.x, spot.constraints).feasible
+    again, proof = ensured(spot, larger)
+    assert proof.feasible and again.evaluations > found.evaluations
 
 
 def test_a_wall_thinner_than_a_step_is_not_jumped_over():

@@ -57,6 +57,7 @@ STAGES = (
 )
 """Our choice."""
 S_RANGE = (-4.0, 12.0)
+KEPT = 1e-7  # of a constraint's scale, by which a point that keeps it may break it: rounding
 REPAIR = 30  # evaluations to bring a stage's last motion back inside
 SMALLER = 4  # times that a motion is halved which cannot be brought back inside
 DEEP = 0.02  # of a constraint's scale: a motion that breaks it by more between the samples leads nowhere (our choice)
@@ -155,7 +156,7 @@ def one_start(
                 back = run.last_unbroken()
                 run, y = run.continued(run.reached(y), *_at_stage(problem, stage, extra))
                 y = run.repaired(y)
-                y = back if run.best is None else y
+                y = back if run.least[0] > KEPT else y
     except KeyboardInterrupt:
         if run.best is None:
             raise
@@ -254,7 +255,7 @@ class StartSearch:
         lacking = (max(found.excess, 0.0), missed[0] if missed else 0.0)
         if lacking < self.least:
             self.least, self.nearest = lacking, y
-        if found.excess > 1e-7:
+        if found.excess > KEPT:
             return
         self.kept += 1
         value = merit(self.problem, found.exact)
@@ -268,7 +269,7 @@ class StartSearch:
         """Return a point that keeps the constraints: repaired, or of a smaller motion where that fails."""
         found = self.repaired(y)
         for _ in range(SMALLER):
-            if self.best is not None:
+            if self.least[0] <= KEPT:  # some point keeps the constraints, whether or not the hard goals
                 break
             y = shrunk(self.problem, y, 0.5)
             found = self.repaired(y)

@@ -173,7 +173,7 @@ def actuator_bounds(known: ClosedRobot, predicted: bool) -> MotionBounds:
     velocity, effort = (np.array([getattr(joint, key) for joint in joints]) for key in ("velocity", "effort"))
     free = np.full(len(joints), np.inf)
     torque = effort if predicted else free
-    origin = dict.fromkeys(("velocity", "torque"), "robot's file")
+    origin: dict[str, str] = dict.fromkeys(("velocity", "torque"), "robot's file")
     place = "in the robot's file: velocity and effort of the actuated joints, and inertias"
     return MotionBounds(known.robot.name, joints, velocity, free, torque, origin, place)
 
