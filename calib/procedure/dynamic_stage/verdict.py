@@ -83,7 +83,7 @@ def judge(
     4. the unseen error is above `GOOD`, or `TRANSFER` times the fit's own: marginal;
     5. else pass.
 
-    Where the robot moves for less than `MIN_MOTION` in all training files that comes first, and nothing passes.
+    Where that is no pass and the robot moves for less than `MIN_MOTION` in all training files, this comes first.
 
     Args:
         fit, validation: scores by file; validation without repeats.
@@ -95,10 +95,10 @@ def judge(
     """
     found = _judge(fit, validation, repeated, excitation, driven, rows, coordinate)
     seconds = sum(report.seconds for report in excitation.values())
-    if not excitation or seconds >= MIN_MOTION:
+    if found.level == "pass" or not excitation or seconds >= MIN_MOTION:
         return found
     told = f"the training motion lasts {seconds:.2g} s, too short to identify by: record 10 s or more of motion"
-    return Verdict("fail" if found.level == "fail" else "marginal", f"{told}; {found.reason}")
+    return Verdict(found.level, f"{told}; {found.reason}")
 
 
 def _judge(
